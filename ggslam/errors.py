@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exception tree of ggslam. Messages name the file or frame, what was expected and what was found."""
+
+from __future__ import annotations
+
+
+class GgslamError(Exception):
+    """Base of every error that ggslam raises on purpose. The command line prints it and exits with `exit_code`."""
+
+    exit_code = 2
+    """2: the user's input is at fault; 1: ggslam or the machine is."""
+
+
+class SequenceError(GgslamError):
+    """A recording cannot be read: folder not recognised, file missing or damaged, sizes that do not agree."""
+
+
+class ConfigError(GgslamError):
+    """A setting is unknown or has an impossible value."""
+
+
+class FormatError(GgslamError):
+    """A file (PLY, trajectory, run folder...) does not follow its format."""
+
+
+class RunFolderError(GgslamError):
+    """A run folder cannot be written or lacks a part that was asked for."""
+
+
+class RenderError(GgslamError):
+    """The renderer was given arrays of wrong shape or type, or a backend that is not available."""
+
+
+class TrackingLost(GgslamError):
+    """The camera could not be located."""
+
+
+class MissingDependency(GgslamError):
+    """An optional package or file is needed for what was asked; the message says how to get it."""
+
+
+class NativeCoreError(GgslamError):
+    """The compiled core is missing or does not fit this version of the Python code."""
+
+    exit_code = 1

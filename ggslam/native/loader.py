@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds and loads the compiled core, and hands out the context (threads, instruction set) its functions run in."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from functools import lru_cache
+from pathlib import Path
+
+from ggslam.errors import NativeCoreError
+
+ABI_VERSION = 1
+INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
+_LIBRARY_NAMES = ("libggslam_core.so", "libggslam_core.dylib")
+
+
+@lru_cache(maxsize=1)
+def load_library() -> ctypes.CDLL:
+    """The compiled core. `GGSLAM_CORE` in the environment names another file than the installed one.
+
+    Raises:
+        NativeCoreError: no library, or one of another version.
+    """
+    folder = Path(__file__).parent / "_lib"
+    candidates = [Path(os.environ["GGSLAM_CORE"])] if "GGSLAM_CORE" in os.environ else []
+    candidates += [folder / name for name in _LIBRARY_NAMES]
+    found = next((path for path in candidates if path.exists()), None)
+    if found is None:
+        raise NativeCoreError(
+            f"the compiled core is missing (looked for {', '.join(map(str, candidates))}): "
+            "run `pip install .` or, in a checkout, `bash scripts/build_native.sh`"
+        )
+    library = ctypes.CDLL(str(found))
+    version = library.ggslam_abi_version()
+    if version != ABI_VERSION:
+        raise NativeCoreError(f"{found}: compiled core has interface version {version}, expected {ABI_VERSION}")
+    library.ggslam_context_create.restype = ctypes.c_void_p
+    library.ggslam_context_create.argtypes = [ctypes.c_int, ctypes.c_int]
+    library.ggslam_context_destroy.argtypes = [ctypes.c_void_p]
+    return library
+
+
+def available_instruction_sets() -> list[str]:
+    """Names of the instruction sets that this processor and this build offer, narrowest first."""
+    library = load_library()
+    return [name for number, name in enumerate(INSTRUCTION_SETS) if library.ggslam_isa_available(number)]
+
+
+class NativeContext:
+    """Threads and instruction set for the kernels. One context serves one caller at a time; make one per thread.
+
+    Args:
+        threads: number of threads; None: the processors this process may use.
+        instruction_set: one of `INSTRUCTION_SETS`; None: `GGSLAM_ISA` in the environment, else the widest available.
+    """
+
+    def __init__(self, threads: int | None = None, instruction_set: str | None = None) -> None:
+        self._handle: int | None = None
+        self._library = load_library()
+        self.threads = threads if threads is not None else available_processors()
+        if self.threads < 1:
+            raise NativeCoreError(f"threads must be at least 1, found {self.threads}")
+        name = instruction_set or os.environ.get("GGSLAM_ISA") or INSTRUCTION_SETS[self._library.ggslam_best_isa()]
+        if name not in available_instruction_sets():
+            raise NativeCoreError(
+                f"instruction set {name!r} is not available here; available: {', '.join(available_instruction_sets())}"
+            )
+        self.instruction_set = name
+        self._handle = self._library.ggslam_context_create(self.threads, INSTRUCTION_SETS.index(name))
+
+    @property
+    def handle(self) -> ctypes.c_void_p:
+        """Pointer that the C functions take as their first argument."""
+        return ctypes.c_void_p(self._handle)
+
+    def __del__(self) -> None:
+        if self._handle is not None:
+            self._library.ggslam_context_destroy(self._handle)
+
+
+def available_processors() -> int:
+    """Number of processors this process may run on."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS
+        return os.cpu_count() or 1

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pinhole camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion.
+
+    Pixel convention of OpenCV: the centre of the top-left pixel is (0, 0), so a point (x, y, z) in the camera frame
+    falls on column u = fx x / z + cx and row v = fy y / z + cy. (3DGS renderers put that centre at (0.5, 0.5); the
+    rendering backends convert.)
+
+    Attributes:
+        width, height: image size in pixels.
+        fx, fy: focal lengths in pixels.
+        cx, cy: principal point in pixels.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        if self.width < 1 or self.height < 1 or not all(map(math.isfinite, numbers)) or self.fx <= 0 or self.fy <= 0:
+            raise ValueError(f"impossible camera: {self}")
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same view with its image resampled to `width` x `height` pixels."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(
+            width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        )
+
+    def scaled(self, factor: float) -> Camera:
+        """The camera with its image size multiplied by `factor` (rounded to whole pixels)."""
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+    def matrix(self) -> np.ndarray:
+        """The 3x3 calibration matrix K, float64."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def rays(self) -> np.ndarray:
+        """Viewing rays with z = 1 through the pixel centres, float32 [H, W, 3]."""
+        u = (np.arange(self.width, dtype=np.float32) - self.cx) / self.fx
+        v = (np.arange(self.height, dtype=np.float32) - self.cy) / self.fy
+        rays = np.ones((self.height, self.width, 3), np.float32)
+        rays[..., 0], rays[..., 1] = u[None, :], v[:, None]
+        return rays
+
+    def back_project(self, depth: np.ndarray) -> np.ndarray:
+        """Points in the camera frame, float32 [H, W, 3], of a depth image [H, W] in metres (0 stays the origin)."""
+        return self.rays() * depth[..., None].astype(np.float32)

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One instant of a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One RGB-D image pair with what is known about it.
+
+    Attributes:
+        index: position in the selected part of the recording (0, 1, 2, ...).
+        source_index: position in the whole recording, before start/stop/stride.
+        timestamp: seconds.
+        color: uint8 [H, W, 3], RGB.
+        depth: float32 [H, W], metres along the optical axis, 0 where unknown; registered to `color`.
+        camera: intrinsics of both images.
+        mask: uint16 [H, W] instance ids, 0 = unlabelled; None when the recording has none.
+        T_world_camera: float64 [4, 4] true pose if the recording tells it. Used for scores only, never for tracking.
+    """
+
+    index: int
+    source_index: int
+    timestamp: float
+    color: np.ndarray
+    depth: np.ndarray
+    camera: Camera
+    mask: np.ndarray | None = None
+    T_world_camera: np.ndarray | None = None

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map: a structure of arrays of 3D Gaussians with spare capacity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+
+SH_C0 = 0.28209479177387814
+"""Zeroth spherical-harmonic constant: colour = 0.5 + SH_C0 * sh[0] for degree 0."""
+
+_PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features")
+_BOOKKEEPING = ("birth_keyframe", "object_id", "updates")
+
+
+def rgb_to_sh(rgb: torch.Tensor) -> torch.Tensor:
+    """Degree-0 spherical-harmonic coefficient of a colour in [0, 1]."""
+    return (rgb - 0.5) / SH_C0
+
+
+def sh_to_rgb(sh: torch.Tensor) -> torch.Tensor:
+    """Colour of a degree-0 spherical-harmonic coefficient."""
+    return 0.5 + SH_C0 * sh
+
+
+@dataclass
+class GaussianMap:
+    """3D Gaussians as arrays whose first `count` rows are in use. Float32 unless said otherwise.
+
+    Properties give views of the used rows:
+        means: [N, 3] metres, world frame.
+        quaternions: [N, 4] wxyz, not necessarily of unit length.
+        log_scales: [N, 3], natural logarithm of the standard deviations in metres.
+        opacity_logits: [N].
+        sh: [N, K, 3] spherical-harmonic colour coefficients, K = (degree + 1)^2.
+        features: [N, F], feature channels splatted like colour (identity vectors); F may be 0.
+        birth_keyframe: int32 [N], index of the keyframe that inserted the Gaussian (-1 unknown).
+        object_id: int32 [N], 0 = unlabelled.
+        updates: int32 [N], optimizer steps seen so far.
+    Adam's two moments of each parameter are kept beside it (`moments[name]` = (first, second)) and grow along.
+    """
+
+    sh_degree: int = 0
+    feature_channels: int = 0
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    with_moments: bool = True
+    count: int = 0
+    version: int = 0
+    """Increases with every change of the set of Gaussians (insert, keep), so that indices can be seen to be stale."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
+        self._storage: dict[str, torch.Tensor] = {}
+        self._moments: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
+        self._allocate(0)
+
+    # --- storage -------------------------------------------------------------------------------------------------
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        shapes: dict[str, tuple[int, ...]] = {
+            "means": (3,), "quaternions": (4,), "log_scales": (3,), "opacity_logits": (),
+            "sh": ((self.sh_degree + 1) ** 2, 3), "features": (self.feature_channels,),
+        }  # fmt: skip
+        return shapes.get(name, ())
+
+    def _allocate(self, capacity: int) -> None:
+        def grown(old: torch.Tensor | None, name: str, dtype: torch.dtype) -> torch.Tensor:
+            new = torch.zeros((capacity, *self._shape(name)), dtype=dtype, device=self.device)
+            if old is not None:
+                new[: self.count] = old[: self.count]
+            return new
+
+        for name in _PARAMETERS:
+            self._storage[name] = grown(self._storage.get(name), name, torch.float32)
+            if self.with_moments:
+                first, second = self._moments.get(name, (None, None))
+                self._moments[name] = (grown(first, name, torch.float32), grown(second, name, torch.float32))
+        for name in _BOOKKEEPING:
+            self._storage[name] = grown(self._storage.get(name), name, torch.int32)
+
+    @property
+    def capacity(self) -> int:
+        """Rows allocated."""
+        return self._storage["means"].shape[0]
+
+    def reserve(self, rows: int) -> None:
+        """Makes room for `rows` Gaussians in all; grows by half at least, so that inserting is amortised."""
+        if rows > self.capacity:
+            self._allocate(max(rows, self.capacity + self.capacity // 2, 16384))
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getattr__(self, name: str) -> torch.Tensor:
+        if name in _PARAMETERS or name in _BOOKKEEPING:
+            return self._storage[name][: self.count]
+        raise AttributeError(name)
+
+    @property
+    def moments(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        """Adam's first and second moment of each parameter, views of the used rows."""
+        return {name: (a[: self.count], b[: self.count]) for name, (a, b) in self._moments.items()}
+
+    # --- derived quantities ----------------------------------------------------------------------------------------
+
+    @property
+    def opacities(self) -> torch.Tensor:
+        """[N] in (0, 1)."""
+        return torch.sigmoid(self.opacity_logits)
+
+    @property
+    def scales(self) -> torch.Tensor:
+        """[N, 3] standard deviations in metres."""
+        return torch.exp(self.log_scales)
+
+    @property
+    def rgb(self) -> torch.Tensor:
+        """[N, 3] view-independent part of the colour, unclamped."""
+        return sh_to_rgb(self.sh[:, 0])
+
+    # --- changes -----------------------------------------------------------------------------------------------------
+
+    def insert(
+        self,
+        means: torch.Tensor,
+        quaternions: torch.Tensor,
+        log_scales: torch.Tensor,
+        opacity_logits: torch.Tensor,
+        rgb: torch.Tensor,
+        features: torch.Tensor | None = None,
+        birth_keyframe: int = -1,
+        object_id: torch.Tensor | None = None,
+    ) -> slice:
+        """Appends M Gaussians (shapes as in the class; `rgb` [M, 3] in [0, 1]) with zero moments.
+
+        Returns:
+            The rows they occupy.
+        """
+        added = means.shape[0]
+        rows = slice(self.count, self.count + added)
+        self.reserve(self.count + added)
+        given = {"means": means, "quaternions": quaternions, "log_scales": log_scales, "opacity_logits": opacity_logits}
+        for name, value in given.items():
+            self._storage[name][rows] = value
+        self._storage["sh"][rows] = 0
+        self._storage["sh"][rows, 0] = rgb_to_sh(rgb)
+        self._storage["features"][rows] = 0 if features is None else features
+        self._storage["birth_keyframe"][rows] = birth_keyframe
+        self._storage["object_id"][rows] = 0 if object_id is None else object_id.to(torch.int32)
+        self._storage["updates"][rows] = 0
+        for first, second in self._moments.values():
+            first[rows] = 0
+            second[rows] = 0
+        self.count += added
+        self.version += 1
+        return rows
+
+    def keep(self, selected: torch.Tensor) -> int:
+        """Keeps the Gaussians where `selected` (bool [N]) is true, in their order; returns how many were removed."""
+        index = torch.nonzero(selected, as_tuple=True)[0]
+        removed = self.count - index.shape[0]
+        if removed == 0:
+            return 0
+        self.reorder(index)
+        return removed
+
+    def reorder(self, index: torch.Tensor) -> None:
+        """Makes row i the former row index[i] (int64 [M]); rows not named are dropped. Moments move along."""
+        kept = index.shape[0]
+        arrays = list(self._storage.values()) + [m for pair in self._moments.values() for m in pair]
+        for array in arrays:
+            array[:kept] = array[: self.count][index]
+        self.count = kept
+        self.version += 1
+
+    def move(self, rows: torch.Tensor, T_new_old: torch.Tensor) -> None:
+        """Moves Gaussians rigidly: means and rotations of `rows` (bool [N] or int64 [M]) by `T_new_old` [4, 4].
+
+        Only the degree-0 part of the colour is independent of the viewing direction; higher degrees are left as they
+        are, which is exact for translations.
+        """
+        T = T_new_old.to(self.means)
+        self.means[rows] = self.means[rows] @ T[:3, :3].T + T[:3, 3]
+        self.quaternions[rows] = _multiply(_quaternion(T[:3, :3]), self.quaternions[rows])
+        self.version += 1
+
+
+def _quaternion(R: torch.Tensor) -> torch.Tensor:
+    from ggslam.scene.poses import matrix_to_quaternion
+
+    return torch.as_tensor(matrix_to_quaternion(R.double().cpu().numpy())).to(R)
+
+
+def _multiply(p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+    """Hamilton product of one quaternion wxyz [4] with many [M, 4]."""
+    w, x, y, z = p
+    a, b, c, d = q.unbind(-1)
+    return torch.stack(
+        [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c,
+         w * c - x * d + y * a + z * b, w * d + x * c - y * b + z * a], -1
+    )  # fmt: skip

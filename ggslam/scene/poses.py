@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rigid transforms: 4x4 float64 matrices, unit quaternions (wxyz), and the exponential map of SE(3)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def skew(w: np.ndarray) -> np.ndarray:
+    """Matrix [w]x with [w]x v = w x v, [3, 3]."""
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def se3_exp(twist: np.ndarray) -> np.ndarray:
+    """Exponential of a twist (v, w) [6], translation first: a transform [4, 4]. |w| in radians."""
+    v, w = np.asarray(twist[:3], float), np.asarray(twist[3:], float)
+    angle = float(np.linalg.norm(w))
+    W = skew(w)
+    if angle < 1e-6:
+        a, b, c = 1.0 - angle**2 / 6, 0.5 - angle**2 / 24, 1.0 / 6 - angle**2 / 120
+    else:
+        a, b, c = np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    T = np.eye(4)
+    T[:3, :3] += a * W + b * W @ W
+    T[:3, 3] = (np.eye(3) + b * W + c * W @ W) @ v
+    return T
+
+
+def so3_log(R: np.ndarray) -> np.ndarray:
+    """Rotation vector [3] in radians of a rotation matrix [3, 3], angle in [0, pi]."""
+    q = matrix_to_quaternion(R)
+    if q[0] < 0:
+        q = -q
+    sine = float(np.linalg.norm(q[1:]))
+    if sine < 1e-12:
+        return 2.0 * q[1:]
+    return 2.0 * np.arctan2(sine, q[0]) * q[1:] / sine
+
+
+def se3_log(T: np.ndarray) -> np.ndarray:
+    """Twist (v, w) [6] with se3_exp(twist) = T; inverse of `se3_exp` for angles below pi."""
+    w = so3_log(T[:3, :3])
+    angle = float(np.linalg.norm(w))
+    W = skew(w)
+    if angle < 1e-6:
+        factor = 1.0 / 12
+    else:
+        factor = 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle)) if angle < np.pi - 1e-6 else 1 / angle**2
+    V_inverse = np.eye(3) - 0.5 * W + factor * W @ W
+    return np.concatenate([V_inverse @ T[:3, 3], w])
+
+
+def inverse(T: np.ndarray) -> np.ndarray:
+    """Inverse of rigid transforms, [..., 4, 4]."""
+    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
+    out = np.zeros_like(T)
+    out[..., :3, :3] = R_t
+    out[..., :3, 3] = -(R_t @ T[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1
+    return out
+
+
+def orthonormalized(T: np.ndarray) -> np.ndarray:
+    """The transform with its 3x3 part replaced by the nearest rotation (removes accumulated rounding)."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    out = np.eye(4)
+    out[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    out[:3, 3] = T[:3, 3]
+    return out
+
+
+def quaternion_to_matrix(q: np.ndarray) -> np.ndarray:
+    """Rotation matrices [..., 3, 3] of quaternions wxyz [..., 4] (normalised here)."""
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def matrix_to_quaternion(R: np.ndarray) -> np.ndarray:
+    """Unit quaternion wxyz [4] of a rotation matrix [3, 3] (Shepperd's method: divide by the largest term)."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    terms = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
+    i = int(np.argmax(terms))
+    if i == 0:
+        q = np.array([1 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    elif i == 1:
+        q = np.array([R[2, 1] - R[1, 2], 1 + 2 * R[0, 0] - trace, R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]])
+    elif i == 2:
+        q = np.array([R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], 1 + 2 * R[1, 1] - trace, R[1, 2] + R[2, 1]])
+    else:
+        q = np.array([R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], 1 + 2 * R[2, 2] - trace])
+    return q / np.linalg.norm(q)
+
+
+def is_valid_pose(T: np.ndarray) -> bool:
+    """Whether a 4x4 matrix is finite and its rotation part orthonormal to 1 % with determinant +1."""
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0.5)

@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shared fixtures."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the shared recordings: `GGSLAM_DATA`, else `../shared/data` beside the checkout. Skips if absent."""
+    folder = Path(os.environ.get("GGSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no shared recordings at {folder} (set GGSLAM_DATA)")
+    return folder
