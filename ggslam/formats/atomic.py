@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ggslam.errors import RunFolderError
+
+
+@contextmanager
+def atomic_write(path: str | Path, fsync: bool = False) -> Iterator[Path]:
+    """Gives the name of a temporary file to fill; it takes the place of `path` when the block ends well.
+
+        with atomic_write("map.ply") as temporary:
+            temporary.write_bytes(data)
+
+    The temporary file lies in the folder of `path` (a rename is atomic only within one file system), is hidden, and
+    ends like `path`, so that writers which go by the ending (images) work too. It exists and is empty when the block
+    begins. If the block raises, whatever stood at `path` before is untouched and the temporary file is gone.
+
+    Args:
+        path: the file to write; its folder must exist.
+        fsync: also waits until the data are on the disk, so that a power cut cannot leave an empty file.
+
+    Raises:
+        RunFolderError: the file cannot be written (folder missing, no permission, disk full, ...), naming `path` and
+            the reason of the operating system.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        raise RunFolderError(f"cannot write {path}: it exists and is not a regular file")
+    path = path.resolve() if path.is_symlink() else path
+    temporary = path.with_name(f".{path.stem[:64]}.{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+    try:
+        temporary.open("xb").close()
+        yield temporary
+        if fsync:
+            _sync(temporary)
+        temporary.replace(path)
+    except OSError as error:
+        if error.filename not in (None, str(temporary), temporary):
+            raise  # the block failed to read some other file: not ours to explain
+        raise RunFolderError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | Path, data: bytes, fsync: bool = False) -> None:
+    """Writes a whole file atomically; see `atomic_write` for errors."""
+    with atomic_write(path, fsync) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: str | Path, text: str, fsync: bool = False) -> None:
+    """Writes a whole UTF-8 text file atomically; see `atomic_write` for errors."""
+    write_bytes(path, text.encode("utf-8"), fsync)
+
+
+def _sync(path: Path) -> None:
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
