@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairing measurements by time, and poses between measured ones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.scene.poses import se3_exp, se3_log
+
+
+def associate(first: np.ndarray, second: np.ndarray, tolerance: float) -> list[tuple[int, int]]:
+    """Pairs (i, j) of times first[i], second[j] at most `tolerance` seconds apart, each used once, closest pairs first.
+
+    Args:
+        first, second: float64 [n], [m], in any order.
+
+    Returns:
+        Pairs sorted by i.
+    """
+    order = np.argsort(second, kind="stable")
+    sorted_second = second[order]
+    low = np.searchsorted(sorted_second, first - tolerance, "left")
+    high = np.searchsorted(sorted_second, first + tolerance, "right")
+    candidates = [
+        (abs(first[i] - sorted_second[j]), i, int(order[j])) for i in range(len(first)) for j in range(low[i], high[i])
+    ]
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, i, j in sorted(candidates):
+        if i not in pairs and j not in taken:
+            pairs[i] = j
+            taken.add(j)
+    return sorted(pairs.items())
+
+
+def poses_at(
+    times: np.ndarray, pose_times: np.ndarray, poses: np.ndarray, largest_gap: float = 0.1, tolerance: float = 0.02
+) -> np.ndarray:
+    """Poses at given times: interpolated on SE(3) between two measurements at most `largest_gap` seconds apart, else
+    the nearest one within `tolerance` seconds, else NaN.
+
+    Args:
+        times: float64 [n], seconds.
+        pose_times: float64 [m], any order.
+        poses: float64 [m, 4, 4]; rows of NaN are left out.
+
+    Returns:
+        float64 [n, 4, 4].
+    """
+    result = np.full((len(times), 4, 4), np.nan)
+    usable = np.nonzero(np.isfinite(poses).all((1, 2)))[0]
+    usable = usable[np.argsort(pose_times[usable], kind="stable")]
+    if len(usable) == 0:
+        return result
+    stamps, known = pose_times[usable], poses[usable]
+    for i, t in enumerate(times):
+        after = int(np.searchsorted(stamps, t, "left"))
+        before = after - 1
+        if before >= 0 and after < len(stamps) and 0 < stamps[after] - stamps[before] <= largest_gap:
+            share = (t - stamps[before]) / (stamps[after] - stamps[before])
+            step = np.linalg.inv(known[before]) @ known[after]
+            result[i] = known[before] @ se3_exp(share * se3_log(step))
+            continue
+        nearest = min((k for k in (before, after) if 0 <= k < len(stamps)), key=lambda k: abs(stamps[k] - t))
+        if abs(stamps[nearest] - t) <= tolerance:
+            result[i] = known[nearest]
+    return result

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Opening a recording: recognising its format and selecting a part of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.masks import find_masks
+from ggslam.sequences.recording import Recording, RecordingFormat
+from ggslam.sequences.replica import ReplicaFormat
+from ggslam.sequences.sequence import OnBadFrame, Sequence
+from ggslam.sequences.seven_scenes import SevenScenesFormat
+from ggslam.sequences.tum import TumFormat
+
+FORMATS: tuple[RecordingFormat, ...] = (ReplicaFormat(), TumFormat(), SevenScenesFormat())
+"""Known formats in the order in which they are tried."""
+
+
+def open_sequence(
+    path: str | Path,
+    *,
+    format: str | None = None,
+    start: int = 0,
+    stop: int | None = None,
+    stride: int = 1,
+    scale: float = 1.0,
+    masks: str | Path | None = None,
+    depth_scale: float | None = None,
+    on_bad_frame: OnBadFrame = "error",
+) -> Sequence:
+    """Opens an RGB-D recording.
+
+    Args:
+        path: folder of the recording.
+        format: name of a format in `FORMATS`; None: recognised from the folder.
+        start, stop, stride: frames start, start + stride, ... below stop (None: to the end). A stop past the end means
+            the end.
+        scale: size of the delivered images, in (0, 1].
+        masks: folder of instance masks to use instead of the recording's own.
+        depth_scale: depth units per metre, instead of the recording's own.
+        on_bad_frame: "error": a damaged frame raises; "skip": `stream` passes over it and lists it in `skipped`.
+
+    Raises:
+        SequenceError: the recording cannot be read; the message names the file, what was expected and what was found.
+    """
+    folder = _existing_folder(Path(path).expanduser())
+    recording = _find_format(folder, format).read(folder)
+    if not recording.files:
+        raise SequenceError(f"{folder}: holds no frames")
+    if masks is not None:
+        found = find_masks(Path(masks), [entry.color for entry in recording.files])
+        pairs = zip(recording.files, found, strict=True)
+        recording.files = [dataclasses.replace(entry, mask=mask) for entry, mask in pairs]
+    if depth_scale is not None:
+        recording.depth_scale = depth_scale
+    if not (math.isfinite(recording.depth_scale) and recording.depth_scale > 0):
+        raise SequenceError(f"{folder}: depth scale must be a positive number, found {recording.depth_scale}")
+    return Sequence(recording, _selection(recording, start, stop, stride), scale=scale, on_bad_frame=on_bad_frame)
+
+
+def recognise_format(path: str | Path) -> str | None:
+    """Name of the format of a folder, None when it is none of the known ones (or no folder)."""
+    folder = Path(path)
+    return next((f.name for f in FORMATS if folder.is_dir() and f.matches(folder)), None)
+
+
+def _existing_folder(folder: Path) -> Path:
+    if not folder.exists():
+        raise SequenceError(f"{folder}: no such folder")
+    if not folder.is_dir():
+        raise SequenceError(f"{folder}: expected the folder of a recording, found a file")
+    return folder
+
+
+def _find_format(folder: Path, name: str | None) -> RecordingFormat:
+    if name is not None:
+        named = next((f for f in FORMATS if f.name == name), None)
+        if named is None:
+            raise SequenceError(f"unknown format '{name}'; known: {', '.join(f.name for f in FORMATS)}")
+        return named
+    recognised = next((f for f in FORMATS if f.matches(folder)), None)
+    if recognised is None:
+        looked_for = "\n".join(f"  {f.name}: {f.layout}" for f in FORMATS)
+        raise SequenceError(f"{folder}: not a known recording; it holds {_contents(folder)}. Looked for:\n{looked_for}")
+    return recognised
+
+
+def _contents(folder: Path, shown: int = 8) -> str:
+    names = sorted(p.name + ("/" if p.is_dir() else "") for p in folder.iterdir())
+    if not names:
+        return "nothing"
+    more = f" and {len(names) - shown} more" if len(names) > shown else ""
+    return ", ".join(names[:shown]) + more
+
+
+def _selection(recording: Recording, start: int, stop: int | None, stride: int) -> range:
+    count = len(recording.files)
+    if not 0 <= start < count:
+        raise SequenceError(f"{recording.path}: start must be from 0 to {count - 1}, found {start}")
+    if stride < 1:
+        raise SequenceError(f"{recording.path}: stride must be at least 1, found {stride}")
+    if stop is not None and stop <= start:
+        raise SequenceError(f"{recording.path}: stop must be above start {start}, found {stop}")
+    return range(start, count if stop is None else min(stop, count), stride)

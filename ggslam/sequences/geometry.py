@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bringing the colour, depth and mask image of a frame onto one pixel grid of one undistorted pinhole camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.scene.camera import Camera
+from ggslam.sequences.recording import FrameFiles, Recording
+from ggslam.sequences.resampling import resize_color, resize_depth, resize_mask
+
+ASPECT_TOLERANCE = 0.01
+"""Relative difference of width/height up to which two sizes count as the same view (1296x968 and 640x480: 0.4 %)."""
+
+Size = tuple[int, int]
+"""(width, height) in pixels."""
+
+
+def image_size(image: np.ndarray) -> Size:
+    """(width, height) of an image [H, W, ...]."""
+    return image.shape[1], image.shape[0]
+
+
+def same_aspect(a: Size, b: Size) -> bool:
+    """Whether two sizes can be the same view at different resolution."""
+    return abs(a[0] * b[1] - a[1] * b[0]) <= ASPECT_TOLERANCE * a[0] * b[1]
+
+
+def _text(size: Size) -> str:
+    return f"{size[0]}x{size[1]}"
+
+
+class ImageGeometry:
+    """Turns the images of one recording, as stored, into images of `camera`.
+
+    Colour and depth of different resolution are brought to the smaller one (to the depth image's when it has its own
+    intrinsics), lens distortion is undone, and the result is scaled down.
+
+    Attributes:
+        camera: intrinsics of the images that come out.
+        native_camera: the same before scaling.
+        color_size, depth_size: sizes (width, height) that every stored image must have.
+    """
+
+    def __init__(
+        self, recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size, scale: float
+    ) -> None:
+        if not same_aspect(color_size, depth_size):
+            raise SequenceError(
+                f"{files.depth}: depth is {_text(depth_size)}, but colour {files.color.name} is {_text(color_size)}: "
+                "not the same view at another resolution"
+            )
+        self.color_size, self.depth_size = color_size, depth_size
+        color_camera = _color_camera(recording, color_size, files.color)
+        self._warp: np.ndarray | None = None
+        self._seen: np.ndarray | None = None
+        if recording.depth_camera is not None:
+            self.native_camera = recording.depth_camera.resized(*depth_size)
+            self._align_color(color_camera.resized(*depth_size))
+        else:
+            size = min(color_size, depth_size, key=lambda s: s[0] * s[1])
+            self.native_camera = color_camera.resized(*size)
+        self._maps = _undistortion(self.native_camera, recording.distortion)
+        self.camera = self.native_camera.scaled(scale)
+
+    def _align_color(self, color_camera: Camera) -> None:
+        """Prepares the affine map from depth pixels to colour pixels of the same size; none if it moves nothing."""
+        c, d = color_camera, self.native_camera
+        ax, ay = c.fx / d.fx, c.fy / d.fy
+        warp = np.array([[ax, 0.0, c.cx - ax * d.cx], [0.0, ay, c.cy - ay * d.cy]])
+        u = warp[0, 0] * np.arange(d.width) + warp[0, 2]
+        v = warp[1, 1] * np.arange(d.height) + warp[1, 2]
+        if max(np.abs(u - np.arange(d.width)).max(), np.abs(v - np.arange(d.height)).max()) < 0.1:
+            return
+        inside_u, inside_v = (u > -0.5) & (u < d.width - 0.5), (v > -0.5) & (v < d.height - 0.5)
+        self._warp, self._seen = warp, inside_v[:, None] & inside_u[None, :]
+
+    def check(self, color: np.ndarray, depth: np.ndarray, files: FrameFiles) -> None:
+        """Raises SequenceError when the images of a frame have another size than those of the first frame."""
+        for kind, path, image, expected in (
+            ("colour", files.color, color, self.color_size),
+            ("depth", files.depth, depth, self.depth_size),
+        ):
+            found = image_size(image)
+            if found != expected:
+                raise SequenceError(
+                    f"{path}: expected {kind} of {_text(expected)} as in the first frame, found {_text(found)}"
+                )
+
+    def color(self, color: np.ndarray) -> np.ndarray:
+        """Colour uint8 [H, W, 3] as stored -> image of `camera`."""
+        native, size = (self.native_camera.width, self.native_camera.height), (self.camera.width, self.camera.height)
+        if self._warp is None and self._maps is None:
+            return resize_color(color, *size)
+        color = resize_color(color, *native)
+        if self._warp is not None:
+            color = cv2.warpAffine(color, self._warp, native, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        if self._maps is not None:
+            color = cv2.remap(color, *self._maps, interpolation=cv2.INTER_LINEAR)
+        return resize_color(color, *size)
+
+    def depth(self, depth: np.ndarray) -> np.ndarray:
+        """Depth float32 [H, W] metres as stored -> image of `camera`."""
+        depth = resize_depth(depth, self.native_camera.width, self.native_camera.height)
+        if self._seen is not None:
+            depth = np.where(self._seen, depth, np.float32(0))  # no colour there
+        if self._maps is not None:
+            depth = cv2.remap(depth, *self._maps, interpolation=cv2.INTER_NEAREST)
+        return resize_depth(depth, self.camera.width, self.camera.height)
+
+    def mask(self, mask: np.ndarray) -> np.ndarray:
+        """Ids uint16 [H, W] as stored, on the colour image -> image of `camera`."""
+        native = (self.native_camera.width, self.native_camera.height)
+        mask = resize_mask(mask, *native)
+        if self._warp is not None:
+            mask = cv2.warpAffine(mask, self._warp, native, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+        if self._maps is not None:
+            mask = cv2.remap(mask, *self._maps, interpolation=cv2.INTER_NEAREST)
+        return resize_mask(mask, self.camera.width, self.camera.height)
+
+
+def _color_camera(recording: Recording, color_size: Size, color_file: Path) -> Camera:
+    if recording.camera is None:
+        if recording.calibration is None:
+            raise SequenceError(f"{recording.path}: no intrinsics")
+        return Camera(*color_size, *recording.calibration)
+    stated = (recording.camera.width, recording.camera.height)
+    if not same_aspect(stated, color_size):
+        raise SequenceError(
+            f"{color_file}: image is {_text(color_size)}, but the intrinsics of the recording are for {_text(stated)}"
+        )
+    return recording.camera.resized(*color_size)
+
+
+def _undistortion(camera: Camera, distortion: np.ndarray | None) -> tuple[np.ndarray, np.ndarray] | None:
+    if distortion is None or not np.any(distortion):
+        return None
+    K, size = camera.matrix(), (camera.width, camera.height)
+    maps = cv2.initUndistortRectifyMap(K, np.asarray(distortion, float), np.eye(3), K, size, cv2.CV_32FC1)
+    return maps[0], maps[1]

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading image files, with damage found rather than decoded.
+
+OpenCV returns a half-grey picture for many truncated files and only prints a warning, so the containers are checked
+first: every PNG chunk by its length and checksum, a JPEG by its end marker.
+"""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ggslam.errors import SequenceError
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def read_color(path: Path) -> np.ndarray:
+    """Colour image, uint8 [H, W, 3] RGB (grey images are spread over the three channels).
+
+    Raises:
+        SequenceError: missing, truncated, or not an image.
+    """
+    # The orientation tag is ignored: depth and calibration refer to the pixels as stored.
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def read_depth(path: Path, depth_scale: float, invalid: int | None = None) -> np.ndarray:
+    """Depth image, float32 [H, W], metres, 0 where nothing was measured.
+
+    Args:
+        path: single-channel 16-bit PNG.
+        depth_scale: units per metre.
+        invalid: raw value that means "nothing measured" beside 0.
+
+    Raises:
+        SequenceError: missing, truncated, not an image, or not 16-bit with one channel.
+    """
+    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    if raw.ndim != 2 or raw.dtype != np.uint16:
+        raise SequenceError(f"{path}: expected a 16-bit depth image with one channel, found {_kind(raw)}")
+    depth = raw.astype(np.float32) / np.float32(depth_scale)
+    if invalid is not None:
+        depth[raw == invalid] = 0
+    return depth
+
+
+def read_ids(path: Path) -> np.ndarray:
+    """Instance ids, uint16 [H, W], of an 8- or 16-bit image with one channel.
+
+    Raises:
+        SequenceError: missing, truncated, not an image, or coloured.
+    """
+    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    if raw.ndim != 2 or raw.dtype not in (np.uint8, np.uint16):
+        raise SequenceError(f"{path}: expected a mask of grey 8- or 16-bit instance ids, found {_kind(raw)}")
+    return raw.astype(np.uint16)
+
+
+def _kind(image: np.ndarray) -> str:
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    return f"{channels} channel{'s' if channels > 1 else ''} of {8 * image.dtype.itemsize}-bit {image.dtype.kind}"
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise SequenceError(f"{path}: image file is missing") from None
+    except OSError as error:
+        raise SequenceError(f"{path}: cannot be read: {error.strerror}") from None
+    damage = find_damage(content)
+    if damage:
+        raise SequenceError(f"{path}: {damage}")
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error as error:
+        raise SequenceError(f"{path}: cannot be decoded: {error}") from None
+    if image is None:
+        raise SequenceError(f"{path}: cannot be decoded as an image ({len(content)} bytes)")
+    return image
+
+
+def find_damage(content: bytes) -> str | None:
+    """What is wrong with the bytes of a PNG or JPEG file; None when nothing was found."""
+    if not content:
+        return "file is empty"
+    if content.startswith(_PNG_SIGNATURE):
+        return _find_png_damage(content)
+    if content.startswith(b"\xff\xd8"):
+        return _find_jpeg_damage(content)
+    return f"expected a PNG or JPEG image, found a file that starts with {content[:8]!r}"
+
+
+def _find_png_damage(content: bytes) -> str | None:
+    view, position = memoryview(content), len(_PNG_SIGNATURE)
+    while position + 12 <= len(content):
+        length = int.from_bytes(view[position : position + 4], "big")
+        kind = bytes(view[position + 4 : position + 8])
+        end = position + 12 + length
+        if end > len(content):
+            return f"PNG is truncated: its {kind.decode('latin1')} chunk needs {end} bytes, found {len(content)}"
+        checksum = int.from_bytes(view[end - 4 : end], "big")
+        if zlib.crc32(view[position + 4 : end - 4]) != checksum:
+            return f"PNG is damaged: wrong checksum in its {kind.decode('latin1')} chunk"
+        if kind == b"IEND":
+            return None
+        position = end
+    return f"PNG is truncated: no end marker in its {len(content)} bytes"
+
+
+def _find_jpeg_damage(content: bytes) -> str | None:
+    position = 2
+    while position + 4 <= len(content):
+        if content[position] != 0xFF:
+            return f"JPEG is damaged at byte {position}"
+        marker = content[position + 1]
+        if marker == 0xFF:  # padding
+            position += 1
+            continue
+        length = int.from_bytes(content[position + 2 : position + 4], "big")
+        if marker == 0xDA:
+            # Inside the scans 0xFF is always followed by 0 or a restart marker, so this is the true end, not the end
+            # of an embedded preview.
+            if content.rfind(b"\xff\xd9") > position:
+                return None
+            break
+        position += 2 + length
+    return f"JPEG is truncated: no end marker in its {len(content)} bytes"

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Making colour, depth and mask images smaller, each in the way its meaning allows."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+DEPTH_TOLERANCE = np.float32(1.02)
+"""Depths under a pixel that are within 2 % of the nearest one belong to the same surface."""
+
+
+def resize_color(color: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Area average of a colour image uint8 [H, W, 3] on `height` x `width` pixels (bilinear when enlarged)."""
+    if color.shape[:2] == (height, width):
+        return color
+    smaller = width <= color.shape[1] and height <= color.shape[0]
+    return cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+
+
+def resize_depth(depth: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Depth float32 [H, W] on `height` x `width` pixels, without inventing surfaces between foreground and background.
+
+    Of the samples under a new pixel only those within 2 % of the nearest valid one are averaged; fewer than half of
+    them valid gives 0. Enlarging takes the nearest pixel.
+    """
+    if depth.shape == (height, width):
+        return depth
+    rows, columns = _samples(depth.shape[0], height), _samples(depth.shape[1], width)
+    samples = [depth[r][:, c] for r in rows for c in columns]  # each [height, width]
+    valid = np.zeros((height, width), np.int32)
+    nearest = np.full((height, width), np.float32(1e9))
+    for z in samples:
+        known = z > 0
+        valid += known
+        np.minimum(nearest, z, out=nearest, where=known)
+    limit = nearest * DEPTH_TOLERANCE
+    total, count = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    for z in samples:
+        same = (z > 0) & (z < limit)
+        total += np.where(same, z, np.float32(0))
+        count += same
+    enough = 2 * valid >= len(samples)
+    return np.where(enough & (count > 0), total / np.maximum(count, 1), np.float32(0)).astype(np.float32)
+
+
+def resize_mask(mask: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Nearest pixel of an id image uint16 [H, W] on `height` x `width` pixels (ids are never mixed)."""
+    if mask.shape == (height, width):
+        return mask
+    return mask[_nearest(mask.shape[0], height)][:, _nearest(mask.shape[1], width)]
+
+
+def _samples(size: int, new_size: int) -> list[np.ndarray]:
+    """For each sample taken under a new pixel along one axis: source index of every new pixel, int64 [new_size]."""
+    ratio = size / new_size
+    count = max(1, math.ceil(ratio - 0.05))
+    start = np.arange(new_size)
+    return [np.minimum(((start + (k + 0.5) / count) * ratio).astype(np.int64), size - 1) for k in range(count)]
+
+
+def _nearest(size: int, new_size: int) -> np.ndarray:
+    """Source index nearest to the centre of every new pixel, int64 [new_size]; ties go to the lower index."""
+    centres = np.ceil((np.arange(new_size) + 0.5) * (size / new_size) - 1.0 - 1e-9)
+    return np.clip(centres, 0, size - 1).astype(np.int64)

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The selected part of a recording, delivered frame by frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.sequences.geometry import ImageGeometry, image_size
+from ggslam.sequences.images import read_color, read_depth
+from ggslam.sequences.masks import read_mask
+from ggslam.sequences.recording import Recording
+from ggslam.sequences.stream import ReadAhead
+
+OnBadFrame = Literal["error", "skip"]
+
+
+@dataclass(frozen=True)
+class SkippedFrame:
+    """A damaged frame that `stream` passed over: its numbers (as in `Frame`) and what is wrong with it."""
+
+    index: int
+    source_index: int
+    reason: str
+
+
+class Sequence:
+    """A recording read as a stream. Made by `open_sequence`; holds no images.
+
+    Attributes:
+        name: name of the folder.
+        format: name of the format.
+        path: folder of the recording.
+        camera: intrinsics of the delivered images.
+        native_camera: the same before `scale`.
+        depth_scale: units per metre of the stored depth images.
+        timestamps: float64 [n], seconds.
+        ground_truth: float64 [n, 4, 4] T_world_camera, rows of NaN where the recording tells none; None when it
+            never does.
+        has_masks: whether any selected frame has a mask.
+        instance_names: mask id -> name, as far as known.
+        pose_source, time_source: what told poses and times, for reports.
+        warnings: what a user should know about this recording.
+        skipped: damaged frames passed over so far (only with on_bad_frame="skip").
+    """
+
+    def __init__(
+        self, recording: Recording, selection: range, *, scale: float = 1.0, on_bad_frame: OnBadFrame = "error"
+    ) -> None:
+        """Prepares the frames `selection` of a recording.
+
+        Raises:
+            SequenceError: the first frame is damaged (with on_bad_frame="skip": every frame is), files are missing, or
+                `scale` is not in (0, 1].
+        """
+        if on_bad_frame not in ("error", "skip"):
+            raise SequenceError(f"on_bad_frame: expected 'error' or 'skip', found '{on_bad_frame}'")
+        if not (math.isfinite(scale) and 0 < scale <= 1):
+            raise SequenceError(f"scale: expected a number above 0 and at most 1, found {scale}")
+        self._recording, self._selection, self._on_bad_frame = recording, selection, on_bad_frame
+        self.path: Path = recording.path
+        self.name: str = recording.path.name
+        self.format: str = recording.format
+        self.depth_scale: float = recording.depth_scale
+        self.instance_names: dict[int, str] = dict(recording.instance_names)
+        self.pose_source: str = recording.pose_source
+        self.time_source: str = recording.time_source
+        self.warnings: list[str] = list(recording.warnings)
+        chosen = np.arange(len(recording.files))[selection.start : selection.stop : selection.step]
+        self.timestamps: np.ndarray = recording.timestamps[chosen].astype(np.float64)
+        self.ground_truth: np.ndarray | None = None if recording.poses is None else recording.poses[chosen]
+        self.has_masks: bool = any(recording.files[i].mask is not None for i in selection)
+        self._skipped: dict[int, SkippedFrame] = {}
+        known = [i for i in selection if i in recording.problems]
+        if on_bad_frame == "error" and known:
+            more = f" (and {len(known) - 1} more damaged frames)" if len(known) > 1 else ""
+            raise SequenceError(recording.problems[known[0]] + more)
+        self._geometry = self._measure(scale)
+        self.camera: Camera = self._geometry.camera
+        self.native_camera: Camera = self._geometry.native_camera
+
+    def __len__(self) -> int:
+        return len(self._selection)
+
+    @property
+    def skipped(self) -> list[SkippedFrame]:
+        """Damaged frames passed over by `stream` so far, in order."""
+        return [self._skipped[i] for i in sorted(self._skipped)]
+
+    def frame(self, index: int) -> Frame:
+        """Reads frame `index` of the selection (0 to len - 1).
+
+        Raises:
+            SequenceError: no such frame, or it is damaged (whatever `on_bad_frame` says).
+        """
+        if not 0 <= index < len(self):
+            raise SequenceError(f"{self.path}: expected a frame from 0 to {len(self) - 1}, found {index}")
+        source = self._selection[index]
+        if source in self._recording.problems:
+            raise SequenceError(self._recording.problems[source])
+        files = self._recording.files[source]
+        color, depth = self._read(source)
+        self._geometry.check(color, depth, files)
+        mask = None
+        if files.mask is not None:
+            # Masks drawn on the aligned depth image are as good as masks on the colour image.
+            mask = self._geometry.mask(read_mask(files.mask, self._geometry.color_size, self._geometry.depth_size))
+        pose = None if self.ground_truth is None else self.ground_truth[index]
+        return Frame(
+            index=index,
+            source_index=source,
+            timestamp=float(self.timestamps[index]),
+            color=self._geometry.color(color),
+            depth=self._geometry.depth(depth),
+            camera=self.camera,
+            mask=mask,
+            T_world_camera=pose.copy() if pose is not None and np.isfinite(pose).all() else None,
+        )
+
+    def stream(self, prefetch: int = 4) -> Iterator[Frame]:
+        """All frames in order, at most `prefetch` of them read ahead by one background thread (0: no thread).
+
+        The thread ends when the iterator is used up, closed or garbage collected.
+
+        Raises:
+            SequenceError: at the place of a damaged frame, unless on_bad_frame="skip".
+        """
+        if prefetch < 1:
+            for index in range(len(self)):
+                yield from self._passed(self._attempt(index))
+            return
+        with ReadAhead(self._attempt, len(self), prefetch) as attempts:
+            for attempt in attempts:
+                yield from self._passed(attempt)
+
+    def _attempt(self, index: int) -> Frame | SkippedFrame:
+        try:
+            return self.frame(index)
+        except SequenceError as error:
+            if self._on_bad_frame == "error":
+                raise
+            return SkippedFrame(index, self._selection[index], str(error))
+
+    def _passed(self, attempt: Frame | SkippedFrame) -> Iterator[Frame]:
+        if isinstance(attempt, SkippedFrame):
+            self._skipped[attempt.index] = attempt
+        else:
+            yield attempt
+
+    def _read(self, source: int) -> tuple[np.ndarray, np.ndarray]:
+        files = self._recording.files[source]
+        depth = read_depth(files.depth, self._recording.depth_scale, self._recording.invalid_depth)
+        return read_color(files.color), depth
+
+    def _measure(self, scale: float) -> ImageGeometry:
+        """Sizes and cameras from the first readable frame."""
+        first_error: SequenceError | None = None
+        for source in self._selection:
+            if source in self._recording.problems:
+                continue
+            try:
+                color, depth = self._read(source)
+            except SequenceError as error:
+                if self._on_bad_frame == "error":
+                    raise
+                first_error = first_error or error
+                continue
+            files = self._recording.files[source]
+            return ImageGeometry(self._recording, files, image_size(color), image_size(depth), scale)
+        reason = first_error or self._recording.problems[self._selection[0]]
+        raise SequenceError(f"{self.path}: none of {len(self)} frames can be read; the first: {reason}")

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""7-Scenes and recordings laid out like it: frame-000000.color.png, .depth.png, .pose.txt, .segm.png."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.pose_files import invalid_pose_reason, read_intrinsics, read_matrix
+from ggslam.sequences.recording import (
+    FrameFiles,
+    Recording,
+    image_files,
+    missing_depth_problems,
+    nominal_timestamps,
+)
+
+DEPTH_CALIBRATION = (585.0, 585.0, 320.0, 240.0)
+"""Of the depth camera, as published with 7-Scenes."""
+COLOR_CALIBRATION = (525.0, 525.0, 320.0, 240.0)
+"""Of the colour camera, for depth that somebody has registered to it (`.depth.proj.png`)."""
+
+
+class SevenScenesFormat:
+    """Depth in millimetres, 65535 invalid. Poses map camera to world."""
+
+    name = "7scenes"
+    layout = "frame-000000.color.png, .depth.png, .pose.txt[, .segm.png] here or in seq-01[; camera-intrinsics*.txt]"
+
+    def matches(self, folder: Path) -> bool:
+        return any(folder.glob("frame-*.color.*")) or any(folder.glob("seq-*/frame-*.color.*"))
+
+    def read(self, folder: Path) -> Recording:
+        frames = self._frames_folder(folder)
+        colors = [p for p in image_files(frames) if p.stem.startswith("frame-") and p.stem.endswith(".color")]
+        bases = [frames / color.stem.removesuffix(".color") for color in colors]
+        registered = bool(bases) and all(Path(f"{base}.depth.proj.png").is_file() for base in bases)
+        suffix = ".depth.proj.png" if registered else ".depth.png"
+        files = [self._files(color, base, suffix) for color, base in zip(colors, bases, strict=True)]
+        calibration, warnings = self._calibration(folder, frames, registered)
+        recording = Recording(
+            self.name, folder, files, nominal_timestamps(len(files)), 1000.0, calibration=calibration,
+            invalid_depth=65535, problems=missing_depth_problems(files), warnings=warnings,
+        )  # fmt: skip
+        self._add_poses(recording, bases)
+        return recording
+
+    def _frames_folder(self, folder: Path) -> Path:
+        if any(folder.glob("frame-*.color.*")):
+            return folder
+        parts = sorted({p.parent for p in folder.glob("seq-*/frame-*.color.*")})
+        if len(parts) != 1:
+            names = ", ".join(p.name for p in parts) or "none"
+            raise SequenceError(f"{folder}: expected one recording, found several ({names}); open one of these folders")
+        return parts[0]
+
+    def _files(self, color: Path, base: Path, suffix: str) -> FrameFiles:
+        mask = Path(f"{base}.segm.png")
+        return FrameFiles(color, Path(f"{base}{suffix}"), mask if mask.is_file() else None)
+
+    def _calibration(
+        self, folder: Path, frames: Path, registered: bool
+    ) -> tuple[tuple[float, float, float, float], list[str]]:
+        places = [p for where in dict.fromkeys((frames, folder)) for p in sorted(where.glob("camera-intrinsics*.txt"))]
+        if places:
+            return read_intrinsics(next((p for p in places if "color" in p.name), places[0])), []
+        if registered:
+            return COLOR_CALIBRATION, []
+        warning = (
+            "plain 7-Scenes depth is not registered to the colour image (two cameras, several centimetres apart): "
+            "colours are off by some pixels; intrinsics 585 585 320 240 of the depth camera are used"
+        )
+        return DEPTH_CALIBRATION, [warning]
+
+    def _add_poses(self, recording: Recording, bases: list[Path]) -> None:
+        poses = np.full((len(bases), 4, 4), np.nan)
+        found = False
+        for i, base in enumerate(bases):
+            path = Path(f"{base}.pose.txt")
+            if not path.is_file():
+                continue
+            found = True
+            T = read_matrix(path)
+            reason = invalid_pose_reason(T)
+            if reason is None:
+                poses[i] = T
+            else:
+                recording.problems.setdefault(i, f"{path}: {reason}")
+        if found:
+            recording.poses = poses
+            recording.pose_source = "frame-*.pose.txt"

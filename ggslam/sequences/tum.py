@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt and the images they list."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.association import associate, poses_at
+from ggslam.sequences.pose_files import data_lines, read_tum_poses
+from ggslam.sequences.recording import FrameFiles, Recording, missing_depth_problems
+
+DEPTH_SCALE = 5000.0
+TOLERANCE = 0.02
+"""Seconds between colour and depth, as in the benchmark's own tool."""
+WIDE_TOLERANCE = 0.08
+"""Tried when almost nothing pairs up within `TOLERANCE`."""
+
+CALIBRATIONS = {
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), None),
+}
+"""Published calibration of the three cameras: (fx, fy, cx, cy) and (k1, k2, p1, p2, k3)."""
+DEFAULT_CALIBRATION = (525.0, 525.0, 319.5, 239.5)
+
+
+class TumFormat:
+    """Colour and depth are paired by time; ground truth is interpolated at the time of the colour image."""
+
+    name = "tum"
+    layout = "rgb.txt and depth.txt (lines 'time file'), groundtruth.txt optional; freiburg1|2|3 in the folder's name"
+
+    def matches(self, folder: Path) -> bool:
+        return (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file()
+
+    def read(self, folder: Path) -> Recording:
+        color_times, color_files = read_image_list(folder / "rgb.txt")
+        depth_times, depth_files = read_image_list(folder / "depth.txt")
+        pairs, warnings = _pair(folder, color_times, depth_times)
+        files = [FrameFiles(folder / color_files[i], folder / depth_files[j]) for i, j in pairs]
+        times = color_times[[i for i, _ in pairs]]
+        calibration, distortion = self._calibration(folder, warnings)
+        recording = Recording(
+            self.name, folder, files, times, DEPTH_SCALE, calibration=calibration, distortion=distortion,
+            time_source="rgb.txt", problems=missing_depth_problems(files), warnings=warnings,
+        )  # fmt: skip
+        self._add_poses(recording)
+        return recording
+
+    def _calibration(
+        self, folder: Path, warnings: list[str]
+    ) -> tuple[tuple[float, float, float, float], np.ndarray | None]:
+        camera = re.search(r"(?:freiburg|fr)([123])", folder.resolve().name)
+        if camera is None:
+            warnings.append(
+                f"the folder's name '{folder.resolve().name}' does not say freiburg1, 2 or 3: default intrinsics "
+                "525 525 319.5 239.5 without distortion are used"
+            )
+            return DEFAULT_CALIBRATION, None
+        calibration, distortion = CALIBRATIONS[camera.group(1)]
+        return calibration, None if distortion is None else np.array(distortion)
+
+    def _add_poses(self, recording: Recording) -> None:
+        path = recording.path / "groundtruth.txt"
+        if not path.is_file():
+            return
+        pose_times, poses, problems = read_tum_poses(path)
+        if problems:
+            raise SequenceError(next(iter(problems.values())))
+        recording.poses = poses_at(recording.timestamps, pose_times, poses)
+        recording.pose_source = path.name
+        without = int(np.isnan(recording.poses[:, 0, 0]).sum())
+        if without == len(recording.files):
+            raise SequenceError(
+                f"{path}: no pose within {TOLERANCE} s of any image; poses span {_span(pose_times)}, images "
+                f"{_span(recording.timestamps)}"
+            )
+        if without:
+            recording.warnings.append(f"{without} of {len(recording.files)} frames have no true pose near in time")
+
+
+def read_image_list(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Times float64 [n] and file names of a TUM image list, in order of time.
+
+    Raises:
+        SequenceError: a line is not 'time file', or there is none.
+    """
+    entries = []
+    for number, line in data_lines(path):
+        words = line.split(maxsplit=1)
+        try:
+            time, name = float(words[0]), words[1]
+        except (ValueError, IndexError):
+            raise SequenceError(f"{path}, line {number}: expected 'time file', found '{line[:60]}'") from None
+        if not np.isfinite(time):
+            raise SequenceError(f"{path}, line {number}: time is not finite")
+        entries.append((time, name))
+    if not entries:
+        raise SequenceError(f"{path}: lists no images")
+    entries.sort()
+    return np.array([time for time, _ in entries]), [name for _, name in entries]
+
+
+def _pair(folder: Path, color: np.ndarray, depth: np.ndarray) -> tuple[list[tuple[int, int]], list[str]]:
+    pairs = associate(color, depth, TOLERANCE)
+    if 2 * len(pairs) >= min(len(color), len(depth)):
+        return pairs, []
+    wide = associate(color, depth, WIDE_TOLERANCE)
+    if not wide:
+        gap = min(np.abs(depth - t).min() for t in color)
+        raise SequenceError(
+            f"{folder}: no image of rgb.txt is within {WIDE_TOLERANCE} s of one in depth.txt (closest: {gap:.3f} s); "
+            f"colour spans {_span(color)}, depth {_span(depth)}"
+        )
+    warning = (
+        f"only {len(pairs)} of {len(color)} colour images have depth within {TOLERANCE} s; {len(wide)} paired within "
+        f"{WIDE_TOLERANCE} s instead"
+    )
+    return wide, [warning]
+
+
+def _span(times: np.ndarray) -> str:
+    return f"{times.min():.3f} to {times.max():.3f} s" if len(times) else "no time at all"
