@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loss of `losses.py` written down plainly in float64 torch, differentiable by autograd. For tests."""
+
+from __future__ import annotations
+
+import torch
+from torch.nn.functional import conv2d
+
+from ggslam.mapping.losses import KeyframeImages, LossSettings
+
+
+def blur(images: torch.Tensor) -> torch.Tensor:
+    """Convolution of [N, H, W] with the 11x11 Gaussian window of SSIM, sigma 1.5, zero padding."""
+    offsets = torch.arange(-5, 6, dtype=images.dtype)
+    window = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    window = window / window.sum()
+    return conv2d(images[:, None], torch.outer(window, window)[None, None], padding=5)[:, 0]
+
+
+def ssim(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Structural similarity of each value of x and y [N, H, W] (Wang et al. 2004)."""
+    c1, c2 = 0.01**2, 0.03**2
+    mx, my = blur(x), blur(y)
+    vx, vy, vxy = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    return (2 * mx * my + c1) * (2 * vxy + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
+
+
+def reference_loss(
+    image: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, exposure: torch.Tensor, target: KeyframeImages,
+    settings: LossSettings,
+) -> dict[str, torch.Tensor]:  # fmt: skip
+    """The values of `LossValues` by name, as float64 scalars that carry their graph.
+
+    Args:
+        image: rendered colour [3, H, W], float64.
+        depth: accumulated depth [H, W], float64, metres.
+        alpha: [H, W], float64.
+        exposure: [3, 2], float64; stands in for `target.exposure`.
+    """
+    y = torch.from_numpy(target.color).permute(2, 0, 1).to(torch.float64) / 255
+    target_depth = torch.from_numpy(target.depth.astype("float64")) * target.depth_scale
+    valid = torch.isfinite(target_depth) & (target_depth > 0)
+
+    exposed = exposure[:, 0, None, None] * image + exposure[:, 1, None, None]
+    x = torch.where(valid, exposed, settings.no_depth_weight * exposed + (1 - settings.no_depth_weight) * y)
+    l1 = (x - y).abs().mean()
+    color = l1
+    if settings.color_kind == "charbonnier":
+        epsilon = settings.charbonnier_epsilon
+        color = (torch.sqrt((x - y) ** 2 + epsilon**2) - epsilon).mean()
+    similarity = ssim(x, y).mean()
+
+    used = valid
+    if settings.depth_kind == "normalised":
+        used = valid & (alpha >= settings.minimum_alpha)
+        depth = depth / torch.where(used, alpha, 1.0)
+    error = (depth - target_depth)[used].abs().sum()
+    count = valid.sum().clamp(min=1)
+    depth_term, opacity_term = error / count, (1 - alpha)[valid].sum() / count
+    total = (1 - settings.dssim_weight) * color + settings.dssim_weight * (1 - similarity)
+    total = total + settings.depth_weight * depth_term + settings.opacity_weight * opacity_term
+    return {
+        "total": total, "color": color, "l1": l1, "ssim": similarity, "depth": depth_term, "opacity": opacity_term,
+        "depth_l1_m": error / used.sum(), "psnr": -10 * ((exposed.clamp(0, 1) - y)[:, valid] ** 2).mean().log10(),
+    }  # fmt: skip
