@@ -2,6 +2,16 @@
 """RGB-D recordings: one file per format, `open_sequence` to read any of them as a stream."""
 
 from ggslam.sequences.factory import FORMATS, open_sequence, recognise_format
+from ggslam.sequences.inspection import Motion, SequenceReport, inspect_sequence
 from ggslam.sequences.sequence import Sequence, SkippedFrame
 
-__all__ = ["FORMATS", "Sequence", "SkippedFrame", "open_sequence", "recognise_format"]
+__all__ = [
+    "FORMATS",
+    "Motion",
+    "Sequence",
+    "SequenceReport",
+    "SkippedFrame",
+    "inspect_sequence",
+    "open_sequence",
+    "recognise_format",
+]

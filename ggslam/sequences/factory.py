@@ -8,14 +8,23 @@ import math
 from pathlib import Path
 
 from ggslam.errors import SequenceError
+from ggslam.sequences.folder import FolderFormat, SyntheticFormat
 from ggslam.sequences.masks import find_masks
 from ggslam.sequences.recording import Recording, RecordingFormat
 from ggslam.sequences.replica import ReplicaFormat
+from ggslam.sequences.scannet import ScanNetFormat
 from ggslam.sequences.sequence import OnBadFrame, Sequence
 from ggslam.sequences.seven_scenes import SevenScenesFormat
 from ggslam.sequences.tum import TumFormat
 
-FORMATS: tuple[RecordingFormat, ...] = (ReplicaFormat(), TumFormat(), SevenScenesFormat())
+FORMATS: tuple[RecordingFormat, ...] = (
+    SyntheticFormat(),
+    FolderFormat(),
+    ReplicaFormat(),
+    TumFormat(),
+    SevenScenesFormat(),
+    ScanNetFormat(),
+)
 """Known formats in the order in which they are tried."""
 
 

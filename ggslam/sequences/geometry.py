@@ -58,8 +58,8 @@ class ImageGeometry:
         color_camera = _color_camera(recording, color_size, files.color)
         self._warp: np.ndarray | None = None
         self._seen: np.ndarray | None = None
-        if recording.depth_camera is not None:
-            self.native_camera = recording.depth_camera.resized(*depth_size)
+        if recording.depth_calibration is not None:
+            self.native_camera = Camera(*depth_size, *recording.depth_calibration)
             self._align_color(color_camera.resized(*depth_size))
         else:
             size = min(color_size, depth_size, key=lambda s: s[0] * s[1])

@@ -9,7 +9,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.poses import is_valid_pose, quaternion_to_matrix
-from ggslam.sequences.recording import read_text
+from ggslam.sequences.recording import Calibration, read_text
 
 
 def data_lines(path: Path) -> list[tuple[int, str]]:
@@ -110,7 +110,7 @@ def read_matrix(path: Path, size: tuple[int, int] = (4, 4)) -> np.ndarray:
     return values.reshape(size)
 
 
-def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
+def read_intrinsics(path: Path) -> Calibration:
     """(fx, fy, cx, cy) of a calibration matrix file, 3x3 or 4x4.
 
     Raises:

@@ -16,6 +16,9 @@ from ggslam.scene.camera import Camera
 NOMINAL_RATE = 30.0
 """Frames per second assumed when a recording tells no time."""
 
+Calibration = tuple[float, float, float, float]
+"""(fx, fy, cx, cy) in pixels."""
+
 COLOR_SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
@@ -40,7 +43,7 @@ class Recording:
         camera: intrinsics of the colour image at the size they were calibrated for; None: the format does not tell the
             size, and `calibration` applies to the size of the colour image.
         calibration: (fx, fy, cx, cy) for the size of the colour image; only when `camera` is None.
-        depth_camera: intrinsics of the depth image when they differ from the colour image's.
+        depth_calibration: (fx, fy, cx, cy) for the size of the depth image when it is another camera's.
         depth_scale: depth units per metre.
         invalid_depth: raw depth value that means "nothing measured" beside 0, or None.
         distortion: OpenCV coefficients (k1, k2, p1, p2, k3) of both images, or None.
@@ -58,8 +61,8 @@ class Recording:
     timestamps: np.ndarray
     depth_scale: float
     camera: Camera | None = None
-    calibration: tuple[float, float, float, float] | None = None
-    depth_camera: Camera | None = None
+    calibration: Calibration | None = None
+    depth_calibration: Calibration | None = None
     invalid_depth: int | None = None
     distortion: np.ndarray | None = None
     poses: np.ndarray | None = None

@@ -10,6 +10,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.sequences.pose_files import invalid_pose_reason, read_intrinsics, read_matrix
 from ggslam.sequences.recording import (
+    Calibration,
     FrameFiles,
     Recording,
     image_files,
@@ -60,9 +61,7 @@ class SevenScenesFormat:
         mask = Path(f"{base}.segm.png")
         return FrameFiles(color, Path(f"{base}{suffix}"), mask if mask.is_file() else None)
 
-    def _calibration(
-        self, folder: Path, frames: Path, registered: bool
-    ) -> tuple[tuple[float, float, float, float], list[str]]:
+    def _calibration(self, folder: Path, frames: Path, registered: bool) -> tuple[Calibration, list[str]]:
         places = [p for where in dict.fromkeys((frames, folder)) for p in sorted(where.glob("camera-intrinsics*.txt"))]
         if places:
             return read_intrinsics(next((p for p in places if "color" in p.name), places[0])), []

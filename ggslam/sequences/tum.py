@@ -11,7 +11,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.sequences.association import associate, poses_at
 from ggslam.sequences.pose_files import data_lines, read_tum_poses
-from ggslam.sequences.recording import FrameFiles, Recording, missing_depth_problems
+from ggslam.sequences.recording import Calibration, FrameFiles, Recording, missing_depth_problems
 
 DEPTH_SCALE = 5000.0
 TOLERANCE = 0.02
@@ -51,9 +51,7 @@ class TumFormat:
         self._add_poses(recording)
         return recording
 
-    def _calibration(
-        self, folder: Path, warnings: list[str]
-    ) -> tuple[tuple[float, float, float, float], np.ndarray | None]:
+    def _calibration(self, folder: Path, warnings: list[str]) -> tuple[Calibration, np.ndarray | None]:
         camera = re.search(r"(?:freiburg|fr)([123])", folder.resolve().name)
         if camera is None:
             warnings.append(

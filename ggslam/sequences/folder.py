@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A plain folder: rgb/, depth/, camera.yaml, and if known poses.txt, timestamps.txt, masks/."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ggslam.errors import SequenceError
+from ggslam.scene.camera import Camera
+from ggslam.sequences.association import poses_at
+from ggslam.sequences.masks import find_masks
+from ggslam.sequences.pose_files import data_lines, read_matrix_rows, read_tum_poses
+from ggslam.sequences.recording import (
+    NOMINAL_RATE,
+    FrameFiles,
+    Recording,
+    image_files,
+    last_number,
+    missing_depth_problems,
+    nominal_timestamps,
+    read_text,
+)
+
+GENERATOR_KEY = "generator"
+"""Entry of camera.yaml that marks a recording as written by `ggslam.sequences.synthetic`."""
+
+
+class FolderFormat:
+    """The simplest layout for one's own data.
+
+    camera.yaml holds width, height, fx, fy, cx, cy, depth_scale and optionally distortion [k1, k2, p1, p2, k3],
+    frame_rate, and instances {id: name}. A depth image belongs to the colour image of the same name or number.
+    poses.txt holds TUM lines or 4x4 matrices as rows.
+    """
+
+    name = "folder"
+    layout = "rgb/, depth/, camera.yaml (width height fx fy cx cy depth_scale)[; poses.txt, timestamps.txt, masks/]"
+
+    def matches(self, folder: Path) -> bool:
+        return (folder / "camera.yaml").is_file()
+
+    def read(self, folder: Path) -> Recording:
+        settings = _read_settings(folder / "camera.yaml")
+        colors = image_files(folder / "rgb")
+        if not colors:
+            raise SequenceError(f"{folder / 'rgb'}: no images")
+        masks: list[Path | None] = [None] * len(colors)
+        if (folder / "masks").is_dir():
+            masks = find_masks(folder / "masks", colors)
+        files = [FrameFiles(*pair) for pair in zip(colors, _depth_files(folder, colors), masks, strict=True)]
+        camera, depth_scale, distortion = _camera(folder / "camera.yaml", settings)
+        timestamps, time_source = _timestamps(folder, colors, settings)
+        recording = Recording(
+            self.name, folder, files, timestamps, depth_scale, camera, distortion=distortion, time_source=time_source,
+            instance_names=_instances(folder / "camera.yaml", settings), problems=missing_depth_problems(files),
+        )  # fmt: skip
+        if (folder / "poses.txt").is_file():
+            _add_poses(recording, folder / "poses.txt")
+        return recording
+
+
+class SyntheticFormat(FolderFormat):
+    """A plain folder written by `ggslam synth`: camera.yaml says so."""
+
+    name = "synthetic"
+    layout = f"as 'folder', with '{GENERATOR_KEY}:' in camera.yaml"
+
+    def matches(self, folder: Path) -> bool:
+        try:
+            return super().matches(folder) and GENERATOR_KEY in _read_settings(folder / "camera.yaml")
+        except SequenceError:
+            return False  # the plain folder's reader will tell what is wrong
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    try:
+        settings = yaml.safe_load(read_text(path))
+    except yaml.YAMLError as error:
+        raise SequenceError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(settings, dict):
+        raise SequenceError(f"{path}: expected entries width, height, fx, fy, cx, cy, depth_scale, found none")
+    return settings
+
+
+def _number(path: Path, settings: dict[str, Any], key: str) -> float:
+    if key not in settings:
+        raise SequenceError(f"{path}: entry '{key}' is missing")
+    value = settings[key]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise SequenceError(f"{path}: expected a number for '{key}', found '{value}'")
+    return float(value)
+
+
+def _camera(path: Path, settings: dict[str, Any]) -> tuple[Camera, float, np.ndarray | None]:
+    width, height, fx, fy, cx, cy = (
+        _number(path, settings, key) for key in ("width", "height", "fx", "fy", "cx", "cy")
+    )
+    try:
+        camera = Camera(int(width), int(height), fx, fy, cx, cy)
+    except ValueError as error:
+        raise SequenceError(f"{path}: {error}") from None
+    distortion = settings.get("distortion")
+    if distortion is None:
+        return camera, _number(path, settings, "depth_scale"), None
+    values = distortion if isinstance(distortion, list) else []
+    if len(values) not in (4, 5, 8) or not all(isinstance(v, (int, float)) and np.isfinite(v) for v in values):
+        raise SequenceError(f"{path}: expected 4, 5 or 8 numbers for 'distortion', found '{distortion}'")
+    return camera, _number(path, settings, "depth_scale"), np.array(values, float)
+
+
+def _instances(path: Path, settings: dict[str, Any]) -> dict[int, str]:
+    instances = settings.get("instances") or {}
+    try:
+        return {int(key): str(value) for key, value in instances.items()}
+    except (AttributeError, TypeError, ValueError):
+        raise SequenceError(f"{path}: expected 'instances' to map ids to names, found '{instances}'") from None
+
+
+def _depth_files(folder: Path, colors: list[Path]) -> list[Path]:
+    """The depth image of each colour image: of the same name, else of the same number; a missing one gets a name."""
+    candidates = image_files(folder / "depth", (".png",))
+    if not candidates:
+        raise SequenceError(f"{folder / 'depth'}: no PNG images")
+    by_name = {path.stem: path for path in candidates}
+    by_number = {last_number(path.stem): path for path in candidates}
+    by_number.pop(None, None)
+    if any(color.stem in by_name for color in colors):
+        return [by_name.get(c.stem, folder / "depth" / f"{c.stem}.png") for c in colors]
+    found = [by_number.get(last_number(color.stem)) for color in colors]
+    if not any(found):
+        raise SequenceError(
+            f"{folder}: colour and depth images have neither names nor numbers in common ({colors[0].name}, "
+            f"{candidates[0].name})"
+        )
+    return [path or folder / "depth" / f"{color.stem}.png" for path, color in zip(found, colors, strict=True)]
+
+
+def _timestamps(folder: Path, colors: list[Path], settings: dict[str, Any]) -> tuple[np.ndarray, str]:
+    path = folder / "timestamps.txt"
+    if path.is_file():
+        try:
+            times = np.array([float(line.split()[0]) for _, line in data_lines(path)])
+        except ValueError:
+            raise SequenceError(f"{path}: expected one time in seconds on each line") from None
+        if len(times) != len(colors):
+            raise SequenceError(f"{path}: expected {len(colors)} times, one an image, found {len(times)}")
+        return times, path.name
+    try:
+        if all("." in color.stem for color in colors):
+            return np.array([float(color.stem) for color in colors]), "names of the images"
+    except ValueError:
+        pass
+    rate = _number(folder / "camera.yaml", settings, "frame_rate") if "frame_rate" in settings else NOMINAL_RATE
+    if rate <= 0:
+        raise SequenceError(f"{folder / 'camera.yaml'}: expected a positive 'frame_rate', found {rate:g}")
+    return nominal_timestamps(len(colors), rate), f"{rate:g} frames/s of camera.yaml" if "frame_rate" in settings else (
+        f"nominal {rate:g} frames/s"
+    )
+
+
+def _add_poses(recording: Recording, path: Path) -> None:
+    """Poses in the order of the frames when there are as many; a TUM trajectory of another length is paired by time."""
+    lines = data_lines(path)
+    count = len(recording.files)
+    if lines and len(lines[0][1].replace(",", " ").split()) == 8:
+        times, poses, problems = read_tum_poses(path)
+        if len(poses) != count:
+            if recording.time_source.startswith("nominal"):
+                raise SequenceError(
+                    f"{path}: expected {count} poses, one a frame, found {len(poses)} (and the images "
+                    "tell no time to pair them by)"
+                )
+            if problems:
+                raise SequenceError(next(iter(problems.values())))
+            poses = poses_at(recording.timestamps, times, poses)
+        elif recording.time_source.startswith("nominal"):
+            recording.timestamps, recording.time_source = times, path.name
+    else:
+        poses, problems = read_matrix_rows(path)
+        if len(poses) != count:
+            raise SequenceError(f"{path}: expected {count} poses, one a frame, found {len(poses)}")
+    recording.poses, recording.pose_source = poses, path.name
+    for i, reason in problems.items():
+        recording.problems.setdefault(i, reason)

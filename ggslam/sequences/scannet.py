@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ScanNet as exported from .sens files: color/0.jpg, depth/0.png, pose/0.txt, intrinsic/intrinsic_color.txt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.masks import find_masks
+from ggslam.sequences.pose_files import invalid_pose_reason, read_intrinsics, read_matrix
+from ggslam.sequences.recording import (
+    Calibration,
+    FrameFiles,
+    Recording,
+    image_files,
+    missing_depth_problems,
+    nominal_timestamps,
+)
+
+
+class ScanNetFormat:
+    """Depth in millimetres; poses map camera to world and are -inf where tracking was lost; the colour image is brought
+    onto the depth image's pixels by the two intrinsics."""
+
+    name = "scannet"
+    layout = "color/0.jpg, depth/0.png, pose/0.txt, intrinsic/intrinsic_color.txt, here or in frames/[; instance-filt/]"
+
+    def matches(self, folder: Path) -> bool:
+        return _root(folder) is not None
+
+    def read(self, folder: Path) -> Recording:
+        root = _root(folder)
+        if root is None:
+            raise SequenceError(f"{folder}: expected {self.layout}")
+        colors = image_files(root / "color")
+        if not colors:
+            raise SequenceError(f"{root / 'color'}: no images")
+        masks = self._masks(folder, root, colors)
+        files = [FrameFiles(c, root / "depth" / f"{c.stem}.png", m) for c, m in zip(colors, masks, strict=True)]
+        calibration, depth_calibration, warnings = self._calibrations(root)
+        recording = Recording(
+            self.name, folder, files, nominal_timestamps(len(files)), 1000.0, calibration=calibration,
+            depth_calibration=depth_calibration, problems=missing_depth_problems(files), warnings=warnings,
+        )  # fmt: skip
+        self._add_poses(recording, root / "pose", colors)
+        return recording
+
+    def _masks(self, folder: Path, root: Path, colors: list[Path]) -> list[Path | None]:
+        for where in (root / "instance-filt", folder / "instance-filt"):
+            if where.is_dir():
+                return find_masks(where, colors)
+        return [None] * len(colors)
+
+    def _calibrations(self, root: Path) -> tuple[Calibration, Calibration | None, list[str]]:
+        color, depth = root / "intrinsic" / "intrinsic_color.txt", root / "intrinsic" / "intrinsic_depth.txt"
+        if not color.is_file():
+            raise SequenceError(f"{color}: file is missing; ScanNet's intrinsics of the colour camera are needed")
+        if depth.is_file():
+            return read_intrinsics(color), read_intrinsics(depth), []
+        return (
+            read_intrinsics(color),
+            None,
+            [f"{depth} is missing: the depth image is taken to be the same view as colour"],
+        )
+
+    def _add_poses(self, recording: Recording, folder: Path, colors: list[Path]) -> None:
+        paths = [folder / f"{color.stem}.txt" for color in colors]
+        poses = np.full((len(paths), 4, 4), np.nan)
+        for i, path in enumerate(paths):
+            if path.is_file():
+                T = read_matrix(path)
+                if invalid_pose_reason(T) is None:
+                    poses[i] = T
+        without = int(np.isnan(poses[:, 0, 0]).sum())
+        if without == len(paths):
+            return
+        recording.poses, recording.pose_source = poses, "pose/*.txt"
+        if without:
+            recording.warnings.append(f"{without} of {len(paths)} frames have no true pose (-inf or missing)")
+
+
+def _root(folder: Path) -> Path | None:
+    """The folder that holds color/ and depth/: the given one or frames/ in it."""
+    for root in (folder, folder / "frames"):
+        if (root / "color").is_dir() and (root / "depth").is_dir():
+            return root
+    return None
