@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussian maps as PLY files in the layout of the reference 3DGS code, which every splat viewer reads.
+
+Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023. Per vertex, all float32:
+`x y z` (metres), `nx ny nz` (zero), `f_dc_0..2` (degree-0 colour coefficients), `f_rest_*` (higher degrees, all of red,
+then green, then blue), `opacity` (logit), `scale_0..2` (natural logarithm of metres), `rot_0..3` (quaternion wxyz).
+On request, properties that viewers pass over: `object_id` (int) and `identity_0..F-1` (float32).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ggslam.errors import FormatError
+from ggslam.formats.ply import read_ply, write_ply
+from ggslam.scene.gaussian_map import GaussianMap
+
+EXTRAS = ("object_id", "identity")
+_MEANS, _NORMALS = ["x", "y", "z"], ["nx", "ny", "nz"]
+_COLORS = [f"f_dc_{i}" for i in range(3)]
+_SCALES, _ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
+_REQUIRED = [*_MEANS, *_COLORS, "opacity", *_SCALES, *_ROTATIONS]
+
+
+def write_gaussian_ply(
+    path: str | Path, gaussians: GaussianMap, extra: Collection[str] = (), comments: Sequence[str] = ()
+) -> None:
+    """Writes a map, atomically. Quaternions are normalised on the way, since not every viewer does.
+
+    Args:
+        path: the file to write.
+        gaussians: the map (any device).
+        extra: which additional properties to write, of `EXTRAS`.
+        comments: single ASCII lines for the header.
+
+    Raises:
+        ValueError: an unknown extra.
+        RunFolderError: the file cannot be written.
+    """
+    unknown = set(extra) - set(EXTRAS)
+    if unknown:
+        raise ValueError(f"unknown extra properties {sorted(unknown)}, expected some of {EXTRAS}")
+    count, rest = len(gaussians), gaussians.sh.shape[1] - 1
+    quaternions = torch.nn.functional.normalize(gaussians.quaternions, dim=1)
+    columns: dict[str, np.ndarray] = {}
+    _add(columns, _MEANS, gaussians.means)
+    _add(columns, _NORMALS, torch.zeros(count, 3))
+    _add(columns, _COLORS, gaussians.sh[:, 0])
+    channel_major = gaussians.sh[:, 1:].transpose(1, 2).reshape(count, 3 * rest)
+    _add(columns, [f"f_rest_{i}" for i in range(3 * rest)], channel_major)
+    _add(columns, ["opacity"], gaussians.opacity_logits[:, None])
+    _add(columns, _SCALES, gaussians.log_scales)
+    _add(columns, _ROTATIONS, quaternions)
+    if "object_id" in extra:
+        _add(columns, ["object_id"], gaussians.object_id[:, None])
+    if "identity" in extra:
+        _add(columns, [f"identity_{i}" for i in range(gaussians.features.shape[1])], gaussians.features)
+    rows = np.empty(count, [(name, column.dtype.str) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    write_ply(path, {"vertex": rows}, comments)
+
+
+def _add(columns: dict[str, np.ndarray], names: Sequence[str], values: torch.Tensor) -> None:
+    columns.update(zip(names, values.detach().cpu().numpy().T, strict=True))
+
+
+def read_gaussian_ply(path: str | Path, device: torch.device | str = "cpu", with_moments: bool = True) -> GaussianMap:
+    """Reads a map written here or by other 3DGS software (SH degree 0 to 3, property order free, extras kept).
+
+    Args:
+        path: the file.
+        device: where the map shall live.
+        with_moments: whether the map gets room for the optimizer's moments (to be optimised further).
+
+    Raises:
+        FormatError: no PLY file, no Gaussians in it, properties missing, or values that are not finite.
+    """
+    vertex = read_ply(path).elements.get("vertex")
+    names = (vertex.dtype.names or ()) if vertex is not None else ()
+    missing = [name for name in _REQUIRED if name not in names]
+    if vertex is None or missing:
+        raise FormatError(f"{path} holds no Gaussians: the properties {missing} of 'vertex' are missing")
+    # PlayCanvas' compressed layout and others have the names but pack them into integers: refused by `_floats`.
+    rest, features = _numbered(path, names, "f_rest_"), _numbered(path, names, "identity_")
+    degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(len(rest))
+    if degree is None:
+        raise FormatError(f"{path}: {len(rest)} properties f_rest_*, expected 0, 9, 24 or 45 (SH degree 0 to 3)")
+    out = GaussianMap(degree, len(features), torch.device(device), with_moments)
+    out.insert(
+        means=_floats(path, vertex, _MEANS),
+        quaternions=_floats(path, vertex, _ROTATIONS),
+        log_scales=_floats(path, vertex, _SCALES),
+        opacity_logits=_floats(path, vertex, ["opacity"])[:, 0],
+        rgb=torch.zeros(len(vertex), 3),
+        features=_floats(path, vertex, features),
+        object_id=torch.from_numpy(vertex["object_id"].astype(np.int32)) if "object_id" in names else None,
+    )
+    out.sh[:, 0] = _floats(path, vertex, _COLORS).to(out.sh)
+    out.sh[:, 1:] = _floats(path, vertex, rest).reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2).to(out.sh)
+    norms = out.quaternions.norm(dim=1)
+    if (norms < 1e-6).any():
+        raise FormatError(f"{path}: the quaternion of vertex {int(norms.argmin())} is zero")
+    return out
+
+
+def _numbered(path: str | Path, names: Sequence[str], prefix: str) -> list[str]:
+    """The properties prefix0, prefix1, ... in numerical order; there must be no gap."""
+    found = [name for name in names if name.startswith(prefix)]
+    expected = [f"{prefix}{i}" for i in range(len(found))]
+    if set(found) != set(expected):
+        raise FormatError(f"{path}: the properties {prefix}* are not numbered 0 to {len(found) - 1}: {sorted(found)}")
+    return expected
+
+
+def _floats(path: str | Path, vertex: np.ndarray, names: Sequence[str]) -> torch.Tensor:
+    """Columns as float32 [N, len(names)], all finite."""
+    out = np.empty((len(vertex), len(names)), np.float32)
+    for column, name in enumerate(names):
+        if vertex.dtype[name].kind != "f":
+            raise FormatError(f"{path}: property '{name}' is {vertex.dtype[name]}, expected a floating-point number")
+        out[:, column] = vertex[name]
+        bad = ~np.isfinite(out[:, column])
+        if bad.any():
+            row = int(bad.argmax())
+            raise FormatError(f"{path}: property '{name}' of vertex {row} is {vertex[name][row]}, expected a number")
+    return torch.from_numpy(out)

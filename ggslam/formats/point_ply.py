@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coloured voxel clouds as PLY files: in metres for viewers, as whole grid coordinates for the G-PCC coder.
+
+Both files hold the same points in the same order; header comments tie them together:
+metres = origin + voxel_size * (grid coordinate).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import FormatError
+from ggslam.formats.ply import read_ply, write_ply
+from ggslam.formats.point_sampling import VoxelCloud, sample_points
+
+__all__ = ["GRID_FILE", "METRIC_FILE", "VoxelCloud", "read_points", "sample_points", "write_grid_points",
+           "write_metric_points", "write_points"]  # fmt: skip
+
+METRIC_FILE, GRID_FILE = "points.ply", "points_grid.ply"
+_COLORS = ("red", "green", "blue")
+
+
+def write_points(folder: str | Path, cloud: VoxelCloud) -> None:
+    """Writes both variants, `points.ply` (metres) and `points_grid.ply` (grid coordinates), into an existing folder.
+
+    Raises:
+        RunFolderError: a file cannot be written.
+    """
+    write_metric_points(Path(folder) / METRIC_FILE, cloud)
+    write_grid_points(Path(folder) / GRID_FILE, cloud)
+
+
+def write_metric_points(path: str | Path, cloud: VoxelCloud) -> None:
+    """Writes positions as float32 metres with uint8 colours; raises RunFolderError if that fails."""
+    write_ply(path, {"vertex": _vertices(cloud.points, "f4", cloud)}, _comments(cloud, "x y z are metres"))
+
+
+def write_grid_points(path: str | Path, cloud: VoxelCloud) -> None:
+    """Writes positions as int32 grid coordinates with uint8 colours; raises RunFolderError if that fails."""
+    comments = _comments(cloud, "x y z are grid coordinates; metres = origin + voxel_size * (x, y, z)")
+    write_ply(path, {"vertex": _vertices(cloud.grid, "i4", cloud)}, comments)
+
+
+def read_points(path: str | Path) -> VoxelCloud:
+    """Reads either variant back; which one it is follows from the type of the coordinates.
+
+    Raises:
+        FormatError: not a cloud written by ggslam (properties or the comments with scale and origin missing).
+    """
+    ply = read_ply(path)
+    vertex = ply.elements.get("vertex")
+    if vertex is None or not {"x", "y", "z", *_COLORS} <= set(vertex.dtype.names or ()):
+        raise FormatError(f"{path}: expected a 'vertex' element with x y z red green blue")
+    voxel_size = float(_comment(path, ply.comments, "voxel_size", 1)[0])
+    origin = _comment(path, ply.comments, "origin", 3)
+    position = np.stack([vertex[name] for name in "xyz"], 1)
+    if position.dtype.kind == "f":
+        position = np.rint((position - origin) / voxel_size)
+    colors = np.stack([vertex[name] for name in _COLORS], 1).astype(np.uint8)
+    object_id = vertex["object_id"].astype(np.int32) if "object_id" in (vertex.dtype.names or ()) else None
+    return VoxelCloud(position.astype(np.int32), colors, object_id, voxel_size, origin)
+
+
+def _vertices(position: np.ndarray, code: str, cloud: VoxelCloud) -> np.ndarray:
+    fields = [(name, code) for name in "xyz"] + [(name, "u1") for name in _COLORS]
+    if cloud.object_id is not None:
+        fields.append(("object_id", "i4"))
+    rows = np.empty(len(cloud), fields)
+    for axis, name in enumerate("xyz"):
+        rows[name] = position[:, axis]
+    for channel, name in enumerate(_COLORS):
+        rows[name] = cloud.colors[:, channel]
+    if cloud.object_id is not None:
+        rows["object_id"] = cloud.object_id
+    return rows
+
+
+def _comments(cloud: VoxelCloud, meaning: str) -> list[str]:
+    origin = " ".join(repr(float(value)) for value in cloud.origin)
+    return [meaning, f"voxel_size {float(cloud.voxel_size)!r}", f"origin {origin}"]
+
+
+def _comment(path: str | Path, comments: list[str], key: str, count: int) -> np.ndarray:
+    """The numbers behind `key` in the header comments."""
+    for text in comments:
+        words = text.split()
+        if words and words[0] == key:
+            try:
+                numbers = np.array([float(word) for word in words[1:]])
+            except ValueError:
+                break
+            if len(numbers) == count and np.isfinite(numbers).all() and (key != "voxel_size" or numbers[0] > 0):
+                return numbers
+    raise FormatError(f"{path}: no usable header comment '{key}' (is it a cloud written by ggslam?)")

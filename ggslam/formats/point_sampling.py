@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coloured points sampled from a Gaussian map, on a regular grid."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import quaternion_to_matrix
+
+_CHUNK = 1_000_000
+"""Samples held in memory at a time."""
+_SPACING = 0.7
+"""Distance of samples in voxels; below 1/sqrt(2) a lattice turned in its plane still meets every voxel of the plane."""
+_MOST_STEPS = 40
+"""Most samples from the centre outwards along one axis; larger Gaussians are sampled more thinly."""
+_BITS = 21
+"""Bits per axis of the packed voxel number."""
+
+
+@dataclass(frozen=True)
+class VoxelCloud:
+    """Coloured points on a regular grid, at most one per voxel, sorted by grid coordinate (z fastest).
+
+    Attributes:
+        grid: int32 [N, 3] grid coordinates, none negative.
+        colors: uint8 [N, 3] RGB.
+        object_id: int32 [N], 0 = unlabelled, or None.
+        voxel_size: metres.
+        origin: float64 [3], metres: where grid coordinate (0, 0, 0) lies; a whole multiple of the voxel size.
+    """
+
+    grid: np.ndarray
+    colors: np.ndarray
+    object_id: np.ndarray | None
+    voxel_size: float
+    origin: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.grid)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Positions in metres, float64 [N, 3]: origin + voxel_size * grid."""
+        return self.origin + self.voxel_size * self.grid
+
+
+def sample_points(
+    gaussians: GaussianMap, voxel_size: float = 0.01, minimum_opacity: float = 0.3, with_object_id: bool = False
+) -> VoxelCloud:
+    """Samples a map into a coloured cloud, one point per voxel that a Gaussian visibly fills.
+
+    Each Gaussian gives its mean and, where it is larger than a voxel, the points of a lattice along its principal axes
+    at which its own alpha, opacity * exp(-d^2 / 2) with the Mahalanobis distance d, is at least `minimum_opacity`.
+    Points that share a voxel become one: colours are averaged with these alphas as weights, the object id is the one
+    of largest weight. Deterministic.
+
+    Args:
+        gaussians: the map; only the view-independent part of its colours is used.
+        voxel_size: edge of a voxel in metres.
+        minimum_opacity: in (0, 1); fainter Gaussians and the faint outskirts of others are left out.
+        with_object_id: whether the points carry the object ids.
+
+    Raises:
+        ValueError: impossible settings, or a map that spans more than 2^21 voxels.
+    """
+    if not voxel_size > 0 or not 0 < minimum_opacity < 1:
+        raise ValueError(f"impossible voxel size {voxel_size} or minimum opacity {minimum_opacity}")
+    merged = _Sums.empty()
+    for position, weight, color, object_id in _samples(gaussians, voxel_size, minimum_opacity):
+        lattice = np.rint(position / voxel_size)
+        if np.abs(lattice).max(initial=0) >= 1 << (_BITS - 1):
+            raise ValueError(f"the map spans more than 2^{_BITS} voxels of {voxel_size} m")
+        labels = object_id if with_object_id else np.zeros_like(object_id)
+        part = _Sums(_packed(lattice.astype(np.int64)), labels, weight, weight[:, None] * color)
+        merged = merged.joined(part)
+    return _cloud(merged, voxel_size, with_object_id)
+
+
+def _packed(lattice: np.ndarray) -> np.ndarray:
+    """One int64 per voxel from signed coordinates [N, 3]."""
+    x, y, z = (lattice + (1 << (_BITS - 1))).T
+    return (x << 2 * _BITS) | (y << _BITS) | z
+
+
+def _unpacked(key: np.ndarray) -> np.ndarray:
+    limit = (1 << _BITS) - 1
+    return np.stack([key >> 2 * _BITS, (key >> _BITS) & limit, key & limit], 1) - (1 << (_BITS - 1))
+
+
+def _samples(
+    gaussians: GaussianMap, voxel_size: float, minimum_opacity: float
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Chunks of (position [M, 3], weight [M], colour [M, 3] in [0, 1], object id [M]), float64 and int32."""
+    opacity = gaussians.opacities.detach().cpu().numpy().astype(np.float64)
+    used = np.nonzero(opacity >= minimum_opacity)[0]
+    opacity = opacity[used]
+    means = gaussians.means.detach().cpu().numpy().astype(np.float64)[used]
+    scales = gaussians.scales.detach().cpu().numpy().astype(np.float64)[used]
+    axes = quaternion_to_matrix(gaussians.quaternions.detach().cpu().numpy().astype(np.float64)[used])
+    color = gaussians.rgb.detach().cpu().numpy().astype(np.float64)[used].clip(0, 1)
+    object_id = gaussians.object_id.cpu().numpy()[used]
+    reach = scales * np.sqrt(2 * np.log(opacity / minimum_opacity))[:, None]
+    step = np.maximum(_SPACING * voxel_size, reach / _MOST_STEPS)
+    steps = np.floor(reach / step).astype(np.int64)
+    per_gaussian = np.prod(2 * steps + 1, axis=1)
+    bounds = np.concatenate([[0], np.cumsum(per_gaussian)])
+    start = 0
+    while start < len(used):
+        stop = max(start + 1, int(np.searchsorted(bounds, bounds[start] + _CHUNK, side="right")) - 1)
+        owner = np.repeat(np.arange(start, stop), per_gaussian[start:stop])
+        number = np.arange(bounds[start], bounds[stop]) - bounds[owner]
+        offset = _lattice_point(number, steps[owner]) * step[owner]
+        alpha = opacity[owner] * np.exp(-0.5 * ((offset / scales[owner]) ** 2).sum(1))
+        visible = alpha >= minimum_opacity * (1 - 1e-9)
+        owner, offset = owner[visible], offset[visible]
+        position = means[owner] + np.einsum("nij,nj->ni", axes[owner], offset)
+        yield position, alpha[visible], color[owner], object_id[owner]
+        start = stop
+
+
+def _lattice_point(number: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Whole coordinates [N, 3], each in -steps..steps, of the number-th point of a box [N]."""
+    width = 2 * steps + 1
+    z = number % width[:, 2]
+    y = number // width[:, 2] % width[:, 1]
+    x = number // (width[:, 2] * width[:, 1])
+    return np.stack([x, y, z], 1) - steps
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Weighted sums per voxel and object: key and label [N] (sorted, unique pairs once joined), weight, colour."""
+
+    key: np.ndarray
+    label: np.ndarray
+    weight: np.ndarray
+    color: np.ndarray
+
+    @staticmethod
+    def empty() -> _Sums:
+        return _Sums(np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0), np.empty((0, 3)))
+
+    def joined(self, other: _Sums) -> _Sums:
+        """Both together, one row per (voxel, label)."""
+        key, label = np.concatenate([self.key, other.key]), np.concatenate([self.label, other.label])
+        order = np.lexsort((label, key)) if label.any() else np.argsort(key, kind="stable")
+        key, label = key[order], label[order]
+        first = _first_of_runs(key) | _first_of_runs(label)
+        starts = np.nonzero(first)[0]
+        weight = np.concatenate([self.weight, other.weight])[order]
+        color = np.concatenate([self.color, other.color])[order]
+        if not len(starts):
+            return self
+        return _Sums(key[starts], label[starts], np.add.reduceat(weight, starts), np.add.reduceat(color, starts))
+
+
+def _first_of_runs(values: np.ndarray) -> np.ndarray:
+    first = np.ones(len(values), bool)
+    first[1:] = values[1:] != values[:-1]
+    return first
+
+
+def _cloud(sums: _Sums, voxel_size: float, with_object_id: bool) -> VoxelCloud:
+    if not len(sums.key):
+        nothing = np.empty((0, 3), np.int32)
+        ids = np.empty(0, np.int32) if with_object_id else None
+        return VoxelCloud(nothing, nothing.astype(np.uint8), ids, voxel_size, np.zeros(3))
+    # Heaviest label first within each voxel, the smaller id at a tie: the first row of each run then names the object.
+    order = np.lexsort((sums.label, -sums.weight, sums.key))
+    key, label = sums.key[order], sums.label[order]
+    starts = np.nonzero(_first_of_runs(key))[0]
+    color = np.add.reduceat(sums.color[order], starts) / np.add.reduceat(sums.weight[order], starts)[:, None]
+    lattice = _unpacked(key[starts])
+    corner = lattice.min(0)
+    return VoxelCloud(
+        grid=(lattice - corner).astype(np.int32),
+        colors=np.rint(255 * color).astype(np.uint8),
+        object_id=label[starts] if with_object_id else None,
+        voxel_size=voxel_size,
+        origin=corner * voxel_size,
+    )

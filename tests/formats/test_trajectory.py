@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories survive a round trip; damaged ones are refused with file and line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ggslam.errors import FormatError
+from ggslam.formats.trajectory import read_matrices, read_trajectory, read_tum, write_tum
+from ggslam.scene.poses import se3_exp
+
+
+def poses(count: int = 20) -> np.ndarray:
+    generator = np.random.default_rng(1)
+    return np.stack([se3_exp(generator.normal(size=6)) for _ in range(count)])
+
+
+def test_tum_round_trip(tmp_path: Path) -> None:
+    times = 1.3e9 + np.arange(20) / 30
+    assert write_tum(tmp_path / "a.txt", times, poses()) == 20
+    found = read_tum(tmp_path / "a.txt")
+    np.testing.assert_allclose(found.timestamps, times, atol=3e-7)
+    np.testing.assert_allclose(found.T_world_camera, poses(), atol=5e-9)
+
+
+def test_tum_files_are_xyzw(tmp_path: Path) -> None:
+    turned = np.eye(4)  # 90 degrees about z: x goes to y
+    turned[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    write_tum(tmp_path / "a.txt", [0.5], turned[None])
+    row = [float(word) for word in (tmp_path / "a.txt").read_text().splitlines()[-1].split()]
+    np.testing.assert_allclose(row, [0.5, 0, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-9)
+    (tmp_path / "b.txt").write_text("1 0 0 0 0.7071067811865476 0 0 0.7071067811865476\n")
+    np.testing.assert_allclose(read_tum(tmp_path / "b.txt").T_world_camera[0, :3, :3] @ [0, 1, 0], [0, 0, 1], atol=1e-9)
+
+
+def test_lost_frames_are_left_out(tmp_path: Path) -> None:
+    some = poses(5)
+    some[2] = np.nan
+    assert write_tum(tmp_path / "a.txt", range(5), some) == 4
+    assert read_tum(tmp_path / "a.txt").timestamps.tolist() == [0, 1, 3, 4]
+
+
+@pytest.mark.parametrize("columns", [12, 16])
+def test_matrix_rows(tmp_path: Path, columns: int) -> None:
+    path = tmp_path / "traj.txt"
+    np.savetxt(path, poses().reshape(20, 16)[:, :columns])
+    for found in (read_matrices(path), read_trajectory(path)):
+        np.testing.assert_allclose(found.T_world_camera, poses(), atol=1e-9)
+        assert found.timestamps.tolist() == list(range(20))
+
+
+def test_missing_poses_only_where_allowed(tmp_path: Path) -> None:
+    rows = poses(3).reshape(3, 16)
+    rows[1] = -np.inf
+    np.savetxt(tmp_path / "traj.txt", rows)
+    with pytest.raises(FormatError, match=r"traj\.txt, line 2: column 1 is -inf"):
+        read_matrices(tmp_path / "traj.txt")
+    found = read_matrices(tmp_path / "traj.txt", allow_missing=True).T_world_camera
+    assert np.isnan(found[1]).all() and np.isfinite(found[[0, 2]]).all()
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("1 0 0 0 0 0 0", "expected 8 columns, found 7"),
+        ("1 0 0 0 0 0 0 1 5", "expected 8 columns, found 9"),
+        ("1 0 nan 0 0 0 0 1", "column 3 is nan"),
+        ("1 0 0 0 0 0 0 inf", "column 8 is inf"),
+        ("1 0 0 zero 0 0 0 1", "could not convert"),
+        ("1 0 0 0 0 0 0 0", "quaternion 0 0 0 0 has length 0"),
+        ("1 0 0 0 3 0 0 1", "length 3.16"),
+    ],
+)
+def test_damaged_tum_lines_are_named(tmp_path: Path, line: str, reason: str) -> None:
+    (tmp_path / "t.txt").write_text("# a comment\n\n0 0 0 0 0 0 0 1\n" + line + "\n")
+    with pytest.raises(FormatError, match=rf"t\.txt, line 4: .*{reason}"):
+        read_tum(tmp_path / "t.txt")
+
+
+def test_other_damage(tmp_path: Path) -> None:
+    path = tmp_path / "t.txt"
+    path.write_text("# nothing\n")
+    for read in (read_tum, read_matrices, read_trajectory):
+        with pytest.raises(FormatError, match="no poses"):
+            read(path)
+        with pytest.raises(FormatError, match="No such file"):
+            read(tmp_path / "none.txt")
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FormatError, match="not a text file"):
+        read_tum(path)
+    path.write_text(" ".join(map(str, (2 * np.eye(4)).ravel())))
+    with pytest.raises(FormatError, match="line 1: not a rigid transform"):
+        read_matrices(path)
+
+
+def test_shared_recordings(shared_data: Path) -> None:
+    path = shared_data / "livingroom" / "traj.txt"
+    if not path.exists():
+        pytest.skip("no livingroom")
+    assert len(read_trajectory(path)) == 200
+    assert len(read_trajectory(shared_data / "rgbd_dataset_freiburg3_cabinet" / "groundtruth.txt")) > 50
