@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Generalised ICP of a frame's points against the map's own Gaussians."""
+
+from __future__ import annotations
+
+import ctypes
+import enum
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.native.loader import NativeContext
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.tracking import native
+from ggslam.tracking.points import FramePoints
+from ggslam.tracking.settings import AlignSettings, DepthNoise, TargetSettings
+
+
+class GicpTarget:
+    """The map as the tracker sees it: Gaussians gathered in voxels of two sizes. Never changes once built."""
+
+    def __init__(self) -> None:
+        self._library = native.library()
+        self._handle: int | None = self._library.ggslam_gicp_target_create()
+        self.voxel = 0.0
+        """Edge of a fine voxel, metres."""
+
+    def __del__(self) -> None:
+        if getattr(self, "_handle", None) is not None:
+            self._library.ggslam_gicp_target_destroy(self._handle)
+
+    @property
+    def handle(self) -> int:
+        """Pointer for the core."""
+        assert self._handle is not None
+        return self._handle
+
+    @classmethod
+    def from_gaussians(
+        cls,
+        gaussians: GaussianMap,
+        settings: TargetSettings,
+        context: NativeContext,
+        camera_positions: np.ndarray | None = None,
+        voxel: float | None = None,
+    ) -> GicpTarget:
+        """Gathers a map's Gaussians.
+
+        A voxel's mean is that of its Gaussians' means, weighted by opacity over area; its shape joins their own
+        regularised covariances with the scatter of the means in the voxel and its neighbours. A Gaussian's normal is
+        the direction of its smallest scale.
+
+        Args:
+            gaussians: the map; only read.
+            settings: voxel sizes and bounds.
+            context: threads to work on.
+            camera_positions: [K, 3] world positions of the keyframes that `birth_keyframe` counts; they turn normals
+                to the side the surface was seen from. Without them the third axis of a disc is taken to point there.
+            voxel: edge of a fine voxel in metres instead of the settings'.
+        """
+        def array(tensor: object) -> np.ndarray:
+            return np.ascontiguousarray(tensor.detach().cpu().numpy())  # type: ignore[attr-defined]
+
+        arrays = [
+            array(getattr(gaussians, name)).astype(np.float32, copy=False)
+            for name in ("means", "quaternions", "log_scales", "opacity_logits")
+        ]
+        birth = array(gaussians.birth_keyframe)
+        return cls.from_arrays(*arrays, settings, context, birth, camera_positions, voxel)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        means: np.ndarray,
+        quaternions: np.ndarray,
+        log_scales: np.ndarray,
+        opacity_logits: np.ndarray,
+        settings: TargetSettings,
+        context: NativeContext,
+        birth: np.ndarray | None = None,
+        camera_positions: np.ndarray | None = None,
+        voxel: float | None = None,
+    ) -> GicpTarget:
+        """As `from_gaussians`, from contiguous float32 arrays [n, 3], [n, 4] wxyz, [n, 3], [n]; `birth` int32 [n]."""
+        target = cls()
+        cameras = 0 if camera_positions is None else len(camera_positions)
+        positions = np.ascontiguousarray(np.zeros((1, 3)) if camera_positions is None else camera_positions, np.float32)
+        target.voxel = settings.voxel if voxel is None else voxel
+        arrays = (means, quaternions, log_scales, opacity_logits)
+        given = native.TargetInput(
+            *(native.address(a) for a in arrays), None if birth is None else native.address(birth),
+            native.address(positions), len(means), cameras,
+        )  # fmt: skip
+        arguments = native.TargetSettings(
+            target.voxel, math.log(settings.min_opacity / (1 - settings.min_opacity)), settings.min_thickness,
+            settings.max_thickness, settings.max_elongation, settings.scatter_weight, settings.neighbour_weight,
+        )  # fmt: skip
+        target._library.ggslam_gicp_target_build(context.handle, target.handle, given, arguments)
+        return target
+
+    def __len__(self) -> int:
+        """Number of fine voxels."""
+        return self._library.ggslam_gicp_target_size(self.handle, 0)
+
+    def voxels(self, level: int = 0) -> dict[str, np.ndarray]:
+        """Copies of a level's (0 fine, 1 coarse) means [n, 3], normals [n, 3], covariances [n, 6], weights [n]."""
+        count = self._library.ggslam_gicp_target_size(self.handle, level)
+        rows = np.empty((count, 16), np.float32)
+        self._library.ggslam_gicp_target_voxels(self.handle, level, native.address(rows))
+        return {"means": rows[:, :3], "weights": rows[:, 3], "normals": rows[:, 4:7], "covariances": rows[:, 8:14]}
+
+
+class AlignmentStatus(enum.Enum):
+    """What an alignment is worth."""
+
+    OK = "ok"
+    DEGENERATE = "degenerate"
+    """Some direction of motion is not seen by the geometry; see `weak_directions`."""
+    LOST = "lost"
+    """Too few matches."""
+
+
+@dataclass(frozen=True)
+class AlignmentResult:
+    """Where the frame is and how well that is known.
+
+    Attributes:
+        T_world_camera: float64 [4, 4].
+        status: OK, DEGENERATE or LOST.
+        converged: whether the last step was below both tolerances.
+        iterations: linearisations at both levels.
+        overlap: share of the frame's points with an inlier match: a point-to-plane distance below
+            overlap_constant + overlap_sigmas sigma(z).
+        rmse: root mean square of the inliers' point-to-plane distances, metres.
+        information: float64 [6, 6], inverse covariance of the twist (v, w), translation first, that turns the true
+            pose into this one from the left: T_true = exp([v, w]) T_world_camera, in world axes about the world's
+            origin. From the point-to-plane distances alone, each with its depth noise and taken as independent (an
+            optimist's view: neighbouring points share errors).
+        camera_information: the same about the camera centre: p' = p + v + w x (p - c).
+        visibility: float64 [6] ascending, eigenvalues of `camera_information` per point, with a radian worth the
+            median depth and the noise divided out: the share of points that see each direction of motion.
+        weak_directions: float64 [k, 6], unit eigenvectors (v, w median depth), world axes about the camera centre,
+            of the eigenvalues below the limit.
+        matches: int32 [n], index of the fine voxel each point is matched to, -1 without.
+        squared_distances: float32 [n], squared point-to-plane distances, infinite without match.
+        cost: mean robust cost of the geometry per unit of weight, square metres (plus the photometric part's).
+        photometric_residual: mean absolute grey difference to the reference, [0, 1]; 0 without a reference.
+        photometric_share: share of the photometric points seen by the reference.
+    """
+
+    T_world_camera: np.ndarray
+    status: AlignmentStatus
+    converged: bool
+    iterations: int
+    overlap: float
+    rmse: float
+    information: np.ndarray
+    camera_information: np.ndarray
+    visibility: np.ndarray
+    weak_directions: np.ndarray
+    matches: np.ndarray
+    squared_distances: np.ndarray
+    cost: float
+    photometric_residual: float = 0.0
+    photometric_share: float = 0.0
+
+    @property
+    def degenerate(self) -> bool:
+        """Whether some direction of motion is not seen."""
+        return len(self.weak_directions) > 0
+
+
+def native_align_settings(settings: AlignSettings, noise: DepthNoise, plane_variance: float) -> native.AlignSettings:
+    """The core's form of the settings."""
+    photometric_weight = settings.photometric_weight * (noise.sigma(1.0) / settings.photometric_sigma) ** 2
+    return native.AlignSettings(
+        settings.translation_tolerance, settings.rotation_tolerance, settings.coarse_kernel_factor,
+        noise.constant, noise.square, settings.kernel_constant, settings.kernel_sigmas, settings.overlap_constant,
+        settings.overlap_sigmas, settings.min_normal_dot, plane_variance,
+        settings.coarse_iterations, settings.fine_iterations, settings.coarse_points, settings.min_matches,
+        photometric_weight, settings.huber, settings.depth_tolerance,
+    )  # fmt: skip
+
+
+def native_points(points: FramePoints) -> native.AlignPoints:
+    """The core's form of a frame's points, which must stay alive."""
+    arrays = (points.points, points.normals, points.covariances, points.weights)
+    return native.AlignPoints(*(native.address(a) for a in arrays), len(points))
+
+
+PLANE_VARIANCE = 0.02
+"""Variance along the normal of a match of two planes: twice the default thickness. Scales the cost to metres."""
+
+
+def align(
+    source: FramePoints,
+    target: GicpTarget,
+    T_world_camera_guess: np.ndarray,
+    settings: AlignSettings,
+    noise: DepthNoise,
+    context: NativeContext,
+) -> AlignmentResult:
+    """Aligns a frame's points to the map, from the coarse voxels to the fine ones.
+
+    Generalised ICP (Segal et al., RSS 2009) with a Geman-McClure kernel, Levenberg-Marquardt with analytic
+    Jacobians. The result does not depend on the number of threads.
+
+    Args:
+        T_world_camera_guess: [4, 4]; should be right to about a coarse voxel (12 cm) and 10 degrees.
+    """
+    guess = np.ascontiguousarray(T_world_camera_guess, np.float64)
+    matches, squared = np.empty(len(source), np.int32), np.empty(len(source), np.float32)
+    result = native.AlignResult()
+    native.library().ggslam_gicp_align(
+        context.handle, target.handle, native_points(source), native_align_settings(settings, noise, PLANE_VARIANCE),
+        None, None, native.address(guess), native.address(matches), native.address(squared), ctypes.byref(result),
+    )  # fmt: skip
+    return _result(result, source, settings, noise, matches, squared)
+
+
+def _result(
+    found: native.AlignResult,
+    source: FramePoints,
+    settings: AlignSettings,
+    noise: DepthNoise,
+    matches: np.ndarray,
+    squared: np.ndarray,
+) -> AlignmentResult:
+    T = np.array(found.pose).reshape(4, 4)
+    information = np.array(found.information).reshape(6, 6)
+    visibility, weak = observability(information, source, noise, settings.degenerate_below)
+    status = AlignmentStatus.OK
+    if not found.usable:
+        status = AlignmentStatus.LOST
+    elif len(weak):
+        status = AlignmentStatus.DEGENERATE
+    return AlignmentResult(
+        T, status, bool(found.converged), found.coarse_iterations + found.fine_iterations, found.overlap, found.rmse,
+        about_world_origin(information, T[:3, 3]), information, visibility, weak, matches, squared, found.cost,
+        found.photometric_residual, found.photometric_share,
+    )  # fmt: skip
+
+
+def about_world_origin(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Information of a twist about `centre` [3] turned into that of the twist about the world's origin, [6, 6].
+
+    A twist (v, w) about the origin moves the centre by v + w x c, so v_centre = v - [c]x w.
+    """
+    A = np.eye(6)
+    A[:3, 3:] = -np.array([[0, -centre[2], centre[1]], [centre[2], 0, -centre[0]], [-centre[1], centre[0], 0]])
+    return A.T @ information @ A
+
+
+def observability(
+    information: np.ndarray, source: FramePoints, noise: DepthNoise, limit: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues [6], ascending, of the information per point, and the eigenvectors [k, 6] of those below `limit`.
+
+    Lengths are divided by the median depth for rotations, and each point's information by its own noise, so that an
+    eigenvalue is the share of points that see the direction: the mean of (normal . motion)^2.
+    """
+    if not len(source):
+        return np.zeros(6), np.eye(6)
+    z = source.points[:, 2]
+    per_point = float((1.0 / (noise.constant + noise.square * z * z) ** 2).sum())
+    scale = np.array([1.0, 1.0, 1.0] + [1.0 / max(source.median_depth, 1e-3)] * 3)
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale) / per_point)
+    return values, vectors[:, values < limit].T

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of a frame: a grid over its depth image, each with normal and covariance from its neighbours."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.tracking import native
+from ggslam.tracking.settings import DepthNoise, PointSettings
+
+
+@dataclass(frozen=True)
+class FramePoints:
+    """Points of one depth image, in its camera's frame.
+
+    Attributes:
+        points: float32 [n, 3], metres.
+        normals: float32 [n, 3], unit, towards the camera.
+        covariances: float32 [n, 6], xx xy xz yy yz zz, regularised: median eigenvalue 1 (equation 1 of GS-ICP).
+        pixels: int32 [n, 2], column and row.
+        weights: float32 [n], (sigma(1 m) / sigma(z))^2.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    covariances: np.ndarray
+    pixels: np.ndarray
+    weights: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def median_depth(self) -> float:
+        """Median depth in metres; 0 without points."""
+        return float(np.median(self.points[:, 2])) if len(self.points) else 0.0
+
+
+def grid_stride(camera: Camera, count: int) -> int:
+    """Pixels between grid points so that an image full of depth gives about `count` points (and not far fewer)."""
+    return max(1, math.floor(math.sqrt(camera.width * camera.height / count) + 0.25))
+
+
+def extract_points(
+    depth: np.ndarray, camera: Camera, settings: PointSettings, noise: DepthNoise, context: NativeContext
+) -> FramePoints:
+    """Points, normals and regularised covariances of a depth image.
+
+    A neighbour counts if its depth differs by no more than a steep surface and three times the depth noise allow. The
+    depth noise is taken off the measured thickness before the shape is regularised.
+
+    Args:
+        depth: float32 [H, W], metres, 0 where unknown.
+        camera: its intrinsics.
+
+    Raises:
+        ValueError: `depth` has another shape than `camera`.
+    """
+    if depth.shape != (camera.height, camera.width):
+        raise ValueError(f"depth is {depth.shape}, expected {(camera.height, camera.width)} of the camera")
+    depth = np.ascontiguousarray(depth, np.float32)
+    stride = grid_stride(camera, settings.count)
+    room = math.ceil(camera.width / stride) * math.ceil(camera.height / stride)
+    found = FramePoints(
+        np.empty((room, 3), np.float32), np.empty((room, 3), np.float32), np.empty((room, 6), np.float32),
+        np.empty((room, 2), np.int32), np.empty(room, np.float32),
+    )  # fmt: skip
+    arguments = native.DepthPointsSettings(
+        camera.fx, camera.fy, camera.cx, camera.cy, noise.constant, noise.square, settings.min_depth,
+        settings.max_depth, settings.min_thickness, settings.max_elongation, settings.min_neighbours,
+        camera.width, camera.height, stride, settings.window, max(1, round(camera.width / 320)),
+    )  # fmt: skip
+    arrays = (found.points, found.normals, found.covariances, found.pixels, found.weights)
+    out = native.DepthPointsOutput(*(native.address(array) for array in arrays))
+    count = native.library().ggslam_depth_points(context.handle, native.address(depth), arguments, out)
+    return FramePoints(*(array[:count] for array in arrays))

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every number of the tracker, documented. One default serves all recordings: lengths follow the depth noise, the
+resolution and the distance of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+PhotometricMode = Literal["off", "degenerate", "always"]
+
+
+@dataclass(frozen=True)
+class DepthNoise:
+    """Standard deviation of a depth measurement: sigma(z) = constant + square z^2 (z, sigma in metres).
+
+    The default is a structured-light camera's (Khoshelham and Oude Elberink, Sensors 2012, round the values up).
+    """
+
+    constant: float = 0.0012
+    square: float = 0.0019
+
+    def sigma(self, z: float) -> float:
+        """Standard deviation in metres at depth `z`."""
+        return self.constant + self.square * z * z
+
+
+@dataclass(frozen=True)
+class PointSettings:
+    """How points are taken from a depth image."""
+
+    count: int = 8500
+    """Points aimed at when the whole image has depth; the pixel stride follows from it and the resolution."""
+    window: int = 2
+    """Neighbours come from (2 window + 1)^2 samples, about as far apart as a pixel of a 320-pixel-wide image."""
+    min_neighbours: float = 0.6
+    """Share of the window that must lie on the point's surface, or the point is dropped."""
+    min_depth: float = 0.1
+    max_depth: float = 8.0
+    """Depth range in metres."""
+    min_thickness: float = 0.01
+    """Lower bound of the smallest regularised eigenvalue (equation 1 of GS-ICP): a plane's thickness."""
+    max_elongation: float = 4.0
+    """Upper bound of the largest regularised eigenvalue."""
+
+
+@dataclass(frozen=True)
+class TargetSettings:
+    """How the map's Gaussians become what a frame is aligned to."""
+
+    voxel: float = 0.03
+    """Edge of a fine voxel in metres at a typical depth of 2 m; coarse voxels are four times as wide."""
+    min_opacity: float = 0.1
+    """Gaussians less opaque than this take no part."""
+    min_thickness: float = 0.01
+    max_thickness: float = 0.01
+    """Bounds of a voxel's smallest regularised eigenvalue. The upper one keeps a noisy plane a plane."""
+    max_elongation: float = 4.0
+    """Upper bound of the largest regularised eigenvalue."""
+    scatter_weight: float = 1.0
+    """Weight of the scatter of the means against the Gaussians' own covariances in a voxel's shape."""
+    neighbour_weight: float = 0.3
+    """Weight of the 26 neighbours in a voxel's scatter."""
+
+
+@dataclass(frozen=True)
+class AlignSettings:
+    """How points are aligned to a target."""
+
+    coarse_iterations: int = 6
+    coarse_points: int = 1500
+    """Iterations and points at the coarse level; 0 iterations: fine level only."""
+    fine_iterations: int = 12
+    translation_tolerance: float = 1e-4
+    rotation_tolerance: float = 5e-5
+    """The iteration stops at a step below both (metres, radians)."""
+    kernel_constant: float = 0.01
+    kernel_sigmas: float = 2.0
+    """Width of the Geman-McClure kernel in metres: constant + sigmas sigma(z)."""
+    coarse_kernel_factor: float = 2.0
+    """The coarse level's kernel is this much wider."""
+    overlap_constant: float = 0.01
+    overlap_sigmas: float = 2.0
+    """A match is an inlier if its point-to-plane distance is below constant + sigmas sigma(z), metres."""
+    min_normal_dot: float = 0.5
+    """Normals of a match agree to this cosine."""
+    min_matches: int = 100
+    degenerate_below: float = 0.02
+    """Geometry is degenerate if some direction of motion is seen by less than this share of the points."""
+    photometric_sigma: float = 0.03
+    """Standard deviation of a photometric residual, grey levels in [0, 1]."""
+    photometric_weight: float = 0.2
+    """Weight of the photometric part against the geometric one when both are weighed by their noise."""
+    huber: float = 0.05
+    """Grey level from which a photometric residual counts linearly."""
+    depth_tolerance: float = 0.05
+    """A pixel of the photometric reference is occluded if its depth differs by more than this share."""
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """Everything the tracker needs to know."""
+
+    noise: DepthNoise = field(default_factory=DepthNoise)
+    points: PointSettings = field(default_factory=PointSettings)
+    target: TargetSettings = field(default_factory=TargetSettings)
+    align: AlignSettings = field(default_factory=AlignSettings)
