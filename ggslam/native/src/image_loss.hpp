@@ -37,6 +37,8 @@ struct ImageLossJob {
 };
 
 constexpr int kImageLossTaps = 11;  // window of SSIM
+constexpr int kImageLossRows = 4;   // rows that are blurred vertically together
+constexpr int kImageLossSlots = kImageLossTaps - 1 + kImageLossRows;
 constexpr int kImageLossPad = 16;   // floats of zeros on each side of a row that is blurred horizontally
 
 // Row length used inside, a multiple of every vector length. Columns from W on hold zeros.
@@ -54,7 +56,7 @@ struct ImageLossPlanes {
 
 // Floats one thread needs for its rows: 4 of the depth image, 7 padded ones, 7 rings with their results, 2 of colour.
 inline std::size_t image_loss_row_floats(std::size_t stride) {
-  return 4 * stride + 7 * (stride + 2 * kImageLossPad) + 7 * (kImageLossTaps + 1) * stride + 2 * stride;
+  return 4 * stride + 7 * (stride + 2 * kImageLossPad) + 7 * (kImageLossSlots + kImageLossRows) * stride + 2 * stride;
 }
 
 // Sums over one band of rows of one channel (or of the depth image). They are added up in the order of the bands, so
