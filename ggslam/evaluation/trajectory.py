@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of an estimated trajectory: ATE and RPE.
+
+J. Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012. Alignment: S. Umeyama,
+"Least-Squares Estimation of Transformation Parameters Between Two Point Patterns", PAMI 1991.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import FormatError
+from ggslam.formats.trajectory import read_trajectory
+from ggslam.scene.poses import inverse
+
+FEWEST_POSES = 3
+"""Fewer positions than this can be laid upon anything."""
+
+
+@dataclass(frozen=True)
+class TrajectoryScores:
+    """Errors over the frames for which both the estimate and the truth are known.
+
+    Attributes:
+        ate_rmse_m: root mean square distance of the positions after the best rigid alignment (no scale).
+        ate_mean_m, ate_median_m, ate_max_m: of the same distances. (Some papers print the mean under the name RMSE.)
+        ate_raw_rmse_m: root mean square distance without alignment, the first common pose alone being put upon the
+            truth; for a run that began at the true first pose these are the poses as estimated.
+        rpe_trans_m, rpe_rot_deg: root mean square error of the motion over `rpe_delta` frames; NaN if no two known
+            frames lie that far apart.
+        rpe_delta: frames.
+        frames_compared: number of common frames.
+    """
+
+    ate_rmse_m: float
+    ate_mean_m: float
+    ate_median_m: float
+    ate_max_m: float
+    ate_raw_rmse_m: float
+    rpe_trans_m: float
+    rpe_rot_deg: float
+    rpe_delta: int
+    frames_compared: int
+
+    def to_dict(self) -> dict[str, float | int | None]:
+        """For JSON: NaN becomes None."""
+        return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(self).items()}
+
+
+def align_points(source: np.ndarray, target: np.ndarray, with_scale: bool = False) -> tuple[np.ndarray, float]:
+    """The similarity that brings `source` nearest to `target` in the least-squares sense (Umeyama).
+
+    Args:
+        source, target: [N, 3] corresponding points, N >= 3.
+        with_scale: also estimates a scale; else it is 1 (Horn).
+
+    Returns:
+        (T_target_source [4, 4] rigid, scale s): target ~ R (s source) + t.
+    """
+    if source.shape != target.shape or source.ndim != 2 or len(source) < FEWEST_POSES:
+        raise ValueError(f"expected two sets of at least {FEWEST_POSES} points, found {source.shape}, {target.shape}")
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    a, b = source - source_mean, target - target_mean
+    U, singular, Vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])  # no reflections
+    R = U @ np.diag(signs) @ Vt
+    spread = float((a * a).sum())
+    scale = float(singular @ signs) / spread if with_scale and spread > 0 else 1.0
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = target_mean - scale * R @ source_mean
+    return T, scale
+
+
+def score_trajectory(
+    estimated: np.ndarray | Sequence[np.ndarray | None],
+    truth: np.ndarray | Sequence[np.ndarray | None],
+    rpe_delta: int = 1,
+) -> TrajectoryScores | None:
+    """Compares two trajectories frame by frame.
+
+    Args:
+        estimated, truth: N camera-to-world poses [4, 4] each, None or not finite where unknown; such frames are left
+            out.
+        rpe_delta: distance of the frames between which motion is compared.
+
+    Returns:
+        The scores; None if fewer than 3 frames are known in both.
+
+    Raises:
+        ValueError: different lengths, or rpe_delta < 1.
+    """
+    P, Q = _stacked(estimated), _stacked(truth)
+    if len(P) != len(Q) or rpe_delta < 1:
+        raise ValueError(f"{len(P)} estimated and {len(Q)} true poses, rpe_delta {rpe_delta}")
+    known = np.isfinite(P).all((1, 2)) & np.isfinite(Q).all((1, 2))
+    if known.sum() < FEWEST_POSES:
+        return None
+    T, _ = align_points(P[known, :3, 3], Q[known, :3, 3])
+    distance = _distances(T, P[known], Q[known])
+    first = int(np.argmax(known))
+    raw = _distances(Q[first] @ inverse(P[first]), P[known], Q[known])
+    translation, rotation = _relative_errors(P, Q, known, rpe_delta)
+    return TrajectoryScores(
+        ate_rmse_m=_rms(distance),
+        ate_mean_m=float(distance.mean()),
+        ate_median_m=float(np.median(distance)),
+        ate_max_m=float(distance.max()),
+        ate_raw_rmse_m=_rms(raw),
+        rpe_trans_m=_rms(translation),
+        rpe_rot_deg=float(np.rad2deg(_rms(rotation))),
+        rpe_delta=rpe_delta,
+        frames_compared=int(known.sum()),
+    )
+
+
+def score_trajectory_files(
+    estimated: str | Path, truth: str | Path, max_difference_s: float = 0.02, rpe_delta: int = 1
+) -> TrajectoryScores:
+    """Compares two trajectory files; poses belong together if their timestamps are nearest and close enough.
+
+    Args:
+        estimated, truth: files that `ggslam.formats.trajectory.read_trajectory` reads.
+        max_difference_s: greatest difference of timestamps in seconds (0.02 as in the TUM benchmark).
+        rpe_delta: as in `score_trajectory`, counted in associated poses.
+
+    Raises:
+        FormatError: a file is damaged, or fewer than 3 poses belong together.
+    """
+    P, Q = read_trajectory(estimated), read_trajectory(truth)
+    pairs = associate(P.timestamps, Q.timestamps, max_difference_s)
+    scores = score_trajectory(P.T_world_camera[pairs[:, 0]], Q.T_world_camera[pairs[:, 1]], rpe_delta)
+    if scores is None:
+        raise FormatError(
+            f"{estimated} and {truth} have {len(pairs)} poses within {max_difference_s} s of each other, expected at "
+            f"least {FEWEST_POSES}; their times span {_span(P.timestamps)} and {_span(Q.timestamps)}"
+        )
+    return scores
+
+
+def associate(times: np.ndarray, other_times: np.ndarray, max_difference_s: float = 0.02) -> np.ndarray:
+    """Pairs nearest timestamps, each used once, the closest pairs first.
+
+    Returns:
+        int64 [M, 2] indices into both, by increasing time.
+    """
+    order = np.argsort(other_times, kind="stable")
+    right = np.searchsorted(other_times[order], times)
+    candidates = []
+    for shift in (-2, -1, 0, 1):  # the two neighbours on either side: enough for the second choice after a conflict
+        j = right + shift
+        inside = (j >= 0) & (j < len(order))
+        i = np.nonzero(inside)[0]
+        candidates.append(np.stack([i, order[j[inside]]], 1))
+    pairs = np.concatenate(candidates)
+    difference = np.abs(times[pairs[:, 0]] - other_times[pairs[:, 1]])
+    used: tuple[set[int], set[int]] = (set(), set())
+    chosen = []
+    for k in np.argsort(difference, kind="stable"):
+        a, b = int(pairs[k, 0]), int(pairs[k, 1])
+        if difference[k] > max_difference_s:
+            break
+        if a not in used[0] and b not in used[1]:
+            used[0].add(a)
+            used[1].add(b)
+            chosen.append((a, b))
+    out = np.array(chosen, np.int64).reshape(-1, 2)
+    return out[np.argsort(times[out[:, 0]], kind="stable")]
+
+
+def _stacked(poses: np.ndarray | Sequence[np.ndarray | None]) -> np.ndarray:
+    """[N, 4, 4] float64 with NaN for None."""
+    unknown = np.full((4, 4), np.nan)
+    return np.array([unknown if T is None else T for T in poses], np.float64).reshape(-1, 4, 4)
+
+
+def _distances(T: np.ndarray, P: np.ndarray, Q: np.ndarray) -> np.ndarray:
+    """Distances [N] of the positions of T P and Q."""
+    moved = P[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
+    return np.linalg.norm(moved - Q[:, :3, 3], axis=1)
+
+
+def _relative_errors(P: np.ndarray, Q: np.ndarray, known: np.ndarray, delta: int) -> tuple[np.ndarray, np.ndarray]:
+    """Translation [M] and rotation angle [M] of (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) for j = i + delta, both known."""
+    start = np.nonzero(known[:-delta] & known[delta:])[0] if len(known) > delta else np.empty(0, np.int64)
+    true_motion = inverse(Q[start]) @ Q[start + delta]
+    E = inverse(true_motion) @ (inverse(P[start]) @ P[start + delta])
+    R = E[:, :3, :3]
+    # atan2 of sine and cosine: unlike the arc cosine of the trace it is exact for small angles.
+    axis = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1)
+    angle = np.arctan2(np.linalg.norm(axis, axis=1), np.trace(R, axis1=1, axis2=2) - 1)
+    return np.linalg.norm(E[:, :3, 3], axis=1), angle
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def _span(times: np.ndarray) -> str:
+    return f"{times.min():.3f} to {times.max():.3f} s"
