@@ -24,7 +24,7 @@ def sh_to_rgb(sh: torch.Tensor) -> torch.Tensor:
     return 0.5 + SH_C0 * sh
 
 
-@dataclass
+@dataclass(eq=False)
 class GaussianMap:
     """3D Gaussians as arrays whose first `count` rows are in use. Float32 unless said otherwise.
 

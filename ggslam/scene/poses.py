@@ -42,10 +42,10 @@ def se3_log(T: np.ndarray) -> np.ndarray:
     w = so3_log(T[:3, :3])
     angle = float(np.linalg.norm(w))
     W = skew(w)
-    if angle < 1e-6:
-        factor = 1.0 / 12
+    if angle < 1e-4:
+        factor = 1.0 / 12 + angle**2 / 720
     else:
-        factor = 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle)) if angle < np.pi - 1e-6 else 1 / angle**2
+        factor = (1 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2  # the half angle stays exact near half a turn
     V_inverse = np.eye(3) - 0.5 * W + factor * W @ W
     return np.concatenate([V_inverse @ T[:3, 3], w])
 

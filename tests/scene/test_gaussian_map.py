@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map keeps rows, bookkeeping and optimizer moments together through growth, pruning and movement."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ggslam.scene.gaussian_map import GaussianMap, rgb_to_sh, sh_to_rgb
+from ggslam.scene.poses import quaternion_to_matrix, se3_exp
+
+PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features")
+
+
+def insert(out: GaussianMap, count: int, start: int = 0, keyframe: int = 0) -> slice:
+    """Gaussians whose mean's x tells their number."""
+    number = torch.arange(start, start + count, dtype=torch.float32)
+    means = torch.stack([number, number * 0, number * 0], 1)
+    return out.insert(
+        means, torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.zeros(count, 3), number, torch.rand(count, 3),
+        number[:, None].repeat(1, out.feature_channels), keyframe, number.int() + 1,
+    )  # fmt: skip
+
+
+def mark_moments(out: GaussianMap) -> None:
+    """Puts each Gaussian's number into all its moments."""
+    for first, second in out.moments.values():
+        shape = (-1, *[1] * (first.dim() - 1))
+        first[:] = out.means[:, 0].view(shape)
+        second[:] = 2 * out.means[:, 0].view(shape)
+
+
+def check_rows(out: GaussianMap, numbers: list[int], with_marks: bool = True) -> None:
+    expected = torch.tensor(numbers, dtype=torch.float32)
+    assert len(out) == len(numbers) and out.object_id.tolist() == [n + 1 for n in numbers]
+    torch.testing.assert_close(out.means[:, 0], expected)
+    torch.testing.assert_close(out.opacity_logits, expected)
+    for name in PARAMETERS:
+        first, second = out.moments[name]
+        assert first.shape == second.shape == getattr(out, name).shape
+        if with_marks:
+            shape = (-1, *[1] * (first.dim() - 1))
+            torch.testing.assert_close(first, expected.view(shape).expand_as(first))
+            torch.testing.assert_close(second, 2 * expected.view(shape).expand_as(second))
+
+
+def test_growth_keeps_what_was_there_and_is_amortised() -> None:
+    out = GaussianMap(sh_degree=1, feature_channels=2)
+    assert len(out) == 0 and out.means.shape == (0, 3) and out.sh.shape == (0, 4, 3)
+    capacities = set()
+    for step in range(40):
+        rows = insert(out, 1000, 1000 * step, keyframe=step)
+        assert (rows.start, rows.stop) == (1000 * step, 1000 * (step + 1))
+        assert all((moment[rows] == 0).all() for pair in out.moments.values() for moment in pair)
+        mark_moments(out)
+        capacities.add(out.capacity)
+    check_rows(out, list(range(40_000)))
+    assert len(capacities) <= 4 and out.birth_keyframe[12_345] == 12 and out.version == 40
+
+
+def test_views_write_through() -> None:
+    out = GaussianMap()
+    insert(out, 10)
+    out.means[3, 1] = 7.0
+    out.moments["means"][0][3] = 5.0
+    assert out.means[3, 1] == 7 and (out.moments["means"][0][3] == 5).all()
+
+
+def test_keep_and_reorder_carry_everything_along() -> None:
+    out = GaussianMap(feature_channels=1)
+    insert(out, 100)
+    mark_moments(out)
+    version = out.version
+    assert out.keep(torch.ones(100, dtype=torch.bool)) == 0 and out.version == version
+    selected = torch.arange(100) % 3 == 0
+    assert out.keep(selected) == 66 and out.version == version + 1
+    check_rows(out, list(range(0, 100, 3)))
+    out.reorder(torch.arange(33, -1, -1))
+    check_rows(out, list(range(99, -1, -3)))
+    assert out.keep(torch.zeros(34, dtype=torch.bool)) == 34 and len(out) == 0
+
+
+def test_rows_inserted_after_pruning_start_afresh() -> None:
+    """The storage beyond the used rows still holds what was pruned; none of it may come back."""
+    out = GaussianMap(sh_degree=2, feature_channels=3)
+    insert(out, 50)
+    out.sh[:] = 9.0
+    out.updates[:] = 4
+    mark_moments(out)
+    out.keep(torch.arange(50) < 10)
+    rows = out.insert(torch.zeros(5, 3), torch.ones(5, 4), torch.zeros(5, 3), torch.zeros(5), torch.full((5, 3), 0.25))
+    assert all((moment[rows] == 0).all() for pair in out.moments.values() for moment in pair)
+    assert (out.sh[rows, 1:] == 0).all() and (out.features[rows] == 0).all()
+    assert (
+        (out.updates[rows] == 0).all() and (out.object_id[rows] == 0).all() and (out.birth_keyframe[rows] == -1).all()
+    )
+    torch.testing.assert_close(out.rgb[rows], torch.full((5, 3), 0.25))
+
+
+def test_moving_turns_position_and_orientation() -> None:
+    generator = np.random.default_rng(0)
+    T = se3_exp(generator.normal(size=6))
+    means, quaternions = generator.normal(size=(20, 3)), generator.normal(size=(20, 4))
+    for rows in (torch.arange(20) % 2 == 0, torch.arange(0, 20, 2)):
+        out = GaussianMap()
+        out.insert(
+            torch.from_numpy(means).float(), torch.from_numpy(quaternions).float(), torch.zeros(20, 3), torch.zeros(20),
+            torch.zeros(20, 3),
+        )  # fmt: skip
+        out.move(rows, torch.from_numpy(T))
+        moved = means[::2] @ T[:3, :3].T + T[:3, 3]
+        np.testing.assert_allclose(out.means[::2].numpy(), moved, atol=1e-5)
+        np.testing.assert_allclose(out.means[1::2].numpy(), means[1::2], atol=1e-6)
+        turned = T[:3, :3] @ quaternion_to_matrix(quaternions[::2])
+        np.testing.assert_allclose(quaternion_to_matrix(out.quaternions[::2].numpy()), turned, atol=1e-5)
+
+
+def test_colours_and_activations() -> None:
+    rgb = torch.rand(5, 3)
+    torch.testing.assert_close(sh_to_rgb(rgb_to_sh(rgb)), rgb)
+    out = GaussianMap(with_moments=False)
+    insert(out, 4)
+    assert out.moments == {} and (out.scales == 1).all()
+    torch.testing.assert_close(out.opacities, torch.sigmoid(torch.arange(4.0)))
+    assert out != GaussianMap(with_moments=False, count=0)  # maps are compared by identity, not by their settings
+    assert out in {out}
+    with pytest.raises(ValueError, match="sh_degree"):
+        GaussianMap(sh_degree=4)
+    with pytest.raises(AttributeError):
+        _ = out.no_such_array
