@@ -152,6 +152,20 @@ def test_missing_file_endless_header_and_unwritable_values(tmp_path: Path) -> No
     assert not (tmp_path / "a.ply").exists()
 
 
+def test_a_write_that_breaks_off_leaves_the_old_file(tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource", reason="limits of file size exist on POSIX systems only")
+    write_ply(tmp_path / "a.ply", {"vertex": VERTEX})
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))  # stands in for a disk that is full after 4 KiB
+    try:
+        with pytest.raises(RunFolderError, match=r"cannot write .*a\.ply: File too large"):
+            write_ply(tmp_path / "a.ply", {"vertex": np.repeat(VERTEX, 10_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").elements["vertex"], VERTEX)
+
+
 def test_real_clouds_are_read(shared_data: Path) -> None:
     path = shared_data / "clouds" / "angel.ply"
     if not path.exists():
