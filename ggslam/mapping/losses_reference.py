@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss of `losses.py` written down plainly in float64 torch, differentiable by autograd. For tests."""
+"""The loss of `losses.py` written down plainly in torch, differentiable by autograd. For tests and comparisons."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def reference_loss(
     image: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, exposure: torch.Tensor, target: KeyframeImages,
     settings: LossSettings,
 ) -> dict[str, torch.Tensor]:  # fmt: skip
-    """The values of `LossValues` by name, as float64 scalars that carry their graph.
+    """The values of `LossValues` by name, as scalars that carry their graph. Computes in the type of `image`.
 
     Args:
-        image: rendered colour [3, H, W], float64.
-        depth: accumulated depth [H, W], float64, metres.
-        alpha: [H, W], float64.
-        exposure: [3, 2], float64; stands in for `target.exposure`.
+        image: rendered colour [3, H, W]; float64 for tests.
+        depth: accumulated depth [H, W], metres.
+        alpha: [H, W].
+        exposure: [3, 2]; stands in for `target.exposure`.
     """
-    y = torch.from_numpy(target.color).permute(2, 0, 1).to(torch.float64) / 255
-    target_depth = torch.from_numpy(target.depth.astype("float64")) * target.depth_scale
+    y = torch.from_numpy(target.color).permute(2, 0, 1).to(image.dtype) / 255
+    target_depth = torch.from_numpy(target.depth.astype("float64")).to(image.dtype) * target.depth_scale
     valid = torch.isfinite(target_depth) & (target_depth > 0)
 
     exposed = exposure[:, 0, None, None] * image + exposure[:, 1, None, None]

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Printing: progress bars and tables."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+console = Console()
+
+
+def progress_bar(unit: str = "frames") -> Progress:
+    """A one-line progress bar with rate and time left; the task's field `info` is free text."""
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(bar_width=20), MofNCompleteColumn(), TextColumn(unit),
+        TaskProgressColumn(show_speed=True), TextColumn("{task.fields[info]}"), TimeRemainingColumn(compact=True),
+        console=console, refresh_per_second=4,
+    )  # fmt: skip
+
+
+def table(title: str, columns: list[str], rows: list[list[str]]) -> Table:
+    """A small table; the first column is left-aligned, the others right-aligned."""
+    result = Table(title=title, title_justify="left")
+    for number, name in enumerate(columns):
+        result.add_column(name, justify="left" if number == 0 else "right")
+    for row in rows:
+        result.add_row(*row)
+    return result

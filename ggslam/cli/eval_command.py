@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam eval`: score a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ggslam.cli import options
+from ggslam.cli.console import console, progress_bar
+from ggslam.cli.observer import ProgressObserver
+from ggslam.cli.summary import print_scores
+
+EPILOG = "[bold]Examples[/]  ggslam eval runs/kitchen    ggslam eval runs/kitchen --sequence elsewhere/kitchen"
+
+
+def evaluate(
+    run: options.RunPath,
+    sequence: Annotated[Path | None, typer.Option(help="The recording, if it is not where it was.")] = None,
+    lpips: Annotated[bool, typer.Option("--lpips/--no-lpips", help="Also LPIPS (needs its weights).")] = True,
+    every: Annotated[int, typer.Option(help="Score every n-th frame only.", min=1)] = 1,
+) -> None:
+    """Score a run against its recording: trajectory, images of keyframes, held-out and all frames."""
+    from ggslam.pipeline import open_recording_of
+    from ggslam.run_folder import RunFolder
+    from ggslam.scoring import score_run
+
+    folder = RunFolder.open(run)
+    recording = open_recording_of(folder, sequence)
+    with progress_bar() as bar:
+        metrics = score_run(folder, recording, ProgressObserver(bar), lpips=lpips, every=every)
+    print_scores(metrics)
+    console.print(f"wrote {folder.path / 'metrics.json'}", highlight=False)

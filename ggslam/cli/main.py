@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: `ggslam COMMAND`. Each command is one small file: parse, call, print."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+from rich.console import Console
+
+from ggslam import __version__
+from ggslam.cli import eval_command, export_command, inspect_command, render_command, run_command, synth_command
+from ggslam.errors import GgslamError
+
+app = typer.Typer(
+    name="ggslam",
+    help="RGB-D Gaussian SLAM on two CPU cores: a recording in; trajectory, Gaussian map and scores out.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"ggslam {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _options(
+    version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True, help="Print the version."),
+) -> None:
+    pass
+
+
+_COMMANDS = {
+    "run": (run_command.run, run_command.EPILOG), "eval": (eval_command.evaluate, eval_command.EPILOG),
+    "render": (render_command.render, render_command.EPILOG), "export": (export_command.export, export_command.EPILOG),
+    "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
+}  # fmt: skip
+for _name, (_function, _epilog) in _COMMANDS.items():
+    app.command(_name, epilog=_epilog, no_args_is_help=True)(_function)
+
+
+def main() -> None:
+    """Entry point. Exit codes: 0 done, 2 the user's input is at fault, 1 ggslam or the machine is, 130 interrupted."""
+    errors = Console(stderr=True)
+    try:
+        app()
+    except GgslamError as error:
+        errors.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True, markup=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        errors.print("interrupted")
+        sys.exit(130)
+    except OSError as error:
+        errors.print(f"error: {error}", highlight=False, soft_wrap=True, markup=False)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

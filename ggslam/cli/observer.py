@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shows how a run goes on."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from rich.progress import Progress, TaskID
+
+if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
+    from ggslam.slam import StepReport
+
+
+class ProgressObserver:
+    """Feeds a progress bar: one line per stage."""
+
+    def __init__(self, bar: Progress) -> None:
+        self._bar = bar
+        self._task: TaskID | None = None
+        self._done = 0
+
+    def begin(self, stage: str, total: int) -> None:
+        """A stage of `total` steps begins."""
+        self._task, self._done = self._bar.add_task(stage, total=total, info=""), 0
+
+    def frame(self, report: StepReport) -> None:
+        """A frame was processed."""
+        assert self._task is not None
+        self._done += 1
+        psnr = f"{report.psnr:.1f} dB" if math.isfinite(report.psnr) else "-"
+        info = f"overlap {report.frame.overlap:4.0%}  {report.gaussians / 1000:.0f}k Gaussians  PSNR {psnr}"
+        if report.frame.status != "ok":
+            info += f"  [yellow]{report.frame.status}[/]"
+        self._bar.update(self._task, completed=self._done, info=info)
+
+    def advance(self, done: int, total: int) -> None:
+        """`done` of `total` steps of the current stage are done."""
+        assert self._task is not None
+        self._bar.update(self._task, completed=done, total=total)

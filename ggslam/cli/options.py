@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+SequencePath = Annotated[
+    Path, typer.Argument(metavar="SEQUENCE", help="Folder of the recording; its format is recognised.")
+]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `ggslam run` wrote.")]
+Start = Annotated[int, typer.Option(help="First frame to use.")]
+Stop = Annotated[int | None, typer.Option(help="Frame to stop before.")]
+Stride = Annotated[int, typer.Option(help="Use every n-th frame.")]
+Scale = Annotated[float, typer.Option(help="Resize the images by this factor, e.g. 0.5.")]
+Format = Annotated[str | None, typer.Option("--format", help="Recording format, if it is not recognised.")]
+DepthScale = Annotated[float | None, typer.Option(help="Raw depth units per metre, to override the recording's.")]

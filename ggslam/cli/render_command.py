@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam render`: pictures of a run's map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ggslam.cli import options
+from ggslam.cli.console import console, progress_bar
+
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam render runs/kitchen --frames 0,50,100
+
+  ggslam render runs/kitchen --what color,depth --every 5 --width 1280 --out pictures
+"""
+
+
+def render(
+    run: options.RunPath,
+    out: Annotated[Path | None, typer.Option(help="Folder for the pictures; default RUN/renders.")] = None,
+    frames: Annotated[str | None, typer.Option(help="Frame numbers, e.g. 0,50,100; default: 8 spread evenly.")] = None,
+    every: Annotated[int | None, typer.Option(help="Every n-th frame instead.", min=1)] = None,
+    what: Annotated[str, typer.Option(help="Of color, depth, alpha; separated by commas.")] = "color,depth",
+    width: Annotated[int | None, typer.Option(help="Width of the pictures; default: as the run saw them.")] = None,
+) -> None:
+    """Render a run's map from the poses of its frames."""
+    from ggslam.rendering_jobs import render_frames, select_frames
+    from ggslam.run_folder import RunFolder
+
+    folder = RunFolder.open(run)
+    numbers = select_frames(folder, frames, every)
+    with progress_bar() as bar:
+        task = bar.add_task("render", total=len(numbers), info="")
+        written = render_frames(
+            folder, numbers, what.split(","), out or folder.path / "renders", width,
+            progress=lambda done: bar.update(task, completed=done),
+        )  # fmt: skip
+    console.print(f"wrote {len(written)} pictures to {out or folder.path / 'renders'}", highlight=False)

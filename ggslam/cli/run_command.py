@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam run`: track and map a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ggslam.cli import options
+from ggslam.cli.console import console, progress_bar
+from ggslam.cli.observer import ProgressObserver
+from ggslam.cli.summary import print_scores
+
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam run data/redkitchen --scale 0.5
+
+  ggslam run data/redkitchen --scale 0.5 --iterations 8 --refine 1000 --out runs/kitchen
+
+  ggslam run data/redkitchen --scale 0.5 --realtime 10
+
+  ggslam run data/redkitchen --set mapping.insertion.opacity=0.7 --set seed=1
+"""
+
+
+def run(
+    sequence: options.SequencePath,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default runs/NAME.")] = None,
+    config: Annotated[str | None, typer.Option(help="Preset name or YAML file with settings.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Override one setting; repeatable.")
+    ] = None,
+    start: options.Start = 0,
+    stop: options.Stop = None,
+    stride: options.Stride = 1,
+    scale: options.Scale = 1.0,
+    format_name: options.Format = None,
+    depth_scale: options.DepthScale = None,
+    masks: Annotated[Path | None, typer.Option(help="Folder with instance masks, if not the recording's own.")] = None,
+    iterations: Annotated[int | None, typer.Option(help="Mapping iterations per frame (default 4).")] = None,
+    refine: Annotated[int | None, typer.Option(help="Iterations of final refinement after the last frame.")] = None,
+    realtime: Annotated[
+        float | None, typer.Option(metavar="FPS", help="Frames arrive at this rate; tracker and mapper side by side.")
+    ] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of all random draws.")] = None,
+    skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
+    evaluate: Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")] = True,
+    overwrite: Annotated[bool, typer.Option(help="Replace a finished run in the output folder.")] = False,
+) -> None:
+    """Track the camera, build the map, write a run folder and score it."""
+    from ggslam.pipeline import RunRequest, SequenceRequest, execute  # imports torch: only when needed
+
+    overrides = [*(settings or [])]
+    shortcuts = {
+        "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
+        "threads": threads, "seed": seed,
+    }  # fmt: skip
+    overrides += [f"{name}={value}" for name, value in shortcuts.items() if value is not None]
+    request = RunRequest(
+        sequence=SequenceRequest(
+            sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, masks=masks,
+            depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error",
+        ),
+        out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite,
+    )  # fmt: skip
+    with progress_bar() as bar:
+        outcome = execute(request, ProgressObserver(bar))
+    console.print(f"[bold]{outcome.folder.path}[/]: {outcome.headline()}", highlight=False)
+    if outcome.metrics is not None:
+        print_scores(outcome.metrics)
+    if outcome.error is not None:
+        raise outcome.error

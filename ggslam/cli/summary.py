@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Prints scores."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ggslam.cli.console import console, table
+
+_IMAGE_COLUMNS = [
+    ("frames", "frames", 1.0, "d"), ("PSNR", "psnr", 1.0, ".2f"), ("PSNR all px", "psnr_unmasked", 1.0, ".2f"),
+    ("SSIM", "ssim", 1.0, ".3f"), ("LPIPS", "lpips", 1.0, ".3f"), ("depth L1 cm", "depth_l1_m", 100.0, ".2f"),
+]  # fmt: skip
+
+
+def _text(value: float | None, factor: float, form: str) -> str:
+    return "-" if value is None else format(value if form == "d" else factor * value, form)
+
+
+def print_scores(metrics: dict[str, Any]) -> None:
+    """A table of the image scores and a line each for trajectory and speed."""
+    rows = [
+        [name.replace("_", " "), *(_text(scores.get(key), factor, form) for _, key, factor, form in _IMAGE_COLUMNS)]
+        for name, scores in metrics["images"].items()
+    ]
+    columns = ["images (PSNR, SSIM over pixels with depth)", *(title for title, *_ in _IMAGE_COLUMNS)]
+    console.print(table("", columns, rows))
+    console.print(_trajectory_line(metrics.get("trajectory")), highlight=False)
+    console.print(_speed_line(metrics), highlight=False)
+    for note in metrics.get("notes", []):
+        console.print(f"note: {note}", highlight=False, markup=False)
+
+
+def _trajectory_line(t: dict[str, Any] | None) -> str:
+    if not t:
+        return "trajectory: no ground truth to compare with"
+    centimetres = {key: _text(t[key], 100, ".2f") for key in t if key.endswith("_m")}
+    return (
+        f"trajectory: ATE RMSE {centimetres['ate_rmse_m']} cm, mean {centimetres['ate_mean_m']} cm (aligned), "
+        f"raw {centimetres['ate_raw_rmse_m']} cm; RPE {centimetres['rpe_trans_m']} cm, "
+        f"{_text(t['rpe_rot_deg'], 1, '.3f')} deg"
+    )
+
+
+def _speed_line(metrics: dict[str, Any]) -> str:
+    s = metrics["speed"]
+    return (
+        f"speed: {_text(s['frames_per_s'], 1, '.1f')} frames/s, tracking {_text(s['tracking_ms'], 1, '.1f')} ms a "
+        f"frame, mapping {_text(s['mapping_iteration_ms'], 1, '.1f')} ms an iteration; {metrics['map']['gaussians']} "
+        f"Gaussians, peak memory {_text(metrics['memory']['peak_rss_mb'], 1, '.0f')} MB"
+    )

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every setting in one typed tree. Presets are YAML files in configs/; unknown names and impossible values are refused.
+
+The settings of a part live beside the part (`ggslam/tracking`, `ggslam/mapping`) as frozen dataclasses whose fields
+are documented there; `Config` puts them together.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import typing
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import pydantic
+import yaml
+
+from ggslam.errors import ConfigError
+from ggslam.formats.atomic import write_text
+from ggslam.mapping.settings import MapperSettings
+from ggslam.tracking.keyframes import KeyframeSettings
+from ggslam.tracking.tracker import TrackerSettings
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What is kept away from training, so that it can be scored honestly."""
+
+    held_out_every: int = 8
+    """Every n-th frame is tracked but never a keyframe and never trained on; 0: none."""
+    held_out_offset: int = 4
+    """The first frame held out (the very first frame has to be a keyframe)."""
+
+    def is_held_out(self, frame_index: int) -> bool:
+        """Whether the frame is kept for scoring."""
+        return self.held_out_every > 0 and frame_index % self.held_out_every == self.held_out_offset
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of a run."""
+
+    seed: int = 0
+    """Of every random draw. A synchronous run on one machine repeats bit for bit."""
+    threads: int = 0
+    """Threads of the compiled core; 0: the processors this process may use."""
+    sh_degree: int = 0
+    """Spherical-harmonic degree of the colours, 0 to 3."""
+    realtime_fps: float = 0.0
+    """0: synchronous. Otherwise frames arrive at this rate like from a camera; tracker and mapper run side by side."""
+    refine_iterations: int = 0
+    """Optimisation steps after the last frame."""
+    tracking: TrackerSettings = field(default_factory=TrackerSettings)
+    keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
+    mapping: MapperSettings = field(default_factory=MapperSettings)
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+
+    def __post_init__(self) -> None:
+        limits = {
+            "threads": (self.threads, 0, 1024), "sh_degree": (self.sh_degree, 0, 3),
+            "realtime_fps": (self.realtime_fps, 0, 1e4), "refine_iterations": (self.refine_iterations, 0, 10**7),
+            "mapping.iterations_per_frame": (self.mapping.iterations_per_frame, 0, 1000),
+        }  # fmt: skip
+        for name, (value, low, high) in limits.items():
+            if not low <= value <= high:
+                raise ConfigError(f"{name}: expected {low} to {high}, found {value}")
+
+
+def config_to_dict(config: Config) -> dict[str, Any]:
+    """The settings as nested dictionaries of plain values, in the order of the fields."""
+    return _plain(dataclasses.asdict(config))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value.value if hasattr(value, "value") else value
+
+
+def config_from_dict(values: dict[str, Any], origin: str = "settings") -> Config:
+    """The settings from nested dictionaries; what is not named keeps its default.
+
+    Raises:
+        ConfigError: an unknown name (the nearest known one is suggested) or a value of the wrong type or range.
+    """
+    _refuse_unknown(values, Config, "", origin)
+    try:
+        return pydantic.TypeAdapter(Config).validate_python(values)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(f"{origin}: {name}: {first['msg']}, found {first['input']!r}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{origin}: {error}") from None
+
+
+def _refuse_unknown(values: Any, kind: type, prefix: str, origin: str) -> None:
+    if not isinstance(values, dict):
+        place = prefix.rstrip(".") or "top level"
+        raise ConfigError(f"{origin}: {place}: expected names with values, found {values!r}")
+    types = typing.get_type_hints(kind)
+    known = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    for name, value in values.items():
+        if name not in known:
+            near = difflib.get_close_matches(str(name), known, 1)
+            hint = f"; did you mean {prefix}{near[0]}?" if near else f"; known: {', '.join(prefix + k for k in known)}"
+            raise ConfigError(f"{origin}: unknown setting {prefix}{name}{hint}")
+        if dataclasses.is_dataclass(types[name]):
+            _refuse_unknown(value, typing.cast(type, types[name]), f"{prefix}{name}.", origin)
+
+
+def presets() -> dict[str, Path]:
+    """The presets that come with ggslam: name -> file."""
+    folders = [Path(__file__).parents[1] / "configs", Path(str(resources.files("ggslam"))) / "configs"]
+    return {path.stem: path for folder in folders if folder.is_dir() for path in sorted(folder.glob("*.yaml"))}
+
+
+def load_config(preset_or_file: str | Path | None = None, overrides: list[str] | None = None) -> Config:
+    """Settings from a preset's name or a YAML file, then `name.of.setting=value` overrides, in order.
+
+    Raises:
+        ConfigError: naming the file and the setting.
+    """
+    values: dict[str, Any] = {}
+    origin = "settings"
+    if preset_or_file is not None:
+        path = Path(preset_or_file)
+        if not path.suffix and str(preset_or_file) in presets():
+            path = presets()[str(preset_or_file)]
+        values, origin = _read_yaml(path), str(path)
+        config_from_dict(values, origin)
+    for override in overrides or []:
+        name, equals, text = override.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {override}: expected name=value")
+        _assign(values, name.strip().split("."), yaml.safe_load(text), override)
+    return config_from_dict(values, "--set" if overrides else origin)
+
+
+def _assign(values: dict[str, Any], names: list[str], value: Any, override: str) -> None:
+    for name in names[:-1]:
+        values = values.setdefault(name, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"--set {override}: {name} is a value, not a group")
+    values[names[-1]] = value
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text())
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file, nor a preset (presets: {', '.join(presets())})") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read as YAML: {error}") from None
+    return values if values is not None else {}
+
+
+def save_config(config: Config, path: Path) -> None:
+    """Writes all settings, defaults included, as YAML."""
+    write_text(path, yaml.safe_dump(config_to_dict(config), sort_keys=False))

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exposure of one keyframe: an affine map of the rendered colour, corrected = gain * rendered + offset per channel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.errors import RenderError
+from ggslam.mapping.settings import ExposureSettings
+
+
+def identity_exposure() -> np.ndarray:
+    """Gain 1 and offset 0 for each channel, float64 [3, 2]."""
+    return np.tile([1.0, 0.0], (3, 1))
+
+
+class ExposureAdam:
+    """Adam (Kingma and Ba 2015) on gain and offset of one keyframe.
+
+    It descends loss + regularization / 2 |exposure - identity|^2: without the second term map and exposures could
+    drift together, all keyframes darker and the map brighter, at no cost in the loss.
+    """
+
+    def __init__(self, settings: ExposureSettings, beta1: float = 0.9, beta2: float = 0.99) -> None:
+        self.settings, self.beta1, self.beta2 = settings, beta1, beta2
+        self.first, self.second, self.steps = np.zeros((3, 2)), np.zeros((3, 2)), 0
+
+    def step(self, exposure: np.ndarray, gradient: np.ndarray, rate_factor: float = 1.0) -> np.ndarray:
+        """The exposure after one step, float64 [3, 2].
+
+        A gradient that is not finite is passed over: one broken view must not spoil the moments for good.
+
+        Args:
+            exposure: gain and offset per channel [3, 2].
+            gradient: of the loss with respect to it [3, 2].
+            rate_factor: multiplies the step size.
+
+        Raises:
+            RenderError: another shape.
+        """
+        for name, array in (("exposure", exposure), ("gradient", gradient)):
+            if np.shape(array) != (3, 2):
+                raise RenderError(f"{name}: expected [3, 2], found {list(np.shape(array))}")
+        if not np.isfinite(gradient).all():
+            return exposure
+        gradient = gradient + self.settings.regularization * (exposure - identity_exposure())
+        self.steps += 1
+        self.first += (1 - self.beta1) * (gradient - self.first)
+        self.second += (1 - self.beta2) * (gradient**2 - self.second)
+        first = self.first / (1 - self.beta1**self.steps)
+        second = self.second / (1 - self.beta2**self.steps)
+        return exposure - rate_factor * self.settings.rate * first / (np.sqrt(second) + 1e-12)

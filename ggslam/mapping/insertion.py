@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""New Gaussians where the map does not yet explain a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ggslam.mapping.settings import InsertionSettings
+from ggslam.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class NewGaussians:
+    """Gaussians to insert, world frame: means [M, 3], quaternions wxyz [M, 4], log_scales [M, 3], rgb [M, 3]."""
+
+    means: np.ndarray
+    quaternions: np.ndarray
+    log_scales: np.ndarray
+    rgb: np.ndarray
+    pixels: np.ndarray
+    """Flat pixel index of each, int64 [M]."""
+
+
+def unexplained(depth: np.ndarray, alpha: np.ndarray, rendered_depth: np.ndarray, s: InsertionSettings) -> np.ndarray:
+    """Pixels to insert at, bool [H, W]: nothing is rendered there, or something behind what is measured.
+
+    Args:
+        depth: measured depth [H, W], metres, 0 = none.
+        alpha: rendered alpha [H, W].
+        rendered_depth: rendered expected depth (normalised by alpha) [H, W].
+    """
+    tolerance = np.maximum(s.depth_tolerance_m, s.depth_tolerance_relative * depth)
+    return (alpha < s.alpha_threshold) | (depth < rendered_depth - tolerance)
+
+
+def grid_selection(color: np.ndarray, depth: np.ndarray, s: InsertionSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of the sampling grid, bool [H, W], and the grid's stride at each, int32 [H, W].
+
+    The stride is 1, or with `adaptive_stride` 2 where neither colour nor depth has an edge: a wall needs fewer
+    Gaussians than a bookshelf.
+    """
+    height, width = depth.shape
+    if not s.adaptive_stride:
+        return np.ones((height, width), bool), np.ones((height, width), np.int32)
+    grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    texture = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0)) + np.abs(cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    steps = np.abs(cv2.Sobel(depth, cv2.CV_32F, 1, 0)) + np.abs(cv2.Sobel(depth, cv2.CV_32F, 0, 1))
+    edge = np.where(steps > 0.3 * depth, 1e3, texture)
+    smooth = cv2.dilate(edge, np.ones((3, 3), np.uint8)) < s.texture_threshold
+    stride = np.where(smooth, 2, 1).astype(np.int32)
+    rows, columns = np.mgrid[0:height, 0:width]
+    return (rows % stride == stride // 2) & (columns % stride == stride // 2), stride
+
+
+def surface_normals(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Unit normals towards the camera, float32 [H, W, 3], from central differences; zero where there is none.
+
+    Args:
+        points: [H, W, 3] in the camera frame.
+        depth: [H, W], metres. A pixel whose 5x5 surroundings have a hole or a jump gets no normal.
+    """
+    smooth = cv2.boxFilter(points, -1, (3, 3), borderType=cv2.BORDER_REPLICATE)
+    du, dv = np.zeros_like(points), np.zeros_like(points)
+    du[:, 1:-1] = smooth[:, 2:] - smooth[:, :-2]
+    dv[1:-1] = smooth[2:] - smooth[:-2]
+    normals = np.cross(du, dv)
+    length = np.linalg.norm(normals, axis=-1)
+    normals *= np.where(_is_smooth(depth) & (length > 1e-12), 1 / np.maximum(length, 1e-12), 0)[..., None]
+    facing = np.einsum("hwc,hwc->hw", normals, points) > 0
+    normals[facing] *= -1
+    return normals
+
+
+def _is_smooth(depth: np.ndarray) -> np.ndarray:
+    """Whether depth is known and without a jump in the 5x5 pixels around each pixel, bool [H, W].
+
+    A plane is linear in inverse depth however steeply it is seen, so a jump shows in the second difference.
+    """
+    inverse = 1 / np.maximum(depth, 1e-3)
+    bend = np.zeros_like(depth)
+    bend[:, 1:-1] = np.abs(inverse[:, 2:] + inverse[:, :-2] - 2 * inverse[:, 1:-1])
+    bend[1:-1] = np.maximum(bend[1:-1], np.abs(inverse[2:] + inverse[:-2] - 2 * inverse[1:-1]))
+    broken = (bend > 0.03 * inverse) | (depth <= 0)
+    return cv2.dilate(broken.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
+
+
+def new_gaussians(
+    color: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, where: np.ndarray,
+    s: InsertionSettings,
+) -> NewGaussians:  # fmt: skip
+    """Discs on the measured surface, one per selected pixel (bool [H, W]) with usable depth.
+
+    Each disc covers its pixel's footprint: sigma = scale_pixels * stride * z / f across the viewing direction, longer
+    by 1 / cos along the slope of the surface, thin along the normal. Without a normal it is a small sphere.
+    """
+    on_grid, stride = grid_selection(color, depth, s)
+    usable = (depth > 0.05) & (depth < s.max_depth_m)
+    pixels = np.flatnonzero(where & on_grid & usable)
+    points = camera.back_project(depth)
+    normals = surface_normals(points, depth).reshape(-1, 3)[pixels]
+    positions = points.reshape(-1, 3)[pixels]
+    footprint = s.scale_pixels * stride.reshape(-1)[pixels] * positions[:, 2] * (2.0 / (camera.fx + camera.fy))
+    log_scales, axes = _disc_shape(positions, normals, footprint, s)
+    R = T_world_camera[:3, :3].astype(np.float32)
+    return NewGaussians(
+        means=positions @ R.T + T_world_camera[:3, 3].astype(np.float32),
+        quaternions=_quaternions(np.einsum("ij,njk->nik", R, axes)),
+        log_scales=log_scales,
+        rgb=color.reshape(-1, 3)[pixels].astype(np.float32) / 255,
+        pixels=pixels,
+    )
+
+
+def _disc_shape(
+    positions: np.ndarray, normals: np.ndarray, footprint: np.ndarray, s: InsertionSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log standard deviations [M, 3] and axes (columns of [M, 3, 3]): slope direction, across it, normal."""
+    rays = -positions / np.linalg.norm(positions, axis=1, keepdims=True)
+    has_normal = np.einsum("ni,ni->n", normals, normals) > 0.5
+    n = np.where(has_normal[:, None], normals, rays)
+    cosine = np.clip(np.einsum("ni,ni->n", n, rays), 1e-3, 1)
+    across = np.cross(n, rays)
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    helper = np.where(np.abs(n[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]).astype(np.float32)
+    across = np.where(length > 1e-4, across / np.maximum(length, 1e-9), _unit(np.cross(n, helper)))
+    along = np.cross(across, n)
+    stretch = np.where(has_normal, np.minimum(1 / cosine, s.max_slope), 1)
+    thin = np.where(has_normal, s.flatness, 1)
+    scales = footprint[:, None] * np.stack([stretch, np.ones_like(stretch), thin], 1)
+    return np.log(scales).astype(np.float32), np.stack([along, across, n], -1).astype(np.float32)
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
+
+
+def _quaternions(R: np.ndarray) -> np.ndarray:
+    """Unit quaternions wxyz [M, 4] of rotation matrices [M, 3, 3]: of the four equivalent formulas the one with the
+    largest divisor is taken for each matrix."""
+    m00, m11, m22 = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
+    squares = np.stack([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], 1)
+    a, b, c = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
+    d, e, f = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
+    candidates = np.stack(
+        [np.stack([squares[:, 0], a, b, c], 1), np.stack([a, squares[:, 1], d, e], 1),
+         np.stack([b, d, squares[:, 2], f], 1), np.stack([c, e, f, squares[:, 3]], 1)], 1
+    )  # fmt: skip
+    best = candidates[np.arange(len(R)), np.argmax(squares, 1)]
+    return _unit(best).astype(np.float32)

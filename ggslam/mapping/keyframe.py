@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A frame that the map is trained on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse, se3_exp
+
+DEPTH_UNITS_PER_METRE = 5000.0
+"""Depth of keyframes is kept as uint16 in units of 0.2 mm (range 13.1 m), the resolution of the TUM recordings."""
+
+
+@dataclass
+class Keyframe:
+    """Images are kept as integers: 8 bytes a pixel less than floats, for every keyframe of a long recording.
+
+    Attributes:
+        index: number of the keyframe (0, 1, 2, ...).
+        frame_index: index of the frame it was made from.
+        color: uint8 [H, W, 3].
+        depth: uint16 [H, W], units of 1 / DEPTH_UNITS_PER_METRE metres, 0 = none.
+        T_camera_world: float64 [4, 4], the pose as refined so far.
+        T_camera_world_tracked: float64 [4, 4], the pose as the tracker gave it.
+        exposure: float64 [3, 2], gain and offset per channel applied to the rendered colour.
+        mask: uint16 [H, W] or None.
+    """
+
+    index: int
+    frame_index: int
+    timestamp: float
+    camera: Camera
+    color: np.ndarray
+    depth: np.ndarray
+    T_camera_world: np.ndarray
+    T_camera_world_tracked: np.ndarray
+    mask: np.ndarray | None = None
+    exposure: np.ndarray = field(default_factory=lambda: np.tile([1.0, 0.0], (3, 1)))
+    iterations: int = 0
+
+    @property
+    def T_world_camera(self) -> np.ndarray:
+        """The refined pose, camera to world."""
+        return inverse(self.T_camera_world)
+
+    def depth_m(self) -> np.ndarray:
+        """Depth in metres, float32 [H, W]."""
+        return self.depth.astype(np.float32) / np.float32(DEPTH_UNITS_PER_METRE)
+
+
+def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyframe:
+    """The keyframe of a frame seen from `T_world_camera`."""
+    units = np.clip(frame.depth * DEPTH_UNITS_PER_METRE + 0.5, 0, 65535).astype(np.uint16)
+    units[frame.depth * DEPTH_UNITS_PER_METRE > 65535] = 0
+    T_camera_world = inverse(T_world_camera)
+    return Keyframe(
+        index, frame.index, frame.timestamp, frame.camera, np.ascontiguousarray(frame.color), units,
+        T_camera_world, T_camera_world.copy(), frame.mask,
+    )  # fmt: skip
+
+
+class PoseAdam:
+    """Adam on the 6-D twist of one keyframe's pose (left perturbation in the camera frame, translation first)."""
+
+    def __init__(self, beta1: float = 0.9, beta2: float = 0.99) -> None:
+        self.beta1, self.beta2 = beta1, beta2
+        self.first, self.second, self.steps = np.zeros(6), np.zeros(6), 0
+
+    def step(self, T_camera_world: np.ndarray, gradient: np.ndarray, rates: np.ndarray) -> np.ndarray:
+        """The pose after one step down `gradient` [6] with step sizes `rates` [6]."""
+        if not np.isfinite(gradient).all():
+            return T_camera_world
+        self.steps += 1
+        self.first += (1 - self.beta1) * (gradient - self.first)
+        self.second += (1 - self.beta2) * (gradient**2 - self.second)
+        first = self.first / (1 - self.beta1**self.steps)
+        second = self.second / (1 - self.beta2**self.steps)
+        return se3_exp(-rates * first / (np.sqrt(second) + 1e-15)) @ T_camera_world

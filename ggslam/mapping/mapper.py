@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mapper: inserts Gaussians for new keyframes and optimises the map against the keyframes' images."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ggslam.mapping.exposure import ExposureAdam
+from ggslam.mapping.insertion import new_gaussians, unexplained
+from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
+from ggslam.mapping.losses import ImageLoss, KeyframeImages
+from ggslam.mapping.pruning import prune
+from ggslam.mapping.sampling import KeyframeSampler
+from ggslam.mapping.settings import MapperSettings
+from ggslam.native.loader import NativeContext
+from ggslam.rendering.cpu import AdamSettings, CpuRasterizer
+from ggslam.scene.frame import Frame
+from ggslam.scene.gaussian_map import GaussianMap
+
+
+@dataclass
+class MapperTimes:
+    """Seconds spent so far in each part, and how often."""
+
+    insertion: float = 0.0
+    forward: float = 0.0
+    loss: float = 0.0
+    backward: float = 0.0
+    iterations: int = 0
+    keyframes: int = 0
+
+    @property
+    def iteration_ms(self) -> float:
+        """Mean milliseconds of one optimisation step."""
+        return 1e3 * (self.forward + self.loss + self.backward) / max(1, self.iterations)
+
+
+class Mapper:
+    """Holds the map and its keyframes.
+
+    Args:
+        gaussians: the map; empty or loaded.
+        settings: see `MapperSettings`.
+        context: threads and instruction set.
+        seed: of the draw of keyframes. With the same seed, frames and iteration counts a run on one machine repeats
+            bit for bit, for any number of threads.
+    """
+
+    def __init__(
+        self, gaussians: GaussianMap, settings: MapperSettings, context: NativeContext, seed: int = 0
+    ) -> None:
+        self.map = gaussians
+        self.settings = settings
+        self.keyframes: list[Keyframe] = []
+        self.times = MapperTimes()
+        self.last_psnr = float("nan")
+        self._rasterizer = CpuRasterizer(context=context)
+        self._loss = ImageLoss(context)
+        self._sampler = KeyframeSampler(np.random.default_rng(seed))
+        self._pose_optimizers: list[PoseAdam] = []
+        self._exposure_optimizers: list[ExposureAdam] = []
+
+    # --- growth ------------------------------------------------------------------------------------------------------
+
+    def add_keyframe(self, frame: Frame, T_world_camera: np.ndarray) -> Keyframe:
+        """Makes a keyframe of `frame` seen from `T_world_camera` [4, 4] and inserts what the map lacks there."""
+        start = time.perf_counter()
+        keyframe = make_keyframe(len(self.keyframes), frame, T_world_camera)
+        self._insert(keyframe, T_world_camera)
+        self.keyframes.append(keyframe)
+        self._pose_optimizers.append(PoseAdam())
+        self._exposure_optimizers.append(ExposureAdam(self.settings.exposure))
+        self._sampler.add()
+        if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
+            prune(self.map, self.settings.pruning)
+        self.times.insertion += time.perf_counter() - start
+        self.times.keyframes += 1
+        return keyframe
+
+    def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray) -> None:
+        depth, s = keyframe.depth_m(), self.settings.insertion
+        where = np.ones(depth.shape, bool)
+        if self.map.count:
+            view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
+            where = unexplained(depth, view.alpha.numpy(), view.expected_depth.numpy(), s)
+        new = new_gaussians(keyframe.color, depth, keyframe.camera, T_world_camera, where, s)
+        logit = float(np.log(s.opacity / (1 - s.opacity)))
+        self.map.insert(
+            torch.from_numpy(new.means), torch.from_numpy(new.quaternions), torch.from_numpy(new.log_scales),
+            torch.full((len(new.means),), logit), torch.from_numpy(new.rgb), birth_keyframe=keyframe.index,
+        )  # fmt: skip
+
+    # --- optimisation ------------------------------------------------------------------------------------------------
+
+    def run(self, iterations: int) -> None:
+        """Optimisation steps on keyframes in random order."""
+        for _ in range(iterations):
+            self.iterate(self.keyframes[self._sampler.draw()])
+
+    def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
+        """One optimisation step on one keyframe: forward, loss, backward with the optimizer fused in.
+
+        Args:
+            keyframe: what to train on.
+            rate_factor: multiplies every learning rate.
+        """
+        s, t0 = self.settings, time.perf_counter()
+        view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
+        t1 = time.perf_counter()
+        exposure = keyframe.exposure if s.exposure.enabled else None
+        target = KeyframeImages(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
+        loss = self._loss.evaluate(view, target, s.loss)
+        t2 = time.perf_counter()
+        step = self._rasterizer.backward_step(
+            self.map, loss.d_image, loss.d_depth, loss.d_alpha, optimizer=self._adam(rate_factor)
+        )
+        self._refine_keyframe(keyframe, step.twist, loss.exposure_gradient, rate_factor)
+        t3 = time.perf_counter()
+        self.times.forward += t1 - t0
+        self.times.loss += t2 - t1
+        self.times.backward += t3 - t2
+        self.times.iterations += 1
+        keyframe.iterations += 1
+        self.last_psnr = loss.psnr
+
+    def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None) -> None:
+        """Final refinement: keyframes in random order, learning rates falling exponentially."""
+        for i in range(iterations):
+            factor = self.settings.refine_decay ** (i / max(1, iterations - 1))
+            self.iterate(self.keyframes[self._sampler.draw()], factor)
+            if progress is not None and (i % 20 == 19 or i + 1 == iterations):
+                progress(i + 1, iterations)
+
+    def _adam(self, rate_factor: float) -> AdamSettings:
+        rates = self.settings.rates
+        if rate_factor == 1.0:
+            return rates
+        scaled = {name: getattr(rates, name) * rate_factor for name in RATE_NAMES}
+        return replace(rates, **scaled)
+
+    def _refine_keyframe(
+        self, keyframe: Keyframe, twist: np.ndarray, exposure_gradient: np.ndarray, rate_factor: float
+    ) -> None:
+        """Pose and exposure of a keyframe follow their gradients. The first keyframe stays: it is the world."""
+        s = self.settings
+        if keyframe.index == 0:
+            return
+        if s.pose_refinement.enabled:
+            p = s.pose_refinement
+            rates = rate_factor * np.repeat([p.translation_rate, p.rotation_rate], 3)
+            optimizer = self._pose_optimizers[keyframe.index]
+            keyframe.T_camera_world = optimizer.step(keyframe.T_camera_world, twist, rates)
+        if s.exposure.enabled:
+            keyframe.exposure = self._exposure_optimizers[keyframe.index].step(keyframe.exposure, exposure_gradient)

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of the mapper. Defaults are one recipe for every recording; see scripts/bench_slam.py for what they reach."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ggslam.mapping.losses import LossSettings
+
+
+@dataclass(frozen=True)
+class InsertionSettings:
+    """Where new Gaussians are born and what they look like."""
+
+    alpha_threshold: float = 0.6
+    """A pixel whose rendered alpha is below this is not yet explained by the map."""
+    depth_tolerance_m: float = 0.05
+    """A pixel whose measured depth lies this much in front of the rendered depth is not explained either..."""
+    depth_tolerance_relative: float = 0.03
+    """...or this share of the depth, whichever is larger."""
+    opacity: float = 0.5
+    """Opacity at birth."""
+    scale_pixels: float = 0.5
+    """Standard deviation at birth along the surface, in pixels of the frame that inserts it (times the stride)."""
+    flatness: float = 1.0
+    """Standard deviation along the surface normal as a share of that along the surface. Flat discs (0.2) cost 0.5 dB
+    at 4 iterations a frame: a Gaussian that is thick at birth is still seen from the side."""
+    max_slope: float = 3.0
+    """How far a footprint may be stretched along a surface seen at a grazing angle."""
+    adaptive_stride: bool = True
+    """One Gaussian per 2x2 pixels where colour and depth are smooth, one per pixel elsewhere."""
+    texture_threshold: float = 60.0
+    """Smoothness for `adaptive_stride`: Sobel magnitude of the grey image (0 to 255 scale) under which a pixel is flat."""
+    max_depth_m: float = 20.0
+    """Farther measurements do not become Gaussians."""
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam step sizes of each group of parameters."""
+
+    means: float = 4e-4
+    quaternions: float = 4e-3
+    log_scales: float = 5e-2
+    opacity_logits: float = 5e-2
+    sh_dc: float = 9e-3
+    sh_rest: float = 5e-4
+    features: float = 1e-2
+    beta1: float = 0.9
+    beta2: float = 0.99
+    epsilon: float = 1e-15
+    young_updates: int = 8
+    """A Gaussian's first steps..."""
+    young_factor: float = 2.0
+    """...are this much longer."""
+
+
+@dataclass(frozen=True)
+class PruningSettings:
+    """Which Gaussians are dropped, and how often one looks."""
+
+    every_keyframes: int = 5
+    min_opacity: float = 0.05
+    max_scale_m: float = 0.25
+    """Larger Gaussians are dropped."""
+
+
+@dataclass(frozen=True)
+class PoseRefinementSettings:
+    """Refinement of keyframe poses through the renderer's pose gradient (Adam on the twist)."""
+
+    enabled: bool = False
+    translation_rate: float = 2e-4
+    """Metres a step."""
+    rotation_rate: float = 2e-4
+    """Radians a step."""
+
+
+@dataclass(frozen=True)
+class ExposureSettings:
+    """Per-keyframe affine colour (gain and offset per channel), pulled towards the identity."""
+
+    enabled: bool = False
+    rate: float = 2e-3
+    regularization: float = 1e-2
+
+
+@dataclass(frozen=True)
+class MapperSettings:
+    """Everything the mapper needs to know."""
+
+    iterations_per_frame: int = 4
+    """Optimisation steps after each frame (synchronous runs)."""
+    first_frame_iterations: int = 10
+    """Steps on the first keyframe before the second frame is read."""
+    refine_decay: float = 0.1
+    """Final refinement: learning rates fall exponentially to this share of their value."""
+    insertion: InsertionSettings = field(default_factory=InsertionSettings)
+    rates: LearningRates = field(default_factory=LearningRates)
+    loss: LossSettings = field(default_factory=LossSettings)
+    pruning: PruningSettings = field(default_factory=PruningSettings)
+    pose_refinement: PoseRefinementSettings = field(default_factory=PoseRefinementSettings)
+    exposure: ExposureSettings = field(default_factory=ExposureSettings)

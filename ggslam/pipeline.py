@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a recording to a scored run folder: what `ggslam run` does, usable from Python."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ggslam.config import Config, load_config
+from ggslam.errors import GgslamError, RunFolderError, SequenceError
+from ggslam.progress import Observer, SilentObserver
+from ggslam.realtime import RealtimeSlam
+from ggslam.run_folder import RunFolder
+from ggslam.scoring import score_run
+from ggslam.sequences import Sequence, open_sequence
+from ggslam.slam import Slam, SlamResult
+
+
+@dataclass(frozen=True)
+class SequenceRequest:
+    """Which part of which recording, and how to read it; see `open_sequence`."""
+
+    path: Path
+    format: str | None = None
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+    scale: float = 1.0
+    masks: Path | None = None
+    depth_scale: float | None = None
+    on_bad_frame: str = "error"
+
+    def open(self) -> Sequence:
+        """Opens the recording.
+
+        Raises:
+            SequenceError: it cannot be read.
+        """
+        return open_sequence(
+            self.path, format=self.format, start=self.start, stop=self.stop, stride=self.stride, scale=self.scale,
+            masks=self.masks, depth_scale=self.depth_scale, on_bad_frame=self.on_bad_frame,  # type: ignore[arg-type]
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """A whole run."""
+
+    sequence: SequenceRequest
+    out: Path | None = None
+    config: str | None = None
+    overrides: list[str] = field(default_factory=list)
+    evaluate: bool = True
+    overwrite: bool = False
+
+
+@dataclass
+class RunOutcome:
+    """A finished run, or what was saved of one that stopped early (`error` says why)."""
+
+    folder: RunFolder
+    result: SlamResult
+    metrics: dict[str, Any] | None = None
+    error: BaseException | None = None
+
+    def headline(self) -> str:
+        """One line for people."""
+        r = self.result
+        lost = sum(frame.status == "lost" for frame in r.frames)
+        parts = [f"{len(r.frames)} frames", f"{r.frames_per_second():.1f} frames/s", f"{len(r.keyframes)} keyframes",
+                 f"{len(r.gaussians)} Gaussians"]  # fmt: skip
+        parts += [f"{lost} frames lost"] if lost else []
+        parts += [f"{len(r.dropped_frames)} frames dropped"] if r.dropped_frames else []
+        return ", ".join(parts)
+
+
+def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome:
+    """Runs a recording into a run folder. If it stops in the middle (damaged frame, interrupt), what was done is saved
+    all the same and the outcome carries the error.
+
+    Raises:
+        GgslamError: nothing could be done at all: settings, recording or output folder at fault.
+    """
+    observer = observer or SilentObserver()
+    config = load_config(request.config, request.overrides)
+    sequence = request.sequence.open()
+    out = request.out if request.out is not None else Path("runs") / sequence.name
+    folder = RunFolder.create(out, overwrite=request.overwrite)
+    result, error = run_slam(sequence, config, observer)
+    if not result.frames:
+        folder.discard()
+        raise error if error is not None else SequenceError(f"{sequence.path}: no frame could be processed")
+    folder.save(config, describe(request.sequence, sequence), result, None if error is None else repr(error))
+    outcome = RunOutcome(folder, result, None, error)
+    if request.evaluate and error is None:
+        outcome.metrics = score_run(folder, sequence, observer)
+    return outcome
+
+
+def run_slam(sequence: Sequence, config: Config, observer: Observer) -> tuple[SlamResult, BaseException | None]:
+    """The loop over a recording, synchronous or in real time as the settings say."""
+    observer.begin("track + map", len(sequence))
+    error: BaseException | None = None
+    slam = Slam(sequence.camera, config)
+    try:
+        if config.realtime_fps > 0:
+            RealtimeSlam(slam, config.realtime_fps).run(sequence.stream(), observer.frame)
+        else:
+            _run_synchronous(slam, sequence, observer)
+        if config.refine_iterations:
+            observer.begin("refine", config.refine_iterations)
+        return slam.finish(observer.advance), None
+    except (GgslamError, KeyboardInterrupt) as stopped:
+        error = stopped
+    return slam.result(), error
+
+
+def _run_synchronous(slam: Slam, sequence: Sequence, observer: Observer) -> None:
+    for frame in sequence.stream():
+        observer.frame(slam.step(frame))
+
+
+def describe(request: SequenceRequest, sequence: Sequence) -> dict[str, Any]:
+    """What `sequence.json` holds: how to open the recording again, and its camera."""
+    values = {**asdict(request), "path": request.path.absolute()}
+    return {"open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence)}
+
+
+def open_recording_of(folder: RunFolder, path: Path | None = None) -> Sequence:
+    """Opens the recording of a run again, as the run did.
+
+    Args:
+        folder: of the run.
+        path: where the recording is now, if it was moved.
+
+    Raises:
+        SequenceError: it is not there any more.
+        RunFolderError: the run does not say which it was.
+    """
+    try:
+        values = dict(folder.read_json("sequence.json")["open"])
+        values["path"] = Path(path if path is not None else values["path"])
+        values["masks"] = None if values["masks"] is None else Path(values["masks"])
+        request = SequenceRequest(**values)
+    except (KeyError, TypeError) as error:
+        raise RunFolderError(f"{folder.path / 'sequence.json'}: not as ggslam writes it: {error!r}") from None
+    return request.open()

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How long work tells how it goes on."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from ggslam.slam import StepReport
+
+
+class Observer(Protocol):
+    """Is told how a run goes on."""
+
+    def begin(self, stage: str, total: int) -> None:
+        """A stage of `total` steps begins."""
+
+    def frame(self, report: StepReport) -> None:
+        """A frame was processed."""
+
+    def advance(self, done: int, total: int) -> None:
+        """`done` of `total` steps of the current stage are done."""
+
+
+class SilentObserver:
+    """Listens to nothing."""
+
+    def begin(self, stage: str, total: int) -> None:
+        """Ignored."""
+
+    def frame(self, report: StepReport) -> None:
+        """Ignored."""
+
+    def advance(self, done: int, total: int) -> None:
+        """Ignored."""

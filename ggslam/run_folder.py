@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run leaves on disk. Every file is written to a temporary name and renamed: none is ever half there.
+
+    trajectory.txt   TUM: timestamp tx ty tz qx qy qz qw, camera to world, the world being the first camera
+    keyframes.json   poses, exposures and frame numbers of the keyframes; how each frame was tracked
+    map.ply          Gaussians in the fields of 3DGS
+    points.ply       coloured cloud sampled from the map, metres; points_grid.ply: the same in integer grid cells
+    config.yaml      all settings; sequence.json: where the recording was and how it was read
+    timing.json      seconds by part; metrics.json: scores; renders/: pictures
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ggslam import __version__
+from ggslam.config import Config, config_from_dict, save_config
+from ggslam.errors import RunFolderError
+from ggslam.formats.atomic import write_text
+from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from ggslam.formats.point_ply import write_points
+from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.slam import SlamResult
+
+MARKER = "run.json"
+"""Is there if and only if a folder is a run of ggslam."""
+
+
+class RunFolder:
+    """A run on disk.
+
+    Args:
+        path: the folder. Use `create` for a new one and `open` for one that is there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self._made_here = False
+
+    @staticmethod
+    def create(path: Path, overwrite: bool = False) -> RunFolder:
+        """Makes the folder, or takes an empty one, or with `overwrite` an earlier run's.
+
+        Raises:
+            RunFolderError: it holds something else, or a run that was not to be replaced, or cannot be written to.
+        """
+        folder = RunFolder(path)
+        try:
+            if folder.path.is_dir() and any(folder.path.iterdir()):
+                if not (folder.path / MARKER).exists():
+                    raise RunFolderError(f"{path}: not empty and not a run of ggslam; choose another folder with --out")
+                if not overwrite:
+                    raise RunFolderError(f"{path}: there is a run already; use --overwrite or another --out")
+            else:
+                folder.path.mkdir(parents=True, exist_ok=True)
+                folder._made_here = True
+            probe = folder.path / f".probe-{os.getpid()}"
+            probe.write_bytes(b"x")
+            probe.unlink()
+        except OSError as error:
+            raise RunFolderError(f"{path}: cannot be written to: {error.strerror or error}") from None
+        return folder
+
+    @staticmethod
+    def open(path: Path) -> RunFolder:
+        """A run that is there.
+
+        Raises:
+            RunFolderError: no such folder, or not a run.
+        """
+        if not (Path(path) / MARKER).is_file():
+            reason = "is not a run of ggslam (no run.json)" if Path(path).is_dir() else "no such folder"
+            raise RunFolderError(f"{path}: {reason}")
+        return RunFolder(path)
+
+    def discard(self) -> None:
+        """Removes the folder if it was made by `create` and is still empty."""
+        if self._made_here and not any(self.path.iterdir()):
+            self.path.rmdir()
+
+    # --- writing -----------------------------------------------------------------------------------------------------
+
+    def save(self, config: Config, sequence: dict[str, Any], result: SlamResult, error: str | None = None) -> None:
+        """Writes everything but scores and pictures.
+
+        Args:
+            config: all settings.
+            sequence: how the recording was read, as keyword arguments of `open_sequence`, for scoring later.
+            result: of the run.
+            error: why the run stopped early, if it did.
+        """
+        for stale in ("metrics.json", "frames.csv"):
+            (self.path / stale).unlink(missing_ok=True)
+        shutil.rmtree(self.path / "renders", ignore_errors=True)
+        write_tum(self.path / "trajectory.txt", result.timestamps(), result.trajectory())
+        self.write_json("keyframes.json", _keyframes(result))
+        write_gaussian_ply(self.path / "map.ply", result.gaussians)
+        write_points(self.path, sample_points(result.gaussians))
+        save_config(config, self.path / "config.yaml")
+        self.write_json("sequence.json", sequence)
+        self.write_json("timing.json", timing(result))
+        self.write_json(MARKER, {"ggslam": __version__, "complete": error is None, "stopped_by": error})
+
+    def write_json(self, name: str, values: Any) -> Path:
+        """Writes `values` as JSON; numbers that are not finite become null."""
+        write_text(self.path / name, json.dumps(json_ready(values), indent=1) + "\n")
+        return self.path / name
+
+    # --- reading -----------------------------------------------------------------------------------------------------
+
+    def read_json(self, name: str) -> Any:
+        """Content of a JSON file of the run.
+
+        Raises:
+            RunFolderError: it is missing or damaged.
+        """
+        path = self.path / name
+        try:
+            return json.loads(path.read_text())
+        except FileNotFoundError:
+            raise RunFolderError(f"{path}: missing") from None
+        except (OSError, ValueError) as error:
+            raise RunFolderError(f"{path}: cannot be read: {error}") from None
+
+    def config(self) -> Config:
+        """The settings of the run."""
+        path = self.path / "config.yaml"
+        try:
+            return config_from_dict(yaml.safe_load(path.read_text()), str(path))
+        except (OSError, yaml.YAMLError) as error:
+            raise RunFolderError(f"{path}: cannot be read: {error}") from None
+
+    def gaussians(self) -> GaussianMap:
+        """The map, without optimizer state."""
+        return read_gaussian_ply(self.path / "map.ply", with_moments=False)
+
+    def trajectory(self) -> Trajectory:
+        """Camera poses of all frames."""
+        return read_tum(self.path / "trajectory.txt")
+
+
+def json_ready(value: Any) -> Any:
+    """Plain Python values: numpy numbers converted, NaN and infinity as None (JSON has no word for them)."""
+    if isinstance(value, dict):
+        return {str(key): json_ready(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return json_ready(value.tolist())
+    if isinstance(value, np.generic):
+        return json_ready(value.item())
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def timing(result: SlamResult) -> dict[str, Any]:
+    """Where the time went, by part."""
+    frames, t, m = max(1, len(result.frames)), result.times, result.mapper_times
+    return {
+        "frames": len(result.frames), "dropped_frames": result.dropped_frames,
+        "frames_per_s": result.frames_per_second(),
+        "wall_s": t.wall, "tracking_s": t.tracking, "refinement_s": t.refinement,
+        "tracking_ms_per_frame": 1e3 * t.tracking / frames, "mapping_ms_per_iteration": m.iteration_ms,
+        "refine_iterations": result.refine_iterations, "mapping": asdict(m), "gaussians": len(result.gaussians),
+        "peak_rss_mb": peak_memory_mb(),
+    }  # fmt: skip
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, in MB (10^6 bytes)."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def _keyframes(result: SlamResult) -> dict[str, Any]:
+    keyframes = [
+        {"index": k.index, "frame": k.frame_index, "timestamp": k.timestamp, "T_world_camera": k.T_world_camera,
+         "exposure": k.exposure, "iterations": k.iterations} for k in result.keyframes
+    ]  # fmt: skip
+    frames = [
+        {"frame": f.frame_index, "source": f.source_index, "timestamp": f.timestamp, "keyframe": f.keyframe,
+         "T_keyframe_camera": f.T_keyframe_camera, "overlap": f.overlap, "rmse_m": f.rmse_m, "status": f.status,
+         "reason": f.reason} for f in result.frames
+    ]  # fmt: skip
+    return {"keyframes": keyframes, "frames": frames}

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scores of a run: `metrics.json`, one line per frame in `frames.csv`, and a few pictures in `renders/`."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import MissingDependency
+from ggslam.evaluation.image_sets import score_images
+from ggslam.evaluation.images import ImageScores
+from ggslam.evaluation.lpips import Lpips
+from ggslam.evaluation.trajectory import score_trajectory
+from ggslam.formats.atomic import write_text
+from ggslam.progress import Observer
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering_jobs import frame_poses
+from ggslam.reporting.pictures import color_to_uint8, compare, write_picture
+from ggslam.run_folder import RunFolder, json_ready
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse
+from ggslam.sequences import Sequence
+
+PICTURES = 6
+"""Comparison pictures written to renders/, spread over the recording."""
+
+
+def score_run(
+    folder: RunFolder, sequence: Sequence, observer: Observer, lpips: bool = True, every: int = 1
+) -> dict[str, Any]:
+    """Scores a run against its recording and writes the results into the run folder.
+
+    Args:
+        folder: of the run.
+        sequence: the recording, opened as the run opened it.
+        observer: is told of the progress.
+        lpips: score LPIPS too, if its weights are there.
+        every: score the images of every n-th frame only.
+
+    Returns:
+        What `metrics.json` holds:
+            trajectory: see `TrajectoryScores`; null without ground truth.
+            images: for `keyframes` (trained on), `held_out` (never trained on) and `all` frames, see `ImageScores`:
+                plain names count pixels with measured depth, `_unmasked` all pixels.
+            speed, map, memory: of the run.
+            notes: what could not be scored, and why.
+    """
+    notes: list[str] = []
+    metric = _lpips(notes) if lpips else None
+    poses = frame_poses(folder)
+    metrics: dict[str, Any] = {
+        "trajectory": _trajectory(sequence, poses),
+        "images": _images(folder, sequence, poses, metric, observer, every),
+        **_performance(folder),
+        "notes": notes,
+    }
+    if metrics["trajectory"] is None:
+        notes.append("the recording has no ground-truth poses; no trajectory scores")
+    folder.write_json("metrics.json", metrics)
+    return json_ready(metrics)
+
+
+def _lpips(notes: list[str]) -> Lpips | None:
+    try:
+        return Lpips()
+    except MissingDependency as missing:
+        notes.append(f"LPIPS not scored: {missing}")
+        return None
+
+
+def _trajectory(sequence: Sequence, poses: dict[int, np.ndarray]) -> dict[str, Any] | None:
+    if sequence.ground_truth is None:
+        return None
+    truth = sequence.ground_truth
+    scores = score_trajectory([poses.get(i) for i in range(len(truth))], truth)
+    return None if scores is None else asdict(scores)
+
+
+def _images(
+    folder: RunFolder, sequence: Sequence, poses: dict[int, np.ndarray], lpips: Lpips | None, observer: Observer,
+    every: int,
+) -> dict[str, Any]:  # fmt: skip
+    keyframes = {k["frame"] for k in folder.read_json("keyframes.json")["keyframes"]}
+    evaluation = folder.config().evaluation
+    chosen = [i for i in range(len(sequence)) if i % every == 0]
+    held_out = {i for i in chosen if evaluation.is_held_out(i) and i not in keyframes}
+    sets = {"keyframes": keyframes & set(chosen), "held_out": held_out, "all": set(chosen)}
+    pictured = set(np.array(sorted(poses))[np.linspace(0, len(poses) - 1, PICTURES).round().astype(int)].tolist())
+    (folder.path / "renders").mkdir(exist_ok=True)
+    show = _shower(folder, poses, pictured)
+    rows: list[dict[str, Any]] = []
+    observer.begin("score", len(sequence))
+
+    def note(frame: Frame, scores: ImageScores | None) -> None:
+        observer.advance(frame.index + 1, len(sequence))
+        kind = "keyframe" if frame.index in keyframes else "held_out" if frame.index in held_out else "other"
+        rows.append({"frame": frame.index, "kind": kind, **(scores or ImageScores()).to_dict()})
+
+    means = score_images(show, sequence.stream(), sets, lpips, note)
+    observer.advance(len(sequence), len(sequence))
+    _write_rows(folder, rows)
+    return {name: mean.to_dict() for name, mean in means.items()}
+
+
+def _shower(
+    folder: RunFolder, poses: dict[int, np.ndarray], pictured: set[int]
+) -> Callable[[Frame], tuple[np.ndarray, np.ndarray] | None]:
+    """A function that renders the map as a frame's camera sees it, and keeps some of the pictures."""
+    gaussians, rasterizer = folder.gaussians(), CpuRasterizer()
+
+    def show(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
+        if frame.index not in poses:
+            return None
+        T_camera_world = inverse(poses[frame.index])
+        view = rasterizer.forward(gaussians, frame.camera, T_camera_world, features=False)
+        color = np.clip(view.image.numpy(), 0, 1).transpose(1, 2, 0)
+        depth = np.where(view.alpha.numpy() > 0.5, view.expected_depth.numpy(), 0)
+        if frame.index in pictured:
+            picture = compare(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth)
+            write_picture(folder.path / "renders" / f"compare{frame.index:06d}.png", picture)
+        return color, depth
+
+    return show
+
+
+def _write_rows(folder: RunFolder, rows: list[dict[str, Any]]) -> None:
+    text = io.StringIO()
+    if rows:
+        writer = csv.DictWriter(text, rows[0].keys(), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    write_text(folder.path / "frames.csv", text.getvalue())
+
+
+def _performance(folder: RunFolder) -> dict[str, Any]:
+    timing = folder.read_json("timing.json")
+    iterations = timing["mapping"]["iterations"] - timing["refine_iterations"]
+    return {
+        "speed": {
+            "frames_per_s": timing["frames_per_s"], "tracking_ms": timing["tracking_ms_per_frame"],
+            "mapping_iteration_ms": timing["mapping_ms_per_iteration"],
+            "iterations_per_frame": iterations / max(1, timing["frames"]),
+            "dropped_frames": len(timing["dropped_frames"]), "refinement_s": timing["refinement_s"],
+        },
+        "map": {"gaussians": timing["gaussians"], "keyframes": timing["mapping"]["keyframes"]},
+        "memory": {"peak_rss_mb": timing["peak_rss_mb"]},
+    }  # fmt: skip

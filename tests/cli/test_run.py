@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line as people use it, on a small generated recording."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.formats.trajectory import read_tum
+
+
+def ggslam(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "ggslam.cli.main", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder of the generated room."""
+    out = tmp_path_factory.mktemp("runs") / "room"
+    done = ggslam("run", room, "--out", out, "--refine", 20)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_a_run_leaves_everything_it_promises(finished: Path) -> None:
+    names = ["trajectory.txt", "keyframes.json", "map.ply", "points.ply", "points_grid.ply", "config.yaml",
+             "sequence.json", "timing.json", "metrics.json", "frames.csv", "run.json"]  # fmt: skip
+    assert [name for name in names if not (finished / name).is_file()] == []
+    assert len(list((finished / "renders").glob("*.png"))) == 6
+    assert [p.name for p in finished.iterdir() if p.name.startswith(".")] == []  # no temporary files
+    assert len(read_tum(finished / "trajectory.txt")) == 24
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert metrics["map"]["gaussians"] == len(read_gaussian_ply(finished / "map.ply"))
+
+
+def test_the_keys_others_rely_on_hold_sensible_numbers(finished: Path) -> None:
+    m = json.loads((finished / "metrics.json").read_text())
+    t = m["trajectory"]
+    assert 0 < t["ate_mean_m"] <= t["ate_rmse_m"] < 0.03 and t["ate_raw_rmse_m"] < 0.05
+    assert 0 < t["rpe_trans_m"] < 0.02 and 0 < t["rpe_rot_deg"] < 1
+    assert m["images"]["held_out"]["frames"] == 3 and m["images"]["all"]["frames"] == 24
+    for name in ("keyframes", "all", "held_out"):
+        scores = m["images"][name]
+        assert 20 < scores["psnr"] < 50 and 15 < scores["psnr_unmasked"] < 50
+        assert 0.6 < scores["ssim"] < 1 and 0 < scores["depth_l1_m"] < 0.1
+    assert m["speed"]["frames_per_s"] > 0 and m["speed"]["tracking_ms"] > 0
+    assert m["speed"]["mapping_iteration_ms"] > 0
+    assert 4 <= m["speed"]["iterations_per_frame"] < 5  # 4 a frame, 10 on the first
+    assert m["memory"]["peak_rss_mb"] > 50
+
+
+def test_held_out_frames_are_never_keyframes(finished: Path) -> None:
+    record = json.loads((finished / "keyframes.json").read_text())
+    assert not {k["frame"] for k in record["keyframes"]} & {4, 12, 20}
+    assert len(record["frames"]) == 24
+
+
+def test_the_same_run_again_is_the_same_to_the_bit(finished: Path, room: Path, tmp_path: Path) -> None:
+    done = ggslam("run", room, "--out", tmp_path / "again", "--refine", 20, "--no-eval", "--threads", 1)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "again" / "map.ply").read_bytes() == (finished / "map.ply").read_bytes()
+    assert (tmp_path / "again" / "trajectory.txt").read_bytes() == (finished / "trajectory.txt").read_bytes()
+
+
+def test_eval_render_export(finished: Path, tmp_path: Path) -> None:
+    before = json.loads((finished / "metrics.json").read_text())
+    assert ggslam("eval", finished, "--no-lpips", "--every", 2).returncode == 0
+    after = json.loads((finished / "metrics.json").read_text())
+    assert after["trajectory"] == before["trajectory"] and after["images"]["all"]["frames"] == 12
+    assert ggslam("eval", finished).returncode == 0
+    done = ggslam("render", finished, "--frames", "0,5", "--what", "color,depth,alpha", "--width", 200,
+                  "--out", tmp_path / "pictures")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    pictures = sorted((tmp_path / "pictures").glob("*.png"))
+    assert len(pictures) == 6 and cv2.imread(str(pictures[0])).shape[:2] == (150, 200)
+    done = ggslam("export", finished, "--format", "ply", "--min-opacity", 0.5, "--out", tmp_path / "a" / "map.ply")
+    assert done.returncode == 0, done.stderr
+    assert 0 < len(read_gaussian_ply(tmp_path / "a" / "map.ply")) < after["map"]["gaussians"]
+    assert ggslam("export", finished, "--format", "points", "--out", tmp_path / "clouds").returncode == 0
+    assert (tmp_path / "clouds" / "points_grid.ply").is_file()
+    assert ggslam("export", finished, "--format", "trajectory", "--out", tmp_path / "t.txt").returncode == 0
+    assert len(read_tum(tmp_path / "t.txt")) == 24
+
+
+def test_realtime_keeps_pace(room: Path, tmp_path: Path) -> None:
+    done = ggslam("run", room, "--out", tmp_path / "run", "--realtime", 10)
+    assert done.returncode == 0, done.stderr
+    m = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    frames = json.loads((tmp_path / "run" / "keyframes.json").read_text())["frames"]
+    assert m["speed"]["frames_per_s"] < 12
+    assert len(frames) + m["speed"]["dropped_frames"] == 24
+    assert m["images"]["held_out"]["psnr"] > 20
+
+
+@pytest.mark.parametrize("command", ["run", "eval", "render", "export", "synth", "inspect"])
+def test_help_has_an_example(command: str) -> None:
+    done = ggslam(command, "--help")
+    assert done.returncode == 0 and f"ggslam {command}" in done.stdout and "Example" in done.stdout
+
+
+def one_error(done: subprocess.CompletedProcess[str], *words: str) -> None:
+    """Exit code 2 and one clear error with these words; no traceback."""
+    assert done.returncode == 2, (done.returncode, done.stderr)
+    assert "Traceback" not in done.stderr
+    message = " ".join(done.stderr.split())
+    assert all(word in message for word in words), message
+
+
+def copy_of(room: Path, to: Path) -> Path:
+    shutil.copytree(room, to)
+    return to
+
+
+def depth_files(folder: Path) -> list[Path]:
+    return sorted((folder / "depth").iterdir())
+
+
+def test_missing_depth_file(room: Path, tmp_path: Path) -> None:
+    folder = copy_of(room, tmp_path / "room")
+    victim = depth_files(folder)[3]
+    victim.unlink()
+    one_error(ggslam("run", folder, "--out", tmp_path / "run"), victim.name)
+
+
+def test_truncated_png_stops_the_run_but_keeps_what_was_done(room: Path, tmp_path: Path) -> None:
+    folder = copy_of(room, tmp_path / "room")
+    victim = depth_files(folder)[10]
+    victim.write_bytes(victim.read_bytes()[:-200])
+    done = ggslam("run", folder, "--out", tmp_path / "run")
+    one_error(done, victim.name)
+    assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == 10
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["complete"] is False
+    done = ggslam("run", folder, "--out", tmp_path / "skipped", "--skip-bad-frames", "--no-eval")
+    assert done.returncode == 0, done.stderr
+    assert len(read_tum(tmp_path / "skipped" / "trajectory.txt")) == 23
+
+
+def test_depth_of_another_size(room: Path, tmp_path: Path) -> None:
+    folder = copy_of(room, tmp_path / "room")
+    victim = depth_files(folder)[2]
+    cv2.imwrite(str(victim), np.full((77, 50), 1000, np.uint16))
+    one_error(ggslam("run", folder, "--out", tmp_path / "run"), victim.name, "50x77")
+
+
+def test_folders_that_are_no_recordings(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    one_error(ggslam("run", tmp_path / "empty", "--out", tmp_path / "run"), "empty")
+    one_error(ggslam("run", tmp_path / "nowhere", "--out", tmp_path / "run"), "nowhere")
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "a.txt").write_text("hello")
+    one_error(ggslam("inspect", tmp_path / "letters"), "letters")
+    assert not (tmp_path / "run").exists()
+
+
+def test_output_folder_that_cannot_be_used(room: Path, finished: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    one_error(ggslam("run", room, "--out", tmp_path / "file" / "run"), "file")
+    one_error(ggslam("run", room, "--out", "/proc/ggslam"), "/proc/ggslam")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter1.tex").write_text("precious")
+    one_error(ggslam("run", room, "--out", tmp_path / "thesis", "--overwrite"), "thesis")
+    one_error(ggslam("run", room, "--out", finished), "--overwrite")
+
+
+def test_wrong_arguments(room: Path, finished: Path, tmp_path: Path) -> None:
+    one_error(ggslam("run", room, "--set", "mapping.iteration=3"), "mapping.iteration", "did you mean")
+    one_error(ggslam("run", room, "--config", "swift"), "swift", "default")
+    one_error(ggslam("run", room, "--start", 100, "--out", tmp_path / "run"), "24")
+    one_error(ggslam("eval", tmp_path), "run.json")
+    one_error(ggslam("render", finished, "--frames", "99"), "99")
+    one_error(ggslam("render", finished, "--what", "normals"), "normals")
+    one_error(ggslam("export", finished, "--format", "points", "--voxel", -1, "--out", tmp_path / "x"), "voxel")
+
+
+def test_damaged_run_folder(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    data = (folder / "map.ply").read_bytes()
+    (folder / "map.ply").write_bytes(data[: len(data) // 2])
+    one_error(ggslam("render", folder), "map.ply")
+    (folder / "keyframes.json").write_text("{")
+    one_error(ggslam("eval", folder), "keyframes.json")
