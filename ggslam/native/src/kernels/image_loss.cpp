@@ -164,7 +164,8 @@ class ColorBand {
       const Float squares = load(statistics + 2 * n_ + i), product = load(statistics + 3 * n_ + i);
       const Float mxy = mx * my, mm = mx * mx + my * my;
       const Float A = 2.f * mxy + kC1, B = 2.f * (product - mxy) + kC2;
-      const Float C = mm + kC1, D = squares - mm + kC2;
+      // Rounding can make the variances negative where colours are far outside [0, 1].
+      const Float C = mm + kC1, D = maximum(squares - mm, Float{}) + kC2;
       const Float inverse = load(planes_.columns + i) / (C * D);  // 0 beyond the image, and so is all that follows
       const Float S = A * B * inverse;
       ssim += S;
