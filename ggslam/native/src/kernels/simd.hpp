@@ -49,6 +49,9 @@ static inline Float lane_numbers() {
 #if defined(__AVX512F__)
 
 typedef __mmask16 Mask;
+// The forms with a full mask compile to the plain instructions, without GCC 12's false alarms about uninitialised
+// operands.
+constexpr __mmask16 kAll = 0xffff;
 static inline Mask greater_equal(Float a, Float b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
 static inline Mask greater(Float a, Float b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
 static inline Mask greater_equal_int(Int a, Int b) { return _mm512_cmpge_epi32_mask((__m512i)a, (__m512i)b); }
@@ -61,9 +64,9 @@ static inline Int select_int(Mask m, Int a, Int b) {
   return (Int)_mm512_mask_blend_epi32(m, (__m512i)b, (__m512i)a);
 }
 static inline Float zero_unless(Mask m, Float a) { return (Float)_mm512_maskz_mov_ps(m, (__m512)a); }
-static inline Float minimum(Float a, Float b) { return (Float)_mm512_min_ps((__m512)a, (__m512)b); }
-static inline Float maximum(Float a, Float b) { return (Float)_mm512_max_ps((__m512)a, (__m512)b); }
-static inline Float square_root(Float a) { return (Float)_mm512_sqrt_ps((__m512)a); }
+static inline Float minimum(Float a, Float b) { return (Float)_mm512_maskz_min_ps(kAll, (__m512)a, (__m512)b); }
+static inline Float maximum(Float a, Float b) { return (Float)_mm512_maskz_max_ps(kAll, (__m512)a, (__m512)b); }
+static inline Float square_root(Float a) { return (Float)_mm512_maskz_sqrt_ps(kAll, (__m512)a); }
 
 #elif defined(__AVX2__)
 
@@ -127,7 +130,7 @@ static inline Float clamp(Float a, Float low, Float high) { return minimum(maxim
 // 1 / a for normal numbers; within 2 units in the last place, and exactly 1 for a = 1.
 static inline Float reciprocal(Float a) {
 #if defined(__AVX512F__)
-  const Float r = (Float)_mm512_rcp14_ps((__m512)a);
+  const Float r = (Float)_mm512_maskz_rcp14_ps(kAll, (__m512)a);
   return r * (2.0f - a * r);
 #else
   return 1.0f / a;
@@ -138,8 +141,8 @@ static inline Float reciprocal(Float a) {
 // may be infinite or NaN: callers mask them.
 static inline Float exp2_unchecked(Float x) {
 #if defined(__AVX512F__)
-  const Float rounded =
-      (Float)_mm512_roundscale_ps((__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+  constexpr int kToNearest = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
+  const Float rounded = (Float)_mm512_maskz_roundscale_ps(kAll, (__m512)x, kToNearest);
 #else
   constexpr float kMagic = 12582912.0f;  // 1.5 * 2^23: adding it leaves the rounded integer in the low mantissa bits
   const Float shifted = x + kMagic;
@@ -152,7 +155,7 @@ static inline Float exp2_unchecked(Float x) {
   p = p * f + 6.931469671e-1f;
   p = p * f + 1.000000072f;
 #if defined(__AVX512F__)
-  return (Float)_mm512_scalef_ps((__m512)p, (__m512)rounded);
+  return (Float)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)rounded);
 #else
   return (Float)((Int)p + ((Int)shifted << 23));
 #endif
@@ -182,10 +185,11 @@ static inline Float sigmoid(Float x) { return 1.0f / (1.0f + exponential(-x)); }
 // Sums of the lanes of four vectors at once, to out[0..3]. The order of the additions is fixed.
 static inline void sum4(Float a, Float b, Float c, Float d, float* out) {
 #if defined(__AVX512F__)
-  const __m512 ab = _mm512_add_ps(_mm512_unpacklo_ps((__m512)a, (__m512)b), _mm512_unpackhi_ps((__m512)a, (__m512)b));
-  const __m512 cd = _mm512_add_ps(_mm512_unpacklo_ps((__m512)c, (__m512)d), _mm512_unpackhi_ps((__m512)c, (__m512)d));
-  const __m512 abcd = _mm512_add_ps(_mm512_shuffle_ps(ab, cd, 0x44), _mm512_shuffle_ps(ab, cd, 0xEE));
-  const __m256 half = _mm256_add_ps(_mm512_castps512_ps256(abcd), _mm512_extractf32x8_ps(abcd, 1));
+  const __m512 va = (__m512)a, vb = (__m512)b, vc = (__m512)c, vd = (__m512)d;
+  const __m512 ab = _mm512_maskz_unpacklo_ps(kAll, va, vb) + _mm512_maskz_unpackhi_ps(kAll, va, vb);
+  const __m512 cd = _mm512_maskz_unpacklo_ps(kAll, vc, vd) + _mm512_maskz_unpackhi_ps(kAll, vc, vd);
+  const __m512 abcd = _mm512_maskz_shuffle_ps(kAll, ab, cd, 0x44) + _mm512_maskz_shuffle_ps(kAll, ab, cd, 0xEE);
+  const __m256 half = _mm512_maskz_extractf32x8_ps(0xff, abcd, 0) + _mm512_maskz_extractf32x8_ps(0xff, abcd, 1);
   _mm_storeu_ps(out, _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1)));
 #elif defined(__AVX2__)
   const __m256 ab = _mm256_add_ps(_mm256_unpacklo_ps((__m256)a, (__m256)b), _mm256_unpackhi_ps((__m256)a, (__m256)b));

@@ -1,0 +1,168 @@
+// SPDX-License-Identifier: Apache-2.0
+// Backward of compositing one tile, back to front, splat by splat. With g = sum over channels of channel value times
+// image gradient at a pixel, t the transmittance before the splat and "behind" the sum of weight * g over all splats
+// behind it (starting from minus the final transmittance times the gradient of the alpha image):
+//     d loss / d alpha = t g - behind / (1 - alpha)
+// so one scalar per pixel stands for everything behind. The transmittance is recovered by dividing by 1 - alpha.
+//
+// d loss / d log(alpha) =: G leads to the splat's geometry through its moments sum G (1, dx, dy, dx^2, dx dy, dy^2).
+// The sums over the tile's pixels go to the pair's own slot; gather.cpp adds up a Gaussian's slots.
+#include "tile.hpp"
+
+namespace ggslam::GGSLAM_ISA {
+namespace {
+
+enum FeatureMode { kNoFeatures, kFeaturesReachGeometry, kFeaturesDetached };
+
+struct TileGradients {
+  Float channels[kSubBlocks][4];                   // image gradients: red, green, blue, depth
+  Float transmittance[kSubBlocks], behind[kSubBlocks];
+  Int last[kSubBlocks];
+  std::int32_t last_in_tile;                       // highest entry that contributed anywhere
+};
+
+// What one splat wrote to its sub-blocks, for the pass over the feature channels.
+struct WeightList {
+  Float weights[kSubBlocks];
+  std::int32_t sub_blocks[kSubBlocks];
+  int size;
+};
+
+void load_gradients(const Rasterizer& r, int index, const Tile& tile, const ImageGradients& in, ThreadScratch& scratch,
+                    TileGradients& out) {
+  const std::size_t pixels = static_cast<std::size_t>(r.view.width) * r.view.height;
+  const std::size_t first = static_cast<std::size_t>(index) * kSubBlocks * kLanes;
+  const float* image[4] = {in.image, in.image ? in.image + pixels : nullptr, in.image ? in.image + 2 * pixels : nullptr,
+                           in.depth};
+  out.last_in_tile = -1;
+  for (int s = 0; s < kSubBlocks; ++s) {
+    const int x0 = sub_block_x(tile, s), y0 = sub_block_y(tile, s);
+    const bool drop = outside(r.view, x0, y0);
+    for (int k = 0; k < 4; ++k) out.channels[s][k] = drop ? Float{} : load_sub_block(image[k], r.view, x0, y0);
+    out.transmittance[s] = load(r.transmittance.data() + first + s * kLanes);
+    out.last[s] = load_int(r.last_entry.data() + first + s * kLanes);
+    const Float alpha = drop ? Float{} : load_sub_block(in.alpha, r.view, x0, y0);
+    out.behind[s] = -out.transmittance[s] * alpha;
+    for (int lane = 0; lane < kLanes; ++lane)
+      out.last_in_tile = out.last[s][lane] > out.last_in_tile ? out.last[s][lane] : out.last_in_tile;
+    float* features = scratch.pixel_features.data() + s * r.padded_features * kLanes;
+    for (int q = 0; q < r.padded_features; ++q) {
+      const bool zero = drop || in.features == nullptr || q >= r.gaussians.feature_channels;
+      const float* plane = zero ? nullptr : in.features + q * pixels;
+      store(features + q * kLanes, load_sub_block(plane, r.view, x0, y0));
+    }
+  }
+}
+
+// Sum over the feature channels of feature times image gradient.
+inline Float feature_dot(const float* features, const float* pixel_gradients, int channels) {
+  Float a = {}, b = {};
+  for (int q = 0; q < channels; q += 4) {
+    const float* v = pixel_gradients + q * kLanes;
+    a += features[q] * load(v) + features[q + 1] * load(v + kLanes);
+    b += features[q + 2] * load(v + 2 * kLanes) + features[q + 3] * load(v + 3 * kLanes);
+  }
+  return a + b;
+}
+
+template <FeatureMode kMode>
+inline void differentiate_splat(const Tile& tile, const Splat& g, int entry, std::uint32_t sub_blocks,
+                                const float* features, const float* pixel_features, int channels, TileGradients& grad,
+                                WeightList& list, float* slot) {
+  Float m0 = {}, mx = {}, my = {}, mxx = {}, mxy = {}, myy = {};
+  Float red = {}, green = {}, blue = {}, depth = {};
+  int size = 0;
+  for (; sub_blocks != 0; sub_blocks &= sub_blocks - 1) {
+    const int s = __builtin_ctz(sub_blocks);
+    const Float dx = tile.x[s] - g.mean_x, dy = tile.y[s] - g.mean_y;
+    const Float exponent = log2_alpha(g, dx, dy);
+    const Mask taken = both(greater_equal(exponent, broadcast(kLog2MinAlpha)),
+                            greater_equal_int(grad.last[s], broadcast_int(entry)));
+    const Float unlimited = zero_unless(taken, exp2_unchecked(exponent));
+    const Float alpha = minimum(unlimited, broadcast(kMaxAlpha));
+    // alpha = 0 where the splat was not taken: the reciprocal is exactly 1 and all terms below vanish.
+    const Float inverse = reciprocal(1.0f - alpha);
+    const Float t = grad.transmittance[s] * inverse;
+    grad.transmittance[s] = t;
+    const Float weight = alpha * t;
+    const Float* v = grad.channels[s];
+    Float dot = g.red * v[0] + g.green * v[1] + g.blue * v[2] + g.depth * v[3];
+    if (kMode == kFeaturesReachGeometry) dot += feature_dot(features, pixel_features + s * channels * kLanes, channels);
+    const Float behind = grad.behind[s];
+    const Float alpha_gradient = t * dot - inverse * behind;
+    grad.behind[s] = behind + weight * dot;
+    // At the limit kMaxAlpha, alpha does not depend on the splat's shape.
+    const Float G = zero_unless(greater_equal(broadcast(kMaxAlpha), unlimited), alpha * alpha_gradient);
+    const Float Gx = G * dx, Gy = G * dy;
+    m0 += G, mx += Gx, my += Gy;
+    mxx += Gx * dx, mxy += Gx * dy, myy += Gy * dy;
+    red += weight * v[0], green += weight * v[1], blue += weight * v[2], depth += weight * v[3];
+    if (kMode != kNoFeatures) {
+      list.weights[size] = weight;
+      list.sub_blocks[size++] = s;
+    }
+  }
+  list.size = size;
+  sum4(m0, mx, my, mxx, slot);
+  sum4(mxy, myy, red, green, slot + 4);
+  sum4(blue, depth, blue, depth, slot + 8);
+}
+
+template <int kGroup>
+inline void feature_group(const WeightList& list, const float* pixel_features, int channels, float* slot) {
+  Float a[kGroup] = {};
+  for (int i = 0; i < list.size; ++i) {
+    const Float weight = list.weights[i];
+    const float* v = pixel_features + list.sub_blocks[i] * channels * kLanes;
+    for (int q = 0; q < kGroup; ++q) a[q] += weight * load(v + q * kLanes);
+  }
+  for (int q = 0; q < kGroup; q += 4) sum4(a[q], a[q + 1], a[q + 2], a[q + 3], slot + q);
+}
+
+inline void differentiate_features(const WeightList& list, const float* pixel_features, int channels, float* slot) {
+  int q = 0;
+  for (; q + kFeatureGroup <= channels; q += kFeatureGroup)
+    feature_group<kFeatureGroup>(list, pixel_features + q * kLanes, channels, slot + q);
+  for (; q + 8 <= channels; q += 8) feature_group<8>(list, pixel_features + q * kLanes, channels, slot + q);
+  if (q < channels) feature_group<4>(list, pixel_features + q * kLanes, channels, slot + q);
+}
+
+template <FeatureMode kMode>
+void differentiate_tile(Rasterizer& r, int index, const Tile& tile, TileGradients& grad, ThreadScratch& scratch) {
+  const int tile_x = index % r.tiles_x, tile_y = index / r.tiles_x, channels = r.padded_features;
+  const TileEntry* entries = r.entries.data() + tile.begin;
+  const std::uint16_t* contributed = r.contributed.data() + tile.begin;
+  float* features = scratch.gaussian_features.data();
+  WeightList list;
+  for (std::int32_t k = grad.last_in_tile; k >= 0; --k) {
+    if (k >= 16) __builtin_prefetch(r.splats.data() + entries[k - 16].splat);
+    if (contributed[k] == 0) continue;
+    const Splat& g = r.splats[entries[k].splat];
+    const std::uint32_t pair = g.first_pair + (tile_y - g.tile_y) * g.tiles_wide + (tile_x - g.tile_x);
+    if (kMode != kNoFeatures) copy_features(r.gaussians, g.gaussian, channels, features);
+    differentiate_splat<kMode>(tile, g, k, contributed[k], features, scratch.pixel_features.data(), channels, grad,
+                               list, r.slots.data() + static_cast<std::size_t>(pair) * kSlotStride);
+    if (kMode != kNoFeatures)
+      differentiate_features(list, scratch.pixel_features.data(), channels,
+                             r.feature_slots.data() + static_cast<std::size_t>(pair) * channels);
+    r.slot_used[pair] = 1;
+  }
+}
+
+}  // namespace
+
+void backward_tile(Rasterizer& r, int index, const ImageGradients& gradients, ThreadScratch& scratch) {
+  const Tile tile = make_tile(r, index);
+  if (tile.begin == tile.end) return;
+  TileGradients grad;
+  load_gradients(r, index, tile, gradients, scratch, grad);
+  if (r.padded_features == 0) {
+    differentiate_tile<kNoFeatures>(r, index, tile, grad, scratch);
+  } else if (gradients.detach_features) {
+    differentiate_tile<kFeaturesDetached>(r, index, tile, grad, scratch);
+  } else {
+    differentiate_tile<kFeaturesReachGeometry>(r, index, tile, grad, scratch);
+  }
+}
+
+}  // namespace ggslam::GGSLAM_ISA

@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The CPU rasterizer: differentiable splatting of Gaussians, compiled, deterministic for any number of threads."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ggslam.errors import RenderError
+from ggslam.native.loader import NativeContext
+from ggslam.rendering import _native
+from ggslam.rendering._native import pointer
+from ggslam.rendering.adam import AdamSettings
+from ggslam.rendering.types import (
+    PARAMETERS,
+    Gaussians,
+    GaussianTensors,
+    Gradients,
+    RenderBuffers,
+    active_coefficients,
+    check_gaussians,
+    check_pose,
+)
+from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
+
+_FAILURES = {
+    1: "out of memory",
+    2: "too many pairs of a Gaussian and an image tile (2^31): the Gaussians are far too large for the image",
+}
+
+
+@dataclass
+class StepResult:
+    """What a fused backward and optimizer step leaves besides the updated map.
+
+    Attributes:
+        twist: float64 [6], the pose gradient, as in `Gradients`.
+        touched: uint8 [N], 1 where the Gaussian was updated.
+    """
+
+    twist: np.ndarray
+    touched: torch.Tensor
+
+
+@dataclass
+class _LastForward:
+    """Keeps the arrays of the last forward alive: backward reads them again."""
+
+    parameters: GaussianTensors
+    arrays: _native.GaussianArrays
+    buffers: RenderBuffers
+
+
+class CpuRasterizer:
+    """Renders Gaussians on the CPU and differentiates what it rendered last. The rules are those of
+    `ggslam.rendering.reference`.
+
+    One rasterizer serves one caller at a time and holds the buffers of one rendering. Memory grows to the largest
+    rendering and stays.
+
+    Args:
+        threads, instruction_set: as in `NativeContext`.
+        context: share this context instead of making one.
+        near_plane: metres; Gaussians whose mean is nearer are left out.
+    """
+
+    def __init__(
+        self,
+        threads: int | None = None,
+        instruction_set: str | None = None,
+        context: NativeContext | None = None,
+        near_plane: float = 0.05,
+    ) -> None:
+        self._handle: ctypes.c_void_p | None = None
+        self._library = _native.rasterizer_library()
+        self.context = context or NativeContext(threads, instruction_set)
+        if not near_plane > 0:
+            raise RenderError(f"near_plane must be positive, found {near_plane}")
+        self.near_plane = near_plane
+        self._handle = ctypes.c_void_p(self._library.ggslam_rasterizer_create(self.context.handle))
+        self._images: dict[str, torch.Tensor] = {}
+        self._last: _LastForward | None = None
+
+    def __del__(self) -> None:
+        if self._handle is not None:
+            self._library.ggslam_rasterizer_destroy(self._handle)
+
+    # --- forward -------------------------------------------------------------------------------------------------
+
+    def forward(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        T_camera_world: np.ndarray,
+        *,
+        features: bool = True,
+        median_depth: bool = False,
+        active_sh_degree: int | None = None,
+    ) -> RenderBuffers:
+        """Renders.
+
+        Args:
+            gaussians: float32 CPU tensors, contiguous, with the shapes of `Gaussians`.
+            camera: the camera.
+            T_camera_world: [4, 4], world to camera.
+            features: render the feature channels, if there are any.
+            median_depth: render the median depth, too.
+            active_sh_degree: highest spherical-harmonic degree to evaluate; None: all.
+
+        Returns:
+            Images that belong to the rasterizer and are overwritten by its next call of `forward`.
+
+        Raises:
+            RenderError: wrong shapes, dtypes or devices; an impossible pose or degree; out of memory.
+        """
+        self._last = None
+        parameters = _checked_parameters(gaussians)
+        arrays = _native.GaussianArrays(
+            count=parameters.means.shape[0],
+            **{name: pointer(getattr(parameters, name)) for name in PARAMETERS},
+            sh_coefficients=parameters.sh.shape[1],
+            active_sh_coefficients=active_coefficients(parameters, active_sh_degree),
+            feature_channels=parameters.features.shape[1],
+            render_features=int(features and parameters.features.shape[1] > 0),
+        )
+        view = self._view(camera, check_pose(T_camera_world))
+        buffers = self._buffers(camera, parameters.features.shape[1] if arrays.render_features else 0, median_depth)
+        targets = _native.RenderTargets(
+            **{name: pointer(getattr(buffers, name)) for name, _ in _native.RenderTargets._fields_}
+        )
+        status = self._library.ggslam_rasterizer_forward(
+            self._handle, ctypes.byref(arrays), ctypes.byref(view), ctypes.byref(targets)
+        )
+        self._check(status)
+        self._last = _LastForward(parameters, arrays, buffers)
+        return buffers
+
+    def _view(self, camera: Camera, T_camera_world: np.ndarray) -> _native.View:
+        rows = (ctypes.c_float * 12)(*T_camera_world[:3].ravel().tolist())
+        return _native.View(
+            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, self.near_plane, rows
+        )
+
+    def _image(self, name: str, shape: tuple[int, ...]) -> torch.Tensor:
+        image = self._images.get(name)
+        if image is None or image.shape != shape:
+            image = self._images[name] = torch.empty(shape, dtype=torch.float32)
+        return image
+
+    def _buffers(self, camera: Camera, channels: int, median_depth: bool) -> RenderBuffers:
+        size = (camera.height, camera.width)
+        return RenderBuffers(
+            image=self._image("image", (3, *size)),
+            depth=self._image("depth", size),
+            alpha=self._image("alpha", size),
+            features=self._image("features", (channels, *size)) if channels else None,
+            median_depth=self._image("median_depth", size) if median_depth else None,
+        )
+
+    def statistics(self) -> dict[str, int]:
+        """Of the last forward: `visible` Gaussians and `pairs` of a Gaussian and an image tile."""
+        numbers = (ctypes.c_int64 * 2)()
+        self._library.ggslam_rasterizer_statistics(self._handle, numbers)
+        return {"visible": numbers[0], "pairs": numbers[1]}
+
+    # --- backward --------------------------------------------------------------------------------------------------
+
+    def backward(
+        self,
+        grad_image: torch.Tensor | None,
+        grad_depth: torch.Tensor | None = None,
+        grad_alpha: torch.Tensor | None = None,
+        grad_features: torch.Tensor | None = None,
+        *,
+        detach_features: bool = False,
+    ) -> Gradients:
+        """Gradients of a loss through the last `forward`, whose parameters must not have changed since.
+
+        Args:
+            grad_image, grad_depth, grad_alpha, grad_features: d loss / d image, of the shapes of the rendered images,
+                float32; None counts as zero.
+            detach_features: let the gradients of the feature channels reach the features only, not geometry, opacity
+                and pose.
+
+        Raises:
+            RenderError: nothing was rendered, wrong shapes or dtypes, out of memory.
+        """
+        last = self._require_last()
+        image_gradients = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, detach_features)
+        names = PARAMETERS if last.arrays.render_features else PARAMETERS[:-1]
+        arrays = {name: torch.empty_like(getattr(last.parameters, name)) for name in names}
+        twist = np.zeros(6)
+        touched = torch.empty(last.arrays.count, dtype=torch.uint8)
+        out = _native.GaussianGradients(
+            **{name: pointer(array) for name, array in arrays.items()},
+            twist=twist.ctypes.data,
+            touched=pointer(touched),
+        )
+        self._run_backward(image_gradients, out, None)
+        return Gradients(**{"features": None, **arrays}, twist=twist, touched=touched)
+
+    def pose_gradient(
+        self,
+        grad_image: torch.Tensor | None,
+        grad_depth: torch.Tensor | None = None,
+        grad_alpha: torch.Tensor | None = None,
+        grad_features: torch.Tensor | None = None,
+    ) -> np.ndarray:
+        """Only the `twist` of `backward`; the gradients of the Gaussians are not written."""
+        last = self._require_last()
+        image_gradients = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, False)
+        twist = np.zeros(6)
+        touched = torch.empty(last.arrays.count, dtype=torch.uint8)
+        out = _native.GaussianGradients(twist=twist.ctypes.data, touched=pointer(touched))
+        self._run_backward(image_gradients, out, None)
+        return twist
+
+    def backward_step(
+        self,
+        map: GaussianMap,
+        grad_image: torch.Tensor | None,
+        grad_depth: torch.Tensor | None = None,
+        grad_alpha: torch.Tensor | None = None,
+        grad_features: torch.Tensor | None = None,
+        *,
+        optimizer: AdamSettings,
+        detach_features: bool = False,
+    ) -> StepResult:
+        """`backward` and one Adam step in one pass: parameters, moments and update counts of the Gaussians that
+        contributed are changed in place; those of the others stay as they are. No gradient array is written.
+
+        Args:
+            map: the map that was rendered by the last `forward`, unchanged since, with moments.
+            optimizer: learning rates and the like.
+            Others: as in `backward`. Features that were not rendered are not updated.
+
+        Raises:
+            RenderError: as in `backward`; the map is not the one rendered last or has no moments.
+        """
+        last = self._require_last()
+        for name in PARAMETERS:
+            if getattr(map, name).data_ptr() != getattr(last.parameters, name).data_ptr():
+                raise RenderError(f"backward_step: the map's {name} are not those that were rendered last")
+        if not map.moments:
+            raise RenderError("backward_step: the map was made without moments")
+        image_gradients = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, detach_features)
+        schedule = optimizer.schedule()
+        adam = _native.AdamArguments(
+            updates=pointer(map.updates), schedule=pointer(schedule), schedule_rows=schedule.shape[0],
+            beta1=optimizer.beta1, beta2=optimizer.beta2, epsilon=optimizer.epsilon,
+        )  # fmt: skip
+        for name, (first, second) in map.moments.items():
+            setattr(adam, name, _native.AdamArrays(pointer(getattr(map, name)), pointer(first), pointer(second)))
+        twist = np.zeros(6)
+        touched = torch.empty(last.arrays.count, dtype=torch.uint8)
+        out = _native.GaussianGradients(twist=twist.ctypes.data, touched=pointer(touched))
+        self._last = None  # the parameters change now, so there is nothing left to differentiate
+        self._run_backward(image_gradients, out, adam)
+        return StepResult(twist, touched)
+
+    def _run_backward(
+        self,
+        image_gradients: _native.ImageGradients,
+        out: _native.GaussianGradients,
+        adam: _native.AdamArguments | None,
+    ) -> None:
+        status = self._library.ggslam_rasterizer_backward(
+            self._handle,
+            ctypes.byref(image_gradients),
+            ctypes.byref(out),
+            None if adam is None else ctypes.byref(adam),
+        )
+        self._check(status)
+
+    def _require_last(self) -> _LastForward:
+        if self._last is None:
+            raise RenderError("there is no rendering to differentiate: call forward first (and again after every step)")
+        return self._last
+
+    @staticmethod
+    def _image_gradients(
+        last: _LastForward,
+        image: torch.Tensor | None,
+        depth: torch.Tensor | None,
+        alpha: torch.Tensor | None,
+        features: torch.Tensor | None,
+        detach_features: bool,
+    ) -> _native.ImageGradients:
+        buffers = last.buffers
+        if features is not None and buffers.features is None:
+            raise RenderError("grad_features was given, but no features were rendered")
+        given = {"image": image, "depth": depth, "alpha": alpha, "features": features}
+        for name, gradient in given.items():
+            if gradient is not None:
+                _check_tensor(f"grad_{name}", gradient, getattr(buffers, name).shape)
+        return _native.ImageGradients(
+            **{name: pointer(gradient) for name, gradient in given.items()}, detach_features=int(detach_features)
+        )
+
+    @staticmethod
+    def _check(status: int) -> None:
+        if status != 0:
+            raise RenderError(f"rendering failed: {_FAILURES[status]}")
+
+
+def _check_tensor(name: str, tensor: torch.Tensor, shape: torch.Size | None = None) -> None:
+    if shape is not None and tensor.shape != shape:
+        raise RenderError(f"{name}: expected shape {list(shape)}, found {list(tensor.shape)}")
+    if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+        raise RenderError(f"{name}: expected float32 on the CPU, found {tensor.dtype} on {tensor.device}")
+    if not tensor.is_contiguous():
+        raise RenderError(f"{name}: expected a contiguous tensor, found strides {tensor.stride()}")
+
+
+def _checked_parameters(gaussians: Gaussians) -> GaussianTensors:
+    parameters = GaussianTensors(**{name: getattr(gaussians, name).detach() for name in PARAMETERS})
+    check_gaussians(parameters)
+    for name in PARAMETERS:
+        _check_tensor(name, getattr(parameters, name))
+    return parameters
