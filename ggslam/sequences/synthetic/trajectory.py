@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera paths through a scene, smooth but with the small unrest of a hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.synthetic.scene import Scene
+
+TRAJECTORIES = ("loop", "round", "pan")
+LARGEST_STEP, LARGEST_TURN = 0.045, 1.9
+"""Metres and degrees between frames that a path keeps to (short recordings see less of the scene)."""
+CLEARANCE = 0.18
+"""Metres that the camera stays away from every shape."""
+
+
+def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int = 0) -> np.ndarray:
+    """Poses T_world_camera, float64 [frames, 4, 4].
+
+    Args:
+        scene: gives the ellipse to walk and the points to look at.
+        frames: how many.
+        trajectory: "loop": once around the ellipse, the view swinging over the points nearest to the first and back, so
+            that the end meets the beginning; "round": around the ellipse while the view passes over all the points;
+            "pan": turning on the spot.
+        seed: of the unrest.
+
+    Raises:
+        SequenceError: unknown trajectory, fewer than 2 frames, or no way around the furniture.
+    """
+    if trajectory not in TRAJECTORIES:
+        raise SequenceError(f"trajectory: expected one of {', '.join(TRAJECTORIES)}, found '{trajectory}'")
+    if frames < 2:
+        raise SequenceError(f"frames: expected at least 2, found {frames}")
+    for size in (1.0, 0.7, 0.45, 0.25, 0.1):
+        poses = _path(scene, frames, trajectory, seed, size)
+        if _is_clear(scene, poses[:, :3, 3]):
+            return poses
+    raise SequenceError("the scene leaves the camera no free way: every path comes too near to something")
+
+
+def _path(scene: Scene, frames: int, trajectory: str, seed: int, size: float) -> np.ndarray:
+    (cx, cy, cz), radii = scene.walk
+    phase = np.arange(frames) / frames  # 0 to nearly 1: the frame after the last would be the first again
+    length = 2 * np.pi * size * max(radii)
+    shrink = 0.0 if trajectory == "pan" else size * min(1.0, LARGEST_STEP * frames / max(length, 1e-9))
+    around = 2 * np.pi * phase + 0.75 * np.pi
+    unrest = _unrest(frames, seed)
+    position = np.stack(
+        [
+            cx + shrink * radii[0] * np.cos(around),
+            cy - shrink * radii[1] * np.sin(around),
+            cz + 0.10 * shrink * np.sin(2 * around),
+        ],
+        1,
+    )
+    position += 0.012 * unrest[:, :3]
+    first = np.arctan2(*(scene.interest[0] - (cx, cy, cz))[1::-1])
+    turn_limit = np.radians(LARGEST_TURN) * frames
+    if trajectory == "loop":
+        swing = min(np.radians(32), turn_limit / (2 * np.pi) * 0.8)
+        heading = first + swing * np.sin(2 * np.pi * phase)
+    else:
+        heading = first + min(2 * np.pi, turn_limit * 0.8) * phase
+    pitch = np.radians(-17 + 4 * np.cos(2 * np.pi * phase))
+    poses = np.empty((frames, 4, 4))
+    for i in range(frames):
+        angle, tilt = heading[i] + 0.012 * unrest[i, 3], pitch[i] + 0.010 * unrest[i, 4]
+        forward = np.array([np.cos(angle) * np.cos(tilt), np.sin(angle) * np.cos(tilt), np.sin(tilt)])
+        poses[i] = _looking(position[i], forward, 0.012 * unrest[i, 5])
+    return poses
+
+
+def _looking(position: np.ndarray, forward: np.ndarray, roll: float) -> np.ndarray:
+    """Pose of a camera at `position` with its z axis along `forward`, turned about it by `roll` radians."""
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    T = np.eye(4)
+    T[:3, 0] = np.cos(roll) * right + np.sin(roll) * down
+    T[:3, 1] = np.cos(roll) * down - np.sin(roll) * right
+    T[:3, 2], T[:3, 3] = forward, position
+    return T
+
+
+def _unrest(frames: int, seed: int) -> np.ndarray:
+    """Smooth periodic noise [frames, 6] of deviation about 1: a few slow sines for each degree of freedom."""
+    rng = np.random.default_rng([seed, 3])
+    cycles = np.arange(1, max(2, round(frames / 25)) + 1)
+    phase = 2 * np.pi * np.arange(frames)[:, None] / frames
+    values = np.zeros((frames, 6))
+    for k in range(6):
+        amplitude = rng.standard_normal(len(cycles)) / np.sqrt(len(cycles))
+        values[:, k] = (amplitude * np.sin(cycles * phase + rng.uniform(0, 2 * np.pi, len(cycles)))).sum(1)
+    return values
+
+
+def _is_clear(scene: Scene, positions: np.ndarray) -> bool:
+    return all(shape.distance(positions).min() >= CLEARANCE for shape in scene.shapes)

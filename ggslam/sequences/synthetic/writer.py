@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes a generated recording in the plain folder layout."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from ggslam import __version__
+from ggslam.errors import SequenceError
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import matrix_to_quaternion
+from ggslam.sequences.synthetic.raycast import RayCaster
+from ggslam.sequences.synthetic.room import furnished_room
+from ggslam.sequences.synthetic.scene import Scene
+from ggslam.sequences.synthetic.sensor import noisy_color, noisy_depth
+from ggslam.sequences.synthetic.trajectory import camera_path
+
+DEPTH_SCALE = 5000.0
+FOCAL_LENGTH = 0.75
+"""As a share of the image width: 67 degrees of view."""
+
+
+def write_synthetic_sequence(
+    folder: str | Path,
+    *,
+    frames: int = 60,
+    width: int = 320,
+    height: int = 240,
+    seed: int = 0,
+    noise: bool = True,
+    trajectory: str = "loop",
+    frame_rate: float = 30.0,
+    scene: Scene | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Ray-casts a recording of a furnished room and writes it as rgb/, depth/, masks/, camera.yaml and poses.txt.
+
+    The same arguments give the same recording. The folder appears only when it is complete.
+
+    Args:
+        folder: to be made; must not exist or be empty, unless `overwrite`.
+        frames, width, height: size of the recording.
+        seed: of textures, the unrest of the hand, and noise.
+        noise: depth and colour noise of a sensor; otherwise depth is exact to 0.1 mm.
+        trajectory: see `camera_path`.
+        frame_rate: frames per second, for the timestamps.
+        scene: another scene than the furnished room.
+        overwrite: replaces a recording of this generator that is already there.
+        progress: called with (frames done, frames).
+
+    Returns:
+        The folder.
+
+    Raises:
+        SequenceError: impossible arguments, or the folder cannot be written.
+    """
+    target = Path(folder)
+    if width < 16 or height < 16 or not frame_rate > 0:
+        raise SequenceError(f"expected at least 16x16 pixels and a positive frame rate, found {width}x{height}, {frame_rate}")
+    _check_target(target, overwrite)
+    scene = furnished_room(seed) if scene is None else scene
+    poses = camera_path(scene, frames, trajectory, seed)
+    focal = FOCAL_LENGTH * width
+    camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as error:
+        raise SequenceError(f"{target}: cannot be written: {error.strerror}") from None
+    try:
+        _write_images(work, scene, camera, poses, seed, noise, progress)
+        _write_description(work, scene, camera, poses, seed, noise, trajectory, frame_rate)
+        work.chmod(0o755)  # mkdtemp makes it private
+        if target.exists():
+            shutil.rmtree(target)
+        work.rename(target)
+    except OSError as error:
+        raise SequenceError(f"{target}: cannot be written: {error}") from None
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return target
+
+
+def _check_target(target: Path, overwrite: bool) -> None:
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise SequenceError(f"{target}: expected a folder to make, found a file")
+    if not any(target.iterdir()):
+        return
+    description = target / "camera.yaml"
+    generated = description.is_file() and "generator:" in description.read_text(encoding="utf-8", errors="replace")
+    if not (overwrite and generated):
+        hint = "; it is a generated recording: ask for overwriting" if generated else ", and not with a generated recording"
+        raise SequenceError(f"{target}: folder is not empty{hint}")
+
+
+def _write_images(
+    folder: Path, scene: Scene, camera: Camera, poses: np.ndarray, seed: int, noise: bool,
+    progress: Callable[[int, int], None] | None,
+) -> None:  # fmt: skip
+    for name in ("rgb", "depth", "masks"):
+        (folder / name).mkdir()
+    caster = RayCaster(scene, seed)
+    for i, pose in enumerate(poses):
+        images = caster.render(camera, pose)
+        color, depth = images.color, images.depth
+        if noise:
+            rng = np.random.default_rng([seed, 4, i])
+            color, depth = noisy_color(color, rng), noisy_depth(depth, camera, rng)
+        raw = np.rint(np.minimum(depth * DEPTH_SCALE, 65535)).astype(np.uint16)
+        _write_png(folder / "rgb" / f"{i:06d}.png", cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
+        _write_png(folder / "depth" / f"{i:06d}.png", raw)
+        _write_png(folder / "masks" / f"{i:06d}.png", images.mask)
+        if progress is not None:
+            progress(i + 1, len(poses))
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    done, content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not done:
+        raise SequenceError(f"{path}: image cannot be encoded")
+    path.write_bytes(content.tobytes())
+
+
+def _write_description(
+    folder: Path, scene: Scene, camera: Camera, poses: np.ndarray, seed: int, noise: bool, trajectory: str, rate: float
+) -> None:
+    description = {
+        "generator": f"ggslam synth {__version__}",
+        "seed": seed,
+        "noise": noise,
+        "trajectory": trajectory,
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "depth_scale": DEPTH_SCALE,
+        "frame_rate": rate,
+        "instances": dict(scene.instance_names),
+    }
+    (folder / "camera.yaml").write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
+    lines = ["# timestamp tx ty tz qx qy qz qw (camera to world)"]
+    for i, T in enumerate(poses):
+        w, x, y, z = matrix_to_quaternion(T[:3, :3])
+        numbers = (*T[:3, 3], x, y, z, w)
+        lines.append(f"{i / rate:.6f} " + " ".join(f"{value:.9f}" for value in numbers))
+    (folder / "poses.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
