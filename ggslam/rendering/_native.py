@@ -35,7 +35,7 @@ class View(ctypes.Structure):
 
     _fields_ = [
         ("width", _int32), ("height", _int32),
-        ("fx", _float), ("fy", _float), ("cx", _float), ("cy", _float), ("near_plane", _float),
+        ("fx", _float), ("fy", _float), ("cx", _float), ("cy", _float), ("near_plane", _float), ("low_pass", _float),
         ("camera_world", _float * 12),
     ]  # fmt: skip
 

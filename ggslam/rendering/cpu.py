@@ -15,6 +15,7 @@ from ggslam.rendering import _native
 from ggslam.rendering._native import pointer
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.types import (
+    LOW_PASS,
     PARAMETERS,
     Gaussians,
     GaussianTensors,
@@ -66,6 +67,7 @@ class CpuRasterizer:
         threads, instruction_set: as in `NativeContext`.
         context: share this context instead of making one.
         near_plane: metres; Gaussians whose mean is nearer are left out.
+        low_pass: pixels^2 added to both variances of a projected Gaussian.
     """
 
     def __init__(
@@ -74,13 +76,17 @@ class CpuRasterizer:
         instruction_set: str | None = None,
         context: NativeContext | None = None,
         near_plane: float = 0.05,
+        low_pass: float = LOW_PASS,
     ) -> None:
         self._handle: ctypes.c_void_p | None = None
         self._library = _native.rasterizer_library()
         self.context = context or NativeContext(threads, instruction_set)
         if not near_plane > 0:
             raise RenderError(f"near_plane must be positive, found {near_plane}")
+        if not 0 < low_pass < 1e3:
+            raise RenderError(f"low_pass must be positive, found {low_pass}")
         self.near_plane = near_plane
+        self.low_pass = low_pass
         self._handle = ctypes.c_void_p(self._library.ggslam_rasterizer_create(self.context.handle))
         self._images: dict[str, torch.Tensor] = {}
         self._last: _LastForward | None = None
@@ -142,7 +148,8 @@ class CpuRasterizer:
     def _view(self, camera: Camera, T_camera_world: np.ndarray) -> _native.View:
         rows = (ctypes.c_float * 12)(*T_camera_world[:3].ravel().tolist())
         return _native.View(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, self.near_plane, rows
+            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, self.near_plane,
+            self.low_pass, rows,
         )
 
     def _image(self, name: str, shape: tuple[int, ...]) -> torch.Tensor:

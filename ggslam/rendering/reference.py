@@ -7,8 +7,8 @@ This file is the contract; the other backends are tested against it.
     if a log_scale lies outside [-23, 10] or if the squared norm of its quaternion lies outside [1e-20, 1e20].
     Skipped Gaussians get zero gradients.
 2.  Projection (EWA splatting, Zwicker et al. 2001): the 2D mean is the pinhole projection of the mean (centre of the
-    top-left pixel = (0, 0)); the 2D covariance is J W Sigma W^T J^T + 0.3 I pixels^2 with Sigma = R diag(exp(log_scale))^2
-    R^T. In the Jacobian J, x/z and y/z are clamped to the image enlarged by 15 % of its size on each side; the clamp
+    top-left pixel = (0, 0)); the 2D covariance is J W Sigma W^T J^T + low_pass I (pixels^2) with Sigma =
+    R diag(exp(log_scale))^2 R^T. In the Jacobian J, x/z and y/z are clamped to the image enlarged by 15 % of its size on each side; the clamp
     passes no gradient.
 3.  Colour = 0.5 + sum_k Y_k(d) sh_k with d the direction from the camera centre to the mean, in the world frame, and Y
     the real spherical harmonics of 3D Gaussian Splatting. It is not clamped.
@@ -27,10 +27,9 @@ import math
 
 import torch
 
-from ggslam.rendering.types import Gaussians, RenderBuffers, active_coefficients, check_gaussians
+from ggslam.rendering.types import LOW_PASS, Gaussians, RenderBuffers, active_coefficients, check_gaussians
 from ggslam.scene.camera import Camera
 
-LOW_PASS = 0.3
 MIN_ALPHA = 1.0 / 255.0
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
@@ -48,6 +47,7 @@ def render_reference(
     median_depth: bool = False,
     active_sh_degree: int | None = None,
     near_plane: float = 0.05,
+    low_pass: float = LOW_PASS,
 ) -> RenderBuffers:
     """Renders with memory N x H x W: for small scenes.
 
@@ -63,7 +63,7 @@ def render_reference(
     log_scales, opacities = gaussians.log_scales[rows], torch.sigmoid(gaussians.opacity_logits[rows])
 
     position = means @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    mean2d, precision = _project(position, quaternions, log_scales, camera, T_camera_world[:3, :3])
+    mean2d, precision = _project(position, quaternions, log_scales, camera, T_camera_world[:3, :3], low_pass)
     colour = _colour(gaussians.sh[rows, :coefficients], means, T_camera_world)
     z = position[:, 2]
 
@@ -106,7 +106,8 @@ def rotation_matrices(quaternions: torch.Tensor) -> torch.Tensor:
 
 
 def _project(
-    position: torch.Tensor, quaternions: torch.Tensor, log_scales: torch.Tensor, camera: Camera, W: torch.Tensor
+    position: torch.Tensor, quaternions: torch.Tensor, log_scales: torch.Tensor, camera: Camera, W: torch.Tensor,
+    low_pass: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """2D means [N, 2] and inverse covariances [N, 2, 2] (rule 2)."""
     x, y, z = position.unbind(-1)
@@ -121,7 +122,7 @@ def _project(
         [camera.fx / z, zero, -camera.fx * clamped_u / z, zero, camera.fy / z, -camera.fy * clamped_v / z], -1
     ).reshape(-1, 2, 3)
     V = J @ W @ (rotation_matrices(quaternions) * torch.exp(log_scales)[:, None, :])
-    covariance = V @ V.transpose(1, 2) + LOW_PASS * torch.eye(2, dtype=V.dtype, device=V.device)
+    covariance = V @ V.transpose(1, 2) + low_pass * torch.eye(2, dtype=V.dtype, device=V.device)
     mean2d = torch.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], -1)
     return mean2d, torch.linalg.inv(covariance)
 

@@ -20,7 +20,6 @@
 namespace ggslam {
 
 // --- the rendering rules: one contract for all backends, stated in ggslam/rendering/reference.py ---------------------
-constexpr float kLowPass = 0.3f;                // pixels^2 added to both diagonal terms of the 2D covariance
 constexpr float kLog2MinAlpha = -7.99435344f;   // log2(1 / 255): weaker contributions are skipped
 constexpr float kMaxAlpha = 0.999f;
 constexpr float kMinTransmittance = 1e-4f;      // a pixel takes no further Gaussian once its transmittance is below
@@ -48,6 +47,7 @@ struct GaussianArrays {
 struct View {
   std::int32_t width, height;
   float fx, fy, cx, cy, near_plane;
+  float low_pass;  // pixels^2 added to both diagonal terms of the 2D covariance
   float camera_world[12];  // first three rows of T_camera_world
 };
 

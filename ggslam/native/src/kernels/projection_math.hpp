@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Projection of a vector of Gaussians by elliptical weighted averaging (Zwicker et al. 2001, "EWA splatting"): the
 // image of the covariance Sigma = M M^T, M = R(q) diag(exp(log_scale)), under the linearised projection J W is
-// V V^T + kLowPass I with V = J W M. Forward and backward share these terms, so that they can never disagree.
+// V V^T + low_pass I with V = J W M. Forward and backward share these terms, so that they can never disagree.
 #pragma once
 #include "rasterizer.hpp"
 #include "simd.hpp"
@@ -13,7 +13,7 @@ constexpr float kLog2E = 1.44269504f, kLn2 = 0.69314718f;
 // The camera as scalars, with the limits of the slopes x/z and y/z that the Jacobian uses.
 struct ViewConstants {
   float W[3][3], t[3];
-  float fx, fy, cx, cy, near_plane;
+  float fx, fy, cx, cy, near_plane, low_pass;
   float min_u, max_u, min_v, max_v;
 };
 
@@ -23,7 +23,7 @@ static inline ViewConstants view_constants(const View& view) {
     for (int j = 0; j < 3; ++j) c.W[i][j] = view.camera_world[4 * i + j];
     c.t[i] = view.camera_world[4 * i + 3];
   }
-  c.fx = view.fx, c.fy = view.fy, c.cx = view.cx, c.cy = view.cy, c.near_plane = view.near_plane;
+  c.fx = view.fx, c.fy = view.fy, c.cx = view.cx, c.cy = view.cy, c.near_plane = view.near_plane, c.low_pass = view.low_pass;
   // Image borders lie at -0.5 and width - 0.5: pixel centres are whole numbers.
   const float width = static_cast<float>(view.width), height = static_cast<float>(view.height);
   c.min_u = (-0.5f - view.cx - kFrustumMargin * width) / view.fx;
@@ -106,13 +106,13 @@ static inline Projection project(const ViewConstants& c, const RawGaussians& g) 
   const Float xx = p.V[0][0] * p.V[0][0] + p.V[0][1] * p.V[0][1] + p.V[0][2] * p.V[0][2];
   const Float yy = p.V[1][0] * p.V[1][0] + p.V[1][1] * p.V[1][1] + p.V[1][2] * p.V[1][2];
   p.cov_xy = p.V[0][0] * p.V[1][0] + p.V[0][1] * p.V[1][1] + p.V[0][2] * p.V[1][2];
-  p.cov_xx = xx + kLowPass;
-  p.cov_yy = yy + kLowPass;
+  p.cov_xx = xx + c.low_pass;
+  p.cov_yy = yy + c.low_pass;
   // Lagrange's identity: det(V V^T) = |V0 x V1|^2. The usual xx yy - xy^2 loses all its digits for long thin images.
   const Float c0 = p.V[0][1] * p.V[1][2] - p.V[0][2] * p.V[1][1];
   const Float c1 = p.V[0][2] * p.V[1][0] - p.V[0][0] * p.V[1][2];
   const Float c2 = p.V[0][0] * p.V[1][1] - p.V[0][1] * p.V[1][0];
-  const Float determinant = (c0 * c0 + c1 * c1 + c2 * c2) + kLowPass * (xx + yy) + kLowPass * kLowPass;
+  const Float determinant = (c0 * c0 + c1 * c1 + c2 * c2) + c.low_pass * (xx + yy) + c.low_pass * c.low_pass;
   p.inverse_determinant = 1.0f / determinant;
   return p;
 }
