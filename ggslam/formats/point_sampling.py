@@ -53,8 +53,9 @@ def sample_points(
 ) -> VoxelCloud:
     """Samples a map into a coloured cloud, one point per voxel that a Gaussian visibly fills.
 
-    Each Gaussian gives its mean and, where it is larger than a voxel, the points of a lattice along its principal axes
-    at which its own alpha, opacity * exp(-d^2 / 2) with the Mahalanobis distance d, is at least `minimum_opacity`.
+    Gaussians of an RGB-D map stand for pieces of surface, so each gives points of the disc through its mean along its
+    two longest axes: its mean and, where it is larger than a voxel, the points of a square lattice at which its own
+    alpha, opacity * exp(-d^2 / 2) with the Mahalanobis distance d, is at least `minimum_opacity`.
     Points that share a voxel become one: colours are averaged with these alphas as weights, the object id is the one
     of largest weight. Deterministic.
 
@@ -69,14 +70,18 @@ def sample_points(
     """
     if not voxel_size > 0 or not 0 < minimum_opacity < 1:
         raise ValueError(f"impossible voxel size {voxel_size} or minimum opacity {minimum_opacity}")
-    merged = _Sums.empty()
+    merged, pending, waiting = _Sums.empty(), [], 0
     for position, weight, color, object_id in _samples(gaussians, voxel_size, minimum_opacity):
         lattice = np.rint(position / voxel_size)
         if np.abs(lattice).max(initial=0) >= 1 << (_BITS - 1):
             raise ValueError(f"the map spans more than 2^{_BITS} voxels of {voxel_size} m")
         labels = object_id if with_object_id else np.zeros_like(object_id)
-        part = _Sums(_packed(lattice.astype(np.int64)), labels, weight, weight[:, None] * color)
-        merged = merged.joined(part)
+        part = _Sums.of([_Sums(_packed(lattice.astype(np.int64)), labels, weight, weight[:, None] * color)])
+        pending.append(part)
+        waiting += len(part.key)
+        if waiting > len(merged.key):  # rarely, so that all merging together costs about as much as one sort
+            merged, pending, waiting = _Sums.of([merged, *pending]), [], 0
+    merged = _Sums.of([merged, *pending])
     return _cloud(merged, voxel_size, with_object_id)
 
 
@@ -101,6 +106,9 @@ def _samples(
     means = gaussians.means.detach().cpu().numpy().astype(np.float64)[used]
     scales = gaussians.scales.detach().cpu().numpy().astype(np.float64)[used]
     axes = quaternion_to_matrix(gaussians.quaternions.detach().cpu().numpy().astype(np.float64)[used])
+    longest = np.argsort(-scales, axis=1, kind="stable")[:, :2]
+    scales = np.take_along_axis(scales, longest, 1)
+    axes = np.take_along_axis(axes, longest[:, None, :], 2)  # [N, 3, 2]
     color = gaussians.rgb.detach().cpu().numpy().astype(np.float64)[used].clip(0, 1)
     object_id = gaussians.object_id.cpu().numpy()[used]
     reach = scales * np.sqrt(2 * np.log(opacity / minimum_opacity))[:, None]
@@ -117,18 +125,14 @@ def _samples(
         alpha = opacity[owner] * np.exp(-0.5 * ((offset / scales[owner]) ** 2).sum(1))
         visible = alpha >= minimum_opacity * (1 - 1e-9)
         owner, offset = owner[visible], offset[visible]
-        position = means[owner] + np.einsum("nij,nj->ni", axes[owner], offset)
+        position = means[owner] + (axes[owner] * offset[:, None, :]).sum(2)
         yield position, alpha[visible], color[owner], object_id[owner]
         start = stop
 
 
 def _lattice_point(number: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Whole coordinates [N, 3], each in -steps..steps, of the number-th point of a box [N]."""
-    width = 2 * steps + 1
-    z = number % width[:, 2]
-    y = number // width[:, 2] % width[:, 1]
-    x = number // (width[:, 2] * width[:, 1])
-    return np.stack([x, y, z], 1) - steps
+    """Whole coordinates [N, 2], each in -steps..steps, of the number-th point of a rectangle."""
+    return np.stack(np.divmod(number, 2 * steps[:, 1] + 1), 1) - steps
 
 
 @dataclass(frozen=True)
@@ -144,17 +148,17 @@ class _Sums:
     def empty() -> _Sums:
         return _Sums(np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0), np.empty((0, 3)))
 
-    def joined(self, other: _Sums) -> _Sums:
-        """Both together, one row per (voxel, label)."""
-        key, label = np.concatenate([self.key, other.key]), np.concatenate([self.label, other.label])
+    @staticmethod
+    def of(parts: list[_Sums]) -> _Sums:
+        """All parts together, one row per (voxel, label)."""
+        key, label = np.concatenate([p.key for p in parts]), np.concatenate([p.label for p in parts])
         order = np.lexsort((label, key)) if label.any() else np.argsort(key, kind="stable")
         key, label = key[order], label[order]
-        first = _first_of_runs(key) | _first_of_runs(label)
-        starts = np.nonzero(first)[0]
-        weight = np.concatenate([self.weight, other.weight])[order]
-        color = np.concatenate([self.color, other.color])[order]
+        starts = np.nonzero(_first_of_runs(key) | _first_of_runs(label))[0]
         if not len(starts):
-            return self
+            return parts[0]
+        weight = np.concatenate([p.weight for p in parts])[order]
+        color = np.concatenate([p.color for p in parts])[order]
         return _Sums(key[starts], label[starts], np.add.reduceat(weight, starts), np.add.reduceat(color, starts))
 
 
