@@ -8,8 +8,8 @@ This file is the contract; the other backends are tested against it.
     Skipped Gaussians get zero gradients.
 2.  Projection (EWA splatting, Zwicker et al. 2001): the 2D mean is the pinhole projection of the mean (centre of the
     top-left pixel = (0, 0)); the 2D covariance is J W Sigma W^T J^T + low_pass I (pixels^2) with Sigma =
-    R diag(exp(log_scale))^2 R^T. In the Jacobian J, x/z and y/z are clamped to the image enlarged by 15 % of its size on each side; the clamp
-    passes no gradient.
+    R diag(exp(log_scale))^2 R^T. In the Jacobian J, x/z and y/z are clamped to the image enlarged by 15 % of its size on
+    each side; the clamp passes no gradient.
 3.  Colour = 0.5 + sum_k Y_k(d) sh_k with d the direction from the camera centre to the mean, in the world frame, and Y
     the real spherical harmonics of 3D Gaussian Splatting. It is not clamped.
 4.  Gaussians are composited in the order of z; equal depths in the order of their rows.
