@@ -55,22 +55,23 @@ def grid_selection(color: np.ndarray, depth: np.ndarray, s: InsertionSettings) -
     return (rows % stride == stride // 2) & (columns % stride == stride // 2), stride
 
 
-def surface_normals(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Unit normals towards the camera, float32 [H, W, 3], from central differences; zero where there is none.
+def surface_normals(depth: np.ndarray, camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Unit normals towards the camera, float32 [M, 3], from central differences; zero where there is none.
 
     Args:
-        points: [H, W, 3] in the camera frame.
         depth: [H, W], metres. A pixel whose 5x5 surroundings have a hole or a jump gets no normal.
+        camera: its intrinsics.
+        pixels: flat indices of the pixels wanted, int64 [M].
     """
-    smooth = cv2.boxFilter(points, -1, (3, 3), borderType=cv2.BORDER_REPLICATE)
-    du, dv = np.zeros_like(points), np.zeros_like(points)
-    du[:, 1:-1] = smooth[:, 2:] - smooth[:, :-2]
-    dv[1:-1] = smooth[2:] - smooth[:-2]
-    normals = np.cross(du, dv)
-    length = np.linalg.norm(normals, axis=-1)
-    normals *= np.where(_is_smooth(depth) & (length > 1e-12), 1 / np.maximum(length, 1e-12), 0)[..., None]
-    facing = np.einsum("hwc,hwc->hw", normals, points) > 0
-    normals[facing] *= -1
+    height, width = depth.shape
+    smooth = cv2.boxFilter(camera.back_project(depth), -1, (3, 3), borderType=cv2.BORDER_REPLICATE).reshape(-1, 3)
+    good = _is_smooth(depth).reshape(-1)[pixels]
+    row, column = np.divmod(pixels, width)
+    good &= (row > 0) & (row < height - 1) & (column > 0) & (column < width - 1)
+    normals = np.zeros((len(pixels), 3), np.float32)
+    inner = pixels[good]
+    du, dv = smooth[inner + 1] - smooth[inner - 1], smooth[inner + width] - smooth[inner - width]
+    normals[good] = _unit(np.cross(dv, du))  # rows run down and columns right, so this order faces the camera
     return normals
 
 
@@ -99,9 +100,8 @@ def new_gaussians(
     on_grid, stride = grid_selection(color, depth, s)
     usable = (depth > 0.05) & (depth < s.max_depth_m)
     pixels = np.flatnonzero(where & on_grid & usable)
-    points = camera.back_project(depth)
-    normals = surface_normals(points, depth).reshape(-1, 3)[pixels]
-    positions = points.reshape(-1, 3)[pixels]
+    positions = camera.rays().reshape(-1, 3)[pixels] * depth.reshape(-1)[pixels, None]
+    normals = surface_normals(depth, camera, pixels)
     footprint = s.scale_pixels * stride.reshape(-1)[pixels] * positions[:, 2] * (2.0 / (camera.fx + camera.fy))
     log_scales, axes = _disc_shape(positions, normals, footprint, s)
     R = T_world_camera[:3, :3].astype(np.float32)
@@ -110,6 +110,42 @@ def new_gaussians(
         quaternions=_quaternions(np.einsum("ij,njk->nik", R, axes)),
         log_scales=log_scales,
         rgb=color.reshape(-1, 3)[pixels].astype(np.float32) / 255,
+        pixels=pixels,
+    )
+
+
+def fill_gaussians(
+    color: np.ndarray, depth: np.ndarray, alpha: np.ndarray, camera: Camera, T_world_camera: np.ndarray,
+    s: InsertionSettings,
+) -> NewGaussians:  # fmt: skip
+    """Small spheres where neither the sensor nor the map knows a surface, at the depth of the nearest known pixel.
+
+    Args:
+        color: uint8 [H, W, 3]; depth: [H, W], metres, 0 = none; alpha: rendered alpha [H, W].
+    """
+    stride = s.fill_stride
+    unknown = (depth <= 0) & (alpha < 0.5)
+    on_grid = np.zeros(depth.shape, bool)
+    on_grid[stride // 2 :: stride, stride // 2 :: stride] = True
+    pixels = np.flatnonzero(unknown & on_grid)
+    if not len(pixels) or not (depth > 0).any():
+        pixels = pixels[:0]
+        z = np.zeros(0, np.float32)
+    else:
+        absent = (depth <= 0).astype(np.uint8)
+        _, label = cv2.distanceTransformWithLabels(absent, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+        depth_of_label = np.zeros(label.max() + 1, np.float32)
+        depth_of_label[label[depth > 0]] = depth[depth > 0]
+        z = depth_of_label[label.reshape(-1)[pixels]]
+    positions = camera.rays().reshape(-1, 3)[pixels] * z[:, None]
+    R, t = T_world_camera[:3, :3].astype(np.float32), T_world_camera[:3, 3].astype(np.float32)
+    sigma = 2 * s.scale_pixels * stride * z * (2.0 / (camera.fx + camera.fy))
+    smooth = cv2.blur(color, (stride, stride)).reshape(-1, 3)[pixels]
+    return NewGaussians(
+        means=positions @ R.T + t,
+        quaternions=np.tile(np.float32([1, 0, 0, 0]), (len(pixels), 1)),
+        log_scales=np.repeat(np.log(sigma)[:, None], 3, 1).astype(np.float32),
+        rgb=smooth.astype(np.float32) / 255,
         pixels=pixels,
     )
 

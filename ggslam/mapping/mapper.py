@@ -5,20 +5,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from ggslam.mapping.exposure import ExposureAdam
-from ggslam.mapping.insertion import new_gaussians, unexplained
+from ggslam.mapping.insertion import fill_gaussians, new_gaussians, unexplained
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.losses import ImageLoss, KeyframeImages
 from ggslam.mapping.pruning import prune
 from ggslam.mapping.sampling import KeyframeSampler
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
-from ggslam.rendering.cpu import AdamSettings, CpuRasterizer
+from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
+from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -61,6 +62,7 @@ class Mapper:
         self.last_psnr = float("nan")
         self._rasterizer = CpuRasterizer(context=context)
         self._loss = ImageLoss(context)
+        self._standard_adam = self._adam(1.0)
         self._sampler = KeyframeSampler(np.random.default_rng(seed))
         self._pose_optimizers: list[PoseAdam] = []
         self._exposure_optimizers: list[ExposureAdam] = []
@@ -84,16 +86,20 @@ class Mapper:
 
     def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray) -> None:
         depth, s = keyframe.depth_m(), self.settings.insertion
-        where = np.ones(depth.shape, bool)
+        where, alpha = np.ones(depth.shape, bool), np.zeros(depth.shape, np.float32)
         if self.map.count:
             view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
-            where = unexplained(depth, view.alpha.numpy(), view.expected_depth.numpy(), s)
-        new = new_gaussians(keyframe.color, depth, keyframe.camera, T_world_camera, where, s)
+            alpha = view.alpha.numpy()
+            where = unexplained(depth, alpha, view.expected_depth.numpy(), s)
+        parts = [new_gaussians(keyframe.color, depth, keyframe.camera, T_world_camera, where, s)]
+        if s.fill_stride:
+            parts.append(fill_gaussians(keyframe.color, depth, alpha, keyframe.camera, T_world_camera, s))
         logit = float(np.log(s.opacity / (1 - s.opacity)))
-        self.map.insert(
-            torch.from_numpy(new.means), torch.from_numpy(new.quaternions), torch.from_numpy(new.log_scales),
-            torch.full((len(new.means),), logit), torch.from_numpy(new.rgb), birth_keyframe=keyframe.index,
-        )  # fmt: skip
+        for new in parts:
+            self.map.insert(
+                torch.from_numpy(new.means), torch.from_numpy(new.quaternions), torch.from_numpy(new.log_scales),
+                torch.full((len(new.means),), logit), torch.from_numpy(new.rgb), birth_keyframe=keyframe.index,
+            )  # fmt: skip
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 
@@ -117,7 +123,7 @@ class Mapper:
         loss = self._loss.evaluate(view, target, s.loss)
         t2 = time.perf_counter()
         step = self._rasterizer.backward_step(
-            self.map, loss.d_image, loss.d_depth, loss.d_alpha, optimizer=self._adam(rate_factor)
+            self.map, loss.d_image, loss.d_depth, loss.d_alpha, optimizer=self._standard_adam if rate_factor == 1 else self._adam(rate_factor)
         )
         self._refine_keyframe(keyframe, step.twist, loss.exposure_gradient, rate_factor)
         t3 = time.perf_counter()
@@ -137,11 +143,13 @@ class Mapper:
                 progress(i + 1, iterations)
 
     def _adam(self, rate_factor: float) -> AdamSettings:
-        rates = self.settings.rates
-        if rate_factor == 1.0:
-            return rates
-        scaled = {name: getattr(rates, name) * rate_factor for name in RATE_NAMES}
-        return replace(rates, **scaled)
+        r = self.settings.rates
+        young = r.young_factor
+        decay = (1 / young) ** (1 / max(1, r.young_updates)) if young > 1 else 1.0
+        rates = {name: young * rate_factor * getattr(r, name) for name in ADAM_GROUPS}
+        return AdamSettings(
+            learning_rates=rates, beta1=r.beta1, beta2=r.beta2, epsilon=r.epsilon, decay=decay, decay_floor=1 / young
+        )
 
     def _refine_keyframe(
         self, keyframe: Keyframe, twist: np.ndarray, exposure_gradient: np.ndarray, rate_factor: float

@@ -29,8 +29,11 @@ class InsertionSettings:
     """How far a footprint may be stretched along a surface seen at a grazing angle."""
     adaptive_stride: bool = True
     """One Gaussian per 2x2 pixels where colour and depth are smooth, one per pixel elsewhere."""
-    texture_threshold: float = 60.0
+    texture_threshold: float = 90.0
     """Smoothness for `adaptive_stride`: Sobel magnitude of the grey image (0 to 255 scale) under which a pixel is flat."""
+    fill_stride: int = 3
+    """Pixels without depth, where nothing is rendered either, get a Gaussian on a grid of this stride at the depth of
+    the nearest pixel that has one; 0: none. Training with colour then makes them fit what is seen there."""
     max_depth_m: float = 20.0
     """Farther measurements do not become Gaussians."""
 
@@ -43,16 +46,16 @@ class LearningRates:
     quaternions: float = 4e-3
     log_scales: float = 5e-2
     opacity_logits: float = 5e-2
-    sh_dc: float = 9e-3
+    sh_dc: float = 1.8e-2
     sh_rest: float = 5e-4
     features: float = 1e-2
     beta1: float = 0.9
-    beta2: float = 0.99
+    beta2: float = 0.98
     epsilon: float = 1e-15
+    young_factor: float = 3.0
+    """A Gaussian's first step is this much longer..."""
     young_updates: int = 8
-    """A Gaussian's first steps..."""
-    young_factor: float = 2.0
-    """...are this much longer."""
+    """...and the rates fall to their values over this many of its steps."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ class MapperSettings:
     """Final refinement: learning rates fall exponentially to this share of their value."""
     insertion: InsertionSettings = field(default_factory=InsertionSettings)
     rates: LearningRates = field(default_factory=LearningRates)
-    loss: LossSettings = field(default_factory=LossSettings)
+    loss: LossSettings = field(default_factory=lambda: LossSettings(depth_weight=0.6))
     pruning: PruningSettings = field(default_factory=PruningSettings)
     pose_refinement: PoseRefinementSettings = field(default_factory=PoseRefinementSettings)
     exposure: ExposureSettings = field(default_factory=ExposureSettings)

@@ -17,12 +17,15 @@ def plane_depth(normal: np.ndarray, distance: float) -> np.ndarray:
     return (-distance / (CAMERA.rays() @ normal)).astype(np.float32)
 
 
+def normals_of(depth: np.ndarray) -> np.ndarray:
+    return surface_normals(depth, CAMERA, np.arange(depth.size)).reshape(*depth.shape, 3)
+
+
 @pytest.mark.parametrize("tilt", [0.0, 0.5, 1.0])
 def test_discs_lie_in_the_surface(tilt: float) -> None:
     normal = np.array([0.0, -np.sin(tilt), -np.cos(tilt)])
     depth = plane_depth(normal, 2.0)
-    normals = surface_normals(CAMERA.back_project(depth), depth)
-    inner = normals[6:-6, 6:-6].reshape(-1, 3)
+    inner = normals_of(depth)[6:-6, 6:-6].reshape(-1, 3)
     assert np.abs(inner - normal).max() < 1e-3
     T = se3_exp(np.array([0.3, -0.2, 0.5, 0.2, 0.4, -0.3]))
     where = np.zeros((48, 64), bool)
@@ -48,7 +51,7 @@ def test_no_gaussian_without_depth_and_none_at_jumps_has_a_false_normal() -> Non
     depth = np.full((48, 64), 1.0, np.float32)
     depth[:, 32:] = 3.0
     depth[:5] = 0
-    normals = surface_normals(CAMERA.back_project(depth), depth)
+    normals = normals_of(depth)
     assert np.abs(normals[20, 31:33]).max() == 0  # at the jump
     new = new_gaussians(
         np.zeros((48, 64, 3), np.uint8), depth, CAMERA, np.eye(4), np.ones((48, 64), bool), InsertionSettings()
