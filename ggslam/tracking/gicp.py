@@ -81,8 +81,13 @@ class GicpTarget:
         birth: np.ndarray | None = None,
         camera_positions: np.ndarray | None = None,
         voxel: float | None = None,
+        base: GicpTarget | None = None,
     ) -> GicpTarget:
-        """As `from_gaussians`, from contiguous float32 arrays [n, 3], [n, 4] wxyz, [n, 3], [n]; `birth` int32 [n]."""
+        """As `from_gaussians`, from contiguous float32 arrays [n, 3], [n, 4] wxyz, [n, 3], [n]; `birth` int32 [n].
+
+        With `base` the result holds what that target holds, too, as if built from both sets of Gaussians at once; it
+        must have been made with the same settings. The cost then goes with the new Gaussians and the base's voxels.
+        """
         target = cls()
         cameras = 0 if camera_positions is None else len(camera_positions)
         positions = np.ascontiguousarray(np.zeros((1, 3)) if camera_positions is None else camera_positions, np.float32)
@@ -96,7 +101,8 @@ class GicpTarget:
             target.voxel, math.log(settings.min_opacity / (1 - settings.min_opacity)), settings.min_thickness,
             settings.max_thickness, settings.max_elongation, settings.scatter_weight, settings.neighbour_weight,
         )  # fmt: skip
-        target._library.ggslam_gicp_target_build(context.handle, target.handle, given, arguments)
+        earlier = None if base is None else base.handle
+        target._library.ggslam_gicp_target_build(context.handle, target.handle, earlier, given, arguments)
         return target
 
     def __len__(self) -> int:

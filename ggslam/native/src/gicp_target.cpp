@@ -88,18 +88,35 @@ Sorted sort_by_partition(Context& context, const TargetInput& input, const Targe
   return s;
 }
 
+// Blocks of an earlier target that belong to one partition: [begin, end). A target keeps its blocks by partition.
+struct BaseRange {
+  const VoxelLevel* level;
+  std::size_t begin, end;
+};
+
+// The voxels of the blocks: those of the base keep their moments, new ones start empty.
+void make_moments(const BaseRange& base, float size, Partition& out) {
+  for (std::size_t b = 0; b < out.blocks.size(); ++b) {
+    VoxelBlock before{0, 0, 0};
+    if (base.begin + b < base.end) before = base.level->blocks[base.begin + b];
+    out.blocks[b].first = static_cast<uint32_t>(out.moments.size());
+    const VoxelMoments* old = before.occupied ? base.level->moments.data() + before.first : nullptr;
+    for (uint64_t rest = out.blocks[b].occupied; rest; rest &= rest - 1) {
+      const int bit = __builtin_ctzll(rest);
+      out.moments.push_back(before.occupied >> bit & 1 ? *old++ : empty_moments(out.keys[b], bit, size));
+    }
+  }
+}
+
 // Finds the blocks and voxels of one partition and adds up its members.
 template <typename Accumulate>
-void fill_partition(const Sorted& s, int p, const TargetInput& input, const TargetSettings& settings,
-                    Accumulate accumulate, Partition& out) {
+void fill_partition(const Sorted& s, int p, const BaseRange& base, const TargetInput& input,
+                    const TargetSettings& settings, Accumulate accumulate, Partition& out) {
   const std::size_t begin = s.begin[p], n = s.begin[p + 1] - begin;
   std::size_t capacity = 16;
-  while (capacity < 2 * n) capacity *= 2;
+  while (capacity < 2 * (n + base.end - base.begin)) capacity *= 2;
   std::vector<int32_t> slots(capacity, -1);
-  out.voxels.resize(n);
-  for (std::size_t i = 0; i < n; ++i) {
-    const int32_t g = s.order[begin + i];
-    const uint64_t key = s.keys[g];
+  const auto block_of = [&](uint64_t key) {
     std::size_t slot = hash_key(key) & (capacity - 1);
     while (slots[slot] >= 0 && out.keys[slots[slot]] != key) slot = (slot + 1) & (capacity - 1);
     if (slots[slot] < 0) {
@@ -107,14 +124,17 @@ void fill_partition(const Sorted& s, int p, const TargetInput& input, const Targ
       out.keys.push_back(key);
       out.blocks.push_back({0, 0, 0});
     }
-    out.blocks[slots[slot]].occupied |= uint64_t{1} << s.bits[g];
-    out.voxels[i] = slots[slot];
+    return slots[slot];
+  };
+  for (std::size_t b = base.begin; b < base.end; ++b)
+    out.blocks[block_of(base.level->block_keys[b])].occupied = base.level->blocks[b].occupied;
+  out.voxels.resize(n);
+  for (std::size_t i = 0; i < n; ++i) {
+    const int32_t g = s.order[begin + i];
+    out.voxels[i] = block_of(s.keys[g]);
+    out.blocks[out.voxels[i]].occupied |= uint64_t{1} << s.bits[g];
   }
-  for (std::size_t b = 0; b < out.blocks.size(); ++b) {
-    out.blocks[b].first = static_cast<uint32_t>(out.moments.size());
-    for (uint64_t rest = out.blocks[b].occupied; rest; rest &= rest - 1)
-      out.moments.push_back(empty_moments(out.keys[b], __builtin_ctzll(rest), settings.voxel));
-  }
+  make_moments(base, settings.voxel, out);
   for (std::size_t i = 0; i < n; ++i) {
     const VoxelBlock& b = out.blocks[out.voxels[i]];
     const uint64_t below = (uint64_t{1} << s.bits[s.order[begin + i]]) - 1;
@@ -186,13 +206,20 @@ VoxelLevelView VoxelLevel::view() const {
           static_cast<int32_t>(voxels.size())};
 }
 
-void GicpTarget::build(Context& context, const TargetInput& input, const TargetSettings& settings) {
+void GicpTarget::build(Context& context, const GicpTarget* base, const TargetInput& input,
+                       const TargetSettings& settings) {
+  static const VoxelLevel nothing;
+  const VoxelLevel& before = base ? base->fine : nothing;
+  std::array<std::size_t, kPartitions + 1> base_begin{};
+  for (uint64_t key : before.block_keys) ++base_begin[partition_of(key) + 1];
+  for (int p = 0; p < kPartitions; ++p) base_begin[p + 1] += base_begin[p];
   const Sorted sorted = sort_by_partition(context, input, settings);
   std::vector<Partition> partitions(kPartitions);
   const auto accumulate = GGSLAM_DISPATCH(context.isa, accumulate_members);
   context.pool.parallel_for(kPartitions, 1, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t p = begin; p < end; ++p)
-      fill_partition(sorted, static_cast<int>(p), input, settings, accumulate, partitions[p]);
+      fill_partition(sorted, static_cast<int>(p), {&before, base_begin[p], base_begin[p + 1]}, input, settings,
+                     accumulate, partitions[p]);
   });
   fine.size = settings.voxel;
   concatenate(partitions, fine);
@@ -216,9 +243,11 @@ GGSLAM_EXPORT void* ggslam_gicp_target_create() { return new ggslam::GicpTarget;
 
 GGSLAM_EXPORT void ggslam_gicp_target_destroy(void* target) { delete static_cast<ggslam::GicpTarget*>(target); }
 
-GGSLAM_EXPORT void ggslam_gicp_target_build(void* context, void* target, const ggslam::TargetInput* input,
+GGSLAM_EXPORT void ggslam_gicp_target_build(void* context, void* target, const void* base,
+                                            const ggslam::TargetInput* input,
                                             const ggslam::TargetSettings* settings) {
-  static_cast<ggslam::GicpTarget*>(target)->build(*static_cast<ggslam::Context*>(context), *input, *settings);
+  static_cast<ggslam::GicpTarget*>(target)->build(*static_cast<ggslam::Context*>(context),
+                                                  static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
 }
 
 // Number of voxels of a level (0 fine, 1 coarse).

@@ -25,8 +25,9 @@ struct VoxelLevel {
 struct GicpTarget {
   VoxelLevel fine, coarse;
 
-  // Replaces the contents. The result does not depend on the number of threads.
-  void build(Context& context, const TargetInput& input, const TargetSettings& settings);
+  // Replaces the contents by what `base` (may be null) holds and the Gaussians of `input`. `base` must have been built
+  // with the same settings. The result does not depend on the number of threads.
+  void build(Context& context, const GicpTarget* base, const TargetInput& input, const TargetSettings& settings);
 };
 
 }  // namespace ggslam
