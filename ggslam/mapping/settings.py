@@ -42,7 +42,7 @@ class InsertionSettings:
 class LearningRates:
     """Adam step sizes of each group of parameters."""
 
-    means: float = 4e-4
+    means: float = 6e-4
     quaternions: float = 4e-3
     log_scales: float = 5e-2
     opacity_logits: float = 5e-2

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import quaternion_to_matrix, se3_exp
+from ggslam.tracking.gicp import GicpTarget, align
+from ggslam.tracking.points import extract_points
+from ggslam.tracking.settings import TrackerSettings
+from ggslam.tracking.surface import MeasuredSurface, quaternions_from_normals
+
+CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+
+
+def corner_depth(T_world_camera: np.ndarray) -> np.ndarray:
+    """Depth of the inside of a corner (planes x = 1.5, y = 1, z = 3) seen from a pose."""
+    rays = CAMERA.rays().astype(float) @ T_world_camera[:3, :3].T
+    origin = T_world_camera[:3, 3]
+    distances = (np.array([1.5, 1.0, 3.0]) - origin) / np.where(rays > 1e-9, rays, 1e-9)
+    return distances.min(-1).astype(np.float32)
+
+
+def test_quaternions_turn_z_to_the_normal() -> None:
+    normals = np.random.default_rng(0).normal(size=(50, 3))
+    normals = np.concatenate([normals / np.linalg.norm(normals, axis=1, keepdims=True), [[0, 0, -1.0], [0, 0, 1.0]]])
+    assert np.allclose(quaternion_to_matrix(quaternions_from_normals(normals))[:, :, 2], normals, atol=1e-6)
+
+
+def test_gathering_in_steps_is_gathering_at_once() -> None:
+    rng = np.random.default_rng(1)
+    settings, context = TrackerSettings().target, NativeContext(2)
+    means = np.float32(rng.uniform(-1, 1, (6000, 3)) * [1, 1, 0.01])
+    quaternions = np.tile(np.float32([1, 0, 0, 0]), (6000, 1))
+    scales = np.tile(np.log(np.float32([0.01, 0.01, 0.001])), (6000, 1))
+    logits = np.full(6000, 3, np.float32)
+    arrays = (means, quaternions, scales, logits)
+    together = GicpTarget.from_arrays(*arrays, settings, context)
+    first = GicpTarget.from_arrays(*(a[:2500].copy() for a in arrays), settings, context)
+    size_of_first = len(first)
+    both = GicpTarget.from_arrays(*(a[2500:].copy() for a in arrays), settings, context, base=first)
+    assert len(first) == size_of_first < len(both) == len(together)  # the earlier target is as it was
+    for level in (0, 1):
+        a, b = (target.voxels(level) for target in (both, together))
+        order_a, order_b = (np.lexsort(np.round(v["means"], 4).T) for v in (a, b))
+        for name in ("means", "weights", "normals", "covariances"):
+            assert np.allclose(a[name][order_a], b[name][order_b], rtol=1e-3, atol=2e-4), name
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_new_view_of_a_measured_corner_is_located(threads: int) -> None:
+    settings, context = TrackerSettings(), NativeContext(threads)
+    surface = MeasuredSurface(settings.target, context)
+    for twist in ([0, 0, 0, 0, 0, 0], [0.1, 0.05, 0, 0.02, 0.1, 0]):
+        T = se3_exp(np.array(twist, float))
+        surface.add(extract_points(corner_depth(T), CAMERA, settings.points, settings.noise, context), T)
+    assert surface.target is not None
+    truth = se3_exp(np.array([0.08, -0.05, 0.1, 0.05, 0.05, -0.03]))
+    points = extract_points(corner_depth(truth), CAMERA, settings.points, settings.noise, context)
+    guess = se3_exp(np.array([0.03, 0.02, -0.02, 0.02, -0.02, 0.01])) @ truth
+    found = align(points, surface.target, guess, settings.align, settings.noise, context)
+    assert np.linalg.norm(found.T_world_camera[:3, 3] - truth[:3, 3]) < 1e-3
+    assert found.overlap > 0.8
