@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A generated recording: a furnished room, described in `scene` and `room`, ray-cast by `raycast`, written by `writer`."""
+"""A generated recording: a furnished room (`scene`, `room`), ray-cast (`raycast`) and written out (`writer`)."""
 
 from ggslam.sequences.synthetic.raycast import RayCaster, RayImages
 from ggslam.sequences.synthetic.room import furnished_room

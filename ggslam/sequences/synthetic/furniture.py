@@ -21,7 +21,8 @@ def table(b: SceneBuilder, name: str, at: Vector, turn: float, size: Vector, top
     place.box((0, 0, height - 0.07), (width - 0.1, depth - 0.1, 0.06), legs)
     for x in (-1, 1):
         for y in (-1, 1):
-            place.box((x * (width / 2 - 0.06), y * (depth / 2 - 0.06), height / 2 - 0.03), (0.06, 0.06, height - 0.06), legs)
+            foot = (x * (width / 2 - 0.06), y * (depth / 2 - 0.06), height / 2 - 0.03)
+            place.box(foot, (0.06, 0.06, height - 0.06), legs)
     return place
 
 
@@ -52,10 +53,9 @@ def sofa(b: SceneBuilder, m: Palette, at: Vector, turn: float, width: float = 2.
         place.box((x * (width - 0.38) / 4, 0.23, 0.62), ((width - 0.42) / 2, 0.16, 0.40), m.sofa_seat, (-14, 0, 0))
         for y in (-0.34, 0.4):
             place.cylinder((x * (width / 2 - 0.1), y, 0.045), 0.025, 0.09, m.walnut)
-    for name, x, material, angle in (("cushion", -0.66, m.mustard, 14.0), ("cushion", 0.62, m.pattern, -18.0)):
-        pillow = b.instance(name, (at[0], at[1], at[2]), turn)
-        pillow.box((x, 0.04, 0.63), (0.42, 0.12, 0.40), material, (-20, angle, 0.4 * angle))
-        pillow.ellipsoid((x, 0.04, 0.63), (0.19, 0.10, 0.18), material, (-20, angle, 0.4 * angle))
+    for x, material, angle in ((-0.66, m.mustard, 14.0), (0.62, m.pattern, -18.0)):
+        pillow = b.instance("cushion", at, turn)
+        pillow.box((x, 0.04, 0.63), (0.42, 0.11, 0.40), material, (-20, angle, 0.4 * angle))
 
 
 def armchair(b: SceneBuilder, m: Palette, at: Vector, turn: float) -> None:
@@ -73,30 +73,32 @@ def armchair(b: SceneBuilder, m: Palette, at: Vector, turn: float) -> None:
     pillow.box((0.02, 0.13, 0.60), (0.36, 0.11, 0.34), m.rose, (-18, 6, 4))
 
 
-def bookshelf(b: SceneBuilder, m: Palette, rng: np.random.Generator, at: Vector, turn: float, width: float = 1.1) -> None:
+def bookshelf(
+    b: SceneBuilder, m: Palette, rng: np.random.Generator, at: Vector, turn: float, width: float = 1.1
+) -> None:
     """A tall open shelf filled with books and a few things."""
     place = b.instance("bookshelf", at, turn)
     height, depth = 1.95, 0.32
-    for x in (-1, 1):
-        place.box((x * (width / 2 - 0.0125), 0, height / 2), (0.025, depth, height), m.oak)
+    for side in (-1, 1):
+        place.box((side * (width / 2 - 0.0125), 0, height / 2), (0.025, depth, height), m.oak)
     place.box((0, depth / 2 - 0.01, height / 2), (width, 0.02, height), m.oak)
     levels = np.linspace(0.08, height - 0.0125, 6)
     for z in levels:
         place.box((0, 0, float(z)), (width - 0.02, depth, 0.025), m.oak)
     books = b.instance("books", at, turn)
-    for row, z in enumerate(levels[:-1] + 0.0125):
+    for row, board in enumerate(levels[:-1] + 0.0125):
         x = -width / 2 + 0.03
         end = (0.50, 0.44, 0.22, 0.50, 0.36)[row] * width
         while x < end - width * 0.02:
             thick, tall = float(rng.uniform(0.022, 0.055)), float(rng.uniform(0.20, 0.30))
             lean = 7.0 if rng.random() < 0.08 else 0.0
             cover = m.covers[int(rng.integers(len(m.covers)))]
-            books.box((x + thick / 2 + 0.01, float(rng.uniform(-0.05, 0.0)), float(z) + tall / 2 + 0.003),
+            books.box((x + thick / 2 + 0.01, float(rng.uniform(-0.05, 0.0)), float(board) + tall / 2 + 0.003),
                       (thick, 0.20, tall), cover, (0, lean, 0), {5: m.pages})  # fmt: skip
             x += thick + (0.035 if lean else 0.003)
-    b.instance("globe", at, turn).ellipsoid((0.40 * width, -0.02, float(levels[2]) + 0.16), (0.115,) * 3, m.globe)
-    vase = b.instance("vase", at, turn)
-    vase.cylinder((0.34 * width, -0.02, float(levels[2]) + 0.03), 0.05, 0.04, m.walnut)
+    globe = b.instance("globe", at, turn)
+    globe.ellipsoid((0.36 * width, -0.02, float(levels[2]) + 0.17), (0.115, 0.115, 0.115), m.globe, (20, 0, 0))
+    globe.cylinder((0.36 * width, -0.02, float(levels[2]) + 0.04), 0.05, 0.06, m.walnut, top=0.5)
     jar = b.instance("jar", at, turn)
     jar.cylinder((0.43 * width, -0.02, float(levels[4]) + 0.10), 0.06, 0.17, m.vase, top=0.8)
     jar.cylinder((0.43 * width, -0.02, float(levels[4]) + 0.195), 0.05, 0.02, m.walnut)
@@ -141,14 +143,14 @@ def mug(b: SceneBuilder, material: Material, inside: Material, at: Vector, turn:
 def book_pile(b: SceneBuilder, m: Palette, rng: np.random.Generator, at: Vector, count: int = 3) -> None:
     """Books lying on one another."""
     place = b.instance("book pile", at)
-    z = 0.0
+    top = 0.0
     for _ in range(count):
         thick = float(rng.uniform(0.025, 0.045))
         cover = m.covers[int(rng.integers(len(m.covers)))]
         edges = {0: m.pages, 2: m.pages, 3: m.pages}
         size = (float(rng.uniform(0.17, 0.24)), float(rng.uniform(0.24, 0.30)), thick)
-        place.box((0, 0, z + thick / 2), size, cover, (0, 0, float(rng.uniform(-30, 30))), edges)
-        z += thick
+        place.box((0, 0, top + thick / 2), size, cover, (0, 0, float(rng.uniform(-30, 30))), edges)
+        top += thick
 
 
 def fruit_bowl(b: SceneBuilder, m: Palette, at: Vector) -> None:
@@ -163,7 +165,9 @@ def fruit_bowl(b: SceneBuilder, m: Palette, at: Vector) -> None:
     fruit.ellipsoid((0, 0, 0.13), (0.041, 0.041, 0.04), m.orange)
 
 
-def picture(b: SceneBuilder, m: Palette, painting: Material, at: Vector, turn: float, width: float, height: float) -> None:
+def picture(
+    b: SceneBuilder, m: Palette, painting: Material, at: Vector, turn: float, width: float, height: float
+) -> None:
     """A framed picture; `at` is its centre on the wall, front towards -y."""
     place = b.instance("picture", at, turn)
     place.box((0, -0.008, 0), (width, 0.016, height), m.white, faces={2: painting})
@@ -186,7 +190,7 @@ def window(b: SceneBuilder, m: Palette, at: Vector, turn: float, width: float = 
     for x in (-1, 1):
         curtains.box((x * (width / 2 + 0.16), -0.09, -0.05), (0.42, 0.06, height + 0.55), m.curtain)
     curtains.cylinder((0, -0.10, height / 2 + 0.24), 0.016, width + 0.95, m.brass, (0, 90, 0))
-    grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 4), [-0.05], np.linspace(-0.35, 0.35, 4)), -1).reshape(-1, 3)
+    grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 4), [-0.05], np.linspace(-0.35, 0.35, 3)), -1).reshape(-1, 3)
     T = place.T_world_own
     points = (grid * (width, 1, height) - (0, 0.08, 0)) @ T[:3, :3].T + T[:3, 3]
     normal = -T[:3, 1]

@@ -2,8 +2,8 @@
 """Light maps: how much light reaches each patch of each face, computed once for a scene that does not move.
 
 Direct light comes from points spread over each area light, with shadows; ambient light from directions spread over the
-hemisphere, darkened by what is near (ambient occlusion). All patches use the same points and directions, so that shadows
-are smooth rather than noisy.
+hemisphere, darkened by what is near (ambient occlusion). All patches use the same points and directions, so that
+shadows are smooth rather than noisy.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ import numpy as np
 from ggslam.sequences.synthetic.scene import Light, Scene, Shape
 from ggslam.sequences.synthetic.surfaces import face_sizes, intersect, surface_points
 
-PATCH = 0.04
-"""Metres between patches."""
+PATCH = 0.07
+"""Metres between patches of large faces; small faces have finer ones, down to half of it."""
 LARGEST_MAP = 112
 """Patches along a face at most."""
 REACH = 0.9
 """Metres within which things darken the ambient light."""
-AMBIENT_RAYS = 20
+AMBIENT_RAYS = 16
+_STRIP = 16
 OFFSET = 2e-3
 """Metres by which rays start above the surface."""
 
@@ -43,11 +44,12 @@ class LightMaps:
 
 def bake(scene: Scene) -> LightMaps:
     """Computes the light maps of every face of every shape, in the order of shapes and their faces."""
-    sizes, points, normals, owners = [], [], [], []
+    sizes: list[tuple[int, int]] = []
+    points, normals, owners = [], [], []
     for index, shape in enumerate(scene.shapes):
         R, t = shape.T_world_shape[:3, :3], shape.T_world_shape[:3, 3]
         for face, extent in enumerate(face_sizes(shape)):
-            columns, rows = (int(np.clip(np.ceil(side / PATCH), 2, LARGEST_MAP)) for side in extent)
+            columns, rows = _patches(extent[0]), _patches(extent[1])
             v, u = np.mgrid[:rows, :columns].reshape(2, -1) + 0.5
             own, normal = surface_points(shape, face, u / columns, v / rows)
             sizes.append((columns, rows))
@@ -55,10 +57,58 @@ def bake(scene: Scene) -> LightMaps:
             normals.append(normal @ R.T)
             owners.append(np.full(len(own), index))
     position, normal = np.concatenate(points), np.concatenate(normals)
-    light = _ambient(scene, position, normal)
+    position += OFFSET * normal
+    seen = np.nonzero(((position > scene.bounds[0]) & (position < scene.bounds[1])).all(1))[0]
+    patches = _Patches(position[seen], normal[seen], np.concatenate(owners)[seen])
+    light = np.zeros((len(position), 3), np.float32)
+    light[seen] = _ambient(scene, patches)
     for source in scene.lights:
-        light += _direct(scene, source, position, normal)
-    return _pack(light.astype(np.float32), sizes)
+        light[seen] += _direct(scene, source, patches)
+    return _pack(light, sizes)
+
+
+class _Patches:
+    """Patches to be lit: positions just above their surface and normals, float64 [n, 3]; number of their shape [n].
+
+    Most shapes matter to few patches. The tests below find these, first by bounding spheres around strips of patches.
+    """
+
+    def __init__(self, position: np.ndarray, normal: np.ndarray, owner: np.ndarray) -> None:
+        self.position, self.normal, self.owner = position, normal, owner
+        self._strip = np.arange(len(position)) // _STRIP
+        count = np.bincount(self._strip)
+        self._centre = np.stack([np.bincount(self._strip, position[:, k]) / count for k in range(3)], 1)
+        self._radius = np.zeros(len(count))
+        np.maximum.at(self._radius, self._strip, np.linalg.norm(position - self._centre[self._strip], axis=1))
+
+    def near(self, number: int, shape: Shape, reach: float) -> np.ndarray:
+        """Numbers of the patches that look at a shape and may be within `reach` metres of it."""
+        apart = np.linalg.norm(self._centre - shape.T_world_shape[:3, 3], axis=1)
+        chosen = self._looking(number, shape, apart < reach + shape.radius() + self._radius)
+        return chosen[shape.distance(self.position[chosen]) < reach]
+
+    def shaded(self, number: int, shape: Shape, light: np.ndarray, spread: float) -> np.ndarray:
+        """Numbers of the patches that look at a shape which may hide part of a ball of radius `spread` at `light`."""
+        centre, way = shape.T_world_shape[:3, 3], light - self._centre
+        length = np.linalg.norm(way, axis=1)
+        share = np.clip(((centre - self._centre) * way).sum(1) / length**2, 0, 1)
+        apart = np.linalg.norm(self._centre + share[:, None] * way - centre, axis=1)
+        # The ways to the ball form a cone: they spread only towards the light.
+        farthest = np.minimum(share + (shape.radius() + spread) / length, 1)
+        return self._looking(number, shape, apart < shape.radius() + farthest * spread + self._radius)
+
+    def _looking(self, number: int, shape: Shape, strips: np.ndarray) -> np.ndarray:
+        """Of the patches in some strips (bool), those with some of the shape above their plane. A convex shape hides
+        nothing from itself."""
+        chosen = np.nonzero(strips[self._strip])[0]
+        chosen = chosen[self.owner[chosen] != number]
+        towards = shape.T_world_shape[:3, 3] - self.position[chosen]
+        return chosen[np.einsum("nk,nk->n", towards, self.normal[chosen]) > -shape.radius()]
+
+
+def _patches(side: float) -> int:
+    """Patches along a side of `side` metres."""
+    return int(np.clip(np.ceil(side / np.clip(side / 8, PATCH / 2, PATCH)), 2, LARGEST_MAP))
 
 
 def _pack(light: np.ndarray, sizes: list[tuple[int, int]]) -> LightMaps:
@@ -82,63 +132,54 @@ def _pack(light: np.ndarray, sizes: list[tuple[int, int]]) -> LightMaps:
     return LightMaps(atlas, corner, np.array(sizes))
 
 
-def _ambient(scene: Scene, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _ambient(scene: Scene, patches: _Patches) -> np.ndarray:
     """Ambient light [n, 3] on patches."""
     # Directions spread evenly over the hemisphere with density proportional to the cosine (golden-angle spiral).
     i = np.arange(AMBIENT_RAYS)
     radius, angle = np.sqrt((i + 0.5) / AMBIENT_RAYS), i * np.pi * (3 - np.sqrt(5))
+    normal = patches.normal
     tangent = np.cross(normal, np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     other = np.cross(normal, tangent)
-    origin = position + OFFSET * normal
-    directions = np.stack(
-        [r * (np.cos(a) * tangent + np.sin(a) * other) + np.sqrt(1 - r * r) * normal for r, a in zip(radius, angle, strict=True)],
-        1,
-    )  # [n, rays, 3]
-    free = np.full(directions.shape[:2], REACH, np.float32)
-    for shape in scene.shapes:
-        near = np.nonzero(shape.distance(origin) < REACH)[0]
-        if shape.casts_shadow and len(near):
-            hit = _rays(shape, origin[near, None], directions[near])
+    spokes = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)])  # [3, rays]
+    frames = np.stack([tangent, other, normal], 2)  # [n, 3, 3]
+    directions = np.ascontiguousarray((frames @ spokes).transpose(1, 0, 2), np.float32)  # [3, n, rays]
+    free = np.full(directions.shape[1:], REACH, np.float32)
+    for number, shape in enumerate(scene.shapes):
+        if shape.casts_shadow:
+            near = patches.near(number, shape, REACH)
+            hit = _first_hits(shape, patches.position[near], directions[:, near])
             free[near] = np.minimum(free[near], hit)
     openness = np.clip(free / REACH, 0, 1) ** 0.7
-    up = ((directions[..., 2] + 1) / 2)[..., None]
-    colour = np.array(scene.ambient_down) * (1 - up) + np.array(scene.ambient_up) * up
-    return (colour * openness[..., None]).mean(1)
+    up = (directions[2] + 1) / 2
+    below, above = (openness * (1 - up)).mean(1), (openness * up).mean(1)
+    return below[:, None] * np.array(scene.ambient_down) + above[:, None] * np.array(scene.ambient_up)
 
 
-def _direct(scene: Scene, light: Light, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _direct(scene: Scene, light: Light, patches: _Patches) -> np.ndarray:
     """Light [n, 3] that patches get from an area light."""
-    origin = position + OFFSET * normal
-    to_light = light.points[None] - origin[:, None]  # [n, points, 3]
-    squared = (to_light**2).sum(-1)
+    to_light = (light.points.T[:, None] - patches.position.T[:, :, None]).astype(np.float32)  # [3, n, points]
+    squared = (to_light**2).sum(0)
     length = np.sqrt(squared)
-    strength = np.maximum(np.einsum("npk,nk->np", to_light, normal) / length, 0) / (squared + 0.05)
+    falling = np.einsum("knp,nk->np", to_light, patches.normal) / length
+    strength = np.maximum(falling, 0) / (squared + 0.05)
     if light.normal is not None:
-        strength *= np.maximum(-(to_light @ np.array(light.normal)) / length, 0)
-    lit = np.nonzero(strength.max(1) > 1e-4)[0]
+        strength *= np.maximum(-np.einsum("knp,k->np", to_light, np.array(light.normal)) / length, 0)
+    lit = strength.max(1) > 1e-4
     visible = np.ones(strength.shape, bool)
     centre = light.points.mean(0)
-    spread = np.linalg.norm(light.points - centre, axis=1).max()
-    for shape in scene.shapes:
-        if not shape.casts_shadow:
-            continue
-        chosen = lit[_may_shade(shape, origin[lit], centre, spread)]
-        if len(chosen):
-            visible[chosen] &= _rays(shape, origin[chosen, None], to_light[chosen]) > 1
+    spread = float(np.linalg.norm(light.points - centre, axis=1).max())
+    for number, shape in enumerate(scene.shapes):
+        if shape.casts_shadow:
+            chosen = patches.shaded(number, shape, centre, spread)
+            chosen = chosen[lit[chosen]]
+            visible[chosen] &= _first_hits(shape, patches.position[chosen], to_light[:, chosen]) > 1
     return (strength * visible).mean(1)[:, None] * np.array(light.power)
 
 
-def _may_shade(shape: Shape, origin: np.ndarray, centre: np.ndarray, spread: float) -> np.ndarray:
-    """Whether a shape's bounding sphere touches the way from points [n, 3] to a light of radius `spread`."""
-    middle, radius = shape.T_world_shape[:3, 3], float(np.linalg.norm(shape.bounds())) + spread
-    way = centre - origin
-    share = np.clip(((middle - origin) * way).sum(1) / np.maximum((way**2).sum(1), 1e-9), 0, 1)
-    return ((origin + share[:, None] * way - middle) ** 2).sum(1) < radius**2
-
-
-def _rays(shape: Shape, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Ray parameters [...] of the first hits with a shape; rays in world axes, [..., 3]."""
-    R, t = shape.T_world_shape[:3, :3], shape.T_world_shape[:3, 3]
-    o, d = ((origin - t) @ R).astype(np.float32), (direction @ R).astype(np.float32)
-    return intersect(shape, (o[..., 0], o[..., 1], o[..., 2]), (d[..., 0], d[..., 1], d[..., 2]))
+def _first_hits(shape: Shape, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Ray parameters [n, rays] of the first hits with a shape; world origins [n, 3], directions [3, n, rays]."""
+    R, t = shape.T_world_shape[:3, :3].astype(np.float32), shape.T_world_shape[:3, 3]
+    o = (origin - t).astype(np.float32) @ R
+    d = [R[0, k] * directions[0] + R[1, k] * directions[1] + R[2, k] * directions[2] for k in range(3)]
+    return intersect(shape, (o[:, :1], o[:, 1:2], o[:, 2:]), (d[0], d[1], d[2]))

@@ -106,8 +106,8 @@ class MaterialMaker:
         column = (shifted // width).astype(int)
         wobble = 1.2 * self.noise(slope=1.0)
         inside = (y % height + wobble > joint) & (shifted % width + wobble > joint)
-        tone = 1 + 0.16 * self.rng.standard_normal((rows, columns))[row, column]
-        hue = 0.05 * self.rng.standard_normal((rows, columns, 3))[row, column]
+        tone = 1 + 0.13 * self.rng.standard_normal((rows, columns))[row, column]
+        hue = 0.022 * self.rng.standard_normal((rows, columns, 3))[row, column]
         rough = 1 + 0.07 * self.noise(slope=0.5)
         brick = (np.array(color) + hue) * (tone * rough)[..., None]
         return self.finish(np.where(inside[..., None], brick, np.array(mortar) * rough[..., None]), tile)

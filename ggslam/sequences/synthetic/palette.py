@@ -8,6 +8,14 @@ import numpy as np
 from ggslam.sequences.synthetic import pictures
 from ggslam.sequences.synthetic.materials import Material, MaterialMaker
 
+_CLOTH = np.array(
+    [(0.50, 0.16, 0.14), (0.14, 0.22, 0.38), (0.16, 0.32, 0.24), (0.55, 0.40, 0.20), (0.30, 0.20, 0.14),
+     (0.70, 0.64, 0.52), (0.22, 0.24, 0.27), (0.66, 0.34, 0.18), (0.28, 0.42, 0.48), (0.42, 0.20, 0.32)]
+)  # fmt: skip
+"""Colours of book covers."""
+_PRINT = np.array([(0.86, 0.76, 0.46), (0.90, 0.88, 0.82), (0.14, 0.13, 0.14), (0.72, 0.28, 0.20)])
+"""Colours of the bands on them."""
+
 
 class Palette:
     """All materials, made once from a seed."""
@@ -77,12 +85,12 @@ class Palette:
             make.bands([(0.30, 0.55, 0.35), (0.85, 0.90, 0.80)]),
         ]
         self.vase = make.bands([(0.16, 0.30, 0.45), (0.80, 0.82, 0.80), (0.25, 0.48, 0.60), (0.80, 0.82, 0.80)])
-        self.covers = [self._cover(make) for _ in range(14)]
+        self.covers = [self._cover(make) for _ in range(20)]
 
     @staticmethod
     def _cover(make: MaterialMaker) -> Material:
         """A book cover: one colour with two bands of another."""
-        base = make.rng.uniform(0.12, 0.80, 3)
-        other = np.clip(base + make.rng.choice([-1, 1]) * make.rng.uniform(0.25, 0.5, 3), 0.05, 0.95)
+        base = _CLOTH[make.rng.integers(len(_CLOTH))] * make.rng.uniform(0.8, 1.2)
+        other = _PRINT[make.rng.integers(len(_PRINT))]
         a, b = (float(base[0]), float(base[1]), float(base[2])), (float(other[0]), float(other[1]), float(other[2]))
         return make.bands([a, b, a, b, a])

@@ -57,7 +57,8 @@ def portrait(make: MaterialMaker, ground: Color, figure: Color) -> Material:
     for _ in range(18):
         x, y = int(make.rng.integers(50, 170)), int(make.rng.integers(50, 165))
         cv2.line(image, (110, 180), (x, y), (0.2, 0.4, 0.2), 2, cv2.LINE_AA)
-        cv2.circle(image, (x, y), int(make.rng.integers(8, 17)), tuple(make.rng.uniform(0.35, 0.95, 3)), -1, cv2.LINE_AA)
+        petals = tuple(make.rng.uniform(0.35, 0.95, 3))
+        cv2.circle(image, (x, y), int(make.rng.integers(8, 17)), petals, -1, cv2.LINE_AA)
         cv2.circle(image, (x, y), 4, (0.95, 0.85, 0.3), -1, cv2.LINE_AA)
     return make.finish(image, None)
 
@@ -81,10 +82,11 @@ def door(make: MaterialMaker, color: Color) -> Material:
     """A panelled door."""
     height, width = 400, 180
     image = _canvas(height, width, color) * (1 + 0.03 * make.noise(height, width, 0.8))[..., None]
+    dark, light = tuple(np.array(color) * 0.62), tuple(np.minimum(np.array(color) * 1.12, 1))
     for top, bottom in ((24, 150), (172, 236), (258, 376)):
         for left, right in ((22, 82), (98, 158)):
-            cv2.rectangle(image, (left, top), (right, bottom), tuple(np.array(color) * 0.62), 3)
-            cv2.rectangle(image, (left + 5, top + 5), (right - 5, bottom - 5), tuple(np.minimum(np.array(color) * 1.12, 1)), 2)
+            cv2.rectangle(image, (left, top), (right, bottom), dark, 3)
+            cv2.rectangle(image, (left + 5, top + 5), (right - 5, bottom - 5), light, 2)
     return make.finish(image, None)
 
 

@@ -24,8 +24,8 @@ _BOX_EDGES = np.array([(i, j) for i in range(8) for j in range(i + 1, 8) if bin(
 
 @dataclass(frozen=True)
 class RayImages:
-    """Of one view: colour uint8 [H, W, 3]; depth float32 [H, W], metres along the optical axis, 0 = nothing; mask uint16
-    [H, W]."""
+    """One view: colour uint8 [H, W, 3]; depth float32 [H, W], metres along the optical axis, 0 = nothing; mask
+    uint16 [H, W]."""
 
     color: np.ndarray
     depth: np.ndarray
@@ -50,7 +50,9 @@ class RayCaster:
         """Per face: material, texture coordinates as an affine map of (u, v), and metres per texel."""
         numbers: dict[int, int] = {}
         self._first_face = np.cumsum([0] + [FACES[shape.kind] for shape in self._shapes])[:-1]
-        material, affine, texel = [], [], []
+        material: list[int] = []
+        affine: list[tuple[float, ...]] = []
+        texel: list[float] = []
         for shape in self._shapes:
             offset = rng.uniform(0, 1, 2)
             for face, (width, height) in enumerate(face_sizes(shape)):

@@ -26,6 +26,7 @@ def furnished_room(seed: int = 0) -> Scene:
     _desk_corner(b, m, rng)
     _south_side(b, m, rng)
     scene = b.scene
+    scene.bounds = ((0.0, 0.0, 0.0), (WIDTH, DEPTH, HEIGHT))
     scene.walk = ((3.15, 1.75, 1.45), (0.75, 0.55))
     scene.interest = np.array(
         [(1.9, 3.3, 0.75), (0.4, 2.4, 0.85), (0.9, 0.8, 0.7), (2.4, 0.2, 0.8), (4.9, 1.6, 0.85), (4.2, 4.0, 0.95)]

@@ -24,8 +24,8 @@ class Kind(IntEnum):
     ELLIPSOID = 1
     """Radii `half`. One face: longitude, latitude."""
     FRUSTUM = 2
-    """Around z, half height half[2], radius half[0] at the bottom and `top` times that at the top. Faces: side, upper cap,
-    lower cap."""
+    """Around z, half height half[2], radius half[0] at the bottom and `top` times that at the top. Faces: side, upper
+    cap, lower cap."""
 
 
 FACES = {Kind.BOX: 6, Kind.ELLIPSOID: 1, Kind.FRUSTUM: 3}
@@ -59,17 +59,21 @@ class Shape:
         radius = max(1.0, self.top) if self.kind == Kind.FRUSTUM else 1.0
         return np.array([self.half[0] * radius, self.half[1] * radius, self.half[2]])
 
+    def radius(self) -> float:
+        """Radius of the bounding sphere around the origin of the shape's axes."""
+        return float(np.linalg.norm(self.bounds()))
+
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance [n] of world points [n, 3] to the bounding box of the shape; 0 inside."""
         R, t = self.T_world_shape[:3, :3], self.T_world_shape[:3, 3]
         outside = np.maximum(np.abs((points - t) @ R) - self.bounds(), 0)
-        return np.linalg.norm(outside, axis=1)
+        return np.sqrt(np.einsum("nk,nk->n", outside, outside))
 
 
 @dataclass(frozen=True)
 class Light:
-    """A small area that shines: `points` [n, 3] on it, colour times intensity [3] at 1 m, and the direction it faces (None:
-    all directions)."""
+    """A small area that shines: `points` [n, 3] on it, colour times intensity [3] at 1 m, and the direction it faces
+    (None: all directions)."""
 
     points: np.ndarray
     power: Vector
@@ -85,6 +89,7 @@ class Scene:
         lights: area lights.
         instance_names: mask id -> name, from 1.
         ambient_up, ambient_down: colour of the light that comes from above and from below.
+        bounds: lowest and highest corner of the inhabited space; what lies outside is never seen and gets no light.
         walk: centre (x, y, z) and radii (x, y) of an ellipse with free space around it, for the camera.
         interest: points [n, 3] worth looking at; the first is where a recording begins.
     """
@@ -94,6 +99,7 @@ class Scene:
     instance_names: dict[int, str] = field(default_factory=dict)
     ambient_up: Vector = (0.40, 0.40, 0.40)
     ambient_down: Vector = (0.24, 0.20, 0.16)
+    bounds: tuple[Vector, Vector] = ((-1e6, -1e6, -1e6), (1e6, 1e6, 1e6))
     walk: tuple[Vector, tuple[float, float]] = ((0.0, 0.0, 1.4), (0.5, 0.5))
     interest: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
 
@@ -144,15 +150,13 @@ class Placer:
         self, centre: Vector, radii: Vector, material: Material, angles: Vector = (0.0, 0.0, 0.0), shadow: bool = True
     ) -> None:
         """An ellipsoid (a ball for equal radii)."""
-        self._add(
-            Shape(Kind.ELLIPSOID, radii, _placed(centre, angles), material, self.identifier, casts_shadow=shadow)
-        )
+        self._add(Shape(Kind.ELLIPSOID, radii, _placed(centre, angles), material, self.identifier, casts_shadow=shadow))
 
     def cylinder(
         self, centre: Vector, radius: float, height: float, material: Material, angles: Vector = (0.0, 0.0, 0.0),
         top: float = 1.0, cap: Material | None = None, shadow: bool = True,
     ) -> None:  # fmt: skip
-        """A cylinder about z, or a truncated cone whose upper radius is `top` times `radius`; `cap` is the upper cap's."""
+        """A cylinder about z, or a truncated cone of upper radius `top` times `radius`; `cap` is for the upper cap."""
         faces = {1: cap} if cap is not None else {}
         half = (radius, radius, height / 2)
         pose = _placed(centre, angles)

@@ -93,7 +93,7 @@ def locate(
         half, top: float32 [n, 3], [n], of each point's shape.
 
     Returns:
-        face int [n]; u, v float32 [n] in [0, 1], v downwards on upright faces; normal float32 [n, 3], not of unit length.
+        face int [n]; u, v float32 [n] in [0, 1], v downwards on upright faces; normal float32 [n, 3] of any length.
     """
     q = points / half
     if kind == Kind.BOX:

@@ -64,7 +64,9 @@ def write_synthetic_sequence(
     """
     target = Path(folder)
     if width < 16 or height < 16 or not frame_rate > 0:
-        raise SequenceError(f"expected at least 16x16 pixels and a positive frame rate, found {width}x{height}, {frame_rate}")
+        raise SequenceError(
+            f"expected at least 16x16 pixels and a positive frame rate, found {width}x{height} and {frame_rate}"
+        )
     _check_target(target, overwrite)
     scene = furnished_room(seed) if scene is None else scene
     poses = camera_path(scene, frames, trajectory, seed)
@@ -99,8 +101,8 @@ def _check_target(target: Path, overwrite: bool) -> None:
     description = target / "camera.yaml"
     generated = description.is_file() and "generator:" in description.read_text(encoding="utf-8", errors="replace")
     if not (overwrite and generated):
-        hint = "; it is a generated recording: ask for overwriting" if generated else ", and not with a generated recording"
-        raise SequenceError(f"{target}: folder is not empty{hint}")
+        hint = "ask for overwriting" if generated else "and holds no generated recording"
+        raise SequenceError(f"{target}: folder is not empty: {hint}")
 
 
 def _write_images(
