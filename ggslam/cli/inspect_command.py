@@ -3,10 +3,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import typer
 
 from ggslam.cli import options
 from ggslam.cli.console import console
+
+if TYPE_CHECKING:
+    from ggslam.scene.camera import Camera
+    from ggslam.sequences.inspection import SequenceReport
 
 EPILOG = "[bold]Example[/]  ggslam inspect data/rgbd_dataset_freiburg3_cabinet"
 
@@ -29,7 +35,36 @@ def inspect(
         sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale
     )
     report = inspect_sequence(recording, samples=samples)
-    for name, value in report.lines():
-        console.print(f"[bold]{name:<14}[/] {value}", highlight=False)
+    for name, value in _lines(report):
+        console.print(f"[bold]{name:<13}[/] {value}", highlight=False)
+    for reason in report.damaged:
+        console.print(f"[red]damaged:[/] {reason}", highlight=False)
     for warning in report.warnings:
         console.print(f"[yellow]warning:[/] {warning}", highlight=False)
+
+
+def _camera(c: Camera) -> str:
+    return f"{c.width}x{c.height}, fx {c.fx:.2f} fy {c.fy:.2f} cx {c.cx:.2f} cy {c.cy:.2f}"
+
+
+def _lines(r: SequenceReport) -> list[tuple[str, str]]:
+    lines = [
+        ("recording", f"{r.name} ({r.format})"),
+        ("frames", f"{r.frames}, {r.duration_s:.1f} s at {r.rate_hz:.1f} Hz ({r.time_source})"),
+        ("camera", _camera(r.camera)),
+        ("depth", f"{r.depth_m[0]:.2f} to {r.depth_m[2]:.2f} m, median {r.depth_m[1]:.2f} m; {r.valid_share:.0%} of pixels"
+                  f"; {r.depth_scale:g} units a metre"),
+        ("poses", f"{r.posed_frames} frames ({r.pose_source})" if r.posed_frames else "none"),
+    ]  # fmt: skip
+    if r.native_camera != r.camera:
+        lines.insert(3, ("stored as", _camera(r.native_camera)))
+    if r.motion is not None:
+        step, turn = r.motion.step_m, r.motion.turn_deg
+        lines.append(("motion", f"path {r.motion.path_m:.2f} m; a frame: {step[0] * 100:.1f} cm and {turn[0]:.1f} deg "
+                                f"(median), {step[2] * 100:.1f} cm and {turn[2]:.1f} deg (most)"))  # fmt: skip
+    if r.pose_depth_error is not None:
+        lines.append(("consistency", f"depth agrees with the poses to {r.pose_depth_error:.1%}"))
+    if r.masked_frames:
+        masks = f"{len(r.mask_ids)} ids, {r.named_ids} named, {r.labelled_share:.0%} of pixels"
+        lines.append(("masks", f"in {r.masked_frames:.0%} of the frames looked at: {masks}"))
+    return lines

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 
 import typer
 from rich.console import Console
@@ -35,7 +36,7 @@ def _options(
     pass
 
 
-_COMMANDS = {
+_COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "run": (run_command.run, run_command.EPILOG), "eval": (eval_command.evaluate, eval_command.EPILOG),
     "render": (render_command.render, render_command.EPILOG), "export": (export_command.export, export_command.EPILOG),
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),

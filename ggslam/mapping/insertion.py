@@ -143,7 +143,7 @@ def fill_gaussians(
     smooth = cv2.blur(color, (stride, stride)).reshape(-1, 3)[pixels]
     return NewGaussians(
         means=positions @ R.T + t,
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (len(pixels), 1)),
+        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (len(pixels), 1)),
         log_scales=np.repeat(np.log(sigma)[:, None], 3, 1).astype(np.float32),
         rgb=smooth.astype(np.float32) / 255,
         pixels=pixels,

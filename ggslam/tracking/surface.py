@@ -41,12 +41,15 @@ class MeasuredSurface:
         R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
         sigma = SPACING * points.points[:, 2]
         log_scales = np.log(sigma)[:, None] + np.log([1.0, 1.0, FLATNESS])
-        arrays = (
-            points.points @ R.T + t, quaternions_from_normals(points.normals @ R.T), log_scales,
-            np.full(len(points), _OPACITY_LOGIT),
+
+        def contiguous(array: np.ndarray) -> np.ndarray:
+            return np.ascontiguousarray(array, np.float32)
+
+        self.target = GicpTarget.from_arrays(
+            contiguous(points.points @ R.T + t), contiguous(quaternions_from_normals(points.normals @ R.T)),
+            contiguous(log_scales), np.full(len(points), _OPACITY_LOGIT, np.float32),
+            self._settings, self._context, base=self.target,
         )  # fmt: skip
-        contiguous = [np.ascontiguousarray(array, np.float32) for array in arrays]
-        self.target = GicpTarget.from_arrays(*contiguous, self._settings, self._context, base=self.target)
         return self.target
 
 
