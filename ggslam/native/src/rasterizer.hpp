@@ -12,9 +12,8 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
-#include <cstdlib>
-#include <new>
 
+#include "buffer.hpp"
 #include "context.hpp"
 
 namespace ggslam {
@@ -101,33 +100,6 @@ static_assert(sizeof(Splat) == 64, "a splat fills one cache line");
 struct TileEntry {
   std::uint32_t depth_bits;  // the float's bits: ordered like the depth, which is positive
   std::uint32_t splat;
-};
-
-// Memory that grows and is never shrunk; contents are lost when it grows.
-template <class T>
-class Buffer {
- public:
-  Buffer() = default;
-  Buffer(const Buffer&) = delete;
-  Buffer& operator=(const Buffer&) = delete;
-  ~Buffer() { std::free(data_); }
-  void reserve(std::size_t size) {
-    if (size <= capacity_) return;
-    std::free(data_);
-    capacity_ = size + size / 4 + 64;
-    const std::size_t bytes = (capacity_ * sizeof(T) + 63) & ~std::size_t{63};
-    data_ = static_cast<T*>(std::aligned_alloc(64, bytes));
-    if (data_ == nullptr) {
-      capacity_ = 0;
-      throw std::bad_alloc();
-    }
-  }
-  T* data() const { return data_; }
-  T& operator[](std::size_t i) const { return data_[i]; }
-
- private:
-  T* data_ = nullptr;
-  std::size_t capacity_ = 0;
 };
 
 struct ThreadScratch {

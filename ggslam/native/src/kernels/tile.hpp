@@ -153,10 +153,25 @@ static inline Float load_sub_block(const float* plane, const View& view, int x0,
 
 static inline bool outside(const View& view, int x0, int y0) { return x0 >= view.width || y0 >= view.height; }
 
+static inline const float* feature_row(const GaussianArrays& arrays, std::int32_t gaussian) {
+  return arrays.features + static_cast<std::size_t>(gaussian) * arrays.feature_channels;
+}
+
+// Always inline: GCC takes a function that only prefetches for one without effect and drops its calls.
+#define GGSLAM_PREFETCHING static inline __attribute__((always_inline)) void
+
+GGSLAM_PREFETCHING prefetch_features(const GaussianArrays& arrays, std::int32_t gaussian) {
+  const float* row = feature_row(arrays, gaussian);
+  for (int q = 0; q < arrays.feature_channels; q += 16) __builtin_prefetch(row + q);
+  __builtin_prefetch(row + arrays.feature_channels - 1);  // a row may straddle one line more
+}
+
 // Copies the features of one Gaussian, padded with zeros to a multiple of 4.
 static inline void copy_features(const GaussianArrays& arrays, std::int32_t gaussian, int padded, float* out) {
-  const float* in = arrays.features + static_cast<std::size_t>(gaussian) * arrays.feature_channels;
-  for (int q = 0; q < padded; ++q) out[q] = q < arrays.feature_channels ? in[q] : 0.0f;
+  const float* in = feature_row(arrays, gaussian);
+  int q = 0;
+  for (; q + 4 <= arrays.feature_channels; q += 4) __builtin_memcpy(out + q, in + q, 4 * sizeof(float));
+  for (; q < padded; ++q) out[q] = q < arrays.feature_channels ? in[q] : 0.0f;
 }
 
 // Feature channels are handled in groups of as many as registers hold.

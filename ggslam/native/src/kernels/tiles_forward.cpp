@@ -34,16 +34,8 @@ struct WeightList {
   int size;
 };
 
-void prefetch(const Rasterizer& r, std::uint32_t entry) {
-  const Splat* splat = r.splats.data() + r.entries[entry].splat;
-  __builtin_prefetch(splat);
-}
-
-// The splat's own line must have arrived before its features can be asked for, hence the second, shorter distance.
-void prefetch_features(const Rasterizer& r, std::uint32_t entry) {
-  const std::int32_t gaussian = r.splats[r.entries[entry].splat].gaussian;
-  const float* row = r.gaussians.features + static_cast<std::size_t>(gaussian) * r.gaussians.feature_channels;
-  for (int q = 0; q < r.gaussians.feature_channels; q += 16) __builtin_prefetch(row + q);
+GGSLAM_PREFETCHING prefetch_splat(const Rasterizer& r, std::uint32_t entry) {
+  __builtin_prefetch(r.splats.data() + r.entries[entry].splat);
 }
 
 void load_chunk(const Rasterizer& r, const Tile& tile, std::uint32_t begin, int n, std::uint32_t alive,
@@ -51,11 +43,13 @@ void load_chunk(const Rasterizer& r, const Tile& tile, std::uint32_t begin, int 
   alignas(64) std::uint16_t masks[kChunk] = {};
   chunk.first = static_cast<std::int32_t>(begin - tile.begin);
   for (int k = 0; k < n; ++k) {
-    if (begin + k + 16 < tile.end) prefetch(r, begin + k + 16);
+    if (begin + k + 16 < tile.end) prefetch_splat(r, begin + k + 16);
     const Splat& splat = chunk.splats[k] = r.splats[r.entries[begin + k].splat];
     masks[k] = static_cast<std::uint16_t>(covered_sub_blocks(splat, tile) & alive);
     if (r.padded_features > 0) {
-      if (begin + k + 8 < tile.end) prefetch_features(r, begin + k + 8);
+      // The splat's own line must have arrived before its features can be asked for: a shorter distance.
+      if (begin + k + 8 < tile.end)
+        prefetch_features(r.gaussians, r.splats[r.entries[begin + k + 8].splat].gaussian);
       copy_features(r.gaussians, splat.gaussian, r.padded_features,
                     scratch.gaussian_features.data() + k * r.padded_features);
     }
@@ -134,7 +128,7 @@ void composite_tile(Rasterizer& r, const Tile& tile, TileState& state, ThreadScr
   Chunk chunk;
   WeightList list;
   const int channels = r.padded_features;
-  for (std::uint32_t e = tile.begin; e < tile.end && e < tile.begin + 16; ++e) prefetch(r, e);
+  for (std::uint32_t e = tile.begin; e < tile.end && e < tile.begin + 16; ++e) prefetch_splat(r, e);
   std::uint32_t begin = tile.begin;
   for (; begin < tile.end && state.alive != 0; begin += kChunk) {
     const int n = static_cast<int>(tile.end - begin < kChunk ? tile.end - begin : kChunk);
