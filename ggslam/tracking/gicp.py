@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from ggslam.native.loader import NativeContext
 from ggslam.scene.gaussian_map import GaussianMap
@@ -59,15 +60,15 @@ class GicpTarget:
                 to the side the surface was seen from. Without them the third axis of a disc is taken to point there.
             voxel: edge of a fine voxel in metres instead of the settings'.
         """
-        def array(tensor: object) -> np.ndarray:
-            return np.ascontiguousarray(tensor.detach().cpu().numpy())  # type: ignore[attr-defined]
 
-        arrays = [
-            array(getattr(gaussians, name)).astype(np.float32, copy=False)
-            for name in ("means", "quaternions", "log_scales", "opacity_logits")
-        ]
-        birth = array(gaussians.birth_keyframe)
-        return cls.from_arrays(*arrays, settings, context, birth, camera_positions, voxel)
+        def array(tensor: torch.Tensor) -> np.ndarray:
+            return np.ascontiguousarray(tensor.detach().cpu().numpy())
+
+        return cls.from_arrays(
+            array(gaussians.means), array(gaussians.quaternions), array(gaussians.log_scales),
+            array(gaussians.opacity_logits), settings, context, array(gaussians.birth_keyframe), camera_positions,
+            voxel,
+        )  # fmt: skip
 
     @classmethod
     def from_arrays(

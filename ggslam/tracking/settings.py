@@ -98,6 +98,24 @@ class AlignSettings:
 
 
 @dataclass(frozen=True)
+class RecoverySettings:
+    """What happens when constant velocity does not lead to the pose."""
+
+    convincing_overlap: float = 0.6
+    """Under this overlap other starts are tried, too."""
+    min_overlap: float = 0.25
+    """Under this overlap from every start the frame is lost."""
+    views: int = 2
+    """Located frames whose features are matched, the latest first."""
+    features: int = 1000
+    max_hamming: int = 64
+    """ORB features and the largest distance of a match."""
+    reprojection: float = 2.0
+    """RANSAC's inlier distance in pixels of a 320-pixel-wide image."""
+    min_inliers: int = 12
+
+
+@dataclass(frozen=True)
 class TrackerSettings:
     """Everything the tracker needs to know."""
 
@@ -105,3 +123,4 @@ class TrackerSettings:
     points: PointSettings = field(default_factory=PointSettings)
     target: TargetSettings = field(default_factory=TargetSettings)
     align: AlignSettings = field(default_factory=AlignSettings)
+    recovery: RecoverySettings = field(default_factory=RecoverySettings)

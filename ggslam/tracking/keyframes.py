@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When a frame becomes a keyframe."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ggslam.scene.poses import inverse, so3_log
+
+
+class Tracked(Protocol):
+    """What the policy wants to know of a tracked frame (`tracker.TrackingResult` has it)."""
+
+    @property
+    def T_world_camera(self) -> np.ndarray:
+        """Float64 [4, 4]."""
+
+    @property
+    def overlap(self) -> float:
+        """Share of the frame's points that match the target."""
+
+    @property
+    def median_depth_m(self) -> float:
+        """Of the frame's points, metres."""
+
+
+class KeyframeKind(enum.Enum):
+    """Why a frame is a keyframe."""
+
+    FIRST = "first"
+    TRACKING = "tracking"
+    """The target no longer covers the frame: the tracker needs its points."""
+    MAPPING = "mapping"
+    """Enough frames or motion since the last keyframe: the mapper wants the view."""
+
+
+@dataclass(frozen=True)
+class KeyframeSettings:
+    """Limits. What counts as overlap already scales with depth noise (`AlignSettings.overlap_*`), motion with depth."""
+
+    min_overlap: float = 0.8
+    """A tracking keyframe is made when less of the frame than this matches the target."""
+    min_gap: int = 2
+    """Tracking keyframes come at least this many frames after the last keyframe unless overlap falls under 3/4 of the
+    limit: where part of every frame matches nothing (clutter at the depth camera's edge), each frame would be one."""
+    max_gap: int = 5
+    """A mapping keyframe is made after this many frames without a keyframe."""
+    max_translation: float = 0.1
+    """A mapping keyframe is made after a motion of this many times the median depth."""
+    max_rotation_deg: float = 10.0
+    """Likewise, degrees."""
+
+
+class KeyframePolicy:
+    """Decides frame by frame; remembers the last keyframe.
+
+    Args:
+        settings: limits.
+    """
+
+    def __init__(self, settings: KeyframeSettings | None = None) -> None:
+        self.settings = settings or KeyframeSettings()
+        self.kind: KeyframeKind | None = None
+        """Of the last keyframe."""
+        self._frame_index = 0
+        self._T_world_camera = np.eye(4)
+
+    def decide(self, frame_index: int, tracked: Tracked) -> bool:
+        """Whether the frame becomes a keyframe; if so it is remembered as the last one and `kind` says why.
+
+        Frames that must not become keyframes (held out, lost) are not to be asked about.
+        """
+        kind = self._kind(frame_index, tracked)
+        if kind is None:
+            return False
+        self.kind, self._frame_index, self._T_world_camera = kind, frame_index, tracked.T_world_camera.copy()
+        return True
+
+    def _kind(self, frame_index: int, tracked: Tracked) -> KeyframeKind | None:
+        s = self.settings
+        if self.kind is None:
+            return KeyframeKind.FIRST
+        gap = frame_index - self._frame_index
+        if tracked.overlap < (s.min_overlap if gap >= s.min_gap else 0.75 * s.min_overlap):
+            return KeyframeKind.TRACKING
+        motion = inverse(self._T_world_camera) @ tracked.T_world_camera
+        translation = float(np.linalg.norm(motion[:3, 3]))
+        rotation = float(np.degrees(np.linalg.norm(so3_log(motion[:3, :3]))))
+        moved = translation > s.max_translation * max(tracked.median_depth_m, 1e-3) or rotation > s.max_rotation_deg
+        return KeyframeKind.MAPPING if gap >= s.max_gap or moved else None
