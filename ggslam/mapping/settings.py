@@ -50,7 +50,7 @@ class LearningRates:
     sh_rest: float = 5e-4
     features: float = 1e-2
     beta1: float = 0.9
-    beta2: float = 0.98
+    beta2: float = 0.99
     epsilon: float = 1e-15
     young_factor: float = 3.0
     """A Gaussian's first step is this much longer..."""
@@ -73,9 +73,9 @@ class PoseRefinementSettings:
     """Refinement of keyframe poses through the renderer's pose gradient (Adam on the twist)."""
 
     enabled: bool = False
-    translation_rate: float = 2e-4
+    translation_rate: float = 4e-4
     """Metres a step."""
-    rotation_rate: float = 2e-4
+    rotation_rate: float = 4e-4
     """Radians a step."""
 
 
