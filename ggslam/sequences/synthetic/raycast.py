@@ -12,7 +12,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.sequences.synthetic.lighting import bake
 from ggslam.sequences.synthetic.materials import Material
-from ggslam.sequences.synthetic.scene import FACES, Kind, Scene, Shape
+from ggslam.sequences.synthetic.scene import FACES, Kind, Scene
 from ggslam.sequences.synthetic.surfaces import face_sizes, intersect, locate
 
 _NEAR = 0.02
@@ -41,6 +41,8 @@ class RayCaster:
         self._kinds = np.array([int(shape.kind) for shape in scene.shapes])
         self._half = np.array([shape.half for shape in scene.shapes], np.float32)
         self._top = np.array([shape.top for shape in scene.shapes], np.float32)
+        self._bounds = np.array([shape.bounds() for shape in scene.shapes])
+        self._T_shape_world = inverse(np.array([shape.T_world_shape for shape in scene.shapes]))
         self._instances = np.array([0] + [shape.instance for shape in scene.shapes], np.uint16)
         self._materials: list[Material] = []
         self._pyramids: list[list[np.ndarray]] = []
@@ -79,30 +81,31 @@ class RayCaster:
         """One view. `T_world_camera` [4, 4]."""
         u = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
         v = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
-        depth, hit = self._trace(u, v, T_world_camera)
+        T_shape_camera = self._T_shape_world @ T_world_camera
+        depth, hit = self._trace(u, v, T_shape_camera)
         fine = camera.resized(2 * camera.width, 2 * camera.height)
         u = ((np.arange(fine.width) - fine.cx) / fine.fx).astype(np.float32)
         v = ((np.arange(fine.height) - fine.cy) / fine.fy).astype(np.float32)
-        light = self._shade(u, v, *self._trace(u, v, T_world_camera), T_world_camera, 1 / fine.fx)
+        light = self._shade(u, v, *self._trace(u, v, T_shape_camera), T_shape_camera, 1 / fine.fx)
         light = cv2.resize(light, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         color = (1 - np.exp(-_EXPOSURE * light)) ** (1 / 2.2)
         return RayImages(
             np.rint(255 * color).astype(np.uint8), np.where(hit >= 0, depth, np.float32(0)), self._instances[hit + 1]
         )
 
-    def _trace(self, u: np.ndarray, v: np.ndarray, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _trace(self, u: np.ndarray, v: np.ndarray, T_shape_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Depth float32 [H, W] and number of the nearest shape int16 [H, W] (-1: none) on the rays (u, v, 1)."""
         depth = np.full((len(v), len(u)), np.inf, np.float32)
         hit = np.full((len(v), len(u)), -1, np.int16)
-        for number, shape in enumerate(self._shapes):
-            T_shape_camera = inverse(shape.T_world_shape) @ T_world_camera
-            window = _outline(shape, T_shape_camera, u, v)
-            if window is None:
-                continue
-            R, o = T_shape_camera[:3, :3].astype(np.float32), T_shape_camera[:3, 3].astype(np.float32)
+        boxes = _outlines(self._bounds, T_shape_camera)
+        columns = np.searchsorted(u, boxes[:, (0, 2)])
+        rows = np.searchsorted(v, boxes[:, (1, 3)])
+        for number in np.nonzero((columns[:, 0] < columns[:, 1]) & (rows[:, 0] < rows[:, 1]))[0]:
+            window = (slice(*rows[number]), slice(*columns[number]))
+            R, o = (part.astype(np.float32) for part in np.split(T_shape_camera[number, :3], [3], 1))
             across, down = u[window[1]][None, :], v[window[0]][:, None]
-            direction = tuple(R[k, 0] * across + (R[k, 1] * down + R[k, 2]) for k in range(3))
-            t = intersect(shape, tuple(o), direction)
+            direction = [R[k, 0] * across + (R[k, 1] * down + R[k, 2]) for k in range(3)]
+            t = intersect(self._shapes[number], (o[0], o[1], o[2]), (direction[0], direction[1], direction[2]))
             nearest = depth[window]
             closer = t < nearest
             np.copyto(nearest, t, where=closer)
@@ -110,12 +113,12 @@ class RayCaster:
         return depth, hit
 
     def _shade(
-        self, u: np.ndarray, v: np.ndarray, depth: np.ndarray, hit: np.ndarray, T_world_camera: np.ndarray, angle: float
+        self, u: np.ndarray, v: np.ndarray, depth: np.ndarray, hit: np.ndarray, T_shape_camera: np.ndarray, angle: float
     ) -> np.ndarray:
         """Linear light float32 [H, W, 3] that comes back along the rays; `angle` is the angle between them."""
         light = np.zeros((depth.size, 3), np.float32)
         flat_hit, flat_depth = hit.ravel().astype(np.int64), depth.ravel()
-        T = np.stack([inverse(shape.T_world_shape) @ T_world_camera for shape in self._shapes]).astype(np.float32)
+        T = T_shape_camera.astype(np.float32)
         kind_of_pixel = np.append(self._kinds, -1)[flat_hit]
         for kind in Kind:
             pixels = np.nonzero(kind_of_pixel == kind)[0]
@@ -172,24 +175,25 @@ def _sample(image: np.ndarray, x: np.ndarray, y: np.ndarray, border: int) -> np.
     return cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=border).reshape(-1, 3)[:count]
 
 
-def _outline(shape: Shape, T_shape_camera: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[slice, slice] | None:
-    """Rows and columns of the rays that can meet a shape, None when none can."""
-    R, o = T_shape_camera[:3, :3], T_shape_camera[:3, 3]
-    corners = (_BOX_CORNERS * shape.bounds() - o) @ R  # in the camera frame
-    front = corners[:, 2] > _NEAR
-    if not front.any():
-        return None
-    points = corners[front]
-    if not front.all():
-        first, second = corners[_BOX_EDGES[:, 0]], corners[_BOX_EDGES[:, 1]]
-        crossing = (first[:, 2] > _NEAR) != (second[:, 2] > _NEAR)
-        first, second = first[crossing], second[crossing]
-        share = (_NEAR - first[:, 2:]) / (second[:, 2:] - first[:, 2:])
-        points = np.concatenate([points, first + share * (second - first)])
-    projected = points[:, :2] / points[:, 2:]
-    low, high = projected.min(0) - 1e-4, projected.max(0) + 1e-4
-    left, right = np.searchsorted(u, [low[0], high[0]])
-    top, bottom = np.searchsorted(v, [low[1], high[1]])
-    if left >= right or top >= bottom:
-        return None
-    return slice(top, bottom), slice(left, right)
+def _outlines(bounds: np.ndarray, T_shape_camera: np.ndarray) -> np.ndarray:
+    """Rectangles around the images of bounding boxes: left, top, right, bottom [n, 4] in units of x/z and y/z (left >
+    right for boxes behind the camera).
+
+    Args:
+        bounds: half extents [n, 3]; T_shape_camera: [n, 4, 4].
+    """
+    R, o = T_shape_camera[:, :3, :3], T_shape_camera[:, None, :3, 3]
+    corners = (_BOX_CORNERS * bounds[:, None] - o) @ R  # in the camera frame, [n, 8, 3]
+    first, second = corners[:, _BOX_EDGES[:, 0]], corners[:, _BOX_EDGES[:, 1]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Where edges cross the near plane, the points on it bound the image.
+        share = (_NEAR - first[..., 2:]) / (second[..., 2:] - first[..., 2:])
+        cuts = first + share * (second - first)
+        points = np.concatenate([corners, cuts], 1)
+        projected = points[..., :2] / points[..., 2:]
+    front = corners[..., 2] > _NEAR
+    crossing = front[:, _BOX_EDGES[:, 0]] != front[:, _BOX_EDGES[:, 1]]
+    used = np.concatenate([front, crossing], 1)[..., None]
+    low = np.where(used, projected, np.inf).min(1) - 1e-4
+    high = np.where(used, projected, -np.inf).max(1) + 1e-4
+    return np.concatenate([low, high], 1)
