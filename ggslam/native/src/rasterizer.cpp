@@ -26,7 +26,7 @@ void prepare(Rasterizer& r, const GaussianArrays& gaussians, const View& view) {
 
   const std::size_t tiles = r.tiles(), pixels = tiles * kTileWidth * r.tile_height;
   r.splats.reserve(static_cast<std::size_t>(r.blocks) * r.block_size);
-  r.tile_cursor.reserve(r.blocks * tiles);
+  r.tile_cursor.reserve(r.blocks * (tiles + 1));
   r.tile_start.reserve(tiles + 1);
   r.transmittance.reserve(pixels);
   r.last_entry.reserve(pixels);
@@ -52,7 +52,7 @@ bool allot_pairs(Rasterizer& r) {
   for (int tile = 0; tile < tiles; ++tile) {
     r.tile_start[tile] = next;
     for (int b = 0; b < r.blocks; ++b) {
-      std::uint32_t& cursor = r.tile_cursor[static_cast<std::size_t>(b) * tiles + tile];
+      std::uint32_t& cursor = r.cursors(b)[tile];
       const std::uint32_t here = cursor;
       cursor = next;
       next += here;
@@ -61,7 +61,7 @@ bool allot_pairs(Rasterizer& r) {
   }
   r.tile_start[tiles] = next;
   for (int t = 0; t < r.context.pool.size(); ++t) r.scratch[t].sorting.reserve(longest);
-  r.entries.reserve(r.pair_count);
+  r.entries.reserve(r.pair_count + kMaxBlocks);
   r.contributed.reserve(r.pair_count + kChunk);  // written in whole chunks
   return true;
 }

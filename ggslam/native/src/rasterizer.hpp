@@ -126,9 +126,9 @@ struct Rasterizer {
   std::uint64_t pairs[kMaxBlocks];    // number of (splat, tile) pairs per block; then of all blocks before it
   std::uint64_t pair_count = 0;
 
-  Buffer<std::uint32_t> tile_cursor;  // [blocks][tiles]: counts, then where the block's next entry goes
+  Buffer<std::uint32_t> tile_cursor;  // [blocks][tiles + 1]: counts, then where the block's next entry goes; one spare
   Buffer<std::uint32_t> tile_start;   // [tiles + 1]
-  Buffer<TileEntry> entries;          // [pairs], tile by tile; sorted by depth by forward_tile
+  Buffer<TileEntry> entries;          // [pairs], tile by tile; sorted by depth by forward_tile; one spare per block
   Buffer<std::uint16_t> contributed;  // [pairs] in the order of entries: sub-blocks to which the splat contributed
   Buffer<float> transmittance;        // [tiles][sub-blocks][lanes], after the last Gaussian
   Buffer<std::int32_t> last_entry;    // [tiles][sub-blocks][lanes]: number in the tile's list of the last contribution
@@ -139,6 +139,9 @@ struct Rasterizer {
   Buffer<double> block_twist;         // [blocks][6]
 
   int tiles() const { return tiles_x * tiles_y; }
+  std::uint32_t* cursors(int block) const {
+    return tile_cursor.data() + static_cast<std::size_t>(block) * static_cast<std::size_t>(tiles() + 1);
+  }
   std::int64_t block_begin(int b) const { return b * block_size; }
   std::int64_t block_end(int b) const {
     const std::int64_t end = (b + 1) * block_size;

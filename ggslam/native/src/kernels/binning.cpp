@@ -1,12 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 // Writes each splat into the lists of the tiles it covers. Lists start in the order of the Gaussians; forward_tile
 // sorts them by depth.
-#include "rasterizer.hpp"
+#include "tile_rectangle.hpp"
 
 namespace ggslam::GGSLAM_ISA {
 
 void scatter_block(Rasterizer& r, int block) {
-  std::uint32_t* cursor = r.tile_cursor.data() + static_cast<std::size_t>(block) * r.tiles();
+  std::uint32_t* cursors = r.cursors(block);
+  const int tiles_x = r.tiles_x, spare = r.tiles();
+  cursors[spare] = static_cast<std::uint32_t>(r.pair_count) + static_cast<std::uint32_t>(block);
   TileEntry* entries = r.entries.data();
   const std::uint32_t first = static_cast<std::uint32_t>(r.block_begin(block));
   std::uint32_t pair = static_cast<std::uint32_t>(r.pairs[block]);
@@ -17,10 +19,13 @@ void scatter_block(Rasterizer& r, int block) {
     TileEntry entry;
     __builtin_memcpy(&entry.depth_bits, &splat.depth, sizeof(float));
     entry.splat = first + i;
-    for (int y = 0; y < splat.tiles_high; ++y) {
-      std::uint32_t* row = cursor + (splat.tile_y + y) * r.tiles_x + splat.tile_x;
-      for (int x = 0; x < splat.tiles_wide; ++x) entries[row[x]++] = entry;
-    }
+    const TileRectangle tiles{splat.tile_x, splat.tile_y, splat.tiles_wide, splat.tiles_high};
+    visit_tiles(tiles, tiles_x, spare, [=](int tile, int exists) {
+      const std::uint32_t place = cursors[tile];
+      cursors[tile] = place + exists;
+      entries[place] = entry;
+      __builtin_prefetch(entries + place + 8, 1);  // hundreds of lists are written at once
+    });
   }
 }
 

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // From Gaussians to splats: project, drop what cannot be seen, count the tiles that each one covers.
 #include "projection_math.hpp"
+#include "tile_rectangle.hpp"
 #include "view_colour.hpp"
 
 namespace ggslam::GGSLAM_ISA {
@@ -59,8 +60,9 @@ int rasterizer_lanes() { return kLanes; }
 
 void project_block(Rasterizer& r, int block) {
   const ViewConstants c = view_constants(r.view);
-  std::uint32_t* counts = r.tile_cursor.data() + static_cast<std::size_t>(block) * r.tiles();
-  __builtin_memset(counts, 0, sizeof(*counts) * r.tiles());
+  std::uint32_t* counts = r.cursors(block);
+  __builtin_memset(counts, 0, sizeof(*counts) * (r.tiles() + 1));
+  const int tiles_x = r.tiles_x, spare = r.tiles();
   const std::int64_t begin = r.block_begin(block), end = r.block_end(block);
   Splat* splat = r.splats.data() + begin;
   std::uint64_t pairs = 0;
@@ -74,13 +76,13 @@ void project_block(Rasterizer& r, int block) {
       const int lane = __builtin_ctz(left);
       float* fields = &splat->mean_x;  // the twelve floats of a splat, in the order of SplatVectors::Field
       for (int k = 0; k < SplatVectors::kFields; ++k) fields[k] = v.fields[k][lane];
-      const int x0 = v.tile_x0[lane], x1 = v.tile_x1[lane], y0 = v.tile_y0[lane], y1 = v.tile_y1[lane];
+      const TileRectangle tiles{v.tile_x0[lane], v.tile_y0[lane], v.tile_x1[lane] - v.tile_x0[lane] + 1,
+                                v.tile_y1[lane] - v.tile_y0[lane] + 1};
       splat->gaussian = rows[lane];
-      splat->tile_x = static_cast<std::uint16_t>(x0), splat->tiles_wide = static_cast<std::uint16_t>(x1 - x0 + 1);
-      splat->tile_y = static_cast<std::uint16_t>(y0), splat->tiles_high = static_cast<std::uint16_t>(y1 - y0 + 1);
-      pairs += static_cast<std::uint64_t>(x1 - x0 + 1) * (y1 - y0 + 1);
-      for (int y = y0; y <= y1; ++y)
-        for (int x = x0; x <= x1; ++x) ++counts[y * r.tiles_x + x];
+      splat->tile_x = static_cast<std::uint16_t>(tiles.x), splat->tiles_wide = static_cast<std::uint16_t>(tiles.wide);
+      splat->tile_y = static_cast<std::uint16_t>(tiles.y), splat->tiles_high = static_cast<std::uint16_t>(tiles.high);
+      pairs += static_cast<std::uint64_t>(tiles.wide) * static_cast<std::uint64_t>(tiles.high);
+      visit_tiles(tiles, tiles_x, spare, [counts](int tile, int) { ++counts[tile]; });
       ++splat;
     }
   }
