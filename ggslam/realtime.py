@@ -13,11 +13,10 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 
-import numpy as np
-
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.slam import Slam, StepReport
+from ggslam.tracking.tracker import TrackingResult
 
 MAX_LAG_FRAMES = 3
 """A frame that is this many frame times late is dropped: a live camera would have overwritten it."""
@@ -34,7 +33,7 @@ class RealtimeSlam:
     def __init__(self, slam: Slam, frames_per_second: float) -> None:
         self.slam = slam
         self.period = 1.0 / frames_per_second
-        self._jobs: queue.Queue[tuple[Frame, np.ndarray] | None] = queue.Queue()
+        self._jobs: queue.Queue[tuple[Frame, TrackingResult] | None] = queue.Queue()
         self._mapper_error: BaseException | None = None
         # The kernels of one context take turns; the tracker must not wait for the mapper's.
         slam.tracker.context = NativeContext(slam.context.threads, slam.context.instruction_set)
@@ -82,8 +81,8 @@ class RealtimeSlam:
         tracking = slam.track(frame)
         is_keyframe = slam.wants_keyframe(frame, tracking)
         if is_keyframe:
-            slam.anchor_to(frame, tracking.T_world_camera)
-            self._jobs.put((frame, tracking.T_world_camera))
+            slam.anchor_to(tracking.T_world_camera)
+            self._jobs.put((frame, tracking))
         slam.remember(frame, tracking)
         slam.times.stop()
         return StepReport(slam.frames[-1], is_keyframe, slam.map.count, slam.mapper.last_psnr)
@@ -107,8 +106,6 @@ class RealtimeSlam:
             return True
         if job is None:
             return False
-        frame, T_world_camera = job
-        slam.mapper.add_keyframe(frame, T_world_camera)
-        slam.tracker.set_target(slam.make_target())
+        slam.insert(*job)
         self._jobs.task_done()
         return True

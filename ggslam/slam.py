@@ -25,8 +25,8 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
-from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.keyframes import KeyframePolicy
+from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
 
 
@@ -150,6 +150,7 @@ class Slam:
         self.context = NativeContext(self.config.threads or None)
         self.map = GaussianMap(sh_degree=self.config.sh_degree)
         self.tracker = Tracker(camera, self.config.tracking, self.context)
+        self.surface = MeasuredSurface(self.config.tracking.target, self.context)
         self.policy = KeyframePolicy(self.config.keyframes)
         self.mapper = Mapper(self.map, self.config.mapping, self.context, self.config.seed)
         self.frames: list[TrackedFrame] = []
@@ -170,15 +171,13 @@ class Slam:
         tracking = self.track(frame)
         is_keyframe = self.wants_keyframe(frame, tracking)
         if is_keyframe:
-            self.mapper.add_keyframe(frame, tracking.T_world_camera)
-            self.anchor_to(frame, tracking.T_world_camera)
+            self.anchor_to(tracking.T_world_camera)
+            self.insert(frame, tracking)
         self.remember(frame, tracking)
         if self.mapper.keyframes:
             first = len(self.frames) == 1
             settings = self.config.mapping
             self.mapper.run(settings.first_frame_iterations if first else settings.iterations_per_frame)
-        if is_keyframe:
-            self.tracker.set_target(self.make_target())
         self.times.stop()
         return StepReport(self.frames[-1], is_keyframe, self.map.count, self.mapper.last_psnr)
 
@@ -218,7 +217,12 @@ class Slam:
             return False
         return self.policy.decide(frame.index, tracking)
 
-    def anchor_to(self, frame: Frame, T_world_camera: np.ndarray) -> None:
+    def insert(self, frame: Frame, tracking: TrackingResult) -> None:
+        """A keyframe goes into the map and into what the tracker aligns to."""
+        self.mapper.add_keyframe(frame, tracking.T_world_camera)
+        self.tracker.set_target(self.surface.add(tracking.points, tracking.T_world_camera))
+
+    def anchor_to(self, T_world_camera: np.ndarray) -> None:
         """From now on poses are remembered relative to this keyframe."""
         self._anchor = Anchor(self._anchor.keyframe + 1, T_world_camera.copy())
 
@@ -231,7 +235,3 @@ class Slam:
                 tracking.overlap, tracking.rmse_m, tracking.status.value, tracking.reason,
             )
         )  # fmt: skip
-
-    def make_target(self) -> GicpTarget:
-        """What the tracker aligns to: a snapshot of the map's Gaussians."""
-        return GicpTarget.from_gaussians(self.map, self.config.tracking.target, self.context)

@@ -52,8 +52,8 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
         ("recording", f"{r.name} ({r.format})"),
         ("frames", f"{r.frames}, {r.duration_s:.1f} s at {r.rate_hz:.1f} Hz ({r.time_source})"),
         ("camera", _camera(r.camera)),
-        ("depth", f"{r.depth_m[0]:.2f} to {r.depth_m[2]:.2f} m, median {r.depth_m[1]:.2f} m; {r.valid_share:.0%} of pixels"
-                  f"; {r.depth_scale:g} units a metre"),
+        ("depth", f"{r.depth_m[0]:.2f} to {r.depth_m[2]:.2f} m, median {r.depth_m[1]:.2f} m; {r.valid_share:.0%} of "
+                  f"pixels; {r.depth_scale:g} units a metre"),
         ("poses", f"{r.posed_frames} frames ({r.pose_source})" if r.posed_frames else "none"),
     ]  # fmt: skip
     if r.native_camera != r.camera:

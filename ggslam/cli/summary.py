@@ -8,7 +8,7 @@ from typing import Any
 from ggslam.cli.console import console, table
 
 _IMAGE_COLUMNS = [
-    ("frames", "frames", 1.0, "d"), ("PSNR", "psnr", 1.0, ".2f"), ("PSNR all px", "psnr_unmasked", 1.0, ".2f"),
+    ("frames", "frames", 1.0, "d"), ("PSNR", "psnr", 1.0, ".2f"), ("PSNR unmasked", "psnr_unmasked", 1.0, ".2f"),
     ("SSIM", "ssim", 1.0, ".3f"), ("LPIPS", "lpips", 1.0, ".3f"), ("depth L1 cm", "depth_l1_m", 100.0, ".2f"),
 ]  # fmt: skip
 
@@ -23,8 +23,8 @@ def print_scores(metrics: dict[str, Any]) -> None:
         [name.replace("_", " "), *(_text(scores.get(key), factor, form) for _, key, factor, form in _IMAGE_COLUMNS)]
         for name, scores in metrics["images"].items()
     ]
-    columns = ["images (PSNR, SSIM over pixels with depth)", *(title for title, *_ in _IMAGE_COLUMNS)]
-    console.print(table("", columns, rows))
+    columns = ["scores", *(title for title, *_ in _IMAGE_COLUMNS)]
+    console.print(table("images; all but 'unmasked' over pixels with measured depth", columns, rows))
     console.print(_trajectory_line(metrics.get("trajectory")), highlight=False)
     console.print(_speed_line(metrics), highlight=False)
     for note in metrics.get("notes", []):
