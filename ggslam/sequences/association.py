@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ggslam.scene.poses import se3_exp, se3_log
+from ggslam.scene.poses import se3_exp, so3_log
 
 
 def associate(first: np.ndarray, second: np.ndarray, tolerance: float) -> list[tuple[int, int]]:
@@ -36,7 +36,7 @@ def associate(first: np.ndarray, second: np.ndarray, tolerance: float) -> list[t
 def poses_at(
     times: np.ndarray, pose_times: np.ndarray, poses: np.ndarray, largest_gap: float = 0.1, tolerance: float = 0.02
 ) -> np.ndarray:
-    """Poses at given times: interpolated on SE(3) between two measurements at most `largest_gap` seconds apart, else
+    """Poses at given times: interpolated between two measurements at most `largest_gap` seconds apart, else
     the nearest one within `tolerance` seconds, else NaN.
 
     Args:
@@ -58,10 +58,18 @@ def poses_at(
         before = after - 1
         if before >= 0 and after < len(stamps) and 0 < stamps[after] - stamps[before] <= largest_gap:
             share = (t - stamps[before]) / (stamps[after] - stamps[before])
-            step = np.linalg.inv(known[before]) @ known[after]
-            result[i] = known[before] @ se3_exp(share * se3_log(step))
+            result[i] = _between(known[before], known[after], share)
             continue
         nearest = min((k for k in (before, after) if 0 <= k < len(stamps)), key=lambda k: abs(stamps[k] - t))
         if abs(stamps[nearest] - t) <= tolerance:
             result[i] = known[nearest]
+    return result
+
+
+def _between(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
+    """Pose at a share of the way: position on the straight line, rotation about one axis."""
+    turn = so3_log(first[:3, :3].T @ second[:3, :3])
+    result = np.eye(4)
+    result[:3, :3] = first[:3, :3] @ se3_exp(np.concatenate([np.zeros(3), share * turn]))[:3, :3]
+    result[:3, 3] = (1 - share) * first[:3, 3] + share * second[:3, 3]
     return result

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -86,7 +87,7 @@ def inspect_sequence(sequence: Sequence, samples: int = 8) -> SequenceReport:
     if sequence.ground_truth is not None:
         report.posed_frames = int(np.isfinite(sequence.ground_truth).all((1, 2)).sum())
         report.motion = _motion(sequence.ground_truth)
-        report.pose_depth_error = _pose_depth_error(sequence, frames)
+        _check_poses(report, _neighbours(sequence, frames))
     _warn(report, intervals, frames)
     return report
 
@@ -134,9 +135,9 @@ def _motion(poses: np.ndarray) -> Motion | None:
     return Motion(summary(distance), summary(turn), float(distance.sum()))
 
 
-def _pose_depth_error(sequence: Sequence, frames: list[Frame]) -> float | None:
-    """Median relative depth difference of neighbouring frames; a wrong pose convention or depth scale shows here."""
-    errors = []
+def _neighbours(sequence: Sequence, frames: list[Frame]) -> list[tuple[Frame, Frame]]:
+    """Pairs of a frame and the next one where both have a true pose."""
+    pairs = []
     for frame in frames:
         if frame.T_world_camera is None or frame.index + 1 >= len(sequence):
             continue
@@ -145,17 +146,49 @@ def _pose_depth_error(sequence: Sequence, frames: list[Frame]) -> float | None:
         except SequenceError:
             continue
         if after.T_world_camera is not None:
-            errors.append(_relative_depth_error(frame, after))
+            pairs.append((frame, after))
+    return pairs
+
+
+_CONVENTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "world to camera": inverse,
+    "OpenGL camera axes (y up, z back)": lambda T: T @ np.diag([1.0, -1.0, -1.0, 1.0]),
+}
+"""Ways in which poses are often written; each function turns such a pose into ours."""
+
+
+def _check_poses(report: SequenceReport, pairs: list[tuple[Frame, Frame]]) -> None:
+    """Compares neighbouring depth images by the true poses, read as they should be and as they are often written."""
+    error = report.pose_depth_error = _pose_depth_error(pairs, lambda T: T)
+    if error is None:
+        return
+    for name, convert in _CONVENTIONS.items():
+        other = _pose_depth_error(pairs, convert)
+        if other is not None and other < 0.4 * error and error > 0.004:
+            report.warnings.append(
+                f"the true poses look like {name}: read so, neighbouring depth images agree to {other:.2%}, as "
+                f"camera to world with OpenCV axes only to {error:.2%}"
+            )
+            return
+    if error > 0.05:
+        report.warnings.append(
+            f"true poses and depth disagree by {error:.0%}: wrong depth scale or poses, or little seen twice"
+        )
+
+
+def _pose_depth_error(pairs: list[tuple[Frame, Frame]], convert: Callable[[np.ndarray], np.ndarray]) -> float | None:
+    """Median relative depth difference of neighbouring frames by converted poses; None when too little overlaps."""
+    errors = [_relative_depth_error(a, b, convert) for a, b in pairs]
     known = np.concatenate(errors) if errors else np.zeros(0)
     return float(np.median(known)) if len(known) >= 100 else None
 
 
-def _relative_depth_error(frame: Frame, other: Frame) -> np.ndarray:
+def _relative_depth_error(frame: Frame, other: Frame, convert: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """|seen - predicted| / predicted for pixels of `frame` (every 8th row and column) that fall into `other`."""
     assert frame.T_world_camera is not None and other.T_world_camera is not None
     points = frame.camera.back_project(frame.depth)[::8, ::8].reshape(-1, 3)
     points = points[points[:, 2] > 0]
-    T = inverse(other.T_world_camera) @ frame.T_world_camera
+    T = inverse(convert(other.T_world_camera)) @ convert(frame.T_world_camera)
     points = points @ T[:3, :3].T + T[:3, 3]
     points = points[points[:, 2] > 0.05]
     c = other.camera
@@ -179,11 +212,6 @@ def _warn(report: SequenceReport, intervals: np.ndarray, frames: list[Frame]) ->
         add(f"only {report.valid_share:.0%} of the pixels have depth")
     if len(intervals) and intervals.min() <= 0:
         add("timestamps do not increase from frame to frame")
-    if report.pose_depth_error is not None and report.pose_depth_error > 0.05:
-        add(
-            f"true poses and depth disagree by {report.pose_depth_error:.0%}: another pose convention (expected camera "
-            "to world, OpenCV axes), a wrong depth scale, or much of each view is hidden in the next"
-        )
     if report.motion is not None and (report.motion.step_m[1] > 0.2 or report.motion.turn_deg[1] > 15):
         add(
             f"large motion between frames (90th percentile {report.motion.step_m[1]:.2f} m, "

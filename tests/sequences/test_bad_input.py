@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Damaged and strange recordings: one clear line each, naming the file, what was expected and what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ggslam.errors import SequenceError
+from ggslam.sequences import open_sequence
+
+Make = Callable[[str], Path]
+
+
+def read_all(folder: Path, **options: object) -> int:
+    return sum(1 for _ in open_sequence(folder, **options).stream())  # type: ignore[arg-type]
+
+
+def truncate(path: Path, share: float = 0.6) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+
+
+def noisy_image(path: Path, depth: bool) -> None:
+    rng = np.random.default_rng(0)
+    shape, dtype = ((24, 32), np.uint16) if depth else ((24, 32, 3), np.uint8)
+    assert cv2.imwrite(str(path), rng.integers(1, 255, shape).astype(dtype))
+
+
+def replica_file(folder: Path, kind: str, i: int) -> Path:
+    return folder / "results" / (f"frame{i:06d}.jpg" if kind == "frame" else f"depth{i:06d}.png")
+
+
+def break_frame(folder: Path, damage: str) -> str:
+    """Damages frame 3 of a Replica recording; returns what the message must say."""
+    color, depth = replica_file(folder, "frame", 3), replica_file(folder, "depth", 3)
+    if damage == "missing depth":
+        depth.unlink()
+        return r"frame 3: depth file .*depth000003\.png is missing"
+    if damage == "truncated png":
+        noisy_image(depth, True)
+        truncate(depth)
+        return r"depth000003\.png: PNG is truncated"
+    if damage == "truncated in the last bytes":
+        noisy_image(depth, True)
+        depth.write_bytes(depth.read_bytes()[:-12])
+        return r"depth000003\.png: PNG is truncated: no end marker"
+    if damage == "flipped bit":
+        noisy_image(depth, True)
+        content = bytearray(depth.read_bytes())
+        content[len(content) // 2] ^= 4
+        depth.write_bytes(content)
+        return r"depth000003\.png: PNG is damaged: wrong checksum"
+    if damage == "truncated jpg":
+        noisy_image(color, False)
+        truncate(color, 0.8)
+        return r"frame000003\.jpg: JPEG is truncated"
+    if damage == "empty file":
+        color.write_bytes(b"")
+        return r"frame000003\.jpg: file is empty"
+    if damage == "text file":
+        color.write_text("not an image at all")
+        return r"frame000003\.jpg: expected a PNG or JPEG image"
+    if damage == "depth of another size":
+        assert cv2.imwrite(str(depth), np.ones((12, 16), np.uint16))
+        return r"depth000003\.png: expected depth of 32x24 as in the first frame, found 16x12"
+    if damage == "8-bit depth":
+        assert cv2.imwrite(str(depth), np.ones((24, 32), np.uint8))
+        return r"depth000003\.png: expected a 16-bit depth image with one channel, found 1 channel of 8-bit"
+    if damage == "coloured mask":
+        assert cv2.imwrite(
+            str(folder / "semantic_instance" / "semantic_instance_3.png"),
+            np.eye(24, 32, dtype=np.uint8)[..., None] * [1, 2, 3],
+        )
+        return r"semantic_instance_3\.png: expected a mask of grey 8- or 16-bit instance ids, found 3 channels"
+    lines = (folder / "traj.txt").read_text().splitlines()
+    lines[3] = lines[3].replace(lines[3].split()[3], "nan")
+    (folder / "traj.txt").write_text("\n".join(lines))
+    return r"traj\.txt, line 4: pose holds NaN"
+
+
+DAMAGES = (
+    "missing depth", "truncated png", "truncated in the last bytes", "flipped bit", "truncated jpg", "empty file",
+    "text file", "depth of another size", "8-bit depth", "coloured mask", "nan pose",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_frame(make: Make, damage: str) -> None:
+    folder = make("replica")
+    message = break_frame(folder, damage)
+    with pytest.raises(SequenceError, match=message) as caught:
+        read_all(folder)
+    assert "\n" not in str(caught.value)
+    sequence = open_sequence(folder, on_bad_frame="skip")
+    assert [frame.source_index for frame in sequence.stream()] == [0, 1, 2, 4]
+    (skipped,) = sequence.skipped
+    assert (skipped.index, skipped.source_index) == (3, 3)
+    with pytest.raises(SequenceError, match=message):
+        raise SequenceError(skipped.reason)
+    assert read_all(folder, stop=3) == 3  # damage outside the selection does not matter
+
+
+def test_first_frame_damaged(make: Make) -> None:
+    folder = make("replica")
+    replica_file(folder, "depth", 0).write_bytes(b"")
+    with pytest.raises(SequenceError, match="file is empty"):
+        open_sequence(folder)
+    assert read_all(folder, on_bad_frame="skip") == 4
+    for i in range(5):
+        replica_file(folder, "depth", i).write_bytes(b"")
+    with pytest.raises(SequenceError, match="none of 5 frames can be read"):
+        open_sequence(folder, on_bad_frame="skip")
+
+
+def test_no_recording(tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="no such folder"):
+        open_sequence(tmp_path / "nowhere")
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(SequenceError, match="found a file"):
+        open_sequence(tmp_path / "file")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(SequenceError, match="it holds nothing"):
+        open_sequence(empty)
+    (empty / "holiday.mp4").write_text("x")
+    with pytest.raises(SequenceError, match=r"(?s)it holds holiday\.mp4.*replica: results/frame") as caught:
+        open_sequence(empty)
+    assert all(name in str(caught.value) for name in ("tum:", "7scenes:", "scannet:", "folder:"))
+    with pytest.raises(SequenceError, match="unknown format 'kitti'; known: .*replica"):
+        open_sequence(empty, format="kitti")
+    for name in ("replica", "tum", "7scenes", "scannet", "folder", "synthetic"):
+        with pytest.raises(SequenceError):
+            open_sequence(empty, format=name)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"start": 5}, "start must be from 0 to 4, found 5"),
+        ({"start": -1}, "start must be from 0 to 4, found -1"),
+        ({"stop": 0}, "stop must be above start 0, found 0"),
+        ({"start": 3, "stop": 3}, "stop must be above start 3, found 3"),
+        ({"stride": 0}, "stride must be at least 1, found 0"),
+        ({"scale": 0.0}, "scale: expected"),
+        ({"scale": 2.0}, "scale: expected"),
+        ({"depth_scale": 0.0}, "depth scale must be a positive number"),
+        ({"masks": "/nowhere/at/all"}, "masks folder /nowhere/at/all does not exist"),
+        ({"on_bad_frame": "ignore"}, "on_bad_frame: expected 'error' or 'skip'"),
+    ],
+)
+def test_impossible_options(make: Make, options: dict[str, object], message: str) -> None:
+    with pytest.raises(SequenceError, match=message):
+        open_sequence(make("replica"), **options)  # type: ignore[arg-type]
+
+
+def test_short_trajectory(make: Make) -> None:
+    folder = make("replica")
+    lines = (folder / "traj.txt").read_text().splitlines()
+    (folder / "traj.txt").write_text("\n".join(lines[:3]))
+    with pytest.raises(SequenceError, match=r"traj\.txt: expected 5 poses, one a frame, found 3"):
+        open_sequence(folder)
+    (folder / "traj.txt").write_text("\n".join([*lines[:2], "1 2 3", *lines[3:]]))
+    with pytest.raises(SequenceError, match=r"traj\.txt, line 3: expected 16 or 12 numbers, found 3"):
+        open_sequence(folder)
+
+
+def test_wrong_aspect(make: Make) -> None:
+    folder = make("folder")
+    for i in range(5):
+        assert cv2.imwrite(str(folder / "depth" / f"{i}.png"), np.ones((20, 32), np.uint16))
+    with pytest.raises(SequenceError, match=r"0\.png: depth is 32x20, but colour 0\.png is 32x24"):
+        open_sequence(folder)
+
+
+def test_tum_bad_lists(make: Make) -> None:
+    folder = make("tum")
+    (folder / "rgb.txt").write_text("# nothing\n")
+    with pytest.raises(SequenceError, match=r"rgb\.txt: lists no images"):
+        open_sequence(folder)
+    (folder / "rgb.txt").write_text("1000.0 rgb/a.png\nbroken\n")
+    with pytest.raises(SequenceError, match=r"rgb\.txt, line 2: expected 'time file', found 'broken'"):
+        open_sequence(folder)
+
+
+def test_tum_nan_pose_and_foreign_times(make: Make) -> None:
+    folder = make("tum")
+    truth = folder / "groundtruth.txt"
+    lines = truth.read_text().splitlines()
+    truth.write_text("\n".join([*lines[:3], "1000.04 nan 0 0 0 0 0 1", *lines[4:]]))
+    with pytest.raises(SequenceError, match=r"groundtruth\.txt, line 4: pose holds NaN"):
+        open_sequence(folder)
+    truth.write_text("5.0 0 0 0 0 0 0 1\n")
+    with pytest.raises(SequenceError, match=r"no pose within 0\.02 s of any image; poses span 5\.000"):
+        open_sequence(folder)
+
+
+def test_seven_scenes_bad_pose(make: Make) -> None:
+    folder = make("7scenes")
+    path = folder / "frame-000002.pose.txt"
+    path.write_text("1 0 0 0\n0 1 0 nan\n0 0 1 0\n0 0 0 1\n")
+    with pytest.raises(SequenceError, match=r"frame-000002\.pose\.txt: pose holds NaN"):
+        open_sequence(folder)
+    path.write_text("2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    with pytest.raises(SequenceError, match=r"frame-000002\.pose\.txt: pose is not a rigid transform"):
+        open_sequence(folder)
+    path.write_text("1 0 0\n")
+    with pytest.raises(SequenceError, match="expected a 4x4 matrix, found 3 numbers"):
+        open_sequence(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("width: 32\n", "entry 'height' is missing"),
+        ("[", "not YAML"),
+        ("", "expected entries width"),
+        ("width: 32\nheight: 24\nfx: wide\nfy: 3\ncx: 1\ncy: 1\n", "expected a number for 'fx', found 'wide'"),
+        ("width: 32\nheight: 24\nfx: -3\nfy: 3\ncx: 1\ncy: 1\n", "impossible camera"),
+        ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\n", "entry 'depth_scale' is missing"),
+        ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\ndepth_scale: 1\ndistortion: [1]\n", "for 'distortion'"),
+    ],
+)
+def test_folder_bad_settings(make: Make, text: str, message: str) -> None:
+    folder = make("folder")
+    (folder / "camera.yaml").write_text(text)
+    with pytest.raises(SequenceError, match=rf"camera\.yaml: .*{message}"):
+        open_sequence(folder)
+
+
+def test_folder_pose_count(make: Make) -> None:
+    folder = make("folder")
+    (folder / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
+    with pytest.raises(SequenceError, match=r"poses\.txt: expected 5 poses, one a frame, found 1"):
+        open_sequence(folder)
+
+
+def test_replica_bad_parameters(make: Make) -> None:
+    folder = make("replica")
+    (folder / "cam_params.json").write_text('{"camera": {"w": 32}}')
+    with pytest.raises(SequenceError, match=r"cam_params\.json: expected .*KeyError"):
+        open_sequence(folder)
+
+
+def test_masks_that_belong_to_nothing(make: Make, tmp_path: Path) -> None:
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    assert cv2.imwrite(str(masks / "900.png"), np.zeros((24, 32), np.uint8))
+    with pytest.raises(SequenceError, match=r"no mask is named like frame000000\.jpg; found 900\.png"):
+        open_sequence(make("replica"), masks=masks)
