@@ -219,10 +219,14 @@ def test_refusals(tmp_path: Path, recording: Path) -> None:
     assert (tmp_path / "full" / "letter.txt").exists()
     with pytest.raises(SequenceError, match="ask for overwriting"):
         write(recording)
+    small = tmp_path / "small"
+    write(small, frames=3)
+    write(small, frames=2, overwrite=True)
+    assert len(open_sequence(small)) == 2
 
     def stop(done: int, count: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         write(tmp_path / "broken", frames=3, progress=stop)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["full"]  # nothing half-written
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["full", "small"]  # nothing half-written

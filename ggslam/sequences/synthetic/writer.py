@@ -81,14 +81,27 @@ def write_synthetic_sequence(
         _write_images(work, scene, camera, poses, seed, noise, progress)
         _write_description(work, scene, camera, poses, seed, noise, trajectory, frame_rate)
         work.chmod(0o755)  # mkdtemp makes it private
-        if target.exists():
-            shutil.rmtree(target)
-        work.rename(target)
+        _put_in_place(work, target)
     except OSError as error:
         raise SequenceError(f"{target}: cannot be written: {error}") from None
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return target
+
+
+def _put_in_place(work: Path, target: Path) -> None:
+    """Renames a finished folder to its final name; what stood there goes only after that succeeded."""
+    if not target.exists():
+        work.rename(target)
+        return
+    former = Path(tempfile.mkdtemp(prefix=f".{target.name}-former-", dir=target.parent))
+    target.rename(former)  # replaces the empty folder
+    try:
+        work.rename(target)
+    except OSError:
+        former.rename(target)
+        raise
+    shutil.rmtree(former, ignore_errors=True)
 
 
 def _check_target(target: Path, overwrite: bool) -> None:
