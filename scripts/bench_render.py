@@ -38,6 +38,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 
 DEFAULT_PROTOTYPE = Path(__file__).parents[2] / "shared" / "prototypes" / "cpu_rasterizer"
+LOW_PASS = 0.3  # that of the prototype, for ggslam as well
 FLAGS = "-O3 -std=c++17 -fPIC -shared -fno-math-errno -fno-trapping-math -fno-signed-zeros -freciprocal-math"
 FLAGS += " -ffp-contract=fast -pthread -Wno-psabi"
 TARGETS = {"avx512": "-march=native -mprefer-vector-width=512 -DLANES=16", "avx2": "-march=x86-64-v3 -DLANES=8"}
@@ -162,7 +163,7 @@ class Ours:
 
     def __init__(self, instruction_set: str, threads: int, workload: tuple[GaussianMap, Camera, np.ndarray]) -> None:
         self.map, self.camera, self.T_camera_world = workload
-        self.rasterizer = CpuRasterizer(threads, instruction_set)
+        self.rasterizer = CpuRasterizer(threads, instruction_set, low_pass=LOW_PASS)
         self.forward()
         self.gradients = [torch.randn_like(self.buffers.image), torch.randn_like(self.buffers.depth)]
         self.gradients.append(torch.randn_like(self.buffers.alpha))
@@ -238,8 +239,8 @@ def compare_with_reference() -> None:
     (rendered.image.sum() + rendered.depth.sum()).backward()
     forward, backward = (middle - start) * 1e3, (time.perf_counter() - middle) * 1e3
     print(f"\n{len(gaussians)} Gaussians at {camera.width}x{camera.height}, 2 threads, forward / backward in ms:")
-    print(f"  ggslam {best.forward:.2f} / {best.backward:.2f}, torch reference {forward:.0f} / {backward:.0f}, ", end="")
-    print(f"ratio {forward / best.forward:.0f} / {backward / best.backward:.0f}")
+    print(f"  ggslam {best.forward:.2f} / {best.backward:.2f}, torch reference {forward:.0f} / {backward:.0f}")
+    print(f"  ratio {forward / best.forward:.0f} / {backward / best.backward:.0f}")
 
 
 def main() -> None:

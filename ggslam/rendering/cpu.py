@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -90,6 +91,8 @@ class CpuRasterizer:
         self._handle = ctypes.c_void_p(self._library.ggslam_rasterizer_create(self.context.handle))
         self._images: dict[str, torch.Tensor] = {}
         self._last: _LastForward | None = None
+        self.rendering = 0
+        """Number of calls of `forward` so far: tells whether the last rendering is still the one that was meant."""
 
     def __del__(self) -> None:
         if self._handle is not None:
@@ -124,6 +127,7 @@ class CpuRasterizer:
             RenderError: wrong shapes, dtypes or devices; an impossible pose or degree; out of memory.
         """
         self._last = None
+        self.rendering += 1
         parameters = _checked_parameters(gaussians)
         arrays = _native.GaussianArrays(
             count=parameters.means.shape[0],
@@ -136,7 +140,7 @@ class CpuRasterizer:
         view = self._view(camera, check_pose(T_camera_world))
         buffers = self._buffers(camera, parameters.features.shape[1] if arrays.render_features else 0, median_depth)
         targets = _native.RenderTargets(
-            **{name: pointer(getattr(buffers, name)) for name, _ in _native.RenderTargets._fields_}
+            **{field[0]: pointer(getattr(buffers, field[0])) for field in _native.RenderTargets._fields_}
         )
         status = self._library.ggslam_rasterizer_forward(
             self._handle, ctypes.byref(arrays), ctypes.byref(view), ctypes.byref(targets)
@@ -148,9 +152,9 @@ class CpuRasterizer:
     def _view(self, camera: Camera, T_camera_world: np.ndarray) -> _native.View:
         rows = (ctypes.c_float * 12)(*T_camera_world[:3].ravel().tolist())
         return _native.View(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, self.near_plane,
-            self.low_pass, rows,
-        )
+            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+            self.near_plane, self.low_pass, rows,
+        )  # fmt: skip
 
     def _image(self, name: str, shape: tuple[int, ...]) -> torch.Tensor:
         image = self._images.get(name)
@@ -197,9 +201,9 @@ class CpuRasterizer:
             RenderError: nothing was rendered, wrong shapes or dtypes, out of memory.
         """
         last = self._require_last()
-        image_gradients = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, detach_features)
+        grads = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, detach_features)
         names = PARAMETERS if last.arrays.render_features else PARAMETERS[:-1]
-        arrays = {name: torch.empty_like(getattr(last.parameters, name)) for name in names}
+        arrays: dict[str, Any] = {name: torch.empty_like(getattr(last.parameters, name)) for name in names}
         twist = np.zeros(6)
         touched = torch.empty(last.arrays.count, dtype=torch.uint8)
         out = _native.GaussianGradients(
@@ -207,8 +211,9 @@ class CpuRasterizer:
             twist=twist.ctypes.data,
             touched=pointer(touched),
         )
-        self._run_backward(image_gradients, out, None)
-        return Gradients(**{"features": None, **arrays}, twist=twist, touched=touched)
+        self._run_backward(grads, out, None)
+        arrays.setdefault("features", None)
+        return Gradients(**arrays, twist=twist, touched=touched)
 
     def pose_gradient(
         self,
@@ -219,11 +224,11 @@ class CpuRasterizer:
     ) -> np.ndarray:
         """Only the `twist` of `backward`; the gradients of the Gaussians are not written."""
         last = self._require_last()
-        image_gradients = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, False)
+        grads = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, False)
         twist = np.zeros(6)
         touched = torch.empty(last.arrays.count, dtype=torch.uint8)
         out = _native.GaussianGradients(twist=twist.ctypes.data, touched=pointer(touched))
-        self._run_backward(image_gradients, out, None)
+        self._run_backward(grads, out, None)
         return twist
 
     def backward_step(
@@ -254,7 +259,7 @@ class CpuRasterizer:
                 raise RenderError(f"backward_step: the map's {name} are not those that were rendered last")
         if not map.moments:
             raise RenderError("backward_step: the map was made without moments")
-        image_gradients = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, detach_features)
+        grads = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, detach_features)
         schedule = optimizer.schedule()
         adam = _native.AdamArguments(
             updates=pointer(map.updates), schedule=pointer(schedule), schedule_rows=schedule.shape[0],
@@ -266,7 +271,7 @@ class CpuRasterizer:
         touched = torch.empty(last.arrays.count, dtype=torch.uint8)
         out = _native.GaussianGradients(twist=twist.ctypes.data, touched=pointer(touched))
         self._last = None  # the parameters change now, so there is nothing left to differentiate
-        self._run_backward(image_gradients, out, adam)
+        self._run_backward(grads, out, adam)
         return StepResult(twist, touched)
 
     def _run_backward(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rendering rules, as the plainest torch code: dense, differentiable by autograd, any float dtype, any device, slow.
+"""The rendering rules, as the plainest torch code: dense, differentiable by autograd, any float dtype, slow.
 
 This file is the contract; the other backends are tested against it.
 
@@ -7,9 +7,9 @@ This file is the contract; the other backends are tested against it.
     if a log_scale lies outside [-23, 10] or if the squared norm of its quaternion lies outside [1e-20, 1e20].
     Skipped Gaussians get zero gradients.
 2.  Projection (EWA splatting, Zwicker et al. 2001): the 2D mean is the pinhole projection of the mean (centre of the
-    top-left pixel = (0, 0)); the 2D covariance is J W Sigma W^T J^T + low_pass I (pixels^2) with Sigma =
-    R diag(exp(log_scale))^2 R^T. In the Jacobian J, x/z and y/z are clamped to the image enlarged by 15 % of its size on
-    each side; the clamp passes no gradient.
+    top-left pixel = (0, 0)); the 2D covariance is J W Sigma W^T J^T + low_pass I (pixels^2) with
+    Sigma = R diag(exp(log_scale))^2 R^T. In the Jacobian J, x/z and y/z are clamped to the image enlarged by 15 % of
+    its size on each side; the clamp passes no gradient.
 3.  Colour = 0.5 + sum_k Y_k(d) sh_k with d the direction from the camera centre to the mean, in the world frame, and Y
     the real spherical harmonics of 3D Gaussian Splatting. It is not clamped.
 4.  Gaussians are composited in the order of z; equal depths in the order of their rows.
@@ -64,7 +64,7 @@ def render_reference(
 
     position = means @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
     mean2d, precision = _project(position, quaternions, log_scales, camera, T_camera_world[:3, :3], low_pass)
-    colour = _colour(gaussians.sh[rows, :coefficients], means, T_camera_world)
+    colour = view_colours(gaussians.sh[rows, :coefficients], means, T_camera_world)
     z = position[:, 2]
 
     weights, before, after = _weights(mean2d, precision, opacities, camera)
@@ -80,18 +80,22 @@ def render_reference(
     )
 
 
+def renderable(gaussians: Gaussians, z: torch.Tensor, near_plane: float) -> torch.Tensor:
+    """bool [N]: which Gaussians of depths z [N] are not skipped (rule 1)."""
+    with torch.no_grad():
+        numbers = torch.cat([gaussians.means, gaussians.quaternions, gaussians.opacity_logits[:, None]], 1)
+        norm2 = (gaussians.quaternions**2).sum(1)
+        low, high = LOG_SCALE_RANGE
+        ok = torch.isfinite(numbers).all(1) & torch.isfinite(z) & (z >= near_plane)
+        ok &= ((gaussians.log_scales >= low) & (gaussians.log_scales <= high)).all(1)
+        return ok & (norm2 >= QUATERNION_NORM2_RANGE[0]) & (norm2 <= QUATERNION_NORM2_RANGE[1])
+
+
 def _renderable_in_order(gaussians: Gaussians, T_camera_world: torch.Tensor, near_plane: float) -> torch.Tensor:
     """Rows to render, nearest first (rules 1 and 4)."""
     with torch.no_grad():
-        numbers = torch.cat(
-            [gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits[:, None]], 1
-        )
         z = gaussians.means @ T_camera_world[2, :3] + T_camera_world[2, 3]
-        norm2 = (gaussians.quaternions**2).sum(1)
-        ok = torch.isfinite(numbers).all(1) & (z >= near_plane)
-        ok &= ((gaussians.log_scales >= LOG_SCALE_RANGE[0]) & (gaussians.log_scales <= LOG_SCALE_RANGE[1])).all(1)
-        ok &= (norm2 >= QUATERNION_NORM2_RANGE[0]) & (norm2 <= QUATERNION_NORM2_RANGE[1])
-        rows = torch.nonzero(ok)[:, 0]
+        rows = torch.nonzero(renderable(gaussians, z, near_plane))[:, 0]
         return rows[torch.argsort(z[rows], stable=True)]
 
 
@@ -113,7 +117,9 @@ def _project(
     x, y, z = position.unbind(-1)
     u, v = x / z, y / z
     margin_x, margin_y = FRUSTUM_MARGIN * camera.width, FRUSTUM_MARGIN * camera.height
-    clamped_u = u.clamp((-0.5 - camera.cx - margin_x) / camera.fx, (camera.width - 0.5 - camera.cx + margin_x) / camera.fx)
+    clamped_u = u.clamp(
+        (-0.5 - camera.cx - margin_x) / camera.fx, (camera.width - 0.5 - camera.cx + margin_x) / camera.fx
+    )
     clamped_v = v.clamp(
         (-0.5 - camera.cy - margin_y) / camera.fy, (camera.height - 0.5 - camera.cy + margin_y) / camera.fy
     )
@@ -146,8 +152,8 @@ def _weights(
     return weights, before.detach(), after.detach()
 
 
-def _colour(sh: torch.Tensor, means: torch.Tensor, T_camera_world: torch.Tensor) -> torch.Tensor:
-    """View-dependent colour [N, 3] (rule 3)."""
+def view_colours(sh: torch.Tensor, means: torch.Tensor, T_camera_world: torch.Tensor) -> torch.Tensor:
+    """View-dependent colours [N, 3] of coefficients sh [N, K, 3] (rule 3)."""
     centre = -T_camera_world[:3, :3].T @ T_camera_world[:3, 3]
     basis = spherical_harmonics(torch.nn.functional.normalize(means - centre, dim=-1), sh.shape[1])
     return 0.5 + (basis[:, :, None] * sh).sum(1)

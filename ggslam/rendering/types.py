@@ -16,8 +16,8 @@ PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "fea
 
 
 LOW_PASS = 0.1
-"""Default low-pass filter: pixels^2 added to both variances of a projected Gaussian. 3DGS and its viewers use 0.3, which
-is wider than the half-pixel splats of an RGB-D map: 0.1 gains 0.5 dB on views that were not trained on."""
+"""Default low-pass filter: pixels^2 added to both variances of a projected Gaussian. 3DGS and its viewers use 0.3,
+which is wider than the half-pixel splats of an RGB-D map: 0.1 gains 0.5 dB on views that were not trained on."""
 
 
 class Gaussians(Protocol):

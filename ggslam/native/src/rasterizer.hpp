@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // The differentiable Gaussian rasterizer: what its stages share. The stages themselves are in kernels/:
 //
-//   project_block    Gaussians -> splats (mean, conic, opacity, colour in the image), tile counts     projection.cpp
-//   scatter_block    splats -> per-tile lists of (depth, splat)                                       binning.cpp
-//   forward_tile     sort one tile's list by depth, composite it front to back                        tiles_forward.cpp
-//   backward_tile    back to front: one gradient slot per (splat, tile) pair                          tiles_backward.cpp
-//   gather_block     sum a Gaussian's slots, differentiate the projection, store or apply Adam        gather.cpp
+//   project_block    Gaussians -> splats (mean, conic, opacity, colour in the image), tile counts    projection.cpp
+//   scatter_block    splats -> per-tile lists of (depth, splat)                                      binning.cpp
+//   forward_tile     sort one tile's list by depth, composite it front to back                       tiles_forward.cpp
+//   backward_tile    back to front: one gradient slot per (splat, tile) pair                         tiles_backward.cpp
+//   gather_block     sum a Gaussian's slots, differentiate the projection, store or apply Adam       gather.cpp
 //
 // rasterizer.cpp runs them over blocks of Gaussians and over tiles. Blocks and tiles write only to places of their own
 // and every sum has a fixed order, so results do not depend on the number of threads.
@@ -28,7 +28,7 @@ constexpr float kMinQuaternionNorm2 = 1e-20f, kMaxQuaternionNorm2 = 1e20f;
 
 constexpr int kTileWidth = 16;
 constexpr int kSubBlocks = 16;                  // sub-blocks of a tile, 4 x 4, each of kLanes pixels
-constexpr int kBaseGradients = 10;              // log-alpha moments 1, dx, dy, dx^2, dx dy, dy^2; red, green, blue; depth
+constexpr int kBaseGradients = 10;              // log-alpha moments 1, dx, dy, dx^2, dx dy, dy^2; colour; depth
 constexpr int kSlotStride = 16;                 // floats from one gradient slot to the next: one cache line
 constexpr int kMaxBlocks = 32;
 constexpr int kChunk = 64;                      // splats that a tile composites at a time

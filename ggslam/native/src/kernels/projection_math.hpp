@@ -23,7 +23,8 @@ static inline ViewConstants view_constants(const View& view) {
     for (int j = 0; j < 3; ++j) c.W[i][j] = view.camera_world[4 * i + j];
     c.t[i] = view.camera_world[4 * i + 3];
   }
-  c.fx = view.fx, c.fy = view.fy, c.cx = view.cx, c.cy = view.cy, c.near_plane = view.near_plane, c.low_pass = view.low_pass;
+  c.fx = view.fx, c.fy = view.fy, c.cx = view.cx, c.cy = view.cy;
+  c.near_plane = view.near_plane, c.low_pass = view.low_pass;
   // Image borders lie at -0.5 and width - 0.5: pixel centres are whole numbers.
   const float width = static_cast<float>(view.width), height = static_cast<float>(view.height);
   c.min_u = (-0.5f - view.cx - kFrustumMargin * width) / view.fx;

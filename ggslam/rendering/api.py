@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rendering for library users: one function, several backends, gradients by torch autograd."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from ggslam.errors import RenderError
+from ggslam.rendering.autograd import render_cpu, rigid_inverse
+from ggslam.rendering.gsplat_backend import render_gsplat
+from ggslam.rendering.reference import render_reference
+from ggslam.rendering.types import LOW_PASS, Gaussians, RenderBuffers, check_pose
+from ggslam.scene.camera import Camera
+
+Backend = Callable[..., RenderBuffers]
+
+
+def _reference(gaussians: Gaussians, camera: Camera, T_world_camera: torch.Tensor, **options: Any) -> RenderBuffers:
+    return render_reference(gaussians, camera, rigid_inverse(T_world_camera).to(gaussians.means), **options)
+
+
+_BACKENDS: dict[str, Backend] = {"cpu": render_cpu, "reference": _reference, "gsplat": render_gsplat}
+
+
+def register_backend(name: str, backend: Backend) -> None:
+    """Adds a backend, called as backend(gaussians, camera, T_world_camera tensor, features=, median_depth=,
+    active_sh_degree=, near_plane=, low_pass=). Its contract is that of `ggslam.rendering.reference`."""
+    _BACKENDS[name] = backend
+
+
+def backends() -> list[str]:
+    """Names of the backends. "gsplat" is listed whether or not it is installed."""
+    return list(_BACKENDS)
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    T_world_camera: torch.Tensor | np.ndarray,
+    *,
+    backend: str = "cpu",
+    features: bool = True,
+    median_depth: bool = False,
+    active_sh_degree: int | None = None,
+    near_plane: float = 0.05,
+    low_pass: float = LOW_PASS,
+) -> RenderBuffers:
+    """Renders Gaussians, differentiable with respect to their parameters and to the pose.
+
+    Args:
+        gaussians: see `Gaussians`; float32 on the CPU for "cpu", on a CUDA device for "gsplat", any float for
+            "reference".
+        camera: the camera.
+        T_world_camera: [4, 4] rigid transform, camera to world; a tensor may require gradients. The gradient of "cpu"
+            is the part along rigid motions.
+        backend: one of `backends()`.
+        features: render the feature channels, if there are any.
+        median_depth: render the median depth, too.
+        active_sh_degree: highest spherical-harmonic degree to evaluate; None: all.
+        near_plane: metres; Gaussians whose mean is nearer are left out.
+        low_pass: pixels^2 added to both variances of a projected Gaussian.
+
+    Returns:
+        Images of the caller's own.
+
+    Raises:
+        RenderError: unknown backend, wrong shapes, dtypes or devices, an impossible pose or degree.
+        MissingDependency: the backend's package is not installed.
+    """
+    if backend not in _BACKENDS:
+        raise RenderError(f"unknown rendering backend {backend!r}; available: {', '.join(_BACKENDS)}")
+    if not isinstance(T_world_camera, torch.Tensor):
+        T_world_camera = torch.as_tensor(np.asarray(T_world_camera, np.float64))
+    check_pose(T_world_camera.detach().cpu().numpy(), "T_world_camera")
+    return _BACKENDS[backend](
+        gaussians,
+        camera,
+        T_world_camera,
+        features=features,
+        median_depth=median_depth,
+        active_sh_degree=active_sh_degree,
+        near_plane=near_plane,
+        low_pass=low_pass,
+    )
