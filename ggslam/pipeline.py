@@ -105,7 +105,7 @@ def run_slam(sequence: Sequence, config: Config, observer: Observer) -> tuple[Sl
     slam = Slam(sequence.camera, config)
     try:
         if config.realtime_fps > 0:
-            RealtimeSlam(slam, config.realtime_fps).run(sequence.stream(), observer.frame)
+            RealtimeSlam(slam, config.realtime_fps).run(sequence.stream(masks=False), observer.frame)
         else:
             _run_synchronous(slam, sequence, observer)
         if config.refine_iterations:
@@ -117,7 +117,7 @@ def run_slam(sequence: Sequence, config: Config, observer: Observer) -> tuple[Sl
 
 
 def _run_synchronous(slam: Slam, sequence: Sequence, observer: Observer) -> None:
-    for frame in sequence.stream():
+    for frame in sequence.stream(masks=False):  # nothing here looks at masks yet
         observer.frame(slam.step(frame))
 
 

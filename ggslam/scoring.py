@@ -101,7 +101,7 @@ def _images(
         kind = "keyframe" if frame.index in keyframes else "held_out" if frame.index in held_out else "other"
         rows.append({"frame": frame.index, "kind": kind, **(scores or ImageScores()).to_dict()})
 
-    means = score_images(show, sequence.stream(), sets, lpips, note)
+    means = score_images(show, sequence.stream(masks=False), sets, lpips, note)
     observer.advance(len(sequence), len(sequence))
     _write_rows(folder, rows)
     return {name: mean.to_dict() for name, mean in means.items()}
