@@ -3,9 +3,9 @@
 
 This file is the contract; the other backends are tested against it.
 
-1.  A Gaussian is skipped if its depth z in the camera is under the near plane, if any of its numbers is not finite,
-    if a log_scale lies outside [-23, 10] or if the squared norm of its quaternion lies outside [1e-20, 1e20].
-    Skipped Gaussians get zero gradients.
+1.  A Gaussian is skipped if its depth z in the camera is under the near plane or above 1e6 m, if any of its numbers is
+    not finite (features apart, which are not looked at), if a log_scale lies outside [-23, 10] or if the squared norm
+    of its quaternion lies outside [1e-20, 1e20]. Skipped Gaussians get zero gradients.
 2.  Projection (EWA splatting, Zwicker et al. 2001): the 2D mean is the pinhole projection of the mean (centre of the
     top-left pixel = (0, 0)); the 2D covariance is J W Sigma W^T J^T + low_pass I (pixels^2) with
     Sigma = R diag(exp(log_scale))^2 R^T. In the Jacobian J, x/z and y/z are clamped to the image enlarged by 15 % of
@@ -34,6 +34,7 @@ MIN_ALPHA = 1.0 / 255.0
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
 FRUSTUM_MARGIN = 0.15
+MAX_DEPTH = 1e6
 LOG_SCALE_RANGE = (-23.0, 10.0)
 QUATERNION_NORM2_RANGE = (1e-20, 1e20)
 
@@ -83,10 +84,11 @@ def render_reference(
 def renderable(gaussians: Gaussians, z: torch.Tensor, near_plane: float) -> torch.Tensor:
     """bool [N]: which Gaussians of depths z [N] are not skipped (rule 1)."""
     with torch.no_grad():
-        numbers = torch.cat([gaussians.means, gaussians.quaternions, gaussians.opacity_logits[:, None]], 1)
+        parts = [gaussians.means, gaussians.quaternions, gaussians.opacity_logits[:, None], gaussians.sh.flatten(1)]
+        numbers = torch.cat(parts, 1)
         norm2 = (gaussians.quaternions**2).sum(1)
         low, high = LOG_SCALE_RANGE
-        ok = torch.isfinite(numbers).all(1) & torch.isfinite(z) & (z >= near_plane)
+        ok = torch.isfinite(numbers).all(1) & (z >= near_plane) & (z <= MAX_DEPTH)
         ok &= ((gaussians.log_scales >= low) & (gaussians.log_scales <= high)).all(1)
         return ok & (norm2 >= QUATERNION_NORM2_RANGE[0]) & (norm2 <= QUATERNION_NORM2_RANGE[1])
 
@@ -110,7 +112,11 @@ def rotation_matrices(quaternions: torch.Tensor) -> torch.Tensor:
 
 
 def _project(
-    position: torch.Tensor, quaternions: torch.Tensor, log_scales: torch.Tensor, camera: Camera, W: torch.Tensor,
+    position: torch.Tensor,
+    quaternions: torch.Tensor,
+    log_scales: torch.Tensor,
+    camera: Camera,
+    W: torch.Tensor,
     low_pass: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """2D means [N, 2] and inverse covariances [N, 2, 2] (rule 2)."""

@@ -23,6 +23,7 @@ constexpr float kLog2MinAlpha = -7.99435344f;   // log2(1 / 255): weaker contrib
 constexpr float kMaxAlpha = 0.999f;
 constexpr float kMinTransmittance = 1e-4f;      // a pixel takes no further Gaussian once its transmittance is below
 constexpr float kFrustumMargin = 0.15f;         // of the image size: slopes beyond are clamped in the Jacobian
+constexpr float kMaxDepth = 1e6f;               // metres; Gaussians farther away are skipped
 constexpr float kMinLogScale = -23.0f, kMaxLogScale = 10.0f;  // Gaussians with a scale outside are skipped
 constexpr float kMinQuaternionNorm2 = 1e-20f, kMaxQuaternionNorm2 = 1e20f;
 

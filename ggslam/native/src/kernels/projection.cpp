@@ -39,14 +39,16 @@ inline void make_splats(const Rasterizer& r, const ViewConstants& c, const std::
   // decides which pixels are in.
   const Float radius2 = 2.0f * kLn2 * (log2_opacity - kLog2MinAlpha) + 2e-3f;
   Mask ok = both(renderable(c, g, p), greater_equal(log2_opacity, broadcast(kLog2MinAlpha)));
+  Float colour[3];
+  view_colour(r.gaussians, c, rows, n, p.position, colour);
+  const Float brightness = absolute(colour[0]) + absolute(colour[1]) + absolute(colour[2]);
+  ok = both(ok, greater_equal(broadcast(1e30f), brightness));  // false for NaN
   const Float safe = zero_unless(ok, radius2);
   const Float mean_x = c.fx * p.u + c.cx, mean_y = c.fy * p.v + c.cy;
   ok = both(ok, tile_range(mean_x, square_root(safe * p.cov_xx), r.view.width, kTileWidth, out.tile_x0, out.tile_x1));
   ok = both(ok, tile_range(mean_y, square_root(safe * p.cov_yy), r.view.height, kLanes, out.tile_y0, out.tile_y1));
   out.visible = bits(ok) & ((1u << n) - 1);
 
-  Float colour[3];
-  view_colour(r.gaussians, c, rows, n, p.position, colour);
   const Float scale = kLog2E * p.inverse_determinant;
   const Float values[SplatVectors::kFields] = {
       mean_x, mean_y, -0.5f * scale * p.cov_yy, scale * p.cov_xy, -0.5f * scale * p.cov_xx, log2_opacity,

@@ -99,7 +99,7 @@ static inline ParameterGradients differentiate_projection(const ViewConstants& c
 
   for (int j = 0; j < 3; ++j)
     out.mean[j] = c.W[0][j] * position[0] + c.W[1][j] * position[1] + c.W[2][j] * position[2];
-  out.opacity_logit = g.m0 * (1.0f - sigmoid(raw.opacity_logit));  // d log(sigmoid(x)) / d x = 1 - sigmoid(x)
+  out.opacity_logit = g.m0 * sigmoid(-raw.opacity_logit);  // d log(sigmoid(x)) / d x = sigmoid(-x)
   return out;
 }
 

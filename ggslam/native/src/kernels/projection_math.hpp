@@ -121,6 +121,7 @@ static inline Projection project(const ViewConstants& c, const RawGaussians& g) 
 // Gaussians that can be rendered: in front of the near plane, of sane shape, nothing NaN or infinite.
 static inline Mask renderable(const ViewConstants& c, const RawGaussians& g, const Projection& p) {
   Mask ok = greater_equal(p.position[2], broadcast(c.near_plane));
+  ok = both(ok, greater_equal(broadcast(kMaxDepth), p.position[2]));
   ok = both(ok, greater_equal(p.q_norm2, broadcast(kMinQuaternionNorm2)));
   ok = both(ok, greater_equal(broadcast(kMaxQuaternionNorm2), p.q_norm2));
   for (int k = 0; k < 3; ++k) {
@@ -128,6 +129,7 @@ static inline Mask renderable(const ViewConstants& c, const RawGaussians& g, con
     ok = both(ok, greater_equal(broadcast(kMaxLogScale), g.log_scale[k]));
   }
   const Float finite = broadcast(1e30f);
+  ok = both(ok, greater_equal(finite, absolute(g.opacity_logit)));
   return both(ok, both(greater_equal(finite, p.cov_xx + p.cov_yy), greater(p.inverse_determinant, broadcast(0.0f))));
 }
 
