@@ -13,9 +13,11 @@ import torch
 
 from ggslam.native.loader import NativeContext
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import skew
 from ggslam.tracking import native
+from ggslam.tracking.photometric import PhotometricPoints, PhotometricReference
 from ggslam.tracking.points import FramePoints
-from ggslam.tracking.settings import AlignSettings, DepthNoise, TargetSettings
+from ggslam.tracking.settings import AlignSettings, DepthNoise, PhotometricSettings, TargetSettings
 
 
 class GicpTarget:
@@ -145,10 +147,9 @@ class AlignmentResult:
             origin. From the point-to-plane distances alone, each with its depth noise and taken as independent (an
             optimist's view: neighbouring points share errors).
         camera_information: the same about the camera centre: p' = p + v + w x (p - c).
-        visibility: float64 [6] ascending, eigenvalues of `camera_information` per point, with a radian worth the
-            median depth and the noise divided out: the share of points that see each direction of motion.
-        weak_directions: float64 [k, 6], unit eigenvectors (v, w median depth), world axes about the camera centre,
-            of the eigenvalues below the limit.
+        visibility: float64 [6] ascending, the share of points that see each direction of motion (`observability`).
+        weak_directions: float64 [k, 6], the directions seen by less than the limit: unit vectors (v, w radius) in world
+            axes about the points' centroid, radius their root mean square distance from it.
         matches: int32 [n], index of the fine voxel each point is matched to, -1 without.
         squared_distances: float32 [n], squared point-to-plane distances, infinite without match.
         cost: mean robust cost of the geometry per unit of weight, square metres (plus the photometric part's).
@@ -178,15 +179,32 @@ class AlignmentResult:
         return len(self.weak_directions) > 0
 
 
-def native_align_settings(settings: AlignSettings, noise: DepthNoise, plane_variance: float) -> native.AlignSettings:
+PLANE_VARIANCE = 0.02
+"""Variance along the normal of a match of two planes: twice the default thickness. Scales the cost to metres."""
+
+
+@dataclass(frozen=True)
+class PhotometricPart:
+    """What grey values contribute to an alignment: points of the frame, what they are compared with, and how."""
+
+    points: PhotometricPoints
+    reference: PhotometricReference
+    settings: PhotometricSettings
+
+
+def native_align_settings(
+    settings: AlignSettings, noise: DepthNoise, photometric: PhotometricSettings | None = None
+) -> native.AlignSettings:
     """The core's form of the settings."""
-    photometric_weight = settings.photometric_weight * (noise.sigma(1.0) / settings.photometric_sigma) ** 2
+    p = photometric or PhotometricSettings()
+    # The core weighs the geometric part per point of unit weight, which has the noise of 1 m.
+    photometric_weight = p.weight * (noise.sigma(1.0) / p.sigma) ** 2
     return native.AlignSettings(
         settings.translation_tolerance, settings.rotation_tolerance, settings.coarse_kernel_factor,
         noise.constant, noise.square, settings.kernel_constant, settings.kernel_sigmas, settings.overlap_constant,
-        settings.overlap_sigmas, settings.min_normal_dot, plane_variance,
-        settings.coarse_iterations, settings.fine_iterations, settings.coarse_points, settings.min_matches,
-        photometric_weight, settings.huber, settings.depth_tolerance,
+        settings.overlap_sigmas, settings.min_normal_dot, PLANE_VARIANCE, settings.coarse_iterations,
+        settings.fine_iterations, settings.coarse_points, settings.min_matches, photometric_weight, p.huber,
+        p.depth_tolerance,
     )  # fmt: skip
 
 
@@ -196,10 +214,6 @@ def native_points(points: FramePoints) -> native.AlignPoints:
     return native.AlignPoints(*(native.address(a) for a in arrays), len(points))
 
 
-PLANE_VARIANCE = 0.02
-"""Variance along the normal of a match of two planes: twice the default thickness. Scales the cost to metres."""
-
-
 def align(
     source: FramePoints,
     target: GicpTarget,
@@ -207,6 +221,7 @@ def align(
     settings: AlignSettings,
     noise: DepthNoise,
     context: NativeContext,
+    photometric: PhotometricPart | None = None,
 ) -> AlignmentResult:
     """Aligns a frame's points to the map, from the coarse voxels to the fine ones.
 
@@ -215,13 +230,16 @@ def align(
 
     Args:
         T_world_camera_guess: [4, 4]; should be right to about a coarse voxel (12 cm) and 10 degrees.
+        photometric: grey values to add at the fine level, with gain and offset between the images estimated along.
     """
     guess = np.ascontiguousarray(T_world_camera_guess, np.float64)
     matches, squared = np.empty(len(source), np.int32), np.empty(len(source), np.float32)
     result = native.AlignResult()
+    arguments = native_align_settings(settings, noise, photometric.settings if photometric else None)
     native.library().ggslam_gicp_align(
-        context.handle, target.handle, native_points(source), native_align_settings(settings, noise, PLANE_VARIANCE),
-        None, None, native.address(guess), native.address(matches), native.address(squared), ctypes.byref(result),
+        context.handle, target.handle, native_points(source), arguments,
+        photometric.points.native() if photometric else None, photometric.reference.native() if photometric else None,
+        native.address(guess), native.address(matches), native.address(squared), ctypes.byref(result),
     )  # fmt: skip
     return _result(result, source, settings, noise, matches, squared)
 
@@ -236,7 +254,7 @@ def _result(
 ) -> AlignmentResult:
     T = np.array(found.pose).reshape(4, 4)
     information = np.array(found.information).reshape(6, 6)
-    visibility, weak = observability(information, source, noise, settings.degenerate_below)
+    visibility, weak = observability(information, T[:3, :3], source, noise, settings.degenerate_below)
     status = AlignmentStatus.OK
     if not found.usable:
         status = AlignmentStatus.LOST
@@ -244,33 +262,41 @@ def _result(
         status = AlignmentStatus.DEGENERATE
     return AlignmentResult(
         T, status, bool(found.converged), found.coarse_iterations + found.fine_iterations, found.overlap, found.rmse,
-        about_world_origin(information, T[:3, 3]), information, visibility, weak, matches, squared, found.cost,
+        about_point(information, T[:3, 3]), information, visibility, weak, matches, squared, found.cost,
         found.photometric_residual, found.photometric_share,
     )  # fmt: skip
 
 
-def about_world_origin(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Information of a twist about `centre` [3] turned into that of the twist about the world's origin, [6, 6].
+def about_point(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Information of a twist about a centre turned into that of a twist about another point, [6, 6].
 
-    A twist (v, w) about the origin moves the centre by v + w x c, so v_centre = v - [c]x w.
+    A twist (v, w) about the point moves the centre, which lies at `centre` [3] from it, by v + w x centre; so
+    v_centre = v - [centre]x w.
     """
     A = np.eye(6)
-    A[:3, 3:] = -np.array([[0, -centre[2], centre[1]], [centre[2], 0, -centre[0]], [-centre[1], centre[0], 0]])
+    A[:3, 3:] = -skew(centre)
     return A.T @ information @ A
 
 
 def observability(
-    information: np.ndarray, source: FramePoints, noise: DepthNoise, limit: float
+    information: np.ndarray, R_world_camera: np.ndarray, source: FramePoints, noise: DepthNoise, limit: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues [6], ascending, of the information per point, and the eigenvectors [k, 6] of those below `limit`.
+    """How well each direction of motion is seen: eigenvalues [6], ascending, and the eigenvectors [k, 6] of those
+    below `limit`.
 
-    Lengths are divided by the median depth for rotations, and each point's information by its own noise, so that an
-    eigenvalue is the share of points that see the direction: the mean of (normal . motion)^2.
+    The information (about the camera centre) is taken about the points' centroid, where turning and shifting hardly
+    mix; angles are measured by the motion they mean at the points' root mean square distance from it, and each
+    point's information by its own noise. An eigenvalue is then the mean of (normal . motion)^2: the share of points
+    that see the direction.
     """
     if not len(source):
         return np.zeros(6), np.eye(6)
     z = source.points[:, 2]
-    per_point = float((1.0 / (noise.constant + noise.square * z * z) ** 2).sum())
-    scale = np.array([1.0, 1.0, 1.0] + [1.0 / max(source.median_depth, 1e-3)] * 3)
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale) / per_point)
+    inverse_variance = 1.0 / (noise.constant + noise.square * z * z) ** 2
+    total = float(inverse_variance.sum())
+    centroid = inverse_variance @ source.points / total
+    radius = float(np.sqrt(inverse_variance @ ((source.points - centroid) ** 2).sum(1) / total))
+    about = about_point(information, -R_world_camera @ centroid)
+    scale = np.array([1.0, 1.0, 1.0] + [1.0 / max(radius, 1e-3)] * 3)
+    values, vectors = np.linalg.eigh(about * np.outer(scale, scale) / total)
     return values, vectors[:, values < limit].T

@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-PhotometricMode = Literal["off", "degenerate", "always"]
+PhotometricMode = Literal["never", "degenerate", "always"]
 
 
 @dataclass(frozen=True)
@@ -85,16 +85,34 @@ class AlignSettings:
     min_normal_dot: float = 0.5
     """Normals of a match agree to this cosine."""
     min_matches: int = 100
-    degenerate_below: float = 0.02
+    degenerate_below: float = 0.01
     """Geometry is degenerate if some direction of motion is seen by less than this share of the points."""
-    photometric_sigma: float = 0.03
-    """Standard deviation of a photometric residual, grey levels in [0, 1]."""
-    photometric_weight: float = 0.2
-    """Weight of the photometric part against the geometric one when both are weighed by their noise."""
+
+
+@dataclass(frozen=True)
+class PhotometricSettings:
+    """The photometric part of the alignment (direct image alignment, Huber norm)."""
+
+    mode: PhotometricMode = "degenerate"
+    """never; degenerate: where geometry leaves a direction of motion open; always."""
+    shrink: int = 2
+    """Images are this many times smaller, for 320-pixel-wide ones; wider ones are shrunk more."""
+    points: int = 5000
+    """Textured points at most."""
+    min_gradient: float = 0.02
+    """A point is textured if grey, in [0, 1], changes by this per (shrunken) pixel."""
+    sigma: float = 0.03
+    """Standard deviation of a residual, grey levels in [0, 1]."""
+    weight: float = 0.2
+    """Weight against the geometry when both are weighed by their noise, per point."""
     huber: float = 0.05
-    """Grey level from which a photometric residual counts linearly."""
+    """Grey difference from which a residual counts linearly."""
     depth_tolerance: float = 0.05
-    """A pixel of the photometric reference is occluded if its depth differs by more than this share."""
+    """A pixel of the reference is occluded if its depth differs by more than this share."""
+    renew_translation: float = 0.1
+    """A frame becomes the reference after a motion of this many times the median depth since the last one."""
+    renew_rotation_deg: float = 8.0
+    """Likewise, degrees."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +121,8 @@ class RecoverySettings:
 
     convincing_overlap: float = 0.6
     """Under this overlap other starts are tried, too."""
+    convincing_residual: float = 0.04
+    """Over this mean grey difference, where grey values were compared, other starts are tried, too."""
     min_overlap: float = 0.25
     """Under this overlap from every start the frame is lost."""
     views: int = 2
@@ -119,8 +139,10 @@ class RecoverySettings:
 class TrackerSettings:
     """Everything the tracker needs to know."""
 
-    noise: DepthNoise = field(default_factory=DepthNoise)
+    noise: DepthNoise | None = None
+    """Of the depth camera; None: measured on the first frame (`noise.estimate_noise`)."""
     points: PointSettings = field(default_factory=PointSettings)
     target: TargetSettings = field(default_factory=TargetSettings)
     align: AlignSettings = field(default_factory=AlignSettings)
+    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
     recovery: RecoverySettings = field(default_factory=RecoverySettings)

@@ -11,13 +11,18 @@ import numpy as np
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, orthonormalized
-from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
+from ggslam.scene.poses import inverse, orthonormalized, so3_log
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart, align
+from ggslam.tracking.noise import estimate_noise
+from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import FramePoints, extract_points
 from ggslam.tracking.recovery import View, feature_starts
-from ggslam.tracking.settings import TrackerSettings
+from ggslam.tracking.settings import DepthNoise, TrackerSettings
 
 __all__ = ["Tracker", "TrackerSettings", "TrackingResult", "TrackingStatus"]
+
+MIN_TEXTURED = 200
+"""Textured points from which grey values are trusted."""
 
 
 class TrackingStatus(enum.Enum):
@@ -62,7 +67,11 @@ class TrackingResult:
 
 
 class Tracker:
-    """Constant velocity, then G-ICP; if that fails, other starts.
+    """Constant velocity, then G-ICP, with grey values where geometry leaves a direction open; if that fails, other
+    starts.
+
+    Grey values are compared with an earlier frame, which the tracker chooses by itself, unless `set_reference` was
+    given another image.
 
     The target is swapped in whenever it is ready (`set_target`, from any thread); the tracker never waits for it.
 
@@ -85,13 +94,21 @@ class Tracker:
         self.context = context or NativeContext()
         self.target: GicpTarget | None = None
         """What frames are aligned to; None until the first keyframe is in."""
+        self.noise: DepthNoise | None = self.settings.noise
+        """Of the depth camera; measured on the first frame if the settings leave it open."""
         self._pose = np.eye(4) if T_world_camera is None else np.array(T_world_camera, float)
         self._velocity = np.eye(4)
         self._views: list[View] = []
+        self._reference_view: View | None = None
+        self._reference: PhotometricReference | None = None
 
     def set_target(self, target: GicpTarget) -> None:
         """Frames are aligned to `target` from the next one on."""
         self.target = target
+
+    def set_reference(self, reference: PhotometricReference | None) -> None:
+        """Grey values are compared with `reference` until the tracker has moved on and takes a frame of its own."""
+        self._reference = reference
 
     def track(self, frame: Frame) -> TrackingResult:
         """Locates a frame. Takes the target as it is; without one the frame gets the current pose.
@@ -99,59 +116,104 @@ class Tracker:
         Raises:
             ValueError: the depth image does not fit the camera.
         """
-        s, target = self.settings, self.target
-        points = extract_points(frame.depth, self.camera, s.points, s.noise, self.context)
+        target = self.target
+        if self.noise is None:
+            self.noise = estimate_noise(frame.depth, self.camera) or DepthNoise()
+        points = extract_points(frame.depth, self.camera, self.settings.points, self.noise, self.context)
+        view = View(frame.color, frame.depth, self._pose)
         if target is None:
-            self._remember(frame, self._pose)
+            self._remember(view, points)
             return TrackingResult(self._pose.copy(), TrackingStatus.FIRST, 1.0, 0.0, "", points)
-        found = self._align(points, target, self._pose @ self._velocity)
-        status = TrackingStatus.DEGENERATE if found.degenerate else TrackingStatus.OK
-        reason = ""
-        if not self._convincing(found):
-            found, reason = self._retry(frame, points, target, found)
-            status = TrackingStatus.RECOVERED if reason else status
+        found, reason = self._locate(view, points, target)
         if not self._acceptable(found):
             return self._lost(points, found)
         T = orthonormalized(found.T_world_camera)
         self._velocity = inverse(self._pose) @ T
-        self._pose = T
-        self._remember(frame, T)
+        self._pose = view.T_world_camera = T
+        self._remember(view, points)
+        status = TrackingStatus.DEGENERATE if found.degenerate else TrackingStatus.OK
+        status = TrackingStatus.RECOVERED if reason else status
         return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, found)
 
     def move(self, T_new_old: np.ndarray) -> None:
         """Moves the tracker's own pose, after the world about it was moved by a correction [4, 4]."""
         self._pose = orthonormalized(T_new_old @ self._pose)
-        self._views = [View(v.color, v.depth, T_new_old @ v.T_world_camera) for v in self._views]
+        for view in self._views:
+            view.T_world_camera = T_new_old @ view.T_world_camera
+        self._reference = None
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
-    def _align(self, points: FramePoints, target: GicpTarget, guess: np.ndarray) -> AlignmentResult:
-        return align(points, target, guess, self.settings.align, self.settings.noise, self.context)
+    def _locate(self, view: View, points: FramePoints, target: GicpTarget) -> tuple[AlignmentResult, str]:
+        """The best alignment, and which start it came from (empty: constant velocity)."""
+        mode = self.settings.photometric.mode
+        guess = self._pose @ self._velocity
+        photometric = self._photometric_part(view) if mode == "always" else None
+        found = self._align(points, target, guess, photometric)
+        if self._convincing(found) and not (found.degenerate and mode != "never"):
+            return found, ""
+        if photometric is None and found.degenerate and mode != "never":
+            photometric = self._photometric_part(view)
+            found = self._align(points, target, guess, photometric) if photometric else found
+        if self._convincing(found) and self._explains_greys(found):
+            return found, ""
+        return self._retry(view, points, target, found, photometric)
+
+    def _align(
+        self, points: FramePoints, target: GicpTarget, guess: np.ndarray, photometric: PhotometricPart | None
+    ) -> AlignmentResult:
+        assert self.noise is not None
+        return align(points, target, guess, self.settings.align, self.noise, self.context, photometric)
+
+    def _photometric_part(self, view: View) -> PhotometricPart | None:
+        """Textured points of the view and the reference; None without either."""
+        settings = self.settings.photometric
+        reference = self._current_reference()
+        if reference is None:
+            return None
+        points = textured_points(self._small(view), settings)
+        return PhotometricPart(points, reference, settings) if len(points) >= MIN_TEXTURED else None
+
+    def _current_reference(self) -> PhotometricReference | None:
+        if self._reference is None and self._reference_view is not None:
+            view = self._reference_view
+            self._reference = PhotometricReference.from_view(self._small(view), view.T_world_camera)
+        return self._reference
+
+    def _small(self, view: View) -> GreyDepth:
+        shrink = self.settings.photometric.shrink * max(1, round(self.camera.width / 320))
+        return GreyDepth.from_images(view.color, view.depth, self.camera, shrink)
 
     def _convincing(self, found: AlignmentResult) -> bool:
         return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.recovery.convincing_overlap
+
+    def _explains_greys(self, found: AlignmentResult) -> bool:
+        """Whether the images agree at the pose found; true if none were compared."""
+        limit = self.settings.recovery.convincing_residual
+        return found.photometric_share == 0 or found.photometric_residual <= limit
 
     def _acceptable(self, found: AlignmentResult) -> bool:
         return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.recovery.min_overlap
 
     def _retry(
-        self, frame: Frame, points: FramePoints, target: GicpTarget, found: AlignmentResult
-    ) -> tuple[AlignmentResult, str]:
-        """The best alignment over all starts, and which start it came from (empty: constant velocity)."""
+        self, view: View, points: FramePoints, target: GicpTarget, found: AlignmentResult,
+        photometric: PhotometricPart | None,
+    ) -> tuple[AlignmentResult, str]:  # fmt: skip
+        """The best alignment over all starts."""
         best, reason = found, ""
         starts = [("last pose", self._pose)]
-        starts += feature_starts(frame, self.camera, self._views, self.settings.recovery)
+        starts += feature_starts(view, self.camera, self._views, self.settings.recovery)
         for name, guess in starts:
-            candidate = self._align(points, target, guess)
-            if candidate.status is not AlignmentStatus.LOST and self._score(candidate) > self._score(best):
+            candidate = self._align(points, target, guess, photometric)
+            if self._score(candidate) > self._score(best):
                 best, reason = candidate, name
         return best, reason
 
     def _score(self, found: AlignmentResult) -> float:
-        """More overlap is better; a loose fit costs a little."""
+        """More overlap is better; a loose fit costs a little, images that disagree cost more."""
         if found.status is AlignmentStatus.LOST:
             return -1.0
-        return found.overlap - 2.0 * found.rmse
+        return found.overlap - 2.0 * found.rmse - 5.0 * found.photometric_residual
 
     def _lost(self, points: FramePoints, found: AlignmentResult) -> TrackingResult:
         """Stays where it was last known, standing still."""
@@ -162,6 +224,18 @@ class Tracker:
             reason = f"only {len(points)} points have depth, {self.settings.align.min_matches} needed"
         return TrackingResult(self._pose.copy(), TrackingStatus.LOST, found.overlap, found.rmse, reason, points, found)
 
-    def _remember(self, frame: Frame, T_world_camera: np.ndarray) -> None:
-        """Keeps the last located frames for feature matching."""
-        self._views = [View(frame.color, frame.depth, T_world_camera), *self._views[: self.settings.recovery.views - 1]]
+    def _remember(self, view: View, points: FramePoints) -> None:
+        """Keeps the last located frames for feature matching, and a not too distant one for its grey values."""
+        self._views = [view, *self._views[: self.settings.recovery.views - 1]]
+        reference = self._reference_view
+        if reference is None or self._is_far(reference.T_world_camera, view.T_world_camera, points.median_depth):
+            self._reference_view, self._reference = view, None
+
+    def _is_far(self, T_world_reference: np.ndarray, T_world_camera: np.ndarray, depth: float) -> bool:
+        settings = self.settings.photometric
+        motion = inverse(T_world_reference) @ T_world_camera
+        rotation = float(np.degrees(np.linalg.norm(so3_log(motion[:3, :3]))))
+        return (
+            float(np.linalg.norm(motion[:3, 3])) > settings.renew_translation * depth
+            or rotation > settings.renew_rotation_deg
+        )

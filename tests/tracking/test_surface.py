@@ -9,7 +9,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import quaternion_to_matrix, se3_exp
 from ggslam.tracking.gicp import GicpTarget, align
 from ggslam.tracking.points import extract_points
-from ggslam.tracking.settings import TrackerSettings
+from ggslam.tracking.settings import DepthNoise, TrackerSettings
 from ggslam.tracking.surface import MeasuredSurface, quaternions_from_normals
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -55,11 +55,11 @@ def test_a_new_view_of_a_measured_corner_is_located(threads: int) -> None:
     surface = MeasuredSurface(settings.target, context)
     for twist in ([0, 0, 0, 0, 0, 0], [0.1, 0.05, 0, 0.02, 0.1, 0]):
         T = se3_exp(np.array(twist, float))
-        surface.add(extract_points(corner_depth(T), CAMERA, settings.points, settings.noise, context), T)
+        surface.add(extract_points(corner_depth(T), CAMERA, settings.points, DepthNoise(), context), T)
     assert surface.target is not None
     truth = se3_exp(np.array([0.08, -0.05, 0.1, 0.05, 0.05, -0.03]))
-    points = extract_points(corner_depth(truth), CAMERA, settings.points, settings.noise, context)
+    points = extract_points(corner_depth(truth), CAMERA, settings.points, DepthNoise(), context)
     guess = se3_exp(np.array([0.03, 0.02, -0.02, 0.02, -0.02, 0.01])) @ truth
-    found = align(points, surface.target, guess, settings.align, settings.noise, context)
+    found = align(points, surface.target, guess, settings.align, DepthNoise(), context)
     assert np.linalg.norm(found.T_world_camera[:3, 3] - truth[:3, 3]) < 1e-3
     assert found.overlap > 0.8

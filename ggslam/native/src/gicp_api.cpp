@@ -20,6 +20,7 @@ namespace {
 
 constexpr int kUnknowns = 8;          // twist, gain, bias
 constexpr std::size_t kBlockPoints = 256;
+constexpr double kAcceptedRise = 1.05;
 
 struct RigidPose {
   double r[9], t[3];
@@ -160,8 +161,9 @@ class Aligner {
       }
       const System next = linearize(candidate, gain, bias);
       ++evaluations;
-      // Matches change from step to step, which lets the cost rise a little on the way down.
-      if (next.cost <= current.cost * 1.001 && next.matches >= settings_.min_matches) {
+      // Matches change from step to step, which lets the cost rise a little on the way down. Refusing such steps
+      // stops short of the minimum in the directions that few points see.
+      if (next.cost <= current.cost * kAcceptedRise && next.matches >= settings_.min_matches) {
         pose = candidate, gain_ = gain, bias_ = bias;
         current = next;
         damping = std::max(damping * 0.1, 1e-9);
