@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 from dataclasses import dataclass
 
@@ -160,10 +161,12 @@ class Tracker:
         return self._retry(view, points, target, found, photometric)
 
     def _align(
-        self, points: FramePoints, target: GicpTarget, guess: np.ndarray, photometric: PhotometricPart | None
-    ) -> AlignmentResult:
+        self, points: FramePoints, target: GicpTarget, guess: np.ndarray, photometric: PhotometricPart | None,
+        coarse: bool = True,
+    ) -> AlignmentResult:  # fmt: skip
         assert self.noise is not None
-        return align(points, target, guess, self.settings.align, self.noise, self.context, photometric)
+        settings = self.settings.align if coarse else dataclasses.replace(self.settings.align, coarse_iterations=0)
+        return align(points, target, guess, settings, self.noise, self.context, photometric)
 
     def _photometric_part(self, view: View) -> PhotometricPart | None:
         """Textured points of the view and the reference; None without either."""
@@ -201,10 +204,12 @@ class Tracker:
     ) -> tuple[AlignmentResult, str]:  # fmt: skip
         """The best alignment over all starts."""
         best, reason = found, ""
-        starts = [("last pose", self._pose)]
-        starts += feature_starts(view, self.camera, self._views, self.settings.recovery)
-        for name, guess in starts:
-            candidate = self._align(points, target, guess, photometric)
+        # Feature matches are good to a centimetre or two; the coarse level would slide off along a bare wall.
+        starts = [("last pose", self._pose, True)]
+        features = feature_starts(view, self.camera, self._views, self.settings.recovery)
+        starts += [(name, guess, False) for name, guess in features]
+        for name, guess, coarse in starts:
+            candidate = self._align(points, target, guess, photometric, coarse)
             if self._score(candidate) > self._score(best):
                 best, reason = candidate, name
         return best, reason

@@ -67,8 +67,13 @@ void bin_gaussians(const TargetInput& in, const TargetSettings& s, std::size_t b
   const float inverse = 1 / s.voxel, reach = 4.0e6f;  // 2^20 blocks of 4 voxels
   for (std::size_t g = begin; g < end; ++g) {
     const float x = in.means[3 * g] * inverse, y = in.means[3 * g + 1] * inverse, z = in.means[3 * g + 2] * inverse;
-    const float furthest = std::max(std::fabs(x), std::max(std::fabs(y), std::fabs(z)));
-    if (!(in.opacity_logits[g] >= s.min_opacity_logit) || !(furthest < reach)) {
+    // Sums, because a NaN in any term makes the comparison false.
+    const float extent = std::fabs(x) + std::fabs(y) + std::fabs(z);
+    const float *q = in.quaternions + 4 * g, *l = in.log_scales + 3 * g;
+    const float length = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+    const float scales = std::fabs(l[0]) + std::fabs(l[1]) + std::fabs(l[2]);
+    if (!(in.opacity_logits[g] >= s.min_opacity_logit) || !(extent < reach) || !(scales < 40) ||
+        !(length > 1e-12f && length < 1e12f)) {
       keys[g] = kEmptyKey;
       continue;
     }
