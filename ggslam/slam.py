@@ -208,6 +208,8 @@ class Slam:
             )
         start = time.perf_counter()
         result = self.tracker.track(frame)
+        if not self.frames and self.tracker.noise is not None:
+            self.mapper.depth_sigma = self.tracker.noise.sigma(result.median_depth_m)
         self.times.tracking += time.perf_counter() - start
         return result
 

@@ -70,8 +70,8 @@ class PoseAdam:
         self.beta1, self.beta2 = beta1, beta2
         self.first, self.second, self.steps = np.zeros(6), np.zeros(6), 0
 
-    def step(self, T_camera_world: np.ndarray, gradient: np.ndarray, rates: np.ndarray) -> np.ndarray:
-        """The pose after one step down `gradient` [6] with step sizes `rates` [6]."""
+    def step(self, T_camera_world: np.ndarray, gradient: np.ndarray, rate: float) -> np.ndarray:
+        """The pose after one step of size `rate` (metres, radians) down `gradient` [6]."""
         if not np.isfinite(gradient).all():
             return T_camera_world
         self.steps += 1
@@ -79,4 +79,4 @@ class PoseAdam:
         self.second += (1 - self.beta2) * (gradient**2 - self.second)
         first = self.first / (1 - self.beta1**self.steps)
         second = self.second / (1 - self.beta2**self.steps)
-        return se3_exp(-rates * first / (np.sqrt(second) + 1e-15)) @ T_camera_world
+        return se3_exp(-rate * first / (np.sqrt(second) + 1e-15)) @ T_camera_world

@@ -60,6 +60,8 @@ class Mapper:
         self.keyframes: list[Keyframe] = []
         self.times = MapperTimes()
         self.last_psnr = float("nan")
+        self.depth_sigma = 0.004
+        """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
         self._rasterizer = CpuRasterizer(context=context)
         self._loss = ImageLoss(context)
         self._standard_adam = self._adam(1.0)
@@ -158,9 +160,8 @@ class Mapper:
         if keyframe.index == 0:
             return
         if s.pose_refinement.enabled:
-            p = s.pose_refinement
-            rates = rate_factor * np.repeat([p.translation_rate, p.rotation_rate], 3)
+            rate = min(s.pose_refinement.rate_sigmas * self.depth_sigma, s.pose_refinement.max_rate)
             optimizer = self._pose_optimizers[keyframe.index]
-            keyframe.T_camera_world = optimizer.step(keyframe.T_camera_world, twist, rates)
+            keyframe.T_camera_world = optimizer.step(keyframe.T_camera_world, twist, rate_factor * rate)
         if s.exposure.enabled:
             keyframe.exposure = self._exposure_optimizers[keyframe.index].step(keyframe.exposure, exposure_gradient)

@@ -70,13 +70,17 @@ class PruningSettings:
 
 @dataclass(frozen=True)
 class PoseRefinementSettings:
-    """Refinement of keyframe poses through the renderer's pose gradient (Adam on the twist)."""
+    """Refinement of keyframe poses through the renderer's pose gradient (Adam on the twist).
 
-    enabled: bool = False
-    translation_rate: float = 4e-4
-    """Metres a step."""
-    rotation_rate: float = 4e-4
-    """Radians a step."""
+    The steps go with the noise of the depth camera: where depth is exact, tracking leaves nothing to refine, and the
+    steps would only shake the map.
+    """
+
+    enabled: bool = True
+    rate_sigmas: float = 0.1
+    """Step in standard deviations of the depth noise at the scene's median depth: metres, and radians times 1 m."""
+    max_rate: float = 5e-4
+    """Upper bound of the step."""
 
 
 @dataclass(frozen=True)

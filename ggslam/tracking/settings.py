@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-PhotometricMode = Literal["never", "degenerate", "always"]
+PhotometricMode = Literal["never", "degenerate", "auto", "always"]
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,11 @@ class AlignSettings:
 class PhotometricSettings:
     """The photometric part of the alignment (direct image alignment, Huber norm)."""
 
-    mode: PhotometricMode = "degenerate"
-    """never; degenerate: where geometry leaves a direction of motion open; always."""
+    mode: PhotometricMode = "auto"
+    """never; degenerate: where geometry leaves a direction of motion open; always; auto: always if the depth camera is
+    noisy, else where geometry is degenerate."""
+    noisy_m: float = 0.001
+    """For "auto": the depth camera is noisy if its standard deviation at the median depth is above this, metres."""
     shrink: int = 2
     """Images are this many times smaller, for 320-pixel-wide ones; wider ones are shrunk more."""
     points: int = 5000
@@ -105,6 +108,8 @@ class PhotometricSettings:
     """Standard deviation of a residual, grey levels in [0, 1]."""
     weight: float = 0.2
     """Weight against the geometry when both are weighed by their noise, per point."""
+    surface_sigma: float = 0.002
+    """Metres; the geometry's noise at 1 m is taken to be no less."""
     huber: float = 0.05
     """Grey difference from which a residual counts linearly."""
     depth_tolerance: float = 0.05

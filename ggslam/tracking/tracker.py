@@ -18,7 +18,7 @@ from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import FramePoints, extract_points
 from ggslam.tracking.recovery import View, feature_starts
-from ggslam.tracking.settings import DepthNoise, TrackerSettings
+from ggslam.tracking.settings import DepthNoise, PhotometricMode, TrackerSettings
 
 __all__ = ["Tracker", "TrackerSettings", "TrackingResult", "TrackingStatus"]
 
@@ -147,7 +147,7 @@ class Tracker:
 
     def _locate(self, view: View, points: FramePoints, target: GicpTarget) -> tuple[AlignmentResult, str]:
         """The best alignment, and which start it came from (empty: constant velocity)."""
-        mode = self.settings.photometric.mode
+        mode = self._mode(points)
         guess = self._pose @ self._velocity
         photometric = self._photometric_part(view) if mode == "always" else None
         found = self._align(points, target, guess, photometric)
@@ -159,6 +159,14 @@ class Tracker:
         if self._convincing(found) and self._explains_greys(found):
             return found, ""
         return self._retry(view, points, target, found, photometric)
+
+    def _mode(self, points: FramePoints) -> PhotometricMode:
+        """The photometric mode with "auto" decided."""
+        settings = self.settings.photometric
+        if settings.mode != "auto":
+            return settings.mode
+        assert self.noise is not None
+        return "always" if self.noise.sigma(points.median_depth) > settings.noisy_m else "degenerate"
 
     def _align(
         self, points: FramePoints, target: GicpTarget, guess: np.ndarray, photometric: PhotometricPart | None,
