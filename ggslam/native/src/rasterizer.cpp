@@ -19,13 +19,14 @@ void prepare(Rasterizer& r, const GaussianArrays& gaussians, const View& view) {
   r.tiles_y = (view.height + r.tile_height - 1) / r.tile_height;
 
   // The cut into blocks must not depend on the number of threads: the pose gradient is summed block by block.
-  const std::int64_t wanted = std::clamp<std::int64_t>(gaussians.count / 1024, 1, kMaxBlocks);
-  r.block_size = (gaussians.count + wanted - 1) / wanted + 15;
-  r.block_size -= r.block_size % 16;
-  r.blocks = r.block_size > 0 ? static_cast<int>((gaussians.count + r.block_size - 1) / r.block_size) : 0;
+  r.block_shift = 10;
+  while ((gaussians.count >> r.block_shift) >= kMaxBlocks) ++r.block_shift;
+  r.block_size = std::int64_t{1} << r.block_shift;
+  r.blocks = static_cast<int>((gaussians.count + r.block_size - 1) >> r.block_shift);
 
   const std::size_t tiles = r.tiles(), pixels = tiles * kTileWidth * r.tile_height;
   r.splats.reserve(static_cast<std::size_t>(r.blocks) * r.block_size);
+  r.footprints.reserve(static_cast<std::size_t>(r.blocks) * r.block_size);
   r.tile_cursor.reserve(r.blocks * (tiles + 1));
   r.tile_start.reserve(tiles + 1);
   r.transmittance.reserve(pixels);

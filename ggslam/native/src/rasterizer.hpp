@@ -84,6 +84,17 @@ struct AdamArguments {
 
 // --- what the stages hand to one another -----------------------------------------------------------------------------
 
+// Tiles that a splat covers.
+struct TileRectangle {
+  std::uint16_t x, y, wide, high;
+};
+
+// What binning needs to know of a splat.
+struct Footprint {
+  std::uint32_t depth_bits;
+  TileRectangle tiles;
+};
+
 // Everything a tile needs to know of a projected Gaussian, in one cache line.
 struct alignas(64) Splat {
   float mean_x, mean_y;                // pixels
@@ -92,9 +103,9 @@ struct alignas(64) Splat {
   float red, green, blue;
   float depth;
   float slope_x, slope_y;              // the dx (dy) of highest alpha in a row (column) is slope_x dy (slope_y dx)
-  std::uint32_t first_pair;            // its gradient slots: first_pair + number of the tile in its rectangle
+  std::uint32_t first_pair;            // number of its first (splat, tile) pair, within the block
   std::int32_t gaussian;               // row in the map
-  std::uint16_t tile_x, tile_y, tiles_wide, tiles_high;  // rectangle of tiles
+  TileRectangle tiles;
 };
 static_assert(sizeof(Splat) == 64, "a splat fills one cache line");
 
@@ -121,8 +132,10 @@ struct Rasterizer {
   int tile_height = 0, tiles_x = 0, tiles_y = 0;
 
   int blocks = 0;                     // Gaussians [b * block_size, (b + 1) * block_size) form block b
+  int block_shift = 0;                // log2 of block_size
   std::int64_t block_size = 0;
   Buffer<Splat> splats;               // those of block b start at b * block_size
+  Buffer<Footprint> footprints;       // likewise
   std::int32_t visible[kMaxBlocks];   // number of splats per block
   std::uint64_t pairs[kMaxBlocks];    // number of (splat, tile) pairs per block; then of all blocks before it
   std::uint64_t pair_count = 0;
@@ -140,6 +153,12 @@ struct Rasterizer {
   Buffer<double> block_twist;         // [blocks][6]
 
   int tiles() const { return tiles_x * tiles_y; }
+  // Number of the pair of a splat and a tile, which is that of its gradient slot. Pairs are numbered Gaussian by Gaussian
+  // and, within the splat's rectangle, row by row.
+  std::size_t pair_number(std::uint32_t splat_index, const Splat& splat, int tile_x, int tile_y) const {
+    return pairs[splat_index >> block_shift] + splat.first_pair +
+           static_cast<std::size_t>((tile_y - splat.tiles.y) * splat.tiles.wide + (tile_x - splat.tiles.x));
+  }
   std::uint32_t* cursors(int block) const {
     return tile_cursor.data() + static_cast<std::size_t>(block) * static_cast<std::size_t>(tiles() + 1);
   }

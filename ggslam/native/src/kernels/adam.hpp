@@ -11,15 +11,18 @@ namespace ggslam::GGSLAM_ISA {
 struct AdamRows {
   const std::int32_t* rows;
   int n;
+  bool whole_run;                 // kLanes rows that follow one another: no packing needed
+  bool same_count;                // all at the same update: one line of the schedule serves all
   const float* schedule[kLanes];  // each row's line of AdamArguments::schedule
 };
 
 static inline AdamRows count_updates(const AdamArguments& adam, const std::int32_t* rows, int n) {
-  AdamRows result{rows, n, {}};
+  AdamRows result{rows, n, n == kLanes && rows[n - 1] - rows[0] == n - 1, true, {}};
   for (int i = 0; i < n; ++i) {
     const std::int32_t count = ++adam.updates[rows[i]];
     const std::int32_t line = (count < adam.schedule_rows ? count : adam.schedule_rows) - 1;
     result.schedule[i] = adam.schedule + 8 * static_cast<std::size_t>(line);
+    result.same_count &= result.schedule[i] == result.schedule[0];
   }
   return result;
 }
@@ -34,37 +37,57 @@ static inline void adam_step(const AdamArguments& adam, Float gradient, Float st
   v.parameters -= step * v.first / (square_root(v.second) * correction + adam.epsilon);
 }
 
-// Narrow rows: kWidth columns of an array whose rows are `stride` apart. gradients [n][kWidth]. The rows are packed
-// side by side, so that the vectors are full.
+// Adam on kWidth * kLanes numbers, kWidth per row, side by side.
+template <int kWidth>
+static inline void adam_packed(const AdamArguments& adam, const AdamRows& rows, AdamGroup group, const float* gradients,
+                               AdamArrays packed) {
+  alignas(64) float step[kWidth * kLanes], correction[kWidth * kLanes];
+  if (!rows.same_count) {
+    for (int i = 0; i < kWidth * kLanes; ++i) {
+      const float* line = rows.schedule[i / kWidth < rows.n ? i / kWidth : 0];
+      step[i] = line[group], correction[i] = line[kCorrection];
+    }
+  }
+  const Float same_step = broadcast(rows.schedule[0][group]), same_correction = broadcast(rows.schedule[0][kCorrection]);
+  for (int i = 0; i < kWidth * kLanes; i += kLanes) {
+    AdamVectors v{load(packed.parameters + i), load(packed.first_moments + i), load(packed.second_moments + i)};
+    adam_step(adam, load(gradients + i), rows.same_count ? same_step : load(step + i),
+              rows.same_count ? same_correction : load(correction + i), v);
+    store(packed.parameters + i, v.parameters);
+    store(packed.first_moments + i, v.first);
+    store(packed.second_moments + i, v.second);
+  }
+}
+
+template <int kWidth>
+static inline void pack(const AdamRows& rows, const float* array, std::size_t stride, float* packed) {
+  for (int i = 0; i < kLanes; ++i)  // lanes from n on repeat row 0 and are not written back
+    for (int k = 0; k < kWidth; ++k) packed[i * kWidth + k] = array[rows.rows[i < rows.n ? i : 0] * stride + k];
+}
+
+template <int kWidth>
+static inline void unpack(const AdamRows& rows, const float* packed, std::size_t stride, float* array) {
+  for (int i = 0; i < rows.n; ++i)
+    for (int k = 0; k < kWidth; ++k) array[rows.rows[i] * stride + k] = packed[i * kWidth + k];
+}
+
+// Narrow rows: the first kWidth columns of an array whose rows are `stride` apart. gradients [kLanes][kWidth].
 template <int kWidth>
 static inline void adam_narrow(const AdamArguments& adam, AdamArrays arrays, std::size_t stride, const AdamRows& rows,
                                AdamGroup group, const float* gradients) {
-  constexpr int kSize = kWidth * kLanes;
-  alignas(64) float p[kSize], first[kSize], second[kSize], step[kSize], correction[kSize];
-  for (int i = 0; i < kLanes; ++i) {
-    const int row = i < rows.n ? i : 0;  // lanes from n on repeat row 0 and are not written back
-    const std::size_t at = rows.rows[row] * stride;
-    for (int k = 0; k < kWidth; ++k) {
-      p[i * kWidth + k] = arrays.parameters[at + k];
-      first[i * kWidth + k] = arrays.first_moments[at + k];
-      second[i * kWidth + k] = arrays.second_moments[at + k];
-      step[i * kWidth + k] = rows.schedule[row][group];
-      correction[i * kWidth + k] = rows.schedule[row][kCorrection];
-    }
+  if (rows.whole_run && stride == kWidth) {
+    const std::size_t at = rows.rows[0] * stride;
+    const AdamArrays run{arrays.parameters + at, arrays.first_moments + at, arrays.second_moments + at};
+    return adam_packed<kWidth>(adam, rows, group, gradients, run);
   }
-  for (int i = 0; i < kSize; i += kLanes) {
-    AdamVectors v{load(p + i), load(first + i), load(second + i)};
-    adam_step(adam, load(gradients + i), load(step + i), load(correction + i), v);
-    store(p + i, v.parameters), store(first + i, v.first), store(second + i, v.second);
-  }
-  for (int i = 0; i < rows.n; ++i) {
-    const std::size_t at = rows.rows[i] * stride;
-    for (int k = 0; k < kWidth; ++k) {
-      arrays.parameters[at + k] = p[i * kWidth + k];
-      arrays.first_moments[at + k] = first[i * kWidth + k];
-      arrays.second_moments[at + k] = second[i * kWidth + k];
-    }
-  }
+  alignas(64) float parameters[kWidth * kLanes], first[kWidth * kLanes], second[kWidth * kLanes];
+  pack<kWidth>(rows, arrays.parameters, stride, parameters);
+  pack<kWidth>(rows, arrays.first_moments, stride, first);
+  pack<kWidth>(rows, arrays.second_moments, stride, second);
+  adam_packed<kWidth>(adam, rows, group, gradients, {parameters, first, second});
+  unpack<kWidth>(rows, parameters, stride, arrays.parameters);
+  unpack<kWidth>(rows, first, stride, arrays.first_moments);
+  unpack<kWidth>(rows, second, stride, arrays.second_moments);
 }
 
 // Wide rows: columns [begin, end) of an array with `stride` columns, row by row. Row i's gradients start at

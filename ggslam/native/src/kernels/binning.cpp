@@ -11,16 +11,10 @@ void scatter_block(Rasterizer& r, int block) {
   cursors[spare] = static_cast<std::uint32_t>(r.pair_count) + static_cast<std::uint32_t>(block);
   TileEntry* entries = r.entries.data();
   const std::uint32_t first = static_cast<std::uint32_t>(r.block_begin(block));
-  std::uint32_t pair = static_cast<std::uint32_t>(r.pairs[block]);
   for (std::int32_t i = 0; i < r.visible[block]; ++i) {
-    Splat& splat = r.splats[first + i];
-    splat.first_pair = pair;
-    pair += static_cast<std::uint32_t>(splat.tiles_wide) * splat.tiles_high;
-    TileEntry entry;
-    __builtin_memcpy(&entry.depth_bits, &splat.depth, sizeof(float));
-    entry.splat = first + i;
-    const TileRectangle tiles{splat.tile_x, splat.tile_y, splat.tiles_wide, splat.tiles_high};
-    visit_tiles(tiles, tiles_x, spare, [=](int tile, int exists) {
+    const Footprint& footprint = r.footprints[first + i];
+    const TileEntry entry{footprint.depth_bits, first + i};
+    visit_tiles(footprint.tiles, tiles_x, spare, [=](int tile, int exists) {
       const std::uint32_t place = cursors[tile];
       cursors[tile] = place + exists;
       entries[place] = entry;

@@ -102,12 +102,12 @@ void apply_adam(const Rasterizer& r, const Group& group, const GradientRows& row
 }
 
 // Adds up the slots of one splat; false if no tile used it.
-inline bool sum_slots(const Rasterizer& r, const Splat& splat, Group& group, float* features) {
-  const int pairs = splat.tiles_wide * splat.tiles_high, channels = r.padded_features;
+inline bool sum_slots(const Rasterizer& r, const Splat& splat, std::size_t first, Group& group, float* features) {
+  const int pairs = splat.tiles.wide * splat.tiles.high, channels = r.padded_features;
   alignas(64) float total[kSlotStride] = {};
   bool touched = false;
   for (int j = 0; j < pairs; ++j) {
-    const std::size_t pair = splat.first_pair + static_cast<std::size_t>(j);
+    const std::size_t pair = first + static_cast<std::size_t>(j);
     if (!r.slot_used[pair]) continue;
     const float* slot = r.slots.data() + pair * kSlotStride;
     for (int q = 0; q < 12; ++q) total[q] += slot[q];
@@ -148,7 +148,8 @@ void gather_block(Rasterizer& r, int block, const GaussianGradients& gradients, 
   };
   for (int i = 0; i < r.visible[block]; ++i) {
     const Splat& splat = r.splats[begin + i];
-    if (!sum_slots(r, splat, group, features + group.n * r.padded_features)) continue;
+    const std::size_t first = r.pairs[block] + splat.first_pair;
+    if (!sum_slots(r, splat, first, group, features + group.n * r.padded_features)) continue;
     gradients.touched[splat.gaussian] = 1;
     group.rows[group.n++] = splat.gaussian;
     if (group.n == kLanes) flush();

@@ -56,6 +56,12 @@ inline void make_splats(const Rasterizer& r, const ViewConstants& c, const std::
   for (int k = 0; k < SplatVectors::kFields; ++k) store(out.fields[k], values[k]);
 }
 
+inline TileRectangle tile_rectangle(const SplatVectors& v, int lane) {
+  const int x = v.tile_x0[lane], y = v.tile_y0[lane];
+  return {static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(y),
+          static_cast<std::uint16_t>(v.tile_x1[lane] - x + 1), static_cast<std::uint16_t>(v.tile_y1[lane] - y + 1)};
+}
+
 }  // namespace
 
 int rasterizer_lanes() { return kLanes; }
@@ -67,6 +73,7 @@ void project_block(Rasterizer& r, int block) {
   const int tiles_x = r.tiles_x, spare = r.tiles();
   const std::int64_t begin = r.block_begin(block), end = r.block_end(block);
   Splat* splat = r.splats.data() + begin;
+  Footprint* footprint = r.footprints.data() + begin;
   std::uint64_t pairs = 0;
   SplatVectors v;
   std::int32_t rows[kLanes];
@@ -78,12 +85,13 @@ void project_block(Rasterizer& r, int block) {
       const int lane = __builtin_ctz(left);
       float* fields = &splat->mean_x;  // the twelve floats of a splat, in the order of SplatVectors::Field
       for (int k = 0; k < SplatVectors::kFields; ++k) fields[k] = v.fields[k][lane];
-      const TileRectangle tiles{v.tile_x0[lane], v.tile_y0[lane], v.tile_x1[lane] - v.tile_x0[lane] + 1,
-                                v.tile_y1[lane] - v.tile_y0[lane] + 1};
+      const TileRectangle tiles = tile_rectangle(v, lane);
+      splat->first_pair = static_cast<std::uint32_t>(pairs);
       splat->gaussian = rows[lane];
-      splat->tile_x = static_cast<std::uint16_t>(tiles.x), splat->tiles_wide = static_cast<std::uint16_t>(tiles.wide);
-      splat->tile_y = static_cast<std::uint16_t>(tiles.y), splat->tiles_high = static_cast<std::uint16_t>(tiles.high);
-      pairs += static_cast<std::uint64_t>(tiles.wide) * static_cast<std::uint64_t>(tiles.high);
+      splat->tiles = footprint->tiles = tiles;
+      __builtin_memcpy(&footprint->depth_bits, &splat->depth, sizeof(float));
+      ++footprint;
+      pairs += static_cast<std::uint64_t>(tiles.wide) * tiles.high;
       visit_tiles(tiles, tiles_x, spare, [counts](int tile, int) { ++counts[tile]; });
       ++splat;
     }

@@ -153,6 +153,9 @@ static inline Float load_sub_block(const float* plane, const View& view, int x0,
 
 static inline bool outside(const View& view, int x0, int y0) { return x0 >= view.width || y0 >= view.height; }
 
+// How many entries ahead a splat is asked for, and what its own line leads to: feature rows and gradient slots.
+constexpr int kSplatPrefetch = 32, kRowPrefetch = 16;
+
 static inline const float* feature_row(const GaussianArrays& arrays, std::int32_t gaussian) {
   return arrays.features + static_cast<std::size_t>(gaussian) * arrays.feature_channels;
 }

@@ -6,14 +6,10 @@
 
 namespace ggslam::GGSLAM_ISA {
 
-struct TileRectangle {
-  int x, y, wide, high;
-};
-
 // Calls visit(tile, 1) for each tile of the rectangle, row by row, and visit(spare, 0) for places of the 2 x 2 pattern
 // that the rectangle does not have. `spare` is the number of a tile that does not exist.
 template <class Visit>
-static inline void visit_tiles(const TileRectangle& rectangle, int tiles_x, int spare, const Visit& visit) {
+static inline void visit_tiles(TileRectangle rectangle, int tiles_x, int spare, const Visit& visit) {
   const int first = rectangle.y * tiles_x + rectangle.x;
   if (__builtin_expect(rectangle.wide <= 2 && rectangle.high <= 2, 1)) {
     const int wide = rectangle.wide - 1, high = rectangle.high - 1;

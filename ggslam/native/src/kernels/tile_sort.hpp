@@ -1,25 +1,60 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stable sort of a tile's entries by depth: one bucket pass over the actual range of depths, with about two buckets per
-// entry, then insertion. Depths that crowd in few buckets (a near object before a far wall) are bucketed again.
+// Stable sort of a tile's entries by depth: two counting passes over the depths' range in 65536 steps, which leaves few
+// neighbours to exchange, then insertion. Depths that crowd in few steps (something near before a far wall) would make
+// insertion slow; then two more counting passes over all their bits do the rest.
 #pragma once
 #include "rasterizer.hpp"
 
 namespace ggslam::GGSLAM_ISA {
 
-constexpr std::uint32_t kInsertionLimit = 24;
+constexpr int kDigitBits = 8, kDigits = 1 << kDigitBits;
 
-static inline void insertion_sort(TileEntry* entries, std::uint32_t n) {
+// Insertion sort that gives up, with the entries in a stable order still, after `budget` moves. True if done.
+static inline bool insertion_sort(TileEntry* entries, std::uint32_t n, std::int64_t budget) {
   for (std::uint32_t i = 1; i < n; ++i) {
     const TileEntry entry = entries[i];
+    if (__builtin_expect(entries[i - 1].depth_bits <= entry.depth_bits, 1)) continue;
     std::uint32_t j = i;
     for (; j > 0 && entries[j - 1].depth_bits > entry.depth_bits; --j) entries[j] = entries[j - 1];
     entries[j] = entry;
+    budget -= i - j;
+    if (budget < 0) return false;
   }
+  return true;
+}
+
+// One stable counting pass by the digit of (depth - low) at `shift`.
+static inline void counting_pass(const TileEntry* from, TileEntry* to, std::uint32_t n, std::uint32_t low, int shift,
+                                 std::uint32_t* counts) {
+  std::uint32_t next = 0;
+  for (int digit = 0; digit < kDigits; ++digit) {
+    const std::uint32_t here = counts[digit];
+    counts[digit] = next;
+    next += here;
+  }
+  for (std::uint32_t i = 0; i < n; ++i)
+    to[counts[((from[i].depth_bits - low) >> shift) & (kDigits - 1)]++] = from[i];
+}
+
+// Sorts by the 16 bits of (depth - low) from `shift` on.
+static inline void sort_by_two_digits(TileEntry* entries, TileEntry* temporary, std::uint32_t n, std::uint32_t low,
+                                      int shift) {
+  std::uint32_t lower[kDigits] = {}, upper[kDigits] = {};
+  for (std::uint32_t i = 0; i < n; ++i) {
+    const std::uint32_t key = (entries[i].depth_bits - low) >> shift;
+    ++lower[key & (kDigits - 1)];
+    ++upper[(key >> kDigitBits) & (kDigits - 1)];
+  }
+  counting_pass(entries, temporary, n, low, shift, lower);
+  counting_pass(temporary, entries, n, low, shift + kDigitBits, upper);
 }
 
 // Sorts entries[0..n); temporary has room for n.
 static void sort_by_depth(TileEntry* entries, TileEntry* temporary, std::uint32_t n) {
-  if (n <= kInsertionLimit) return insertion_sort(entries, n);
+  if (n < 32) {
+    insertion_sort(entries, n, std::int64_t{1} << 20);
+    return;
+  }
   std::uint32_t low = entries[0].depth_bits, high = low;
   for (std::uint32_t i = 1; i < n; ++i) {
     const std::uint32_t bits = entries[i].depth_bits;
@@ -27,26 +62,11 @@ static void sort_by_depth(TileEntry* entries, TileEntry* temporary, std::uint32_
     high = bits > high ? bits : high;
   }
   if (low == high) return;
-  const int size_bits = 33 - __builtin_clz(n), bucket_bits = size_bits > 11 ? 11 : size_bits;
-  const int range_bits = 32 - __builtin_clz(high - low);
-  const int shift = range_bits > bucket_bits ? range_bits - bucket_bits : 0;
-
-  constexpr int kMaxBuckets = 1 << 11;
-  const std::uint32_t buckets = ((high - low) >> shift) + 1;
-  std::uint32_t start[kMaxBuckets + 1];
-  __builtin_memset(start, 0, sizeof(start[0]) * (buckets + 1));
-  for (std::uint32_t i = 0; i < n; ++i) ++start[((entries[i].depth_bits - low) >> shift) + 1];
-  std::uint32_t largest = 0;
-  for (std::uint32_t b = 1; b <= buckets; ++b) {
-    largest = start[b] > largest ? start[b] : largest;
-    start[b] += start[b - 1];
-  }
-  for (std::uint32_t i = 0; i < n; ++i) temporary[start[(entries[i].depth_bits - low) >> shift]++] = entries[i];
-  __builtin_memcpy(entries, temporary, sizeof(TileEntry) * n);
-  if (shift == 0) return;
-  if (largest <= kInsertionLimit) return insertion_sort(entries, n);  // every entry is already within its bucket
-  for (std::uint32_t b = 0, begin = 0; b < buckets; begin = start[b++])  // start[b] is now the end of bucket b
-    if (start[b] - begin > 1) sort_by_depth(entries + begin, temporary + begin, start[b] - begin);
+  const int range_bits = 32 - __builtin_clz(high - low), shift = range_bits > 16 ? range_bits - 16 : 0;
+  sort_by_two_digits(entries, temporary, n, low, shift);
+  if (shift == 0 || insertion_sort(entries, n, 4 * static_cast<std::int64_t>(n))) return;
+  sort_by_two_digits(entries, temporary, n, low, 0);
+  sort_by_two_digits(entries, temporary, n, low, 16);
 }
 
 }  // namespace ggslam::GGSLAM_ISA

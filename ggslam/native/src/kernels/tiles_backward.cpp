@@ -127,14 +127,10 @@ inline void differentiate_features(const WeightList& list, const float* pixel_fe
   if (q < channels) feature_group<4>(list, pixel_features + q * kLanes, channels, slot + q);
 }
 
-// Number of the (splat, tile) pair, which is that of its gradient slot.
-inline std::size_t pair_number(const Splat& g, int tile_x, int tile_y) {
-  return g.first_pair + static_cast<std::size_t>((tile_y - g.tile_y) * g.tiles_wide + (tile_x - g.tile_x));
-}
-
 // Features are read and slots written in random order: their cache lines are asked for early.
-GGSLAM_PREFETCHING prefetch_pair(const Rasterizer& r, const Splat& g, int tile_x, int tile_y) {
-  const std::size_t pair = pair_number(g, tile_x, tile_y);
+GGSLAM_PREFETCHING prefetch_pair(const Rasterizer& r, std::uint32_t splat, int tile_x, int tile_y) {
+  const Splat& g = r.splats[splat];
+  const std::size_t pair = r.pair_number(splat, g, tile_x, tile_y);
   __builtin_prefetch(r.slots.data() + pair * kSlotStride, 1);
   for (int q = 0; q < r.padded_features; q += 16)
     __builtin_prefetch(r.feature_slots.data() + pair * r.padded_features + q, 1);
@@ -149,11 +145,12 @@ void differentiate_tile(Rasterizer& r, int index, const Tile& tile, TileGradient
   float* features = scratch.gaussian_features.data();
   WeightList list;
   for (std::int32_t k = grad.last_in_tile; k >= 0; --k) {
-    if (k >= 16) __builtin_prefetch(r.splats.data() + entries[k - 16].splat);
-    if (k >= 8 && contributed[k - 8] != 0) prefetch_pair(r, r.splats[entries[k - 8].splat], tile_x, tile_y);
+    if (k >= kSplatPrefetch) __builtin_prefetch(r.splats.data() + entries[k - kSplatPrefetch].splat);
+    if (k >= kRowPrefetch && contributed[k - kRowPrefetch] != 0)
+      prefetch_pair(r, entries[k - kRowPrefetch].splat, tile_x, tile_y);
     if (contributed[k] == 0) continue;
     const Splat& g = r.splats[entries[k].splat];
-    const std::size_t pair = pair_number(g, tile_x, tile_y);
+    const std::size_t pair = r.pair_number(entries[k].splat, g, tile_x, tile_y);
     if (kMode != kNoFeatures) copy_features(r.gaussians, g.gaussian, channels, features);
     differentiate_splat<kMode>(tile, g, k, contributed[k], features, scratch.pixel_features.data(), channels, grad,
                                list, r.slots.data() + pair * kSlotStride);

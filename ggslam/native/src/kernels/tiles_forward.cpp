@@ -24,7 +24,7 @@ struct Chunk {
   Splat splats[kChunk];
   std::uint64_t covering[kSubBlocks];      // per sub-block, one bit per splat
   std::uint64_t contributing[kSubBlocks];
-  std::int32_t first;                      // number of its first splat in the tile's list
+  std::int32_t numbers[kChunk];            // of the splats in the tile's list
 };
 
 // The contributions to one sub-block: weights of the pixels and number of the splat in the chunk.
@@ -41,15 +41,16 @@ GGSLAM_PREFETCHING prefetch_splat(const Rasterizer& r, std::uint32_t entry) {
 void load_chunk(const Rasterizer& r, const Tile& tile, std::uint32_t begin, int n, std::uint32_t alive,
                 ThreadScratch& scratch, Chunk& chunk) {
   alignas(64) std::uint16_t masks[kChunk] = {};
-  chunk.first = static_cast<std::int32_t>(begin - tile.begin);
+  const std::int32_t first = static_cast<std::int32_t>(begin - tile.begin);
+  for (int k = 0; k < kChunk; ++k) chunk.numbers[k] = first + k;
   for (int k = 0; k < n; ++k) {
-    if (begin + k + 16 < tile.end) prefetch_splat(r, begin + k + 16);
+    if (begin + k + kSplatPrefetch < tile.end) prefetch_splat(r, begin + k + kSplatPrefetch);
     const Splat& splat = chunk.splats[k] = r.splats[r.entries[begin + k].splat];
     masks[k] = static_cast<std::uint16_t>(covered_sub_blocks(splat, tile) & alive);
     if (r.padded_features > 0) {
       // The splat's own line must have arrived before its features can be asked for: a shorter distance.
-      if (begin + k + 8 < tile.end)
-        prefetch_features(r.gaussians, r.splats[r.entries[begin + k + 8].splat].gaussian);
+      if (begin + k + kRowPrefetch < tile.end)
+        prefetch_features(r.gaussians, r.splats[r.entries[begin + k + kRowPrefetch].splat].gaussian);
       copy_features(r.gaussians, splat.gaussian, r.padded_features,
                     scratch.gaussian_features.data() + k * r.padded_features);
     }
@@ -80,7 +81,7 @@ inline void composite(const Tile& tile, Chunk& chunk, int s, TileState& state, W
     green += weight * g.green;
     blue += weight * g.blue;
     depth += weight * g.depth;
-    last = select_int(taken, broadcast_int(chunk.first + k), last);
+    last = select_int(taken, broadcast_int(chunk.numbers[k]), last);
     const bool contributes = any(taken);
     contributing |= static_cast<std::uint64_t>(contributes) << k;
     if (kWithMedian) {
@@ -128,7 +129,7 @@ void composite_tile(Rasterizer& r, const Tile& tile, TileState& state, ThreadScr
   Chunk chunk;
   WeightList list;
   const int channels = r.padded_features;
-  for (std::uint32_t e = tile.begin; e < tile.end && e < tile.begin + 16; ++e) prefetch_splat(r, e);
+  for (std::uint32_t e = tile.begin; e < tile.end && e < tile.begin + kSplatPrefetch; ++e) prefetch_splat(r, e);
   std::uint32_t begin = tile.begin;
   for (; begin < tile.end && state.alive != 0; begin += kChunk) {
     const int n = static_cast<int>(tile.end - begin < kChunk ? tile.end - begin : kChunk);
