@@ -197,8 +197,9 @@ def native_align_settings(
 ) -> native.AlignSettings:
     """The core's form of the settings."""
     p = photometric or PhotometricSettings()
-    # The core weighs the geometric part per point of unit weight, which has the noise of 1 m.
-    photometric_weight = p.weight * (noise.sigma(1.0) / p.sigma) ** 2
+    # The core weighs the geometric part per point of unit weight, which has the noise of 1 m. However good the depth,
+    # a match is no better than the map's surface.
+    photometric_weight = p.weight * (max(noise.sigma(1.0), p.surface_sigma) / p.sigma) ** 2
     return native.AlignSettings(
         settings.translation_tolerance, settings.rotation_tolerance, settings.coarse_kernel_factor,
         noise.constant, noise.square, settings.kernel_constant, settings.kernel_sigmas, settings.overlap_constant,

@@ -90,7 +90,11 @@ def library() -> ctypes.CDLL:
     core.ggslam_gicp_target_destroy.argtypes = [c_void_p]
     core.ggslam_gicp_target_destroy.restype = None
     core.ggslam_gicp_target_build.argtypes = [
-        c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)
+        c_void_p,
+        c_void_p,
+        c_void_p,
+        POINTER(TargetInput),
+        POINTER(TargetSettings),
     ]
     core.ggslam_gicp_target_build.restype = None
     core.ggslam_gicp_target_size.argtypes = [c_void_p, ctypes.c_int]

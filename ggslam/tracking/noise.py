@@ -46,7 +46,7 @@ def estimate_noise(depth: np.ndarray, camera: Camera) -> DepthNoise | None:
 
 
 def _window_spread(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Depths [n] of smooth 5x5 windows and the standard deviations [n] about their planes along the ray, metres."""
+    """Depths [n] of smooth 5x5 windows and the standard deviations [n] of depth about their planes, metres."""
     step = max(3, round(camera.width / 100))
     points = sliding_window_view(camera.back_project(depth), (_WINDOW, _WINDOW), axis=(0, 1))[::step, ::step]  # type: ignore[call-overload]
     windows = points.reshape(-1, 3, _WINDOW**2).astype(np.float64)
@@ -54,7 +54,9 @@ def _window_spread(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.nd
     middle = ranges[:, _WINDOW**2 // 2]
     smooth = (ranges > 0).all(1) & (np.ptp(ranges, axis=1) < 0.1 * middle)
     windows, middle = windows[smooth], middle[smooth]
-    centred = windows - windows.mean(2, keepdims=True)
+    centre = windows.mean(2)
+    centred = windows - centre[:, :, None]
     values, axes = np.linalg.eigh(centred @ centred.transpose(0, 2, 1))
-    along = np.abs(axes[:, 2, 0])  # the ray is near the optical axis
+    # An error e of the depth moves a point along its ray by e (x/z, y/z, 1), of which the plane's normal sees this:
+    along = np.abs((axes[:, :, 0] * centre).sum(1)) / centre[:, 2]
     return middle, np.sqrt(np.maximum(values[:, 0], 0) / (_WINDOW**2 - 3)) / np.maximum(along, 0.2)
