@@ -17,11 +17,13 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
+import sys
 import time
 from collections import Counter
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import cv2
 import numpy as np
@@ -241,7 +243,7 @@ def main() -> None:
     parser.add_argument("recordings", nargs="+", type=Path)
     parser.add_argument("--scale", type=float, default=0.5, help="image size (default 0.5)")
     parser.add_argument("--target", nargs="+", default=["surface"], choices=["surface", "birth", "trained"])
-    parser.add_argument("--photometric", nargs="+", default=["degenerate"], choices=["never", "degenerate", "always"])
+    parser.add_argument("--photometric", nargs="+", default=["auto"], choices=["never", "degenerate", "auto", "always"])
     parser.add_argument("--threads", type=int, default=None)
     arguments = parser.parse_args()
     print("recording      target   frames  ATE cm   track extract   align  target   iter overlap   min   rmse   grey")

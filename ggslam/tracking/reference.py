@@ -78,7 +78,7 @@ def voxel_means(
     cells = np.floor(means.astype(np.float32) * np.float32(1 / voxel)).astype(int)
     found: dict[tuple[int, int, int], list[int]] = {}
     for i in np.flatnonzero(opacity >= min_opacity):
-        found.setdefault(tuple(cells[i]), []).append(i)
+        found.setdefault(tuple(cells[i]), []).append(int(i))
     return {cell: np.average(means[rows].astype(float), axis=0, weights=weights[rows]) for cell, rows in found.items()}
 
 

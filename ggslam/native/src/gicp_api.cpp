@@ -139,6 +139,8 @@ class Aligner {
     for (int i = 0; i < args_.points.count; i += step) total_weight_ += args_.points.weights[i];
     // The coarse level is only a start: its leftover points must not look like matches of the fine one.
     std::fill_n(args_.match, args_.points.count, -1);
+    searched_at_.assign(3 * static_cast<std::size_t>(args_.points.count), NAN);
+    args_.searched_at = searched_at_.data();
     std::fill_n(args_.squared_distance, args_.points.count, INFINITY);
   }
 
@@ -280,6 +282,7 @@ class Aligner {
   const AlignSettings settings_;
   LinearizeArgs args_{};
   PhotometricArgs photometric_{};
+  std::vector<float> searched_at_;
   std::vector<AlignSums> sums_;
   std::vector<PlaneSums> plane_sums_;
   std::vector<PhotometricSums> photometric_sums_;

@@ -146,6 +146,7 @@ struct LinearizeArgs {
   int32_t point_step;                 // every point_step-th point is used
   int32_t* match;                     // [n] voxel, or -1
   float* squared_distance;            // [n] squared point-to-plane distance, or +inf
+  float* searched_at;                 // [n, 3] where `match` was searched from; NaN: not yet. Null: search always
 };
 
 // --- photometric part ------------------------------------------------------------------------------------------------

@@ -11,6 +11,8 @@
 namespace ggslam::GGSLAM_ISA {
 namespace {
 
+constexpr float kSearchAgain = 0.02f;  // of a voxel's edge
+
 struct Pose {
   const float* r;  // row by row
   const float* t;
@@ -84,6 +86,18 @@ void add_normal_equations(const float m[6], const float q[3], const float d[3], 
   b[5] += x * md[1] - y * md[0];
 }
 
+// Whether the point has moved so far since its match was found that another voxel may be nearer by more than a trifle;
+// notes the place if so. The last iterations move points by micrometres and need no search.
+bool must_search(const LinearizeArgs& args, std::size_t i, const float p[3]) {
+  if (!args.searched_at) return true;
+  float* at = args.searched_at + 3 * i;
+  const float dx = p[0] - at[0], dy = p[1] - at[1], dz = p[2] - at[2];
+  const float limit = kSearchAgain * args.level.size;
+  if (dx * dx + dy * dy + dz * dz < limit * limit) return false;  // false for NaN, too
+  for (int a = 0; a < 3; ++a) at[a] = p[a];
+  return true;
+}
+
 }  // namespace
 
 // Matches the points begin, begin + point_step, ... < end and sums up their normal equations.
@@ -101,8 +115,8 @@ void linearize_block(const LinearizeArgs& args, std::size_t begin, std::size_t e
     const float sigma = s.noise_constant + s.noise_square * depth * depth;
     const float width = args.kernel_factor * (s.kernel_constant + s.kernel_sigmas * sigma), g = width * width;
     const float weight = args.points.weights[i];
-    const int match = nearest_voxel(args.level, p, n, s.min_normal_dot);
-    args.match[i] = match;
+    if (must_search(args, i, p)) args.match[i] = nearest_voxel(args.level, p, n, s.min_normal_dot);
+    const int match = args.match[i];
     if (match < 0) {
       cost += weight * g;  // the kernel's limit, so that losing a match never looks like an improvement
       args.squared_distance[i] = std::numeric_limits<float>::infinity();
