@@ -8,7 +8,8 @@ ggslam is faster). ggslam's times include the activations exp and sigmoid, which
 "step" is backward and Adam: fused in ggslam, one after the other in the prototype.
 
 Workloads: a camera in a box-shaped room of 6 x 3 x 5 m with ten spheres; Gaussians of about 1.5 pixels standing on the
-visible surfaces, in random order. W1: 100 000 at 320x240; W2: 300 000 at 640x480. Channels: 4 = colour and depth,
+visible surfaces, in random order or, with --coherent, in the order of the pixels they came from (as a map is
+inserted in SLAM). W1: 100 000 at 320x240; W2: 300 000 at 640x480. Channels: 4 = colour and depth,
 20 = colour, 16 features and depth.
 """
 
@@ -64,7 +65,7 @@ def surface_points(camera: Camera, R_world_camera: np.ndarray, centre: np.ndarra
     return centre + rays * depth[:, None], depth
 
 
-def make_workload(name: str, features: int) -> tuple[GaussianMap, Camera, np.ndarray]:
+def make_workload(name: str, features: int, coherent: bool = False) -> tuple[GaussianMap, Camera, np.ndarray]:
     """Map, camera and T_camera_world of W1, W2 or `small` (for the torch reference)."""
     width, height, count = {"W1": (320, 240, 100_000), "W2": (640, 480, 300_000), "small": (96, 72, 3000)}[name]
     focal = 260.0 * width / 320
@@ -77,12 +78,13 @@ def make_workload(name: str, features: int) -> tuple[GaussianMap, Camera, np.nda
     for R, centre in views:
         surface, depth = surface_points(camera, R, centre)
         chosen = random.permutation(len(surface))[:left]
+        chosen = np.sort(chosen) if coherent else chosen
         points.append(surface[chosen])
         sizes.append(1.5 * depth[chosen] / focal)
         left -= len(chosen)
     position, size = np.concatenate(points), np.concatenate(sizes)
     position += random.normal(size=position.shape) * size[:, None] * 0.2
-    order = random.permutation(count)
+    order = np.arange(count) if coherent else random.permutation(count)
 
     def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)
@@ -161,7 +163,9 @@ def _pointer(tensor: torch.Tensor) -> ctypes.c_void_p:
 class Ours:
     """ggslam's rasterizer on one workload."""
 
-    def __init__(self, instruction_set: str, threads: int, workload: tuple[GaussianMap, Camera, np.ndarray]) -> None:
+    def __init__(
+        self, instruction_set: str, threads: int, workload: tuple[GaussianMap, Camera, np.ndarray], detach: bool
+    ) -> None:
         self.map, self.camera, self.T_camera_world = workload
         self.rasterizer = CpuRasterizer(threads, instruction_set, low_pass=LOW_PASS)
         self.forward()
@@ -169,16 +173,18 @@ class Ours:
         self.gradients.append(torch.randn_like(self.buffers.alpha))
         if self.buffers.features is not None:
             self.gradients.append(torch.randn_like(self.buffers.features))
+        self.detach = detach
         self.optimizer = AdamSettings({})  # all rates zero: the scene stays as it is
 
     def forward(self) -> None:
         self.buffers = self.rasterizer.forward(self.map, self.camera, self.T_camera_world)
 
     def backward(self) -> None:
-        self.rasterizer.backward(*self.gradients)
+        self.rasterizer.backward(*self.gradients, detach_features=self.detach)
 
     def step(self) -> None:
-        self.rasterizer.backward_step(self.map, *self.gradients, optimizer=self.optimizer)
+        options = {"optimizer": self.optimizer, "detach_features": self.detach}
+        self.rasterizer.backward_step(self.map, *self.gradients, **options)
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------
@@ -204,14 +210,16 @@ def _milliseconds(function: Callable[[], None]) -> float:
     return (time.perf_counter() - start) * 1e3
 
 
-def compare(name: str, features: int, instruction_set: str, threads: int, library: Path | None, repeat: int) -> None:
+def compare(
+    name: str, features: int, instruction_set: str, threads: int, library: Path | None, options: argparse.Namespace
+) -> None:
     """Prints one line of the table."""
-    workload = make_workload(name, features)
-    candidates: dict[str, Prototype | Ours] = {"ours": Ours(instruction_set, threads, workload)}
+    workload = make_workload(name, features, options.coherent)
+    candidates: dict[str, Prototype | Ours] = {"ours": Ours(instruction_set, threads, workload, options.detach)}
     if library is not None:
         candidates["prototype"] = Prototype(library, threads, workload)
     best = {key: Best() for key in candidates}
-    for _ in range(repeat):
+    for _ in range(options.repeat):
         for key, candidate in candidates.items():
             best[key].measure(candidate)
     ours = best["ours"]
@@ -230,7 +238,7 @@ def compare_with_reference() -> None:
     gaussians, camera, T_camera_world = make_workload("small", 0)
     leaves = {name: getattr(gaussians, name).clone().requires_grad_() for name in PARAMETERS}
     pose = torch.as_tensor(T_camera_world, dtype=torch.float32)
-    ours, best = Ours(available_instruction_sets()[-1], 2, (gaussians, camera, T_camera_world)), Best()
+    ours, best = Ours(available_instruction_sets()[-1], 2, (gaussians, camera, T_camera_world), False), Best()
     for _ in range(3):
         best.measure(ours)
     start = time.perf_counter()
@@ -252,6 +260,8 @@ def main() -> None:
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--features", nargs="+", type=int, default=[0, 16], choices=[0, 8, 16])
     parser.add_argument("--repeat", type=int, default=10)
+    parser.add_argument("--coherent", action="store_true", help="Gaussians in the order of their pixels")
+    parser.add_argument("--detach", action="store_true", help="features' gradients do not reach geometry (ggslam only)")
     parser.add_argument("--no-reference", action="store_true", help="leave the torch reference out")
     arguments = parser.parse_args()
     torch.manual_seed(0)
@@ -269,7 +279,7 @@ def main() -> None:
                 for instruction_set in arguments.instruction_sets:
                     for threads in arguments.threads:
                         library = libraries.get(instruction_set)
-                        compare(name, features, instruction_set, threads, library, arguments.repeat)
+                        compare(name, features, instruction_set, threads, library, arguments)
     if not arguments.no_reference:
         compare_with_reference()
 

@@ -153,7 +153,7 @@ struct Rasterizer {
   Buffer<double> block_twist;         // [blocks][6]
 
   int tiles() const { return tiles_x * tiles_y; }
-  // Number of the pair of a splat and a tile, which is that of its gradient slot. Pairs are numbered Gaussian by Gaussian
+  // Number of the pair of a splat and a tile: that of its gradient slot. Pairs are numbered Gaussian by Gaussian
   // and, within the splat's rectangle, row by row.
   std::size_t pair_number(std::uint32_t splat_index, const Splat& splat, int tile_x, int tile_y) const {
     return pairs[splat_index >> block_shift] + splat.first_pair +

@@ -27,6 +27,16 @@ static inline AdamRows count_updates(const AdamArguments& adam, const std::int32
   return result;
 }
 
+// Asks early for the cache lines of one row: there are too many arrays for the processor to foresee.
+static inline __attribute__((always_inline)) void prefetch_row(const AdamArrays& arrays, std::size_t row, int width) {
+  const std::size_t begin = row * static_cast<std::size_t>(width);
+  for (std::size_t k = begin; k < begin + width; k += 16) {
+    __builtin_prefetch(arrays.parameters + k, 1);
+    __builtin_prefetch(arrays.first_moments + k, 1);
+    __builtin_prefetch(arrays.second_moments + k, 1);
+  }
+}
+
 struct AdamVectors {
   Float parameters, first, second;
 };
@@ -48,7 +58,8 @@ static inline void adam_packed(const AdamArguments& adam, const AdamRows& rows, 
       step[i] = line[group], correction[i] = line[kCorrection];
     }
   }
-  const Float same_step = broadcast(rows.schedule[0][group]), same_correction = broadcast(rows.schedule[0][kCorrection]);
+  const Float same_step = broadcast(rows.schedule[0][group]);
+  const Float same_correction = broadcast(rows.schedule[0][kCorrection]);
   for (int i = 0; i < kWidth * kLanes; i += kLanes) {
     AdamVectors v{load(packed.parameters + i), load(packed.first_moments + i), load(packed.second_moments + i)};
     adam_step(adam, load(gradients + i), rows.same_count ? same_step : load(step + i),

@@ -101,6 +101,13 @@ void apply_adam(const Rasterizer& r, const Group& group, const GradientRows& row
               features, r.padded_features);
 }
 
+inline __attribute__((always_inline)) void prefetch_adam(const Rasterizer& r, const AdamArguments& adam,
+                                                         std::size_t row) {
+  prefetch_row(adam.means, row, 3), prefetch_row(adam.quaternions, row, 4), prefetch_row(adam.log_scales, row, 3);
+  prefetch_row(adam.opacity_logits, row, 1), prefetch_row(adam.sh, row, 3 * r.gaussians.sh_coefficients);
+  if (r.padded_features > 0) prefetch_row(adam.features, row, r.gaussians.feature_channels);
+}
+
 // Adds up the slots of one splat; false if no tile used it.
 inline bool sum_slots(const Rasterizer& r, const Splat& splat, std::size_t first, Group& group, float* features) {
   const int pairs = splat.tiles.wide * splat.tiles.high, channels = r.padded_features;
@@ -151,6 +158,7 @@ void gather_block(Rasterizer& r, int block, const GaussianGradients& gradients, 
     const std::size_t first = r.pairs[block] + splat.first_pair;
     if (!sum_slots(r, splat, first, group, features + group.n * r.padded_features)) continue;
     gradients.touched[splat.gaussian] = 1;
+    if (adam != nullptr) prefetch_adam(r, *adam, splat.gaussian);
     group.rows[group.n++] = splat.gaussian;
     if (group.n == kLanes) flush();
   }

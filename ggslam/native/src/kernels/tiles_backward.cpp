@@ -54,21 +54,39 @@ void load_gradients(const Rasterizer& r, int index, const Tile& tile, const Imag
   }
 }
 
-// Sum over the feature channels of feature times image gradient.
-inline Float feature_dot(const float* features, const float* pixel_gradients, int channels) {
-  Float a = {}, b = {};
-  for (int q = 0; q < channels; q += 4) {
-    const float* v = pixel_gradients + q * kLanes;
-    a += features[q] * load(v) + features[q + 1] * load(v + kLanes);
-    b += features[q + 2] * load(v + 2 * kLanes) + features[q + 3] * load(v + 3 * kLanes);
+// dots[s] += sum of feature times image gradient over kGroup channels, for the sub-blocks in the mask. Features stay
+// in registers; only the image gradients are loaded.
+template <int kGroup>
+inline void add_feature_dots(std::uint32_t sub_blocks, const float* features, const float* pixel_features, int channels,
+                             Float* dots) {
+  Float f[kGroup];
+  for (int q = 0; q < kGroup; ++q) f[q] = broadcast(features[q]);
+  for (; sub_blocks != 0; sub_blocks &= sub_blocks - 1) {
+    const int s = __builtin_ctz(sub_blocks);
+    const float* v = pixel_features + s * channels * kLanes;
+    Float a = dots[s], b = {};  // two sums, for shorter waits
+    for (int q = 0; q < kGroup; q += 2) {
+      a += f[q] * load(v + q * kLanes);
+      b += f[q + 1] * load(v + (q + 1) * kLanes);
+    }
+    dots[s] = a + b;
   }
-  return a + b;
+}
+
+inline void feature_dots(std::uint32_t sub_blocks, const float* features, const float* pixel_features, int channels,
+                         Float* dots) {
+  for (std::uint32_t left = sub_blocks; left != 0; left &= left - 1) dots[__builtin_ctz(left)] = Float{};
+  int q = 0;
+  for (; q + kFeatureGroup <= channels; q += kFeatureGroup)
+    add_feature_dots<kFeatureGroup>(sub_blocks, features + q, pixel_features + q * kLanes, channels, dots);
+  for (; q + 8 <= channels; q += 8)
+    add_feature_dots<8>(sub_blocks, features + q, pixel_features + q * kLanes, channels, dots);
+  if (q < channels) add_feature_dots<4>(sub_blocks, features + q, pixel_features + q * kLanes, channels, dots);
 }
 
 template <FeatureMode kMode>
 inline void differentiate_splat(const Tile& tile, const Splat& g, int entry, std::uint32_t sub_blocks,
-                                const float* features, const float* pixel_features, int channels, TileGradients& grad,
-                                WeightList& list, float* slot) {
+                                const Float* dots, TileGradients& grad, WeightList& list, float* slot) {
   Float m0 = {}, mx = {}, my = {}, mxx = {}, mxy = {}, myy = {};
   Float red = {}, green = {}, blue = {}, depth = {};
   int size = 0;
@@ -87,7 +105,7 @@ inline void differentiate_splat(const Tile& tile, const Splat& g, int entry, std
     const Float weight = alpha * t;
     const Float* v = grad.channels[s];
     Float dot = g.red * v[0] + g.green * v[1] + g.blue * v[2] + g.depth * v[3];
-    if (kMode == kFeaturesReachGeometry) dot += feature_dot(features, pixel_features + s * channels * kLanes, channels);
+    if (kMode == kFeaturesReachGeometry) dot += dots[s];
     const Float behind = grad.behind[s];
     const Float alpha_gradient = t * dot - inverse * behind;
     grad.behind[s] = behind + weight * dot;
@@ -143,7 +161,9 @@ void differentiate_tile(Rasterizer& r, int index, const Tile& tile, TileGradient
   const TileEntry* entries = r.entries.data() + tile.begin;
   const std::uint16_t* contributed = r.contributed.data() + tile.begin;
   float* features = scratch.gaussian_features.data();
+  const float* pixel_features = scratch.pixel_features.data();
   WeightList list;
+  Float dots[kSubBlocks];
   for (std::int32_t k = grad.last_in_tile; k >= 0; --k) {
     if (k >= kSplatPrefetch) __builtin_prefetch(r.splats.data() + entries[k - kSplatPrefetch].splat);
     if (k >= kRowPrefetch && contributed[k - kRowPrefetch] != 0)
@@ -151,12 +171,13 @@ void differentiate_tile(Rasterizer& r, int index, const Tile& tile, TileGradient
     if (contributed[k] == 0) continue;
     const Splat& g = r.splats[entries[k].splat];
     const std::size_t pair = r.pair_number(entries[k].splat, g, tile_x, tile_y);
-    if (kMode != kNoFeatures) copy_features(r.gaussians, g.gaussian, channels, features);
-    differentiate_splat<kMode>(tile, g, k, contributed[k], features, scratch.pixel_features.data(), channels, grad,
-                               list, r.slots.data() + pair * kSlotStride);
+    if (kMode == kFeaturesReachGeometry) {
+      copy_features(r.gaussians, g.gaussian, channels, features);
+      feature_dots(contributed[k], features, pixel_features, channels, dots);
+    }
+    differentiate_splat<kMode>(tile, g, k, contributed[k], dots, grad, list, r.slots.data() + pair * kSlotStride);
     if (kMode != kNoFeatures)
-      differentiate_features(list, scratch.pixel_features.data(), channels,
-                             r.feature_slots.data() + pair * channels);
+      differentiate_features(list, pixel_features, channels, r.feature_slots.data() + pair * channels);
     r.slot_used[pair] = 1;
   }
 }
