@@ -151,6 +151,9 @@ class Tracker:
         guess = self._pose @ self._velocity
         photometric = self._photometric_part(view) if mode == "always" else None
         found = self._align(points, target, guess, photometric)
+        if photometric is not None and not self._explains_greys(found) and not found.degenerate:
+            # Images that do not agree (too far apart, shutters out of step) must not pull at good geometry.
+            found = self._align(points, target, guess, None)
         if self._convincing(found) and not (found.degenerate and mode != "never"):
             return found, ""
         if photometric is None and found.degenerate and mode != "never":
@@ -218,15 +221,22 @@ class Tracker:
         starts += [(name, guess, False) for name, guess in features]
         for name, guess, coarse in starts:
             candidate = self._align(points, target, guess, photometric, coarse)
-            if self._score(candidate) > self._score(best):
+            if self._better(candidate, best):
                 best, reason = candidate, name
         return best, reason
 
-    def _score(self, found: AlignmentResult) -> float:
-        """More overlap is better; a loose fit costs a little, images that disagree cost more."""
-        if found.status is AlignmentStatus.LOST:
-            return -1.0
-        return found.overlap - 2.0 * found.rmse - 5.0 * found.photometric_residual
+    @staticmethod
+    def _better(candidate: AlignmentResult, best: AlignmentResult) -> bool:
+        """Whether an alignment of the same points beats another.
+
+        With grey values the joint cost decides: sliding along a bare wall keeps all the overlap. Without them more
+        overlap is better, and a loose fit costs a little.
+        """
+        if candidate.status is AlignmentStatus.LOST or best.status is AlignmentStatus.LOST:
+            return candidate.status is not AlignmentStatus.LOST
+        if candidate.photometric_share > 0 and best.photometric_share > 0:
+            return candidate.cost < best.cost
+        return candidate.overlap - 2.0 * candidate.rmse > best.overlap - 2.0 * best.rmse
 
     def _lost(self, points: FramePoints, found: AlignmentResult) -> TrackingResult:
         """Stays where it was last known, standing still."""
