@@ -123,8 +123,9 @@ class Mapper:
         target = KeyframeImages(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
         loss = self._loss.evaluate(view, target, s.loss)
         t2 = time.perf_counter()
+        optimizer = self._standard_adam if rate_factor == 1 else self._adam(rate_factor)
         step = self._rasterizer.backward_step(
-            self.map, loss.d_image, loss.d_depth, loss.d_alpha, optimizer=self._standard_adam if rate_factor == 1 else self._adam(rate_factor)
+            self.map, loss.d_image, loss.d_depth, loss.d_alpha, optimizer=optimizer
         )
         self._refine_keyframe(keyframe, step.twist, loss.exposure_gradient, rate_factor)
         t3 = time.perf_counter()

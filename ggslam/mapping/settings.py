@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the mapper. Defaults are one recipe for every recording; see scripts/bench_slam.py for what they reach."""
+"""Settings of the mapper. The defaults are one recipe for all recordings (scripts/bench_slam.py shows what it reaches)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class InsertionSettings:
     adaptive_stride: bool = True
     """One Gaussian per 2x2 pixels where colour and depth are smooth, one per pixel elsewhere."""
     texture_threshold: float = 90.0
-    """Smoothness for `adaptive_stride`: Sobel magnitude of the grey image (0 to 255 scale) under which a pixel is flat."""
+    """For `adaptive_stride`: Sobel magnitude of the grey image (0 to 255) under which a pixel is flat."""
     fill_stride: int = 3
     """Pixels without depth, where nothing is rendered either, get a Gaussian on a grid of this stride at the depth of
     the nearest pixel that has one; 0: none. Training with colour then makes them fit what is seen there."""
