@@ -134,7 +134,8 @@ def track_recording(path: Path, scale: float, target_kind: str, settings: Tracke
     tracker, policy, run = Tracker(sequence.camera, settings, context), KeyframePolicy(), Run()
     surface, discs = MeasuredSurface(settings.target, context), None
     previous: PhotometricReference | None = None
-    for frame in sequence.stream():
+    frames = list(sequence.stream())  # read first, so that decoding does not take the cores
+    for frame in frames:
         target = tracker.target
         start = time.perf_counter()
         result = tracker.track(frame)
@@ -228,7 +229,7 @@ def report(name: str, target_kind: str, run: Run) -> None:
         f"{np.median(run.extract_ms):7.1f} {np.median(run.align_ms):7.1f} {np.median(run.target_ms):7.1f} "
         f"{np.mean([a.iterations for a in aligned]):6.1f} {np.mean([a.overlap for a in aligned]):7.3f} "
         f"{min(a.overlap for a in aligned):5.2f} {1e3 * np.mean([a.rmse for a in aligned]):6.2f} "
-        f"{255 * np.mean(run.grey_residuals):6.2f}  "
+        f"{255 * np.mean(run.grey_residuals) if run.grey_residuals else 0:6.2f}  "
         f"{sum(run.kinds.values())} keyframes, {', '.join(f'{n} {k}' for k, n in sorted(statuses.items()))}",
         flush=True,
     )
