@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 
 import typer
 from rich.console import Console
+
+# NumPy's linear algebra here is on small matrices; its idle threads would spin on cores that the core's threads need.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from ggslam import __version__
 from ggslam.cli import eval_command, export_command, inspect_command, render_command, run_command, synth_command
