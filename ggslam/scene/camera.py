@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -51,13 +52,19 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def rays(self) -> np.ndarray:
-        """Viewing rays with z = 1 through the pixel centres, float32 [H, W, 3]."""
-        u = (np.arange(self.width, dtype=np.float32) - self.cx) / self.fx
-        v = (np.arange(self.height, dtype=np.float32) - self.cy) / self.fy
-        rays = np.ones((self.height, self.width, 3), np.float32)
-        rays[..., 0], rays[..., 1] = u[None, :], v[:, None]
-        return rays
+        """Viewing rays with z = 1 through the pixel centres, float32 [H, W, 3], read-only."""
+        return _rays(self)
 
     def back_project(self, depth: np.ndarray) -> np.ndarray:
         """Points in the camera frame, float32 [H, W, 3], of a depth image [H, W] in metres (0 stays the origin)."""
         return self.rays() * depth[..., None].astype(np.float32)
+
+
+@lru_cache(maxsize=4)
+def _rays(camera: Camera) -> np.ndarray:
+    u = (np.arange(camera.width, dtype=np.float32) - camera.cx) / camera.fx
+    v = (np.arange(camera.height, dtype=np.float32) - camera.cy) / camera.fy
+    rays = np.ones((camera.height, camera.width, 3), np.float32)
+    rays[..., 0], rays[..., 1] = u[None, :], v[:, None]
+    rays.setflags(write=False)
+    return rays

@@ -41,9 +41,9 @@ class FramePoints:
         return float(np.median(self.points[:, 2])) if len(self.points) else 0.0
 
 
-def grid_stride(camera: Camera, count: int) -> int:
-    """Pixels between grid points so that an image full of depth gives about `count` points (and not far fewer)."""
-    return max(1, math.floor(math.sqrt(camera.width * camera.height / count) + 0.25))
+def grid_stride(pixels: int, count: int) -> int:
+    """Pixel stride at which a regular grid over `pixels` pixels with depth has about `count` points."""
+    return max(1, round(math.sqrt(pixels / count)))
 
 
 def extract_points(
@@ -64,7 +64,7 @@ def extract_points(
     if depth.shape != (camera.height, camera.width):
         raise ValueError(f"depth is {depth.shape}, expected {(camera.height, camera.width)} of the camera")
     depth = np.ascontiguousarray(depth, np.float32)
-    stride = grid_stride(camera, settings.count)
+    stride = grid_stride(int(np.count_nonzero(depth > 0)), settings.count)
     room = math.ceil(camera.width / stride) * math.ceil(camera.height / stride)
     found = FramePoints(
         np.empty((room, 3), np.float32), np.empty((room, 3), np.float32), np.empty((room, 6), np.float32),

@@ -29,8 +29,8 @@ class DepthNoise:
 class PointSettings:
     """How points are taken from a depth image."""
 
-    count: int = 8500
-    """Points aimed at when the whole image has depth; the pixel stride follows from it and the resolution."""
+    count: int = 5000
+    """Points aimed at; the pixel stride follows from it and the number of pixels with depth."""
     window: int = 2
     """Neighbours come from (2 window + 1)^2 samples, about as far apart as a pixel of a 320-pixel-wide image."""
     min_neighbours: float = 0.6
