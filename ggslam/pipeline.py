@@ -88,9 +88,10 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
     out = request.out if request.out is not None else Path("runs") / sequence.name
     folder = RunFolder.create(out, overwrite=request.overwrite)
     result, error = run_slam(sequence, config, observer)
-    if not result.frames:
+    if not result.keyframes:
         folder.discard()
-        raise error if error is not None else SequenceError(f"{sequence.path}: no frame could be processed")
+        reason = result.frames[0].reason if result.frames else "no frame could be read"
+        raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
     folder.save(config, describe(request.sequence, sequence), result, None if error is None else repr(error))
     outcome = RunOutcome(folder, result, None, error)
     if request.evaluate and error is None:

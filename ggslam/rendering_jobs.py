@@ -20,10 +20,11 @@ KINDS = ("color", "depth", "alpha")
 
 
 def frame_poses(folder: RunFolder) -> dict[int, np.ndarray]:
-    """T_world_camera of each frame of a run by its index, from its keyframes as refined."""
+    """T_world_camera of each frame of a run that was not lost, by its index, from its keyframes as refined."""
     record = folder.read_json("keyframes.json")
     keyframes = [np.array(k["T_world_camera"]) for k in record["keyframes"]]
-    return {f["frame"]: keyframes[f["keyframe"]] @ np.array(f["T_keyframe_camera"]) for f in record["frames"]}
+    tracked = [f for f in record["frames"] if f["status"] != "lost"]
+    return {f["frame"]: keyframes[f["keyframe"]] @ np.array(f["T_keyframe_camera"]) for f in tracked}
 
 
 def run_camera(folder: RunFolder) -> Camera:

@@ -59,6 +59,9 @@ def score_run(
         **_performance(folder),
         "notes": notes,
     }
+    lost = [f["frame"] for f in folder.read_json("keyframes.json")["frames"] if f["status"] == "lost"]
+    if lost:
+        notes.append(f"{len(lost)} frames were lost (the first: {lost[0]}); they have no pose and are in no score")
     if metrics["trajectory"] is None:
         notes.append("the recording has no ground-truth poses; no trajectory scores")
     folder.write_json("metrics.json", metrics)

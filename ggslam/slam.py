@@ -114,9 +114,13 @@ class SlamResult:
     refine_iterations: int = 0
 
     def trajectory(self) -> np.ndarray:
-        """T_world_camera of every frame, float64 [n, 4, 4]; the world is the first keyframe's camera."""
-        poses = [self.keyframes[f.keyframe].T_world_camera @ f.T_keyframe_camera for f in self.frames]
-        return np.stack(poses) if poses else np.zeros((0, 4, 4))
+        """T_world_camera of every frame, float64 [n, 4, 4], NaN for lost ones; the world is the first keyframe's
+        camera."""
+        poses = np.full((len(self.frames), 4, 4), np.nan)
+        for pose, f in zip(poses, self.frames, strict=True):
+            if f.status != TrackingStatus.LOST.value:
+                pose[:] = self.keyframes[f.keyframe].T_world_camera @ f.T_keyframe_camera
+        return poses
 
     def timestamps(self) -> np.ndarray:
         """Seconds, float64 [n]."""
@@ -175,7 +179,7 @@ class Slam:
             self.insert(frame, tracking)
         self.remember(frame, tracking)
         if self.mapper.keyframes:
-            first = len(self.frames) == 1
+            first = is_keyframe and len(self.mapper.keyframes) == 1
             settings = self.config.mapping
             self.mapper.run(settings.first_frame_iterations if first else settings.iterations_per_frame)
         self.times.stop()
@@ -208,7 +212,7 @@ class Slam:
             )
         start = time.perf_counter()
         result = self.tracker.track(frame)
-        if not self.frames and self.tracker.noise is not None:
+        if not self.mapper.keyframes and self.tracker.noise is not None:
             self.mapper.depth_sigma = self.tracker.noise.sigma(result.median_depth_m)
         self.times.tracking += time.perf_counter() - start
         return result

@@ -119,12 +119,13 @@ class Tracker:
         """
         target = self.target
         if self.noise is None:
-            self.noise = estimate_noise(frame.depth, self.camera) or DepthNoise()
-        points = extract_points(frame.depth, self.camera, self.settings.points, self.noise, self.context)
+            self.noise = estimate_noise(frame.depth, self.camera)
+        noise = self.noise or DepthNoise()
+        points = extract_points(frame.depth, self.camera, self.settings.points, noise, self.context)
         view = View(frame.color, frame.depth, self._pose)
         if target is None:
-            self._remember(view, points)
-            return TrackingResult(self._pose.copy(), TrackingStatus.FIRST, 1.0, 0.0, "", points)
+            return self._first(view, points)
+        self.noise = noise  # what could not be measured before the first keyframe is taken as usual
         found, reason = self._locate(view, points, target)
         if not self._acceptable(found):
             return self._lost(points, found)
@@ -135,6 +136,14 @@ class Tracker:
         status = TrackingStatus.DEGENERATE if found.degenerate else TrackingStatus.OK
         status = TrackingStatus.RECOVERED if reason else status
         return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, found)
+
+    def _first(self, view: View, points: FramePoints) -> TrackingResult:
+        """Before the first keyframe: the pose is given, and all a frame needs is depth to begin with."""
+        if len(points) < self.settings.align.min_matches:
+            reason = f"only {len(points)} points have depth, {self.settings.align.min_matches} needed"
+            return TrackingResult(self._pose.copy(), TrackingStatus.LOST, 0.0, 0.0, reason, points)
+        self._remember(view, points)
+        return TrackingResult(self._pose.copy(), TrackingStatus.FIRST, 1.0, 0.0, "", points)
 
     def move(self, T_new_old: np.ndarray) -> None:
         """Moves the tracker's own pose, after the world about it was moved by a correction [4, 4]."""

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from ggslam.mapping.insertion import fill_gaussians
+from ggslam.mapping.keyframe import PoseAdam, make_keyframe
+from ggslam.mapping.mapper import Mapper
+from ggslam.mapping.pruning import prune
+from ggslam.mapping.settings import InsertionSettings, MapperSettings, PruningSettings
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import se3_exp, se3_log
+
+CAMERA = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
+
+
+def wall(index: int = 0) -> Frame:
+    """A coloured, slanted wall with a hole in its depth."""
+    u, v = np.meshgrid(np.arange(80), np.arange(60))
+    color = np.stack([128 + 100 * np.sin(u / 6), 128 + 100 * np.cos(v / 5), 100 + 50 * np.sin((u + v) / 9)], -1)
+    depth = (2.0 + 0.005 * u).astype(np.float32)
+    depth[20:30, 30:45] = 0
+    return Frame(index, index, index / 30, color.astype(np.uint8), depth, CAMERA)
+
+
+def make_mapper(threads: int = 2, **changes: object) -> Mapper:
+    return Mapper(GaussianMap(), dataclasses.replace(MapperSettings(), **changes), NativeContext(threads))  # type: ignore[arg-type]
+
+
+def test_a_keyframe_is_learned() -> None:
+    mapper = make_mapper()
+    mapper.add_keyframe(wall(), np.eye(4))
+    mapper.run(5)
+    early = mapper.last_psnr
+    mapper.run(60)
+    assert mapper.last_psnr > max(30, early + 3)
+    assert torch.isfinite(mapper.map.means).all() and mapper.map.updates.max() == 65
+
+
+def test_what_is_explained_is_not_inserted_again() -> None:
+    mapper = make_mapper()
+    mapper.add_keyframe(wall(), np.eye(4))
+    mapper.run(20)
+    before = len(mapper.map)
+    mapper.add_keyframe(wall(1), np.eye(4))
+    assert len(mapper.map) - before < 0.05 * before
+    mapper.add_keyframe(wall(2), se3_exp(np.array([0, 0, 0, 0, 0.6, 0])))
+    assert len(mapper.map) - before > 0.2 * before
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_training_repeats_bit_for_bit(threads: int) -> None:
+    maps = []
+    for count in (2, threads):
+        mapper = make_mapper(count)
+        mapper.add_keyframe(wall(), np.eye(4))
+        mapper.add_keyframe(wall(1), se3_exp(np.array([0.02, 0, 0, 0, 0.02, 0])))
+        mapper.run(12)
+        maps.append(mapper)
+    assert torch.equal(maps[0].map.means, maps[1].map.means) and torch.equal(maps[0].map.sh, maps[1].map.sh)
+    assert np.array_equal(maps[0].keyframes[1].T_camera_world, maps[1].keyframes[1].T_camera_world)
+
+
+def test_the_pose_of_a_keyframe_finds_back() -> None:
+    """A second view of the same wall, inserted with an error of a centimetre, is pulled to where it belongs."""
+    insertion = InsertionSettings(depth_tolerance_m=1.0, alpha_threshold=0.0)  # the second view inserts nothing
+    mapper = make_mapper(insertion=insertion)
+    mapper.depth_sigma = 0.004
+    mapper.add_keyframe(wall(), np.eye(4))
+    mapper.run(80)
+    error = np.array([0.01, -0.008, 0.0, 0, 0, 0])
+    keyframe = mapper.add_keyframe(wall(1), se3_exp(error))
+    mapper.run(240)  # both views in turn: the first holds the map in place
+    left = np.linalg.norm(se3_log(keyframe.T_world_camera)[:3])
+    assert left < 0.35 * np.linalg.norm(error[:3])
+    assert np.array_equal(mapper.keyframes[0].T_camera_world, np.eye(4))  # the first one is the world
+
+
+def test_exact_depth_leaves_poses_alone() -> None:
+    mapper = make_mapper()
+    mapper.depth_sigma = 0.0
+    mapper.add_keyframe(wall(), np.eye(4))
+    keyframe = mapper.add_keyframe(wall(1), np.eye(4))
+    mapper.run(10)
+    assert np.allclose(keyframe.T_camera_world, np.eye(4))
+
+
+def test_exposure_follows_a_darker_keyframe() -> None:
+    s = MapperSettings()
+    mapper = make_mapper(exposure=dataclasses.replace(s.exposure, enabled=True, rate=1e-2))
+    mapper.add_keyframe(wall(), np.eye(4))
+    mapper.run(60)
+    frame = wall(1)
+    dark = dataclasses.replace(frame, color=(frame.color * 0.8).astype(np.uint8))
+    keyframe = mapper.add_keyframe(dark, np.eye(4))
+    for _ in range(60):
+        mapper.iterate(keyframe)
+    assert np.all(keyframe.exposure[:, 0] < 0.95)
+    assert np.array_equal(mapper.keyframes[0].exposure, np.tile([1.0, 0.0], (3, 1)))
+
+
+def test_refinement_improves_and_its_rates_fall() -> None:
+    mapper = make_mapper()
+    mapper.add_keyframe(wall(), np.eye(4))
+    mapper.run(20)
+    seen: list[tuple[int, int]] = []
+    before = mapper.last_psnr
+    mapper.refine(100, lambda done, total: seen.append((done, total)))
+    assert mapper.last_psnr > before and seen[-1] == (100, 100)
+
+
+def test_holes_are_filled_at_the_nearest_depth() -> None:
+    frame, s = wall(), InsertionSettings(fill_stride=3)
+    new = fill_gaussians(frame.color, frame.depth, np.zeros((60, 80), np.float32), CAMERA, np.eye(4), s)
+    rows, columns = np.divmod(new.pixels, 80)
+    assert len(new.pixels) == 3 * 5 or 12 <= len(new.pixels) <= 20
+    assert rows.min() >= 20 and rows.max() < 30 and columns.min() >= 30 and columns.max() < 45
+    assert np.all(np.abs(new.means[:, 2] - (2.0 + 0.005 * columns)) < 0.06)
+    nothing = np.zeros_like(frame.depth)
+    assert len(fill_gaussians(frame.color, nothing, nothing, CAMERA, np.eye(4), s).pixels) == 0
+
+
+def test_pruning_drops_transparent_huge_and_broken_gaussians() -> None:
+    gaussians = GaussianMap()
+    means = torch.zeros(4, 3)
+    means[3] = float("nan")
+    scales = torch.full((4, 3), 0.01)
+    scales[1, 0] = 1.0
+    logits = torch.tensor([2.0, 2.0, -6.0, 2.0])
+    gaussians.insert(means, torch.tensor([[1.0, 0, 0, 0]] * 4), scales.log(), logits, torch.rand(4, 3))
+    assert prune(gaussians, PruningSettings()) == 3 and len(gaussians) == 1
+
+
+def test_keyframes_keep_depth_to_a_fifth_of_a_millimetre_and_drop_what_does_not_fit() -> None:
+    frame = wall()
+    frame.depth[0, 0] = 20.0
+    keyframe = make_keyframe(0, frame, np.eye(4))
+    assert keyframe.depth.dtype == np.uint16 and keyframe.depth[0, 0] == 0
+    assert np.abs(keyframe.depth_m() - frame.depth)[5:, 5:].max() <= 1.01e-4
+
+
+def test_pose_adam_ignores_a_gradient_that_is_no_number() -> None:
+    T = np.eye(4)
+    assert PoseAdam().step(T, np.full(6, np.nan), 1e-3) is T

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whole runs on the shared recordings: short ones always (where the recordings are), full ones with `-m slow`.
+
+Quality only; speed is the benchmarks' business.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ggslam.pipeline import RunRequest, SequenceRequest, execute
+
+
+def run(recording: Path, out: Path, overrides: list[str], **selection: Any) -> tuple[dict[str, Any], list[str]]:
+    """Metrics of a run at 320x240 and the status of each frame."""
+    if not recording.is_dir():
+        pytest.skip(f"no recording at {recording}")
+    outcome = execute(RunRequest(SequenceRequest(recording, scale=0.5, **selection), out=out, overrides=overrides))
+    assert outcome.error is None and outcome.metrics is not None
+    return outcome.metrics, [frame.status for frame in outcome.result.frames]
+
+
+def test_livingroom_begins_well(shared_data: Path, tmp_path: Path) -> None:
+    m, status = run(shared_data / "livingroom", tmp_path / "run", [], stop=30)
+    assert "lost" not in status
+    assert m["trajectory"]["ate_rmse_m"] < 0.0005
+    assert m["images"]["held_out"]["psnr"] > 33 and m["images"]["all"]["depth_l1_m"] < 0.012
+
+
+def test_redkitchen_begins_well(shared_data: Path, tmp_path: Path) -> None:
+    m, status = run(shared_data / "redkitchen", tmp_path / "run", [], stop=30)
+    assert "lost" not in status
+    assert m["trajectory"]["ate_rmse_m"] < 0.02
+    assert m["images"]["held_out"]["psnr"] > 21 and m["images"]["all"]["psnr_unmasked"] > 20
+
+
+def test_shelf_is_tracked_to_the_end(shared_data: Path, tmp_path: Path) -> None:
+    m, status = run(shared_data / "shelf", tmp_path / "run", ["mapping.iterations_per_frame=8"])
+    assert len(status) == 15 and "lost" not in status
+    assert m["trajectory"]["ate_rmse_m"] < 0.03
+
+
+@pytest.mark.slow
+def test_livingroom(shared_data: Path, tmp_path: Path) -> None:
+    m, _ = run(shared_data / "livingroom", tmp_path / "run", [])
+    assert m["images"]["held_out"]["psnr"] >= 35.0 and m["map"]["gaussians"] <= 120_000
+    assert m["trajectory"]["ate_rmse_m"] <= 0.0005 and m["images"]["all"]["depth_l1_m"] <= 0.008
+
+
+@pytest.mark.slow
+def test_livingroom_one_iteration(shared_data: Path, tmp_path: Path) -> None:
+    m, _ = run(shared_data / "livingroom", tmp_path / "run", ["mapping.iterations_per_frame=1"])
+    assert m["images"]["held_out"]["psnr"] >= 31.5
+
+
+@pytest.mark.slow
+def test_livingroom_refined(shared_data: Path, tmp_path: Path) -> None:
+    m, _ = run(shared_data / "livingroom", tmp_path / "run", ["refine_iterations=1000"])
+    assert m["images"]["held_out"]["psnr"] >= 37.0
+
+
+@pytest.mark.slow
+def test_redkitchen(shared_data: Path, tmp_path: Path) -> None:
+    m, status = run(shared_data / "redkitchen", tmp_path / "run", [])
+    assert "lost" not in status
+    assert m["images"]["held_out"]["psnr"] >= 24.0 and m["images"]["all"]["psnr_unmasked"] >= 21.0
+    assert m["trajectory"]["ate_rmse_m"] <= 0.03
+
+
+@pytest.mark.slow
+def test_cabinet_is_tracked_to_the_end(shared_data: Path, tmp_path: Path) -> None:
+    recording = shared_data / "rgbd_dataset_freiburg3_cabinet"
+    _, status = run(recording, tmp_path / "run", ["mapping.iterations_per_frame=8"])
+    assert len(status) == 58 and "lost" not in status
