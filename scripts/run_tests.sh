@@ -15,4 +15,4 @@ python="$venv/bin/python"
 "$python" -m ruff check .
 "$python" -m mypy ggslam
 # The tests import the installed package, not the checkout, so that packaging is tested too.
-exec "$python" -P -m pytest -q --import-mode=importlib "$@"
+exec "$venv/bin/pytest" -q "$@"
