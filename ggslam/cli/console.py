@@ -4,18 +4,27 @@
 from __future__ import annotations
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 console = Console()
 
 
-def progress_bar(unit: str = "frames") -> Progress:
+class RateColumn(ProgressColumn):
+    """Steps a second, lately while running, on average when done."""
+
+    def render(self, task: Task) -> Text:
+        """The text of one task."""
+        rate = task.finished_speed or task.speed
+        return Text("" if rate is None else f"{rate:.1f}/s")
+
+
+def progress_bar() -> Progress:
     """A one-line progress bar with rate and time left; the task's field `info` is free text."""
     return Progress(
-        TextColumn("{task.description}"), BarColumn(bar_width=20), MofNCompleteColumn(), TextColumn(unit),
-        TaskProgressColumn(show_speed=True), TextColumn("{task.fields[info]}"), TimeRemainingColumn(compact=True),
-        console=console, refresh_per_second=4,
+        TextColumn("{task.description}"), BarColumn(bar_width=20), MofNCompleteColumn(), RateColumn(),
+        TextColumn("{task.fields[info]}"), TimeRemainingColumn(compact=True), console=console, refresh_per_second=4,
     )  # fmt: skip
 
 
