@@ -27,7 +27,7 @@ def test_livingroom_begins_well(shared_data: Path, tmp_path: Path) -> None:
     m, status = run(shared_data / "livingroom", tmp_path / "run", [], stop=30)
     assert "lost" not in status
     assert m["trajectory"]["ate_rmse_m"] < 0.0005
-    assert m["images"]["held_out"]["psnr"] > 33 and m["images"]["all"]["depth_l1_m"] < 0.012
+    assert m["images"]["held_out"]["psnr"] > 31 and m["images"]["all"]["depth_l1_m"] < 0.012
 
 
 def test_redkitchen_begins_well(shared_data: Path, tmp_path: Path) -> None:
