@@ -18,7 +18,7 @@ from typing import Any
 import pydantic
 import yaml
 
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, check_ranges
 from ggslam.formats.atomic import write_text
 from ggslam.mapping.settings import MapperSettings
 from ggslam.tracking.keyframes import KeyframeSettings
@@ -32,11 +32,15 @@ class EvaluationSettings:
     held_out_every: int = 8
     """Every n-th frame is tracked but never a keyframe and never trained on; 0: none."""
     held_out_offset: int = 4
-    """The first frame held out (the very first frame has to be a keyframe)."""
+    """The first frame held out, modulo `held_out_every`. (The first keyframe is never held out.)"""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, {"held_out_every": (0, 1e9), "held_out_offset": (0, 1e9)})
 
     def is_held_out(self, frame_index: int) -> bool:
         """Whether the frame is kept for scoring."""
-        return self.held_out_every > 0 and frame_index % self.held_out_every == self.held_out_offset
+        every = self.held_out_every
+        return every > 0 and frame_index % every == self.held_out_offset % every
 
 
 @dataclass(frozen=True)
@@ -59,14 +63,11 @@ class Config:
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
 
     def __post_init__(self) -> None:
-        limits = {
-            "threads": (self.threads, 0, 1024), "sh_degree": (self.sh_degree, 0, 3),
-            "realtime_fps": (self.realtime_fps, 0, 1e4), "refine_iterations": (self.refine_iterations, 0, 10**7),
-            "mapping.iterations_per_frame": (self.mapping.iterations_per_frame, 0, 1000),
+        ranges = {
+            "seed": (0, 2**63), "threads": (0, 1024), "sh_degree": (0, 3), "realtime_fps": (0, 1e4),
+            "refine_iterations": (0, 10**7),
         }  # fmt: skip
-        for name, (value, low, high) in limits.items():
-            if not low <= value <= high:
-                raise ConfigError(f"{name}: expected {low} to {high}, found {value}")
+        check_ranges(self, ranges)
 
 
 def config_to_dict(config: Config) -> dict[str, Any]:
@@ -138,7 +139,11 @@ def load_config(preset_or_file: str | Path | None = None, overrides: list[str] |
         name, equals, text = override.partition("=")
         if not equals:
             raise ConfigError(f"--set {override}: expected name=value")
-        _assign(values, name.strip().split("."), yaml.safe_load(text), override)
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--set {override}: cannot be read as a value: {error}") from None
+        _assign(values, name.strip().split("."), value, override)
     return config_from_dict(values, "--set" if overrides else origin)
 
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 
 class GgslamError(Exception):
     """Base of every error that ggslam raises on purpose. The command line prints it and exits with `exit_code`."""
@@ -31,10 +33,6 @@ class RenderError(GgslamError):
     """The renderer was given arrays of wrong shape or type, or a backend that is not available."""
 
 
-class TrackingLost(GgslamError):
-    """The camera could not be located."""
-
-
 class MissingDependency(GgslamError):
     """An optional package or file is needed for what was asked; the message says how to get it."""
 
@@ -43,3 +41,11 @@ class NativeCoreError(GgslamError):
     """The compiled core is missing or does not fit this version of the Python code."""
 
     exit_code = 1
+
+
+def check_ranges(settings: object, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Raises ConfigError for the first attribute of `settings` that is not a number in its closed range."""
+    for name, (low, high) in ranges.items():
+        value = getattr(settings, name)
+        if not low <= value <= high:  # NaN is in no range
+            raise ConfigError(f"{type(settings).__name__}.{name}: expected {low:g} to {high:g}, found {value}")

@@ -3,15 +3,20 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ggslam.config import Config, load_config
-from ggslam.errors import GgslamError, RunFolderError, SequenceError
+from ggslam.errors import RunFolderError, SequenceError
 from ggslam.progress import Observer, SilentObserver
 from ggslam.realtime import RealtimeSlam
-from ggslam.run_folder import RunFolder
+from ggslam.run_folder import RunFolder, json_ready
 from ggslam.scoring import score_run
 from ggslam.sequences import Sequence, open_sequence
 from ggslam.slam import Slam, SlamResult
@@ -67,10 +72,10 @@ class RunOutcome:
     def headline(self) -> str:
         """One line for people."""
         r = self.result
-        lost = sum(frame.status == "lost" for frame in r.frames)
         parts = [f"{len(r.frames)} frames", f"{r.frames_per_second():.1f} frames/s", f"{len(r.keyframes)} keyframes",
                  f"{len(r.gaussians)} Gaussians"]  # fmt: skip
-        parts += [f"{lost} frames lost"] if lost else []
+        counts = Counter(frame.status for frame in r.frames)
+        parts += [f"{counts[status]} frames {status}" for status in ("recovered", "lost") if counts[status]]
         parts += [f"{len(r.dropped_frames)} frames dropped"] if r.dropped_frames else []
         return ", ".join(parts)
 
@@ -87,16 +92,37 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
     sequence = request.sequence.open()
     out = request.out if request.out is not None else Path("runs") / sequence.name
     folder = RunFolder.create(out, overwrite=request.overwrite)
+    for warning in sequence.warnings:
+        observer.note(warning)
     result, error = run_slam(sequence, config, observer)
     if not result.keyframes:
         folder.discard()
         reason = result.frames[0].reason if result.frames else "no frame could be read"
         raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
-    folder.save(config, describe(request.sequence, sequence), result, None if error is None else repr(error))
-    outcome = RunOutcome(folder, result, None, error)
+    for skipped in sequence.skipped:
+        observer.note(f"skipped: {skipped.reason}")
+    with uninterrupted():
+        folder.save(config, describe(request.sequence, sequence), result, None if error is None else repr(error))
+    outcome = RunOutcome(folder, result, error=error)
     if request.evaluate and error is None:
         outcome.metrics = score_run(folder, sequence, observer)
     return outcome
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits until the block is done (in the main thread; elsewhere it does not arrive anyway)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    arrived: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: arrived.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if arrived:
+        raise KeyboardInterrupt
 
 
 def run_slam(sequence: Sequence, config: Config, observer: Observer) -> tuple[SlamResult, BaseException | None]:
@@ -112,7 +138,7 @@ def run_slam(sequence: Sequence, config: Config, observer: Observer) -> tuple[Sl
         if config.refine_iterations:
             observer.begin("refine", config.refine_iterations)
         return slam.finish(observer.advance), None
-    except (GgslamError, KeyboardInterrupt) as stopped:
+    except (Exception, KeyboardInterrupt) as stopped:  # whatever it is: finished work is saved, then it is raised
         error = stopped
     return slam.result(), error
 
@@ -125,7 +151,10 @@ def _run_synchronous(slam: Slam, sequence: Sequence, observer: Observer) -> None
 def describe(request: SequenceRequest, sequence: Sequence) -> dict[str, Any]:
     """What `sequence.json` holds: how to open the recording again, and its camera."""
     values = {**asdict(request), "path": request.path.absolute()}
-    return {"open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence)}
+    return {
+        "open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence),
+        "warnings": sequence.warnings, "skipped": [asdict(skipped) for skipped in sequence.skipped],
+    }  # fmt: skip
 
 
 def open_recording_of(folder: RunFolder, path: Path | None = None) -> Sequence:
@@ -140,10 +169,16 @@ def open_recording_of(folder: RunFolder, path: Path | None = None) -> Sequence:
         RunFolderError: the run does not say which it was.
     """
     try:
-        values = dict(folder.read_json("sequence.json")["open"])
+        record = folder.read_json("sequence.json")
+        values = dict(record["open"])
         values["path"] = Path(path if path is not None else values["path"])
         values["masks"] = None if values["masks"] is None else Path(values["masks"])
         request = SequenceRequest(**values)
     except (KeyError, TypeError) as error:
         raise RunFolderError(f"{folder.path / 'sequence.json'}: not as ggslam writes it: {error!r}") from None
-    return request.open()
+    sequence = request.open()
+    found = {"frames": len(sequence), "camera": asdict(sequence.camera)}
+    expected = {name: record.get(name) for name in found}
+    if json_ready(found) != expected:
+        raise RunFolderError(f"{sequence.path}: not the recording of {folder.path}: expected {expected}, found {found}")
+    return sequence

@@ -20,6 +20,9 @@ class Observer(Protocol):
     def advance(self, done: int, total: int) -> None:
         """`done` of `total` steps of the current stage are done."""
 
+    def note(self, text: str) -> None:
+        """Something the user should know."""
+
 
 class SilentObserver:
     """Listens to nothing."""
@@ -31,4 +34,7 @@ class SilentObserver:
         """Ignored."""
 
     def advance(self, done: int, total: int) -> None:
+        """Ignored."""
+
+    def note(self, text: str) -> None:
         """Ignored."""

@@ -20,6 +20,8 @@ from ggslam.tracking.tracker import TrackingResult
 
 MAX_LAG_FRAMES = 3
 """A frame that is this many frame times late is dropped: a live camera would have overwritten it."""
+MAX_WAITING = 8
+"""While so many keyframes wait for the mapper no more are made, so that memory stays bounded."""
 
 
 class RealtimeSlam:
@@ -79,7 +81,7 @@ class RealtimeSlam:
         slam = self.slam
         slam.times.start()
         tracking = slam.track(frame)
-        is_keyframe = slam.wants_keyframe(frame, tracking)
+        is_keyframe = self._jobs.qsize() < MAX_WAITING and slam.wants_keyframe(frame, tracking)
         if is_keyframe:
             slam.anchor_to(tracking.T_world_camera)
             self._jobs.put((frame, tracking))

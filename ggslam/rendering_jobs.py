@@ -23,7 +23,7 @@ def frame_poses(folder: RunFolder) -> dict[int, np.ndarray]:
     """T_world_camera of each frame of a run that was not lost, by its index, from its keyframes as refined."""
     record = folder.read_json("keyframes.json")
     keyframes = [np.array(k["T_world_camera"]) for k in record["keyframes"]]
-    tracked = [f for f in record["frames"] if f["status"] != "lost"]
+    tracked = [f for f in record["frames"] if f["status"] != "lost" and f["keyframe"] < len(keyframes)]
     return {f["frame"]: keyframes[f["keyframe"]] @ np.array(f["T_keyframe_camera"]) for f in tracked}
 
 

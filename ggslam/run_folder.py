@@ -66,9 +66,7 @@ class RunFolder:
             else:
                 folder.path.mkdir(parents=True, exist_ok=True)
                 folder._made_here = True
-            probe = folder.path / f".probe-{os.getpid()}"
-            probe.write_bytes(b"x")
-            probe.unlink()
+            folder._probe()
         except OSError as error:
             raise RunFolderError(f"{path}: cannot be written to: {error.strerror or error}") from None
         return folder
@@ -84,6 +82,14 @@ class RunFolder:
             reason = "is not a run of ggslam (no run.json)" if Path(path).is_dir() else "no such folder"
             raise RunFolderError(f"{path}: {reason}")
         return RunFolder(path)
+
+    def _probe(self) -> None:
+        """Finds out now, not after hours of work, whether files can be written."""
+        probe = self.path / f".probe-{os.getpid()}"
+        try:
+            probe.write_bytes(b"x")
+        finally:
+            probe.unlink(missing_ok=True)
 
     def discard(self) -> None:
         """Removes the folder if it was made by `create` and is still empty."""
@@ -101,17 +107,20 @@ class RunFolder:
             result: of the run.
             error: why the run stopped early, if it did.
         """
-        for stale in ("metrics.json", "frames.csv"):
+        mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish"}
+        self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
+        for stale in ("metrics.json", "frames.csv", "points.ply", "points_grid.ply"):
             (self.path / stale).unlink(missing_ok=True)
         shutil.rmtree(self.path / "renders", ignore_errors=True)
-        write_tum(self.path / "trajectory.txt", result.timestamps(), result.trajectory())
-        self.write_json("keyframes.json", _keyframes(result))
-        write_gaussian_ply(self.path / "map.ply", result.gaussians)
-        write_points(self.path, sample_points(result.gaussians))
         save_config(config, self.path / "config.yaml")
         self.write_json("sequence.json", sequence)
         self.write_json("timing.json", timing(result))
-        self.write_json(MARKER, {"ggslam": __version__, "complete": error is None, "stopped_by": error})
+        self.write_json("keyframes.json", _keyframes(result))
+        write_tum(self.path / "trajectory.txt", result.timestamps(), result.trajectory())
+        write_gaussian_ply(self.path / "map.ply", result.gaussians)
+        self.write_json(MARKER, {**mark, "complete": error is None, "stopped_by": error})
+        # Last and largest; `ggslam export --format points` makes them again from the map.
+        write_points(self.path, sample_points(result.gaussians))
 
     def write_json(self, name: str, values: Any) -> Path:
         """Writes `values` as JSON; numbers that are not finite become null."""

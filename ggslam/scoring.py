@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -56,14 +57,22 @@ def score_run(
     metrics: dict[str, Any] = {
         "trajectory": _trajectory(sequence, poses),
         "images": _images(folder, sequence, poses, metric, observer, every),
+        "tracking": dict(Counter(f["status"] for f in folder.read_json("keyframes.json")["frames"])),
         **_performance(folder),
+        "scored_every": every,
         "notes": notes,
     }
+    if not metrics["images"]["held_out"]["frames"]:
+        notes.append("no frame was held out; every score is over frames that the map was or could be trained on")
+    if len(poses) and max(poses) + 1 < len(sequence):
+        notes.append(f"the run ends at frame {max(poses)} of {len(sequence)}; scores are of its part")
     lost = [f["frame"] for f in folder.read_json("keyframes.json")["frames"] if f["status"] == "lost"]
     if lost:
         notes.append(f"{len(lost)} frames were lost (the first: {lost[0]}); they have no pose and are in no score")
     if metrics["trajectory"] is None:
-        notes.append("the recording has no ground-truth poses; no trajectory scores")
+        known = sequence.ground_truth is not None
+        reason = "fewer than 3 frames have both poses" if known else "the recording has no ground-truth poses"
+        notes.append(f"{reason}; no trajectory scores")
     folder.write_json("metrics.json", metrics)
     return json_ready(metrics)
 
@@ -90,10 +99,11 @@ def _images(
 ) -> dict[str, Any]:  # fmt: skip
     keyframes = {k["frame"] for k in folder.read_json("keyframes.json")["keyframes"]}
     evaluation = folder.config().evaluation
-    chosen = [i for i in range(len(sequence)) if i % every == 0]
+    chosen = [i for i in range(max(poses, default=-1) + 1) if i % every == 0]
     held_out = {i for i in chosen if evaluation.is_held_out(i) and i not in keyframes}
     sets = {"keyframes": keyframes & set(chosen), "held_out": held_out, "all": set(chosen)}
-    pictured = set(np.array(sorted(poses))[np.linspace(0, len(poses) - 1, PICTURES).round().astype(int)].tolist())
+    spread = np.linspace(0, len(poses) - 1, min(PICTURES, len(poses))).round().astype(int)
+    pictured = set(np.array(sorted(poses))[spread].tolist())
     (folder.path / "renders").mkdir(exist_ok=True)
     show = _shower(folder, poses, pictured)
     rows: list[dict[str, Any]] = []
@@ -104,10 +114,21 @@ def _images(
         kind = "keyframe" if frame.index in keyframes else "held_out" if frame.index in held_out else "other"
         rows.append({"frame": frame.index, "kind": kind, **(scores or ImageScores()).to_dict()})
 
-    means = score_images(show, sequence.stream(masks=False), sets, lpips, note)
+    means = score_images(show, _up_to(max(poses, default=-1), sequence), sets, lpips, note)
     observer.advance(len(sequence), len(sequence))
     _write_rows(folder, rows)
     return {name: mean.to_dict() for name, mean in means.items()}
+
+
+def _up_to(last: int, sequence: Sequence) -> Iterator[Frame]:
+    """Frames 0 to `last`: a run that stopped early is not asked about what it never saw, least of all about the damaged
+    frame that stopped it."""
+    if last < 0:
+        return
+    for frame in sequence.stream(masks=False):
+        yield frame
+        if frame.index >= last:
+            return
 
 
 def _shower(

@@ -118,7 +118,8 @@ class SlamResult:
         camera."""
         poses = np.full((len(self.frames), 4, 4), np.nan)
         for pose, f in zip(poses, self.frames, strict=True):
-            if f.status != TrackingStatus.LOST.value:
+            # A keyframe may be missing if a real-time run stopped before its mapper had taken it in.
+            if f.status != TrackingStatus.LOST.value and f.keyframe < len(self.keyframes):
                 pose[:] = self.keyframes[f.keyframe].T_world_camera @ f.T_keyframe_camera
         return poses
 
@@ -175,8 +176,8 @@ class Slam:
         tracking = self.track(frame)
         is_keyframe = self.wants_keyframe(frame, tracking)
         if is_keyframe:
-            self.anchor_to(tracking.T_world_camera)
             self.insert(frame, tracking)
+            self.anchor_to(tracking.T_world_camera)
         self.remember(frame, tracking)
         if self.mapper.keyframes:
             first = is_keyframe and len(self.mapper.keyframes) == 1
@@ -187,11 +188,13 @@ class Slam:
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refine_iterations`), then the result. `progress(done, total)` is called now and then."""
-        start = time.perf_counter()
-        if self.config.refine_iterations and self.mapper.keyframes:
-            self.mapper.refine(self.config.refine_iterations, progress)
-            self.refine_iterations = self.config.refine_iterations
-        self.times.refinement = time.perf_counter() - start
+        start, before = time.perf_counter(), self.mapper.times.iterations
+        try:
+            if self.config.refine_iterations and self.mapper.keyframes:
+                self.mapper.refine(self.config.refine_iterations, progress)
+        finally:  # an interrupted refinement counts for what it did
+            self.refine_iterations = self.mapper.times.iterations - before
+            self.times.refinement = time.perf_counter() - start
         return self.result()
 
     def result(self) -> SlamResult:
@@ -204,12 +207,12 @@ class Slam:
     # --- its parts, also used by the real-time loop ------------------------------------------------------------------
 
     def track(self, frame: Frame) -> TrackingResult:
-        """Locates one frame against the current target."""
-        if frame.depth.shape != (self.camera.height, self.camera.width):
-            raise SequenceError(
-                f"frame {frame.source_index}: image size {frame.depth.shape[1]}x{frame.depth.shape[0]}, "
-                f"expected {self.camera.width}x{self.camera.height}"
-            )
+        """Locates one frame against the current target.
+
+        Raises:
+            SequenceError: images of another size than the camera's, or of another type than `Frame` says.
+        """
+        check_frame(frame, self.camera)
         start = time.perf_counter()
         result = self.tracker.track(frame)
         if not self.mapper.keyframes and self.tracker.noise is not None:
@@ -218,8 +221,10 @@ class Slam:
         return result
 
     def wants_keyframe(self, frame: Frame, tracking: TrackingResult) -> bool:
-        """Whether the frame becomes a keyframe: never when held out for scoring, and never when lost."""
-        if self.config.evaluation.is_held_out(frame.index) or tracking.status is TrackingStatus.LOST:
+        """Whether the frame becomes a keyframe: never when lost, and never when held out for scoring (but something
+        has to be the first)."""
+        held_out = self.policy.kind is not None and self.config.evaluation.is_held_out(frame.index)
+        if held_out or tracking.status is TrackingStatus.LOST:
             return False
         return self.policy.decide(frame.index, tracking)
 
@@ -241,3 +246,20 @@ class Slam:
                 tracking.overlap, tracking.rmse_m, tracking.status.value, tracking.reason,
             )
         )  # fmt: skip
+
+
+def check_frame(frame: Frame, camera: Camera) -> None:
+    """Raises SequenceError unless the frame's images have the camera's size and the types that `Frame` promises."""
+    size = (camera.height, camera.width)
+    for name, image, shape, kind in (("colour", frame.color, (*size, 3), "u1"), ("depth", frame.depth, size, "f4")):
+        if image.shape[:2] != size:
+            found = "x".join(str(n) for n in image.shape[1::-1])
+            expected = f"{camera.width}x{camera.height}"
+            raise SequenceError(f"frame {frame.source_index}: {name} is {found}, expected {expected}")
+        if image.shape != shape or image.dtype != np.dtype(kind):
+            found = f"{image.dtype} {list(image.shape)}"
+            raise SequenceError(
+                f"frame {frame.source_index}: {name} is {found}, expected {np.dtype(kind)} {list(shape)}"
+            )
+    if not (frame.depth >= 0).all() or not np.isfinite(frame.depth).all():
+        raise SequenceError(f"frame {frame.source_index}: depth has negative, infinite or NaN values; 0 means none")

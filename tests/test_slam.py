@@ -76,6 +76,34 @@ def test_a_frame_of_another_size_is_refused(frames: list[Frame]) -> None:
         slam.step(dataclasses.replace(frames[1], depth=np.ones((10, 10), np.float32)))
 
 
+@pytest.mark.parametrize("change", [{"color": np.zeros((120, 160), np.uint8)}, {"color": np.zeros((120, 160, 3))}])
+def test_images_of_another_type_are_refused(frames: list[Frame], change: dict) -> None:
+    slam = new_slam(frames)
+    slam.step(frames[0])
+    with pytest.raises(SequenceError, match="colour"):
+        slam.step(dataclasses.replace(frames[1], **change))
+    bad = frames[1].depth.copy()
+    bad[3, 4] = np.nan
+    with pytest.raises(SequenceError, match="NaN"):
+        slam.step(dataclasses.replace(frames[1], depth=bad))
+    slam.step(frames[1])  # the loop goes on
+    assert len(slam.finish().trajectory()) == 2
+
+
+def test_a_jump_to_another_place_is_lost_not_believed(room: Path, frames: list[Frame]) -> None:
+    """Mirrored frames fit nowhere: some overlap can be had anywhere, but the images do not agree."""
+    slam = new_slam(frames)
+    for frame in frames[:4]:
+        slam.step(frame)
+    for i, frame in enumerate(frames[4:8]):
+        turned = dataclasses.replace(
+            frame, index=4 + i, color=np.ascontiguousarray(frame.color[:, ::-1]),
+            depth=np.ascontiguousarray(frame.depth[:, ::-1]),
+        )  # fmt: skip
+        assert slam.step(turned).frame.status == "lost"
+    assert len(slam.mapper.keyframes) <= 2
+
+
 def test_spherical_harmonics_are_trained(frames: list[Frame]) -> None:
     slam = new_slam(frames, "sh_degree=2")
     for frame in frames[:6]:

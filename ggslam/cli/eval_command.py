@@ -32,4 +32,4 @@ def evaluate(
     with progress_bar() as bar:
         metrics = score_run(folder, recording, ProgressObserver(bar), lpips=lpips, every=every)
     print_scores(metrics)
-    console.print(f"wrote {folder.path / 'metrics.json'}", highlight=False)
+    console.print(f"wrote {folder.path / 'metrics.json'}", highlight=False, markup=False)

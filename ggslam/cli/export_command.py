@@ -52,4 +52,4 @@ def export(
         message = export_points(folder, out, voxel, min_opacity)
     else:
         message = export_trajectory(folder, out)
-    console.print(message, highlight=False)
+    console.print(message, highlight=False, markup=False)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import typer
+from rich.markup import escape
 
 from ggslam.cli import options
 from ggslam.cli.console import console
@@ -36,11 +37,11 @@ def inspect(
     )
     report = inspect_sequence(recording, samples=samples)
     for name, value in _lines(report):
-        console.print(f"[bold]{name:<13}[/] {value}", highlight=False)
+        console.print(f"[bold]{name:<13}[/] {escape(value)}", highlight=False)
     for reason in report.damaged:
-        console.print(f"[red]damaged:[/] {reason}", highlight=False)
+        console.print(f"[red]damaged:[/] {escape(reason)}", highlight=False)
     for warning in report.warnings:
-        console.print(f"[yellow]warning:[/] {warning}", highlight=False)
+        console.print(f"[yellow]warning:[/] {escape(warning)}", highlight=False)
 
 
 def _camera(c: Camera) -> str:

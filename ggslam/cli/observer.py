@@ -38,3 +38,7 @@ class ProgressObserver:
         """`done` of `total` steps of the current stage are done."""
         assert self._task is not None
         self._bar.update(self._task, completed=done, total=total)
+
+    def note(self, text: str) -> None:
+        """Something the user should know."""
+        self._bar.console.print(f"note: {text}", highlight=False, markup=False)

@@ -26,7 +26,9 @@ def render(
     frames: Annotated[str | None, typer.Option(help="Frame numbers, e.g. 0,50,100; default: 8 spread evenly.")] = None,
     every: Annotated[int | None, typer.Option(help="Every n-th frame instead.", min=1)] = None,
     what: Annotated[str, typer.Option(help="Of color, depth, alpha; separated by commas.")] = "color,depth",
-    width: Annotated[int | None, typer.Option(help="Width of the pictures; default: as the run saw them.")] = None,
+    width: Annotated[
+        int | None, typer.Option(help="Width of the pictures; default: as the run saw them.", min=16, max=8192)
+    ] = None,
 ) -> None:
     """Render a run's map from the poses of its frames."""
     from ggslam.rendering_jobs import render_frames, select_frames
@@ -40,4 +42,4 @@ def render(
             folder, numbers, what.split(","), out or folder.path / "renders", width,
             progress=lambda done: bar.update(task, completed=done),
         )  # fmt: skip
-    console.print(f"wrote {len(written)} pictures to {out or folder.path / 'renders'}", highlight=False)
+    console.print(f"wrote {len(written)} pictures to {out or folder.path / 'renders'}", highlight=False, markup=False)

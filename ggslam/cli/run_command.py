@@ -46,7 +46,7 @@ def run(
         float | None, typer.Option(metavar="FPS", help="Frames arrive at this rate; tracker and mapper side by side.")
     ] = None,
     threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of all random draws.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of all random draws.", min=0)] = None,
     skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
     evaluate: Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")] = True,
     overwrite: Annotated[bool, typer.Option(help="Replace a finished run in the output folder.")] = False,
@@ -69,7 +69,7 @@ def run(
     )  # fmt: skip
     with progress_bar() as bar:
         outcome = execute(request, ProgressObserver(bar))
-    console.print(f"[bold]{outcome.folder.path}[/]: {outcome.headline()}", highlight=False)
+    console.print(f"{outcome.folder.path}: {outcome.headline()}", highlight=False, markup=False)
     if outcome.metrics is not None:
         print_scores(outcome.metrics)
     if outcome.error is not None:

@@ -18,7 +18,7 @@ def synth(
     frames: Annotated[int, typer.Option(help="Number of frames.", min=2)] = 60,
     width: Annotated[int, typer.Option(help="Image width.", min=16)] = 320,
     height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
-    seed: Annotated[int, typer.Option(help="Of room and camera path.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of room and camera path.", min=0)] = 0,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Depth noise of a Kinect-like sensor.")] = True,
 ) -> None:
     """Generate a recording: a textured, furnished room with exact poses and instance masks."""
@@ -30,4 +30,4 @@ def synth(
             folder, frames=frames, width=width, height=height, seed=seed, noise=noise,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
-    console.print(f"wrote {folder}: {frames} frames of {width}x{height}", highlight=False)
+    console.print(f"wrote {folder}: {frames} frames of {width}x{height}", highlight=False, markup=False)

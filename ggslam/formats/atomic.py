@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from collections.abc import Iterator
@@ -10,6 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ggslam.errors import RunFolderError
+
+_MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+"""Not the user's fault: disk full, quota used up, disk broken."""
 
 
 @contextmanager
@@ -45,7 +49,10 @@ def atomic_write(path: str | Path, fsync: bool = False) -> Iterator[Path]:
     except OSError as error:
         if error.filename not in (None, str(temporary), temporary):
             raise  # the block failed to read some other file: not ours to explain
-        raise RunFolderError(f"cannot write {path}: {error.strerror or error}") from error
+        failure = RunFolderError(f"cannot write {path}: {error.strerror or error}")
+        if error.errno in _MACHINE_ERRORS:
+            failure.exit_code = 1
+        raise failure from error
     finally:
         temporary.unlink(missing_ok=True)
 

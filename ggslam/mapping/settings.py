@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from ggslam.errors import check_ranges
 from ggslam.mapping.losses import LossSettings
 
 
@@ -37,6 +38,14 @@ class InsertionSettings:
     max_depth_m: float = 20.0
     """Farther measurements do not become Gaussians."""
 
+    def __post_init__(self) -> None:
+        ranges = {
+            "alpha_threshold": (0, 1), "depth_tolerance_m": (0, 1e3), "depth_tolerance_relative": (0, 1),
+            "opacity": (1e-3, 0.999), "scale_pixels": (1e-2, 100), "flatness": (1e-3, 1), "max_slope": (1, 100),
+            "texture_threshold": (0, 1e4), "fill_stride": (0, 1000), "max_depth_m": (0.05, 1e4),
+        }  # fmt: skip
+        check_ranges(self, ranges)
+
 
 @dataclass(frozen=True)
 class LearningRates:
@@ -57,6 +66,12 @@ class LearningRates:
     young_updates: int = 8
     """...and the rates fall to their values over this many of its steps."""
 
+    def __post_init__(self) -> None:
+        groups = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "features")
+        check_ranges(self, dict.fromkeys(groups, (0.0, 10.0)))
+        betas = {"beta1": (0.0, 0.9999), "beta2": (0.0, 0.99999), "epsilon": (1e-30, 1.0)}
+        check_ranges(self, {**betas, "young_factor": (1, 100), "young_updates": (1, 10**4)})
+
 
 @dataclass(frozen=True)
 class PruningSettings:
@@ -66,6 +81,9 @@ class PruningSettings:
     min_opacity: float = 0.05
     max_scale_m: float = 0.25
     """Larger Gaussians are dropped."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, {"every_keyframes": (1, 10**6), "min_opacity": (1e-6, 0.999), "max_scale_m": (1e-4, 1e4)})
 
 
 @dataclass(frozen=True)
@@ -82,6 +100,9 @@ class PoseRefinementSettings:
     max_rate: float = 5e-4
     """Upper bound of the step."""
 
+    def __post_init__(self) -> None:
+        check_ranges(self, {"rate_sigmas": (0, 100), "max_rate": (0, 1)})
+
 
 @dataclass(frozen=True)
 class ExposureSettings:
@@ -90,6 +111,9 @@ class ExposureSettings:
     enabled: bool = False
     rate: float = 2e-3
     regularization: float = 1e-2
+
+    def __post_init__(self) -> None:
+        check_ranges(self, {"rate": (0, 1), "regularization": (0, 1e6)})
 
 
 @dataclass(frozen=True)
@@ -108,3 +132,7 @@ class MapperSettings:
     pruning: PruningSettings = field(default_factory=PruningSettings)
     pose_refinement: PoseRefinementSettings = field(default_factory=PoseRefinementSettings)
     exposure: ExposureSettings = field(default_factory=ExposureSettings)
+
+    def __post_init__(self) -> None:
+        ranges = {"iterations_per_frame": (0, 1000), "first_frame_iterations": (0, 10**5), "refine_decay": (1e-6, 1)}
+        check_ranges(self, ranges)

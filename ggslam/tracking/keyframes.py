@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ggslam.errors import check_ranges
 from ggslam.scene.poses import inverse, so3_log
 
 
@@ -53,6 +54,13 @@ class KeyframeSettings:
     """A mapping keyframe is made after a motion of this many times the median depth."""
     max_rotation_deg: float = 10.0
     """Likewise, degrees."""
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "min_overlap": (0, 1), "min_gap": (0, 10**6), "max_gap": (1, 10**9), "max_translation": (0, 1e9),
+            "max_rotation_deg": (0, 1e9),
+        }  # fmt: skip
+        check_ranges(self, ranges)
 
 
 class KeyframePolicy:

@@ -7,6 +7,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from ggslam.errors import check_ranges
+
 PhotometricMode = Literal["never", "degenerate", "auto", "always"]
 
 
@@ -23,6 +25,13 @@ class DepthNoise:
     def sigma(self, z: float) -> float:
         """Standard deviation in metres at depth `z`."""
         return self.constant + self.square * z * z
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "constant": (1e-6, 1),
+            "square": (0, 1),
+        }  # fmt: skip
+        check_ranges(self, ranges)
 
 
 @dataclass(frozen=True)
@@ -43,6 +52,18 @@ class PointSettings:
     max_elongation: float = 4.0
     """Upper bound of the largest regularised eigenvalue."""
 
+    def __post_init__(self) -> None:
+        ranges = {
+            "count": (50, 10**6),
+            "window": (1, 20),
+            "min_neighbours": (0, 1),
+            "min_depth": (0, 1e4),
+            "max_depth": (0, 1e4),
+            "min_thickness": (1e-4, 1),
+            "max_elongation": (1, 1e4),
+        }  # fmt: skip
+        check_ranges(self, ranges)
+
 
 @dataclass(frozen=True)
 class TargetSettings:
@@ -61,6 +82,15 @@ class TargetSettings:
     """Weight of the scatter of the means against the Gaussians' own covariances in a voxel's shape."""
     neighbour_weight: float = 0.3
     """Weight of the 26 neighbours in a voxel's scatter."""
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "voxel": (1e-3, 10),
+            "min_opacity": (1e-3, 0.999),
+            "min_thickness": (1e-4, 1),
+            "max_elongation": (1, 1e4),
+        }  # fmt: skip
+        check_ranges(self, ranges)
 
 
 @dataclass(frozen=True)
@@ -130,6 +160,8 @@ class RecoverySettings:
     """Over this mean grey difference, where grey values were compared, other starts are tried, too."""
     min_overlap: float = 0.25
     """Under this overlap from every start the frame is lost."""
+    min_share: float = 0.2
+    """A pose short of the convincing overlap is believed only if this share of the textured points was compared."""
     views: int = 2
     """Located frames whose features are matched, the latest first."""
     features: int = 1000

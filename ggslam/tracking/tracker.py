@@ -216,14 +216,23 @@ class Tracker:
         return found.photometric_share == 0 or found.photometric_residual <= limit
 
     def _acceptable(self, found: AlignmentResult) -> bool:
-        return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.recovery.min_overlap
+        """Whether to believe a pose at all. Some overlap can be had anywhere (a floor is a floor), so that a pose short
+        of the convincing overlap must be witnessed by grey values."""
+        recovery = self.settings.recovery
+        if found.status is AlignmentStatus.LOST or found.overlap < recovery.min_overlap:
+            return False
+        seen = found.photometric_share >= recovery.min_share
+        return self._convincing(found) or (seen and found.photometric_residual <= 2 * recovery.convincing_residual)
 
     def _retry(
         self, view: View, points: FramePoints, target: GicpTarget, found: AlignmentResult,
         photometric: PhotometricPart | None,
     ) -> tuple[AlignmentResult, str]:  # fmt: skip
         """The best alignment over all starts."""
+        photometric = photometric or self._photometric_part(view)
         best, reason = found, ""
+        if photometric is not None and found.photometric_share == 0:  # all starts are compared by the same measure
+            best = self._align(points, target, self._pose @ self._velocity, photometric)
         # Feature matches are good to a centimetre or two; the coarse level would slide off along a bare wall.
         starts = [("last pose", self._pose, True)]
         features = feature_starts(view, self.camera, self._views, self.settings.recovery)
@@ -252,6 +261,11 @@ class Tracker:
         self._velocity = np.eye(4)
         limit = self.settings.recovery.min_overlap
         reason = f"{found.overlap:.0%} of {len(points)} points match the map, {limit:.0%} needed, from every start"
+        if found.overlap >= limit:
+            reason = (
+                f"only {found.overlap:.0%} of {len(points)} points match the map, and the image does not agree "
+                f"(mean grey difference {found.photometric_residual:.3f} over {found.photometric_share:.0%} of it)"
+            )
         if len(points) < self.settings.align.min_matches:
             reason = f"only {len(points)} points have depth, {self.settings.align.min_matches} needed"
         return TrackingResult(self._pose.copy(), TrackingStatus.LOST, found.overlap, found.rmse, reason, points, found)

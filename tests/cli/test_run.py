@@ -178,6 +178,10 @@ def test_wrong_arguments(room: Path, finished: Path, tmp_path: Path) -> None:
     one_error(ggslam("run", room, "--config", "swift"), "swift", "default")
     one_error(ggslam("run", room, "--start", 100, "--out", tmp_path / "run"), "0 to 23")
     one_error(ggslam("eval", tmp_path), "run.json")
+    one_error(ggslam("run", room, "--set", "mapping={", "--out", tmp_path / "run"), "mapping={")
+    one_error(ggslam("run", room, "--set", "mapping.insertion.opacity=.nan", "--out", tmp_path / "run"), "opacity")
+    one_error(ggslam("run", room, "--set", "mapping.pruning.every_keyframes=0", "--out", tmp_path / "r"), "every_keyf")
+    one_error(ggslam("run", tmp_path / "wei[/b]rd"), "wei[/b]rd")
     one_error(ggslam("render", finished, "--frames", "99"), "99")
     one_error(ggslam("render", finished, "--what", "normals"), "normals")
     one_error(ggslam("export", finished, "--format", "points", "--voxel", -1, "--out", tmp_path / "x"), "voxel")
@@ -191,3 +195,33 @@ def test_damaged_run_folder(finished: Path, tmp_path: Path) -> None:
     one_error(ggslam("render", folder), "map.ply")
     (folder / "keyframes.json").write_text("{")
     one_error(ggslam("eval", folder), "keyframes.json")
+
+
+def test_scores_are_of_the_run_s_own_recording(finished: Path, room: Path, tmp_path: Path) -> None:
+    moved = copy_of(room, tmp_path / "moved")
+    assert ggslam("eval", finished, "--sequence", moved, "--no-lpips").returncode == 0
+    for name in ("rgb", "depth", "masks"):
+        sorted((moved / name).iterdir())[-1].unlink()
+    done = ggslam("eval", finished, "--sequence", moved)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+
+
+def test_a_stopped_run_can_be_scored(room: Path, tmp_path: Path) -> None:
+    folder = copy_of(room, tmp_path / "room")
+    victim = depth_files(folder)[14]
+    victim.write_bytes(victim.read_bytes()[:-200])
+    one_error(ggslam("run", folder, "--out", tmp_path / "run"), victim.name)
+    done = ggslam("eval", tmp_path / "run", "--no-lpips")
+    assert done.returncode == 0, done.stderr
+    m = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert m["images"]["all"]["frames"] == 14 and m["images"]["all"]["frames_without_pose"] == 0
+    assert any("ends at frame 13" in note for note in m["notes"])
+
+
+def test_other_shares_of_held_out_frames(room: Path, tmp_path: Path) -> None:
+    done = ggslam("run", room, "--out", tmp_path / "run", "--stop", 12, "--iterations", 1,
+                  "--set", "evaluation.held_out_every=4")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    m = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert m["images"]["held_out"]["frames"] == 2  # frames 4 and 8; frame 0 has to be a keyframe
+    assert m["tracking"]["ok"] + m["tracking"].get("degenerate", 0) == 11
