@@ -121,6 +121,7 @@ class RunFolder:
         self.write_json(MARKER, {**mark, "complete": error is None, "stopped_by": error})
         # Last and largest; `ggslam export --format points` makes them again from the map.
         write_points(self.path, sample_points(result.gaussians))
+        self.write_json("timing.json", timing(result))  # once more: peak memory is that of the whole run
 
     def write_json(self, name: str, values: Any) -> Path:
         """Writes `values` as JSON; numbers that are not finite become null."""

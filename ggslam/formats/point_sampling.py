@@ -11,7 +11,7 @@ import numpy as np
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import quaternion_to_matrix
 
-_CHUNK = 1_000_000
+_CHUNK = 300_000
 """Samples held in memory at a time."""
 _SPACING = 0.7
 """Distance of samples in voxels; below 1/sqrt(2) a lattice turned in its plane still meets every voxel of the plane."""
