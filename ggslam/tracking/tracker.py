@@ -99,6 +99,7 @@ class Tracker:
         """Of the depth camera; measured on the first frame if the settings leave it open."""
         self._pose = np.eye(4) if T_world_camera is None else np.array(T_world_camera, float)
         self._velocity = np.eye(4)
+        self._was_lost = False
         self._views: list[View] = []
         self._reference_view: View | None = None
         self._reference: PhotometricReference | None = None
@@ -130,7 +131,8 @@ class Tracker:
         if not self._acceptable(found):
             return self._lost(points, found)
         T = orthonormalized(found.T_world_camera)
-        self._velocity = inverse(self._pose) @ T
+        self._velocity = np.eye(4) if self._was_lost else inverse(self._pose) @ T
+        self._was_lost = False
         self._pose = view.T_world_camera = T
         self._remember(view, points)
         status = TrackingStatus.DEGENERATE if found.degenerate else TrackingStatus.OK
@@ -158,7 +160,7 @@ class Tracker:
         """The best alignment, and which start it came from (empty: constant velocity)."""
         mode = self._mode(points)
         guess = self._pose @ self._velocity
-        photometric = self._photometric_part(view) if mode == "always" else None
+        photometric = self._photometric_part(view) if mode == "always" or self._was_lost else None
         found = self._align(points, target, guess, photometric)
         if photometric is not None and not self._explains_greys(found) and not found.degenerate:
             # Images that do not agree (too far apart, shutters out of step) must not pull at good geometry.
@@ -217,12 +219,14 @@ class Tracker:
 
     def _acceptable(self, found: AlignmentResult) -> bool:
         """Whether to believe a pose at all. Some overlap can be had anywhere (a floor is a floor), so that a pose short
-        of the convincing overlap must be witnessed by grey values."""
+        of the convincing overlap, or after being lost, must be witnessed by grey values."""
         recovery = self.settings.recovery
         if found.status is AlignmentStatus.LOST or found.overlap < recovery.min_overlap:
             return False
         seen = found.photometric_share >= recovery.min_share
-        return self._convincing(found) or (seen and found.photometric_residual <= 2 * recovery.convincing_residual)
+        tolerance = 1 if self._was_lost else 2
+        agrees = seen and found.photometric_residual <= tolerance * recovery.convincing_residual
+        return agrees or (self._convincing(found) and not self._was_lost)
 
     def _retry(
         self, view: View, points: FramePoints, target: GicpTarget, found: AlignmentResult,
@@ -259,6 +263,7 @@ class Tracker:
     def _lost(self, points: FramePoints, found: AlignmentResult) -> TrackingResult:
         """Stays where it was last known, standing still."""
         self._velocity = np.eye(4)
+        self._was_lost = True
         limit = self.settings.recovery.min_overlap
         reason = f"{found.overlap:.0%} of {len(points)} points match the map, {limit:.0%} needed, from every start"
         if found.overlap >= limit:
