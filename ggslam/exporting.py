@@ -6,19 +6,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from ggslam.errors import ConfigError, RunFolderError
+from ggslam.formats.atomic import make_folder
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.point_ply import write_points
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.trajectory import write_tum
 from ggslam.run_folder import RunFolder
-
-
-def _prepare(path: Path, is_folder: bool = False) -> None:
-    target = path if is_folder else path.parent
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunFolderError(f"{target}: cannot be made: {error.strerror or error}") from None
 
 
 def export_splats(folder: RunFolder, path: Path, min_opacity: float = 0.0) -> str:
@@ -28,7 +21,7 @@ def export_splats(folder: RunFolder, path: Path, min_opacity: float = 0.0) -> st
         gaussians.keep(gaussians.opacities >= min_opacity)
     if not len(gaussians):
         raise RunFolderError(f"{folder.path}: no Gaussian is at least {min_opacity} opaque; nothing to export")
-    _prepare(path)
+    make_folder(path.parent)
     write_gaussian_ply(path, gaussians)
     return f"wrote {path}: {len(gaussians)} Gaussians"
 
@@ -41,7 +34,7 @@ def export_points(folder: RunFolder, path: Path, voxel_size: float, min_opacity:
         raise ConfigError(str(error)) from None
     if not len(cloud):
         raise RunFolderError(f"{folder.path}: the map has no points to export")
-    _prepare(path, is_folder=True)
+    make_folder(path)
     write_points(path, cloud)
     return f"wrote {path}/points.ply and points_grid.ply: {len(cloud)} points on a {voxel_size} m grid"
 
@@ -49,6 +42,6 @@ def export_points(folder: RunFolder, path: Path, voxel_size: float, min_opacity:
 def export_trajectory(folder: RunFolder, path: Path) -> str:
     """Writes the camera poses as a TUM trajectory."""
     trajectory = folder.trajectory()
-    _prepare(path)
+    make_folder(path.parent)
     written = write_tum(path, trajectory.timestamps, trajectory.T_world_camera)
     return f"wrote {path}: {written} poses"

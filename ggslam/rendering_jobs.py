@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import ConfigError, RunFolderError
+from ggslam.errors import ConfigError
+from ggslam.formats.atomic import make_folder
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.reporting.pictures import color_of_depth, color_to_uint8, write_picture
+from ggslam.reporting.pictures import color_of_depth, color_to_uint8, depth_range, write_picture
 from ggslam.run_folder import RunFolder
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
@@ -19,9 +20,12 @@ from ggslam.scene.poses import inverse
 KINDS = ("color", "depth", "alpha")
 
 
-def frame_poses(folder: RunFolder) -> dict[int, np.ndarray]:
-    """T_world_camera of each frame of a run that was not lost, by its index, from its keyframes as refined."""
-    record = folder.read_json("keyframes.json")
+def frame_poses(record: dict[str, Any]) -> dict[int, np.ndarray]:
+    """T_world_camera of each frame of a run that was not lost, by its index, from its keyframes as refined.
+
+    Args:
+        record: content of the run's keyframes.json.
+    """
     keyframes = [np.array(k["T_world_camera"]) for k in record["keyframes"]]
     tracked = [f for f in record["frames"] if f["status"] != "lost" and f["keyframe"] < len(keyframes)]
     return {f["frame"]: keyframes[f["keyframe"]] @ np.array(f["T_keyframe_camera"]) for f in tracked}
@@ -39,7 +43,7 @@ def select_frames(folder: RunFolder, numbers: str | None, every: int | None, cou
     Raises:
         ConfigError: not a number, or no such frame in the run.
     """
-    known = sorted(frame_poses(folder))
+    known = sorted(frame_poses(folder.read_json("keyframes.json")))
     if numbers is not None:
         try:
             wanted = [int(number) for number in numbers.split(",")]
@@ -69,11 +73,9 @@ def render_frames(
     camera = run_camera(folder)
     if width is not None:
         camera = camera.resized(width, round(camera.height * width / camera.width))
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunFolderError(f"{out}: cannot be made: {error.strerror or error}") from None
-    gaussians, rasterizer, poses = folder.gaussians(), CpuRasterizer(), frame_poses(folder)
+    make_folder(out)
+    gaussians, rasterizer = folder.gaussians(), CpuRasterizer()
+    poses = frame_poses(folder.read_json("keyframes.json"))
     written = []
     for done, frame in enumerate(frames):
         view = rasterizer.forward(gaussians, camera, inverse(poses[frame]), features=False)
@@ -91,6 +93,4 @@ def render_frames(
 
 def _depth_picture(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     depth = np.where(alpha > 0.5, depth, 0)
-    seen = depth[depth > 0]
-    near, far = np.percentile(seen, [1, 99]) if len(seen) else (0.0, 1.0)
-    return color_of_depth(depth, float(near), float(far))
+    return color_of_depth(depth, *depth_range(depth))

@@ -17,7 +17,7 @@ from ggslam.evaluation.image_sets import score_images
 from ggslam.evaluation.images import ImageScores
 from ggslam.evaluation.lpips import Lpips
 from ggslam.evaluation.trajectory import score_trajectory
-from ggslam.formats.atomic import write_text
+from ggslam.formats.atomic import make_folder, write_text
 from ggslam.progress import Observer
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering_jobs import frame_poses
@@ -53,11 +53,12 @@ def score_run(
     """
     notes: list[str] = []
     metric = _lpips(notes) if lpips else None
-    poses = frame_poses(folder)
+    record = folder.read_json("keyframes.json")
+    poses = frame_poses(record)
     metrics: dict[str, Any] = {
         "trajectory": _trajectory(sequence, poses),
-        "images": _images(folder, sequence, poses, metric, observer, every),
-        "tracking": dict(Counter(f["status"] for f in folder.read_json("keyframes.json")["frames"])),
+        "images": _images(folder, record, sequence, metric, observer, every),
+        "tracking": dict(Counter(f["status"] for f in record["frames"])),
         **_performance(folder),
         "scored_every": every,
         "notes": notes,
@@ -66,7 +67,7 @@ def score_run(
         notes.append("no frame was held out; every score is over frames that the map was or could be trained on")
     if len(poses) and max(poses) + 1 < len(sequence):
         notes.append(f"the run ends at frame {max(poses)} of {len(sequence)}; scores are of its part")
-    lost = [f["frame"] for f in folder.read_json("keyframes.json")["frames"] if f["status"] == "lost"]
+    lost = [f["frame"] for f in record["frames"] if f["status"] == "lost"]
     if lost:
         notes.append(f"{len(lost)} frames were lost (the first: {lost[0]}); they have no pose and are in no score")
     if metrics["trajectory"] is None:
@@ -94,17 +95,17 @@ def _trajectory(sequence: Sequence, poses: dict[int, np.ndarray]) -> dict[str, A
 
 
 def _images(
-    folder: RunFolder, sequence: Sequence, poses: dict[int, np.ndarray], lpips: Lpips | None, observer: Observer,
-    every: int,
-) -> dict[str, Any]:  # fmt: skip
-    keyframes = {k["frame"] for k in folder.read_json("keyframes.json")["keyframes"]}
+    folder: RunFolder, record: dict[str, Any], sequence: Sequence, lpips: Lpips | None, observer: Observer, every: int
+) -> dict[str, Any]:
+    poses = frame_poses(record)
+    keyframes = {k["frame"] for k in record["keyframes"]}
     evaluation = folder.config().evaluation
     chosen = [i for i in range(max(poses, default=-1) + 1) if i % every == 0]
     held_out = {i for i in chosen if evaluation.is_held_out(i) and i not in keyframes}
     sets = {"keyframes": keyframes & set(chosen), "held_out": held_out, "all": set(chosen)}
     spread = np.linspace(0, len(poses) - 1, min(PICTURES, len(poses))).round().astype(int)
     pictured = set(np.array(sorted(poses))[spread].tolist())
-    (folder.path / "renders").mkdir(exist_ok=True)
+    make_folder(folder.path / "renders")
     show = _shower(folder, poses, pictured)
     rows: list[dict[str, Any]] = []
     observer.begin("score", len(sequence))

@@ -68,6 +68,18 @@ def write_text(path: str | Path, text: str, fsync: bool = False) -> None:
     write_bytes(path, text.encode("utf-8"), fsync)
 
 
+def make_folder(path: str | Path) -> None:
+    """Makes a folder and those above it, if they are not there.
+
+    Raises:
+        RunFolderError: it cannot be made, naming it and the reason of the operating system.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(f"{path}: cannot be made: {error.strerror or error}") from None
+
+
 def _sync(path: Path) -> None:
     with path.open("rb+") as file:
         os.fsync(file.fileno())

@@ -10,6 +10,7 @@ import numpy as np
 
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.scene.camera import Camera
+from ggslam.scene.poses import matrix_to_quaternion
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def new_gaussians(
     R = T_world_camera[:3, :3].astype(np.float32)
     return NewGaussians(
         means=positions @ R.T + T_world_camera[:3, 3].astype(np.float32),
-        quaternions=_quaternions(np.einsum("ij,njk->nik", R, axes)),
+        quaternions=matrix_to_quaternion(np.einsum("ij,njk->nik", R, axes)).astype(np.float32),
         log_scales=log_scales,
         rgb=color.reshape(-1, 3)[pixels].astype(np.float32) / 255,
         pixels=pixels,
@@ -171,18 +172,3 @@ def _disc_shape(
 
 def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
-
-
-def _quaternions(R: np.ndarray) -> np.ndarray:
-    """Unit quaternions wxyz [M, 4] of rotation matrices [M, 3, 3]: of the four equivalent formulas the one with the
-    largest divisor is taken for each matrix."""
-    m00, m11, m22 = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
-    squares = np.stack([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], 1)
-    a, b, c = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
-    d, e, f = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
-    candidates = np.stack(
-        [np.stack([squares[:, 0], a, b, c], 1), np.stack([a, squares[:, 1], d, e], 1),
-         np.stack([b, d, squares[:, 2], f], 1), np.stack([c, e, f, squares[:, 3]], 1)], 1
-    )  # fmt: skip
-    best = candidates[np.arange(len(R)), np.argmax(squares, 1)]
-    return _unit(best).astype(np.float32)

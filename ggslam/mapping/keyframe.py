@@ -25,7 +25,6 @@ class Keyframe:
         color: uint8 [H, W, 3].
         depth: uint16 [H, W], units of 1 / DEPTH_UNITS_PER_METRE metres, 0 = none.
         T_camera_world: float64 [4, 4], the pose as refined so far.
-        T_camera_world_tracked: float64 [4, 4], the pose as the tracker gave it.
         exposure: float64 [3, 2], gain and offset per channel applied to the rendered colour.
         mask: uint16 [H, W] or None.
     """
@@ -37,7 +36,6 @@ class Keyframe:
     color: np.ndarray
     depth: np.ndarray
     T_camera_world: np.ndarray
-    T_camera_world_tracked: np.ndarray
     mask: np.ndarray | None = None
     exposure: np.ndarray = field(default_factory=lambda: np.tile([1.0, 0.0], (3, 1)))
     iterations: int = 0
@@ -56,10 +54,9 @@ def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyfr
     """The keyframe of a frame seen from `T_world_camera`."""
     units = np.clip(frame.depth * DEPTH_UNITS_PER_METRE + 0.5, 0, 65535).astype(np.uint16)
     units[frame.depth * DEPTH_UNITS_PER_METRE > 65535] = 0
-    T_camera_world = inverse(T_world_camera)
     return Keyframe(
         index, frame.index, frame.timestamp, frame.camera, np.ascontiguousarray(frame.color), units,
-        T_camera_world, T_camera_world.copy(), frame.mask,
+        inverse(T_world_camera), frame.mask,
     )  # fmt: skip
 
 

@@ -25,6 +25,13 @@ def color_of_depth(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     return picture
 
 
+def depth_range(depth: np.ndarray) -> tuple[float, float]:
+    """Nearest and farthest depth worth showing: the 1st and 99th percentile of what is known."""
+    seen = depth[depth > 0]
+    near, far = np.percentile(seen, [1, 99]) if len(seen) else (0.0, 1.0)
+    return float(near), float(far)
+
+
 def color_of_error(difference: np.ndarray, full_scale: float) -> np.ndarray:
     """Non-negative errors [H, W] as colours, black for none, bright for `full_scale` and more."""
     level = np.clip(difference / full_scale, 0, 1)
@@ -49,8 +56,7 @@ def compare(
         rendered: uint8 [H, W, 3].
         true_depth, rendered_depth: float [H, W], metres, 0 = none.
     """
-    seen = true_depth[true_depth > 0]
-    near, far = (np.percentile(seen, [1, 99]) if len(seen) else (0.0, 1.0))
+    near, far = depth_range(true_depth)
     error = np.abs(truth.astype(np.float32) - rendered.astype(np.float32)).mean(-1) / 255
     depth_error = np.where((true_depth > 0) & (rendered_depth > 0), np.abs(true_depth - rendered_depth), 0)
     upper = side_by_side([truth, rendered, color_of_error(error, 0.2)])

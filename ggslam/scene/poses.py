@@ -81,19 +81,21 @@ def quaternion_to_matrix(q: np.ndarray) -> np.ndarray:
 
 
 def matrix_to_quaternion(R: np.ndarray) -> np.ndarray:
-    """Unit quaternion wxyz [4] of a rotation matrix [3, 3] (Shepperd's method: divide by the largest term)."""
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
-    terms = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
-    i = int(np.argmax(terms))
-    if i == 0:
-        q = np.array([1 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    elif i == 1:
-        q = np.array([R[2, 1] - R[1, 2], 1 + 2 * R[0, 0] - trace, R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]])
-    elif i == 2:
-        q = np.array([R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], 1 + 2 * R[1, 1] - trace, R[1, 2] + R[2, 1]])
-    else:
-        q = np.array([R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], 1 + 2 * R[2, 2] - trace])
-    return q / np.linalg.norm(q)
+    """Unit quaternions wxyz [..., 4] of rotation matrices [..., 3, 3].
+
+    Shepperd's method: of four equivalent formulas the one with the largest divisor is taken for each matrix.
+    """
+    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    squares = np.stack([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], -1)
+    a, b, c = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    d, e, f = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
+    candidates = np.stack(
+        [np.stack([squares[..., 0], a, b, c], -1), np.stack([a, squares[..., 1], d, e], -1),
+         np.stack([b, d, squares[..., 2], f], -1), np.stack([c, e, f, squares[..., 3]], -1)], -2
+    )  # fmt: skip
+    best = np.argmax(squares, -1)[..., None, None]
+    q = np.take_along_axis(candidates, best, -2)[..., 0, :]
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
 def is_valid_pose(T: np.ndarray) -> bool:
