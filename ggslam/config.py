@@ -20,6 +20,7 @@ import yaml
 
 from ggslam.errors import ConfigError, check_ranges
 from ggslam.formats.atomic import write_text
+from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.settings import MapperSettings
 from ggslam.tracking.keyframes import KeyframeSettings
 from ggslam.tracking.tracker import TrackerSettings
@@ -60,6 +61,7 @@ class Config:
     tracking: TrackerSettings = field(default_factory=TrackerSettings)
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     mapping: MapperSettings = field(default_factory=MapperSettings)
+    identity: IdentitySettings = field(default_factory=IdentitySettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
 
     def __post_init__(self) -> None:

@@ -18,12 +18,14 @@ import numpy as np
 
 from ggslam.config import Config
 from ggslam.errors import SequenceError
+from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper, MapperTimes
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.scene.poses import inverse
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.surface import MeasuredSurface
@@ -153,11 +155,12 @@ class Slam:
         self.camera = camera
         self.config = config or Config()
         self.context = NativeContext(self.config.threads or None)
-        self.map = GaussianMap(sh_degree=self.config.sh_degree)
+        learner = IdentityLearner(self.config.identity, self.config.seed) if self.config.identity.enabled else None
+        self.map = GaussianMap(self.config.sh_degree, IDENTITY_CHANNELS if learner else 0)
         self.tracker = Tracker(camera, self.config.tracking, self.context)
         self.surface = MeasuredSurface(self.config.tracking.target, self.context)
         self.policy = KeyframePolicy(self.config.keyframes)
-        self.mapper = Mapper(self.map, self.config.mapping, self.context, self.config.seed)
+        self.mapper = Mapper(self.map, self.config.mapping, self.context, self.config.seed, learner)
         self.frames: list[TrackedFrame] = []
         self.dropped_frames: list[int] = []
         self.refine_iterations = 0
@@ -230,7 +233,7 @@ class Slam:
 
     def insert(self, frame: Frame, tracking: TrackingResult) -> None:
         """A keyframe goes into the map and into what the tracker aligns to."""
-        self.mapper.add_keyframe(frame, tracking.T_world_camera)
+        self.mapper.add_keyframe(frame, tracking.T_world_camera, lambda keyframe, show: frame.mask)
         self.tracker.set_target(self.surface.add(tracking.points, tracking.T_world_camera))
 
     def anchor_to(self, T_world_camera: np.ndarray) -> None:

@@ -6,11 +6,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 
 from ggslam.mapping.exposure import ExposureAdam
+from ggslam.mapping.identity import IdentityLearner, vote_labels
 from ggslam.mapping.insertion import fill_gaussians, new_gaussians, unexplained
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.losses import ImageLoss, KeyframeImages
@@ -24,6 +26,26 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 
 
+@dataclass(frozen=True)
+class MapLabels:
+    """What the map shows from a new keyframe's pose before anything is inserted there.
+
+    Attributes:
+        ids: uint16 [H, W], object with the largest rendering weight by votes, 0 = none.
+        confidence: float32 [H, W], its share of the pixel's weight, 0 where nothing is rendered.
+        depth: float32 [H, W], metres, 0 = nothing.
+    """
+
+    ids: np.ndarray
+    confidence: np.ndarray
+    depth: np.ndarray
+
+
+Labeller = Callable[[Keyframe, "Callable[[], MapLabels] | None"], "np.ndarray | None"]
+"""Gives the object mask (uint16 [H, W], 0 = unlabelled) of a new keyframe, or None. The second argument shows the map
+from there; None for the first keyframe. Called once, during insertion."""
+
+
 @dataclass
 class MapperTimes:
     """Seconds spent so far in each part, and how often."""
@@ -32,13 +54,14 @@ class MapperTimes:
     forward: float = 0.0
     loss: float = 0.0
     backward: float = 0.0
+    identity: float = 0.0
     iterations: int = 0
     keyframes: int = 0
 
     @property
     def iteration_ms(self) -> float:
         """Mean milliseconds of one optimisation step."""
-        return 1e3 * (self.forward + self.loss + self.backward) / max(1, self.iterations)
+        return 1e3 * (self.forward + self.loss + self.backward + self.identity) / max(1, self.iterations)
 
 
 class Mapper:
@@ -50,13 +73,20 @@ class Mapper:
         context: threads and instruction set.
         seed: of the draw of keyframes. With the same seed, frames and iteration counts a run on one machine repeats
             bit for bit, for any number of threads.
+        identity: learns objects from the keyframes' masks; None: nobody does. The map needs feature channels for it.
     """
 
     def __init__(
-        self, gaussians: GaussianMap, settings: MapperSettings, context: NativeContext, seed: int = 0
+        self,
+        gaussians: GaussianMap,
+        settings: MapperSettings,
+        context: NativeContext,
+        seed: int = 0,
+        identity: IdentityLearner | None = None,
     ) -> None:
         self.map = gaussians
         self.settings = settings
+        self.identity = identity
         self.keyframes: list[Keyframe] = []
         self.times = MapperTimes()
         self.last_psnr = float("nan")
@@ -71,11 +101,17 @@ class Mapper:
 
     # --- growth ------------------------------------------------------------------------------------------------------
 
-    def add_keyframe(self, frame: Frame, T_world_camera: np.ndarray) -> Keyframe:
-        """Makes a keyframe of `frame` seen from `T_world_camera` [4, 4] and inserts what the map lacks there."""
+    def add_keyframe(
+        self, frame: Frame, T_world_camera: np.ndarray, labeller: Labeller | None = None
+    ) -> Keyframe:
+        """Makes a keyframe of `frame` seen from `T_world_camera` [4, 4] and inserts what the map lacks there.
+
+        Args:
+            labeller: tells the keyframe's object mask, if objects are learned.
+        """
         start = time.perf_counter()
         keyframe = make_keyframe(len(self.keyframes), frame, T_world_camera)
-        self._insert(keyframe, T_world_camera)
+        self._insert(keyframe, T_world_camera, labeller)
         self.keyframes.append(keyframe)
         self._pose_optimizers.append(PoseAdam())
         self._exposure_optimizers.append(ExposureAdam(self.settings.exposure))
@@ -85,22 +121,45 @@ class Mapper:
         self.times.keyframes += 1
         return keyframe
 
-    def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray) -> None:
+    def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None) -> None:
         depth, s = keyframe.depth_m(), self.settings.insertion
         where, alpha = np.ones(depth.shape, bool), np.zeros(depth.shape, np.float32)
+        show: Callable[[], MapLabels] | None = None
         if self.map.count:
             view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
-            alpha = view.alpha.numpy()
-            where = unexplained(depth, alpha, view.expected_depth.numpy(), s)
+            alpha, rendered = view.alpha.numpy(), view.expected_depth.numpy()
+            where = unexplained(depth, alpha, rendered, s)
+            show = partial(self._show_labels, alpha, rendered)
+        if self.identity is not None and labeller is not None:
+            keyframe.mask = labeller(keyframe, show)
+            if keyframe.mask is not None:
+                self.identity.observe(keyframe.mask)
         parts = [new_gaussians(keyframe.color, depth, keyframe.camera, T_world_camera, where, s)]
         if s.fill_stride:
             parts.append(fill_gaussians(keyframe.color, depth, alpha, keyframe.camera, T_world_camera, s))
         logit = float(np.log(s.opacity / (1 - s.opacity)))
         for new in parts:
-            self.map.insert(
+            rows = self.map.insert(
                 torch.from_numpy(new.means), torch.from_numpy(new.quaternions), torch.from_numpy(new.log_scales),
                 torch.full((len(new.means),), logit), torch.from_numpy(new.rgb), birth_keyframe=keyframe.index,
             )  # fmt: skip
+            if self.identity is not None:
+                mask = keyframe.mask
+                labels = np.zeros(len(new.pixels), np.uint16) if mask is None else mask.reshape(-1)[new.pixels]
+                self.identity.begin(self.map, rows, labels)
+
+    def _show_labels(self, alpha: np.ndarray, depth: np.ndarray, stride: int = 2) -> MapLabels:
+        """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""
+        height, width = alpha.shape
+        grid = np.arange(height * width, dtype=np.int32).reshape(height, width)[::stride, ::stride]
+        terms = self._rasterizer.pixel_terms(grid.reshape(-1))
+        ids, share = terms.labels(vote_labels(self.map))
+        ids, share = ids.reshape(grid.shape), share.reshape(grid.shape) * (alpha[::stride, ::stride] > 0.5)
+
+        def enlarged(image: np.ndarray) -> np.ndarray:
+            return image.repeat(stride, 0).repeat(stride, 1)[:height, :width]
+
+        return MapLabels(enlarged(np.where(share > 0, ids, 0).astype(np.uint16)), enlarged(share), depth)
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 
@@ -117,21 +176,29 @@ class Mapper:
             rate_factor: multiplies every learning rate.
         """
         s, t0 = self.settings, time.perf_counter()
-        view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
+        learn = self.identity is not None and self.identity.due(keyframe)
+        dense = learn and self.identity is not None and self.identity.settings.schedule == "dense"
+        view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=dense)
         t1 = time.perf_counter()
         exposure = keyframe.exposure if s.exposure.enabled else None
         target = KeyframeImages(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
         loss = self._loss.evaluate(view, target, s.loss)
         t2 = time.perf_counter()
+        grad_features = None
+        if learn and self.identity is not None:
+            grad_features = self.identity.step(self.map, self._rasterizer, keyframe, view)
+        t3 = time.perf_counter()
         optimizer = self._standard_adam if rate_factor == 1 else self._adam(rate_factor)
         step = self._rasterizer.backward_step(
-            self.map, loss.d_image, loss.d_depth, loss.d_alpha, optimizer=optimizer
-        )
+            self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features, optimizer=optimizer,
+            detach_features=self.identity is None or self.identity.settings.detach,
+        )  # fmt: skip
         self._refine_keyframe(keyframe, step.twist, loss.exposure_gradient, rate_factor)
-        t3 = time.perf_counter()
+        t4 = time.perf_counter()
         self.times.forward += t1 - t0
         self.times.loss += t2 - t1
-        self.times.backward += t3 - t2
+        self.times.identity += t3 - t2
+        self.times.backward += t4 - t3
         self.times.iterations += 1
         keyframe.iterations += 1
         self.last_psnr = loss.psnr
@@ -149,9 +216,12 @@ class Mapper:
         young = r.young_factor
         decay = (1 / young) ** (1 / max(1, r.young_updates)) if young > 1 else 1.0
         rates = {name: young * rate_factor * getattr(r, name) for name in ADAM_GROUPS}
+        if self.identity is not None:
+            rates["features"] = self.identity.settings.rate
         return AdamSettings(
-            learning_rates=rates, beta1=r.beta1, beta2=r.beta2, epsilon=r.epsilon, decay=decay, decay_floor=1 / young
-        )
+            learning_rates=rates, beta1=r.beta1, beta2=r.beta2, epsilon=r.epsilon, decay=decay, decay_floor=1 / young,
+            decayed_groups=tuple(name for name in ADAM_GROUPS if name != "features"),
+        )  # fmt: skip
 
     def _refine_keyframe(
         self, keyframe: Keyframe, twist: np.ndarray, exposure_gradient: np.ndarray, rate_factor: float

@@ -77,6 +77,25 @@ class AdamArguments(ctypes.Structure):
     ]  # fmt: skip
 
 
+class PixelTerms(ctypes.Structure):
+    """Terms of pixels, as laid out in native/src/pixel_terms.hpp."""
+
+    _fields_ = [
+        ("pixels", ctypes.c_int64), ("capacity", _int32), ("gaussians", _pointer), ("weights", _pointer),
+        ("counts", _pointer),
+    ]  # fmt: skip
+
+
+class FeatureAdam(ctypes.Structure):
+    """Features and the optimizer's state of them, as laid out in native/src/pixel_terms.hpp."""
+
+    _fields_ = [
+        ("gaussians", ctypes.c_int64), ("features", _pointer), ("first_moments", _pointer),
+        ("second_moments", _pointer), ("updates", _pointer), ("schedule", _pointer), ("schedule_rows", _int32),
+        ("channels", _int32), ("beta1", _float), ("beta2", _float), ("epsilon", _float),
+    ]  # fmt: skip
+
+
 @lru_cache(maxsize=1)
 def rasterizer_library() -> ctypes.CDLL:
     """The compiled core with the signatures of the rasterizer's functions declared."""
@@ -87,6 +106,13 @@ def rasterizer_library() -> ctypes.CDLL:
     library.ggslam_rasterizer_forward.argtypes = [_pointer] * 4
     library.ggslam_rasterizer_backward.argtypes = [_pointer] * 4
     library.ggslam_rasterizer_statistics.argtypes = [_pointer] * 2
+    library.ggslam_rasterizer_pixel_terms.argtypes = [_pointer, _pointer, _float, _pointer]
+    library.ggslam_terms_blend.argtypes = [_pointer, _pointer, _pointer, ctypes.c_int, _pointer]
+    library.ggslam_terms_step.argtypes = [_pointer] * 4
+    library.ggslam_terms_vote.argtypes = [
+        _pointer, _pointer, _pointer, _pointer, ctypes.c_int64, ctypes.c_int, _pointer, _pointer,
+    ]  # fmt: skip
+    library.ggslam_terms_label.argtypes = [_pointer] * 5
     return library
 
 

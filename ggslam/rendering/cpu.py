@@ -15,6 +15,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.rendering import _native
 from ggslam.rendering._native import pointer
 from ggslam.rendering.adam import AdamSettings
+from ggslam.rendering.pixel_terms import PixelTerms
 from ggslam.rendering.types import (
     LOW_PASS,
     PARAMETERS,
@@ -177,6 +178,30 @@ class CpuRasterizer:
         numbers = (ctypes.c_int64 * 2)()
         self._library.ggslam_rasterizer_statistics(self._handle, numbers)
         return {"visible": numbers[0], "pairs": numbers[1]}
+
+    def pixel_terms(self, pixels: np.ndarray, capacity: int = 48, min_weight: float = 1e-3) -> PixelTerms:
+        """Which Gaussians some pixels of the last `forward` are made of, with their weights.
+
+        Args:
+            pixels: int [P], row * width + column.
+            capacity: contributions kept of each pixel, from the front.
+            min_weight: weaker contributions are left out.
+
+        Raises:
+            RenderError: nothing was rendered, a pixel outside the image, out of memory.
+        """
+        last = self._require_last()
+        pixels = np.ascontiguousarray(pixels, np.int32)
+        size = last.buffers.alpha.numel()
+        if len(pixels) and not (0 <= int(pixels.min()) and int(pixels.max()) < size):
+            raise RenderError(f"pixel_terms: pixels must be 0 to {size - 1}, found {pixels.min()} to {pixels.max()}")
+        terms = PixelTerms.empty(len(pixels), capacity, self.context)
+        self._check(
+            self._library.ggslam_rasterizer_pixel_terms(
+                self._handle, pixels.ctypes.data, min_weight, ctypes.byref(terms.native())
+            )
+        )
+        return terms
 
     # --- backward --------------------------------------------------------------------------------------------------
 

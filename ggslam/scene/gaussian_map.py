@@ -11,7 +11,9 @@ SH_C0 = 0.28209479177387814
 """Zeroth spherical-harmonic constant: colour = 0.5 + SH_C0 * sh[0] for degree 0."""
 
 _PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features")
-_BOOKKEEPING = ("birth_keyframe", "object_id", "updates")
+_BOOKKEEPING = ("birth_keyframe", "object_id", "updates", "feature_updates", "vote_ids", "vote_weights")
+VOTE_SLOTS = 4
+"""Object ids that a Gaussian keeps votes for."""
 
 
 def rgb_to_sh(rgb: torch.Tensor) -> torch.Tensor:
@@ -38,6 +40,9 @@ class GaussianMap:
         birth_keyframe: int32 [N], index of the keyframe that inserted the Gaussian (-1 unknown).
         object_id: int32 [N], 0 = unlabelled.
         updates: int32 [N], optimizer steps seen so far.
+        feature_updates: int32 [N], steps that an optimizer of the features alone made.
+        vote_ids, vote_weights: int32 and float32 [N, VOTE_SLOTS], mask ids that a Gaussian was seen under and the
+            rendering weight it had there; id 0 is a free slot. Without feature channels there are no slots.
     Adam's two moments of each parameter are kept beside it (`moments[name]` = (first, second)) and grow along.
     """
 
@@ -48,6 +53,8 @@ class GaussianMap:
     count: int = 0
     version: int = 0
     """Increases with every change of the set of Gaussians (insert, keep), so that indices can be seen to be stale."""
+    order: int = 0
+    """Increases when rows change their places or go: indices from before name other Gaussians now."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= 3:
@@ -59,9 +66,11 @@ class GaussianMap:
     # --- storage -------------------------------------------------------------------------------------------------
 
     def _shape(self, name: str) -> tuple[int, ...]:
+        slots = VOTE_SLOTS if self.feature_channels else 0
         shapes: dict[str, tuple[int, ...]] = {
             "means": (3,), "quaternions": (4,), "log_scales": (3,), "opacity_logits": (),
             "sh": ((self.sh_degree + 1) ** 2, 3), "features": (self.feature_channels,),
+            "vote_ids": (slots,), "vote_weights": (slots,),
         }  # fmt: skip
         return shapes.get(name, ())
 
@@ -78,7 +87,8 @@ class GaussianMap:
                 first, second = self._moments.get(name, (None, None))
                 self._moments[name] = (grown(first, name, torch.float32), grown(second, name, torch.float32))
         for name in _BOOKKEEPING:
-            self._storage[name] = grown(self._storage.get(name), name, torch.int32)
+            dtype = torch.float32 if name == "vote_weights" else torch.int32
+            self._storage[name] = grown(self._storage.get(name), name, dtype)
 
     @property
     def capacity(self) -> int:
@@ -149,7 +159,8 @@ class GaussianMap:
         self._storage["features"][rows] = 0 if features is None else features
         self._storage["birth_keyframe"][rows] = birth_keyframe
         self._storage["object_id"][rows] = 0 if object_id is None else object_id.to(torch.int32)
-        self._storage["updates"][rows] = 0
+        for name in ("updates", "feature_updates", "vote_ids", "vote_weights"):
+            self._storage[name][rows] = 0
         for first, second in self._moments.values():
             first[rows] = 0
             second[rows] = 0
@@ -174,6 +185,7 @@ class GaussianMap:
             array[:kept] = array[: self.count][index]
         self.count = kept
         self.version += 1
+        self.order += 1
 
     def move(self, rows: torch.Tensor, T_new_old: torch.Tensor) -> None:
         """Moves Gaussians rigidly: means and rotations of `rows` (bool [N] or int64 [M]) by `T_new_old` [4, 4].

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The classifier while it is trained: rows are added as object ids appear, Adam's moments grow along."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
+
+FIRST_CLASSES = 100
+"""Rows allocated to begin with."""
+ROW_LENGTH = 4.0
+"""Length of a new class's row: with codes of length 2 a Gaussian of one object has a logit of 8 for it."""
+CODE_LENGTH = 2.0
+
+
+class ClassTable:
+    """A growing linear classifier with its optimizer.
+
+    Args:
+        rng: draws the rows of new classes.
+        channels: length of an identity vector.
+    """
+
+    def __init__(self, rng: np.random.Generator, channels: int = IDENTITY_CHANNELS) -> None:
+        self._rng, self._channels = rng, channels
+        self._rows = np.zeros((FIRST_CLASSES, channels + 1), np.float32)  # weights, then the bias
+        self._moments = np.zeros((2, FIRST_CLASSES, channels + 1), np.float32)
+        self._ids = np.zeros(FIRST_CLASSES, np.uint16)
+        self._class_of = np.full(65536, -1, np.int32)
+        self._steps = 0
+        self.count = 0
+
+    @property
+    def classifier(self) -> IdentityClassifier:
+        """Views of the classes there are."""
+        n = self.count
+        return IdentityClassifier(self._ids[:n], self._rows[:n, :-1], self._rows[:n, -1])
+
+    def classes(self, object_ids: np.ndarray) -> np.ndarray:
+        """Class number of each object id, int32 of the same shape; -1 where there is none."""
+        return self._class_of[object_ids]
+
+    def add(self, object_ids: np.ndarray) -> None:
+        """Makes a class of each id (uint16, distinct) that is not 0 and has none yet."""
+        new = object_ids[(object_ids != 0) & (self._class_of[object_ids] < 0)]
+        needed = self.count + len(new)
+        if needed > len(self._rows):
+            extra = max(needed, 2 * len(self._rows)) - len(self._rows)
+            self._rows = np.pad(self._rows, ((0, extra), (0, 0)))
+            self._moments = np.pad(self._moments, ((0, 0), (0, extra), (0, 0)))
+            self._ids = np.pad(self._ids, (0, extra))
+        directions = self._rng.normal(size=(len(new), self._channels)).astype(np.float32)
+        directions *= ROW_LENGTH / np.linalg.norm(directions, axis=1, keepdims=True)
+        rows = slice(self.count, needed)
+        self._rows[rows, :-1], self._rows[rows, -1], self._ids[rows] = directions, 0, new
+        self._class_of[new] = np.arange(self.count, needed)
+        self.count = needed
+
+    def remove(self, object_id: int) -> None:
+        """Forgets a class; the last one takes its place."""
+        number, last = int(self._class_of[object_id]), self.count - 1
+        if number < 0:
+            return
+        for array in (self._rows, self._ids, self._moments[0], self._moments[1]):
+            array[number] = array[last]
+            array[last] = 0
+        self._class_of[self._ids[number]] = number
+        self._class_of[object_id] = -1
+        self.count = last
+
+    def codes(self, object_ids: np.ndarray) -> np.ndarray:
+        """Identity vectors that the classifier takes for these objects, float32 [M, F]; zeros for those without a
+        class."""
+        number = self._class_of[object_ids]
+        weights = self._rows[: self.count, :-1]
+        codes = CODE_LENGTH * weights / np.maximum(np.linalg.norm(weights, axis=1, keepdims=True), 1e-12)
+        return np.concatenate([codes, np.zeros((1, self._channels), np.float32)])[number]
+
+    def step(self, classes: np.ndarray, gradient: np.ndarray, rate: float) -> None:
+        """Adam (0.9, 0.999) on the rows `classes` [M] with gradient [M, F + 1] (weights, then bias)."""
+        self._steps += 1
+        first, second = self._moments[0][classes], self._moments[1][classes]
+        first += 0.1 * (gradient - first)
+        second += 0.001 * (gradient**2 - second)
+        self._moments[0][classes], self._moments[1][classes] = first, second
+        corrected = np.sqrt(second / (1 - 0.999**self._steps)) + 1e-15
+        self._rows[classes] -= rate / (1 - 0.9**self._steps) * first / corrected

@@ -1,0 +1,328 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identity learning: every Gaussian learns which object it belongs to, from instance masks of the keyframes.
+
+As in Ye et al., "Gaussian Grouping", 2024 and GG-SLAM, a Gaussian carries a 16-D identity vector o, rendered like
+colour; a 1x1 convolution classifies what is rendered. Loss: l_obj CE(logits, mask) + l_obj3d (l_val / C) mean KL over
+nearest neighbours. Otherwise than there
+
+- the cross-entropy is taken at sampled pixels, balanced among objects, through the terms of the view that is rendered
+  for its colours anyway (`rendering.pixel_terms`): no identity image is ever composited;
+- classes are added as ids appear;
+- the same terms count votes: how much rendering weight a Gaussian had under each mask id. They label the map from the
+  first keyframe on, give new Gaussians their first vector, and check what was learned.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from ggslam.mapping.class_table import ClassTable
+from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.neighbours import NeighbourIndex, kl_gradient
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.pixel_terms import FeatureAdamSettings, PixelTerms
+from ggslam.rendering.types import RenderBuffers
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
+
+SH_C0 = 0.28209479177387814
+MANY_CLASSES = 128
+"""Beyond so many classes a step's softmax runs over those in its sample and this many others, drawn at random."""
+POOL_STEPS = 8
+"""Steps' worth of pixels that are drawn from a keyframe at once."""
+BIRTH_VOTE = 0.1
+"""Weight of the vote that a Gaussian gets for the pixel it is born from."""
+
+
+@dataclass
+class IdentityTimes:
+    """Seconds spent so far."""
+
+    steps: float = 0.0
+    labelling: float = 0.0
+    count: int = 0
+
+
+@dataclass
+class PixelPool:
+    """Pixels of one keyframe drawn for steps to come.
+
+    Attributes:
+        pixels: int32, flat indices.
+        vote_weights: float32, inverse of the density with which each was drawn, mean 1.
+        used: how many of them are used up.
+    """
+
+    pixels: np.ndarray
+    vote_weights: np.ndarray
+    used: int = 0
+
+
+@dataclass
+class IdentityLearner:
+    """Trains identity vectors and classifier, counts votes.
+
+    Args:
+        settings: see there.
+        seed: of sampling.
+    """
+
+    settings: IdentitySettings
+    seed: int = 0
+    times: IdentityTimes = field(default_factory=IdentityTimes)
+    last_loss: float = float("nan")
+    """Cross-entropy of the last step."""
+
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng([self.seed, 16])
+        self.table = ClassTable(self._rng)
+        self._alias = np.arange(65536, dtype=np.uint16)
+        self._pools: dict[int, PixelPool] = {}
+        self._index = NeighbourIndex(self.settings.neighbours.growth)
+        self._iterations = 0
+
+    @property
+    def classifier(self) -> IdentityClassifier:
+        """As trained so far."""
+        return self.table.classifier
+
+    # --- objects ------------------------------------------------------------------------------------------------------
+
+    def current(self, ids: np.ndarray) -> np.ndarray:
+        """Object ids with those replaced that were merged into others."""
+        return self._alias[ids]
+
+    def observe(self, mask: np.ndarray) -> None:
+        """A keyframe with this mask (uint16 [H, W]) arrives: its objects get classes."""
+        self.table.add(np.flatnonzero(np.bincount(self.current(mask).reshape(-1), minlength=1)).astype(np.uint16))
+
+    def merge(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
+        """Two objects turned out to be one: masks, votes and classes of `dropped` become those of `kept`."""
+        kept = int(self._alias[kept])
+        if kept == dropped:
+            return
+        self._alias[self._alias == dropped] = kept
+        merge_votes(gaussians, self._alias)
+        self.table.add(np.array([kept], np.uint16))
+        was = self.table.classes(np.array([dropped]))[0] >= 0
+        if was:
+            labels = vote_labels(gaussians)
+            wrong = self.table.classifier.labels(gaussians.features.numpy())[0] == dropped
+            self.table.remove(dropped)
+            gaussians.features.numpy()[wrong] = self.table.codes(np.where(labels[wrong] > 0, labels[wrong], kept))
+
+    def begin(self, gaussians: GaussianMap, rows: slice, labels: np.ndarray) -> None:
+        """New Gaussians get their first identity vectors and votes.
+
+        Args:
+            rows: where they are in the map.
+            labels: uint16 [M], object under the pixel each was born from, 0 = unknown.
+        """
+        ids = self.current(labels)
+        gaussians.vote_ids.numpy()[rows, 0] = ids
+        gaussians.vote_weights.numpy()[rows, 0] = np.where(ids > 0, BIRTH_VOTE, 0)
+        if self.settings.initialisation == "votes":
+            gaussians.features.numpy()[rows] = self.table.codes(ids)
+        else:
+            shape = (len(labels), IDENTITY_CHANNELS)
+            gaussians.features.numpy()[rows] = (self._rng.random(shape, np.float32) - 0.5) / SH_C0
+
+    # --- steps --------------------------------------------------------------------------------------------------------
+
+    def due(self, keyframe: Keyframe) -> bool:
+        """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
+        self._iterations += 1
+        has = keyframe.mask is not None and self.table.count > 0
+        return has and self._iterations % self.settings.every == 0
+
+    def step(
+        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: Keyframe, view: RenderBuffers
+    ) -> torch.Tensor | None:
+        """One step on the view that `rasterizer` rendered last, which must be that of `keyframe`.
+
+        Returns:
+            With the dense schedule the gradient of the rendered features [F, H, W], for the caller's backward pass;
+            else None, and the step is made.
+        """
+        start = time.perf_counter()
+        gradient = None
+        if self.settings.schedule == "dense":
+            gradient = self._dense(gaussians, rasterizer, keyframe, view)
+        pixels, vote_weights = self._draw(keyframe)
+        if len(pixels):
+            assert keyframe.mask is not None
+            labels = self.current(keyframe.mask.reshape(-1)[pixels])
+            terms = rasterizer.pixel_terms(pixels)
+            terms.vote(gaussians, labels, vote_weights)
+            if self.settings.schedule == "sampled":
+                self._train(gaussians, terms, self.table.classes(labels))
+        self.times.steps += time.perf_counter() - start
+        self.times.count += 1
+        return gradient
+
+    def _dense(
+        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: Keyframe, view: RenderBuffers
+    ) -> torch.Tensor:
+        """Cross-entropy of a whole rendered identity image, as published; updates the classifier."""
+        s = self.settings
+        assert keyframe.mask is not None and view.features is not None
+        pixels = np.flatnonzero(keyframe.mask)
+        classes = self.table.classes(self.current(keyframe.mask.reshape(-1)[pixels]))
+        features = view.features.numpy().reshape(IDENTITY_CHANNELS, -1)
+        chosen = np.arange(self.table.count)
+        self.last_loss, gradient, rows = cross_entropy(features[:, pixels].T, self.classifier, classes, chosen)
+        self.table.step(chosen, s.weight * rows, s.classifier_rate)
+        out = np.zeros_like(features)
+        out[:, pixels] = s.weight * gradient.T
+        if s.neighbours.weight > 0 and self.times.count % s.neighbours.every == 0 and len(gaussians) > 1:
+            rows_pulled, pull = self._pull_together(gaussians)
+            terms = PixelTerms.of_gaussians(rows_pulled, 1, rasterizer.context)
+            terms.step(gaussians, pull, FeatureAdamSettings(rate=s.rate))
+        return torch.from_numpy(out.reshape(view.features.shape))
+
+    def _train(self, gaussians: GaussianMap, terms: PixelTerms, classes: np.ndarray) -> None:
+        s = self.settings
+        chosen = self._competing(classes)
+        features = terms.features(gaussians)
+        self.last_loss, gradient, rows = cross_entropy(features, self.classifier, classes, chosen)
+        gradient *= s.weight
+        if s.neighbours.weight > 0 and self.times.count % s.neighbours.every == 0 and len(gaussians) > 1:
+            pulled, pull = self._pull_together(gaussians)
+            terms = terms.joined(PixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
+            gradient = np.concatenate([gradient, pull])
+        terms.step(gaussians, gradient, FeatureAdamSettings(rate=s.rate))
+        self.table.step(chosen, s.weight * rows, s.classifier_rate)
+
+    def _competing(self, classes: np.ndarray) -> np.ndarray:
+        """Classes that a step's softmax runs over: all, or with very many those that appear and some others."""
+        if self.table.count <= MANY_CLASSES:
+            return np.arange(self.table.count)
+        return np.union1d(np.unique(classes), self._rng.choice(self.table.count, MANY_CLASSES, replace=False))
+
+    def _pull_together(self, gaussians: GaussianMap) -> tuple[np.ndarray, np.ndarray]:
+        """Rows [R] of the 3-D loss and their gradients float32 [R, F]; a row may appear more than once."""
+        s, classifier = self.settings.neighbours, self.classifier
+        room = max(16, 400_000 // ((s.neighbours + 1) * max(1, len(classifier))))
+        rows = self._rng.integers(0, len(gaussians), min(s.samples, room))
+        near = self._index.neighbours(gaussians, rows, s.neighbours)
+        features = gaussians.features.numpy()
+        _, own, others = kl_gradient(classifier.logits(features[rows]), classifier.logits(features[near]))
+        factor = np.float32(s.weight * s.value / len(classifier))
+        gradient = np.concatenate([own, others.reshape(-1, len(classifier))]) @ classifier.weight
+        return np.concatenate([rows, near.reshape(-1)]), (factor * gradient).astype(np.float32)
+
+    def _draw(self, keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray]:
+        """The next pixels of a keyframe, int32 [P], and the weight each has as a vote."""
+        pool = self._pools.get(keyframe.index)
+        if pool is None or pool.used + self.settings.pixels > len(pool.pixels):
+            assert keyframe.mask is not None
+            ids = self.current(keyframe.mask.reshape(-1))
+            wanted = POOL_STEPS * self.settings.pixels
+            pool = self._pools[keyframe.index] = draw_pool(ids, wanted, self.settings.balance, self._rng)
+        part = slice(pool.used, pool.used + self.settings.pixels)
+        pool.used = part.stop
+        return pool.pixels[part], pool.vote_weights[part]
+
+    # --- results ------------------------------------------------------------------------------------------------------
+
+    def label(self, gaussians: GaussianMap) -> None:
+        """Writes each Gaussian's object into `object_id`: the learned one, or with the schedule "votes" the one with
+        the most votes; 0 where nothing was ever seen of it or the most probable object is not probable enough."""
+        start = time.perf_counter()
+        seen = gaussians.vote_weights.numpy().sum(1) > 0
+        if self.settings.schedule == "votes":
+            ids = vote_labels(gaussians)
+        else:
+            ids = by_parts(self.classifier, gaussians.features.numpy(), self.settings.min_confidence)
+        gaussians.object_id.numpy()[:] = np.where(seen, ids, 0)
+        self.times.labelling += time.perf_counter() - start
+
+
+def cross_entropy(
+    features: np.ndarray, classifier: IdentityClassifier, classes: np.ndarray, chosen: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mean softmax cross-entropy of classified features.
+
+    Args:
+        features: float32 [P, F].
+        classifier: C classes.
+        classes: true class of each, int [P].
+        chosen: classes that the softmax runs over, int [K], sorted, all of `classes` among them.
+
+    Returns:
+        The mean, its gradient by the features [P, F], and by the rows of `chosen` [K, F + 1] (weights, then bias).
+    """
+    weight = classifier.weight[chosen]
+    z = features @ weight.T + classifier.bias[chosen]
+    z -= z.max(1, keepdims=True)
+    rows, true = np.arange(len(z)), np.searchsorted(chosen, classes)
+    right = z[rows, true]
+    np.exp(z, out=z)
+    sums = z.sum(1)
+    loss = float((np.log(sums) - right).mean())
+    z /= sums[:, None]
+    z[rows, true] -= 1
+    z /= len(z)
+    return loss, z @ weight, np.concatenate([z.T @ features, z.sum(0)[:, None]], 1)
+
+
+def draw_pool(ids: np.ndarray, wanted: int, balance: float, rng: np.random.Generator) -> PixelPool:
+    """Draws labelled pixels, an object of n pixels with a share that goes with n^(1 - balance).
+
+    Args:
+        ids: object of each pixel, uint16 [n]; 0 is never drawn.
+        wanted: how many; a pixel may come twice.
+    """
+    counts = np.bincount(ids)
+    counts[0] = 0
+    present = np.flatnonzero(counts)
+    if not len(present):
+        return PixelPool(np.zeros(0, np.int32), np.zeros(0, np.float32))
+    share = counts[present].astype(np.float64) ** (1 - balance)
+    share /= share.sum()
+    by_object = np.argsort(ids, kind="stable").astype(np.int32)  # a radix sort for 16 bits
+    starts = np.concatenate([[0], np.cumsum(np.bincount(ids))])[present]
+    drawn = rng.choice(len(present), wanted, p=share)
+    pixels = by_object[starts[drawn] + (rng.random(wanted) * counts[present][drawn]).astype(np.int64)]
+    vote_weights = (counts[present] / counts.sum() / share)[drawn]
+    return PixelPool(pixels, vote_weights.astype(np.float32))
+
+
+def vote_labels(gaussians: GaussianMap) -> np.ndarray:
+    """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none."""
+    ids, weights = gaussians.vote_ids.numpy(), gaussians.vote_weights.numpy()
+    best = weights.argmax(1)
+    rows = np.arange(len(ids))
+    return np.where(weights[rows, best] > 0, ids[rows, best], 0).astype(np.uint16)
+
+
+def merge_votes(gaussians: GaussianMap, alias: np.ndarray) -> None:
+    """Replaces ids in the votes by `alias` [65536]; slots that then name one object become one."""
+    ids, weights = gaussians.vote_ids.numpy(), gaussians.vote_weights.numpy()
+    ids[:] = alias[ids]
+    for a in range(ids.shape[1]):
+        for b in range(a + 1, ids.shape[1]):
+            same = (ids[:, a] == ids[:, b]) & (ids[:, a] != 0)
+            weights[same, a] += weights[same, b]
+            ids[same, b], weights[same, b] = 0, 0
+
+
+def by_parts(
+    classifier: IdentityClassifier, features: np.ndarray, min_confidence: float, part: int = 16384,
+    progress: Callable[[int], None] | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Most probable object of each identity vector, uint16 [N], 0 below `min_confidence`; a part at a time, because N
+    times C logits may not fit into memory."""
+    out = np.zeros(len(features), np.uint16)
+    for begin in range(0, len(features), part):
+        ids, confidence = classifier.labels(features[begin : begin + part])
+        out[begin : begin + part] = np.where(confidence >= min_confidence, ids, 0)
+        if progress is not None:
+            progress(begin)
+    return out

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The 3-D regularisation of identity vectors, on an index of neighbours that is refreshed as the map changes.
+
+Ye et al., "Gaussian Grouping", 2024, eq. 4: L = (l_val / C) mean over sampled Gaussians j and their k nearest neighbours
+i of KL(P_j || Q_i), P and Q being softmax(classifier(identity)).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ggslam.scene.gaussian_map import GaussianMap
+
+
+class NeighbourIndex:
+    """k nearest neighbours among the Gaussians' means. Rows are those of the map as it is now.
+
+    Args:
+        growth: share by which the map may grow until the tree is built anew. Removals always lead to a new tree.
+    """
+
+    def __init__(self, growth: float) -> None:
+        self._growth = growth
+        self._tree: cKDTree | None = None
+        self._order = -1
+        self.built = 0
+        """Number of times the tree was built."""
+
+    def neighbours(self, gaussians: GaussianMap, rows: np.ndarray, k: int) -> np.ndarray:
+        """int64 [M, k], the k nearest other Gaussians of each of `rows` [M]; k is less in a tiny map."""
+        if self._tree is None or self._order != gaussians.order or len(gaussians) > self._tree.n * (1 + self._growth):
+            # Unbalanced and loose: built in a third of the time, asked nearly as fast.
+            points = gaussians.means.numpy().copy()
+            self._tree = cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False)
+            self._order = gaussians.order
+            self.built += 1
+        k = min(k, self._tree.n - 1)
+        _, found = self._tree.query(gaussians.means.numpy()[rows], k + 1)
+        return found[:, 1:]
+
+
+def kl_gradient(logits: np.ndarray, neighbour_logits: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mean of KL(P || Q) over samples and neighbours, and its gradients.
+
+    Args:
+        logits: of the samples, [M, C].
+        neighbour_logits: [M, k, C].
+
+    Returns:
+        The mean, d mean / d logits [M, C], d mean / d neighbour_logits [M, k, C].
+    """
+    log_p, log_q = _log_softmax(logits)[:, None], _log_softmax(neighbour_logits)
+    p = np.exp(log_p)
+    difference = log_p - log_q
+    kl = (p * difference).sum(-1, keepdims=True)
+    pairs = kl.size
+    return (
+        float(kl.sum() / pairs),
+        (p * (difference - kl)).sum(1) / pairs,
+        (np.exp(log_q) - p) / pairs,
+    )
+
+
+def _log_softmax(z: np.ndarray) -> np.ndarray:
+    z = z - z.max(-1, keepdims=True)
+    return z - np.log(np.exp(z).sum(-1, keepdims=True))

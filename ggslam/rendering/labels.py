@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Object ids of the pixels of a view: by the classifier from a rendered identity image, or by weight from given labels.
+
+The identity image is what the classifier was trained on: blended over zero and not divided by alpha.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ggslam.errors import RenderError
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.types import Gaussians, RenderBuffers
+from ggslam.scene.camera import Camera
+from ggslam.scene.identity import IdentityClassifier
+
+MIN_ALPHA = 0.5
+"""Pixels that are covered less than this show no object."""
+_VALUES_AT_ONCE = 1 << 21
+"""Logits held at a time (8 MB): with 1,000 classes a whole image of them would take more than a gigabyte."""
+_PIXELS_AT_ONCE = 1 << 15
+"""Pixels whose terms are held at a time (12 MB)."""
+
+
+def label_image(
+    features: torch.Tensor | np.ndarray,
+    alpha: torch.Tensor | np.ndarray,
+    classifier: IdentityClassifier,
+    min_alpha: float = MIN_ALPHA,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Most probable object id of every pixel of a rendered identity image.
+
+    Args:
+        features: float32 [F, H, W], rendered identity vectors.
+        alpha: float32 [H, W], rendered alpha.
+        classifier: of F channels.
+        min_alpha: pixels below it get id 0.
+
+    Returns:
+        Ids uint16 [H, W] and their probabilities float32 [H, W]; 0 and 0 where alpha is too low or without classes.
+
+    Raises:
+        RenderError: shapes that do not fit.
+    """
+    features, alpha = torch.as_tensor(features), torch.as_tensor(alpha)
+    if features.ndim != 3 or features.shape[1:] != alpha.shape or features.shape[0] != classifier.weight.shape[1]:
+        raise RenderError(
+            f"label_image: expected features [{classifier.weight.shape[1]}, H, W] and alpha [H, W], found "
+            f"{list(features.shape)} and {list(alpha.shape)}"
+        )
+    shape = tuple(alpha.shape)
+    ids, confidence = np.zeros(shape, np.uint16), np.zeros(shape, np.float32)
+    if not len(classifier):
+        return ids, confidence
+    weight, bias = torch.from_numpy(classifier.weight), torch.from_numpy(classifier.bias)[:, None]
+    columns = features.reshape(len(features), -1)
+    step = max(1, _VALUES_AT_ONCE // len(classifier))
+    with torch.inference_mode():
+        for start in range(0, columns.shape[1], step):
+            part = slice(start, start + step)
+            logits = torch.addmm(bias, weight, columns[:, part])
+            highest, best = logits.max(0)
+            confidence.reshape(-1)[part] = logits.sub_(highest).exp_().sum(0).reciprocal_().numpy()
+            ids.reshape(-1)[part] = classifier.class_ids[best.numpy()]
+    empty = (alpha < min_alpha).numpy()
+    ids[empty], confidence[empty] = 0, 0
+    return ids, confidence
+
+
+def render_labels(
+    rasterizer: CpuRasterizer,
+    gaussians: Gaussians,
+    classifier: IdentityClassifier,
+    camera: Camera,
+    T_camera_world: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Object ids uint16 [H, W] and their probabilities float32 [H, W] as a camera sees them; see `label_image`.
+
+    Raises:
+        RenderError: the Gaussians have no feature channels, or not those of the classifier.
+    """
+    view = rasterizer.forward(gaussians, camera, T_camera_world)
+    if view.features is None:
+        raise RenderError("render_labels: the Gaussians have no feature channels")
+    return label_image(view.features, view.alpha, classifier)
+
+
+def vote_label_image(
+    rasterizer: CpuRasterizer, view: RenderBuffers, labels: np.ndarray, min_alpha: float = MIN_ALPHA
+) -> np.ndarray:
+    """For every pixel the label with the largest rendering weight, uint16 [H, W]; 0 where alpha is below `min_alpha` or
+    unlabelled Gaussians weigh most. Costs no rendering beside the one that is there.
+
+    Args:
+        rasterizer: which rendered `view` last.
+        view: what its last `forward` gave.
+        labels: uint16 [N], one for each rendered Gaussian, 0 = unlabelled.
+
+    Raises:
+        RenderError: nothing was rendered, or out of memory.
+    """
+    ids = np.zeros(tuple(view.alpha.shape), np.uint16)
+    pixels = np.flatnonzero(view.alpha.numpy() >= min_alpha).astype(np.int32)
+    for start in range(0, len(pixels), _PIXELS_AT_ONCE):
+        part = pixels[start : start + _PIXELS_AT_ONCE]
+        ids.reshape(-1)[part] = rasterizer.pixel_terms(part).labels(labels)[0]
+    return ids

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The classifier that says which object an identity vector belongs to: a 1x1 convolution, in other words one matrix.
+
+Ye et al., "Gaussian Grouping: Segment and Edit Anything in 3D Scenes", 2024; GG-SLAM. Unlike there the number of
+classes is not fixed: a class is added for every object id that appears.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import FormatError
+
+IDENTITY_CHANNELS = 16
+"""Length of an identity vector."""
+
+
+@dataclass
+class IdentityClassifier:
+    """Linear classifier of identity vectors.
+
+    Attributes:
+        class_ids: uint16 [C], the object id of each class; distinct, never 0 (0 = unlabelled is no class).
+        weight: float32 [C, F].
+        bias: float32 [C].
+    """
+
+    class_ids: np.ndarray
+    weight: np.ndarray
+    bias: np.ndarray
+
+    @staticmethod
+    def empty(channels: int = IDENTITY_CHANNELS) -> IdentityClassifier:
+        """A classifier without classes."""
+        return IdentityClassifier(np.zeros(0, np.uint16), np.zeros((0, channels), np.float32), np.zeros(0, np.float32))
+
+    def __len__(self) -> int:
+        return len(self.class_ids)
+
+    def logits(self, features: np.ndarray) -> np.ndarray:
+        """float32 [..., C] of identity vectors [..., F] (single Gaussians' or rendered)."""
+        return features @ self.weight.T + self.bias
+
+    def probabilities(self, features: np.ndarray) -> np.ndarray:
+        """Softmax of the logits, float32 [..., C]."""
+        z = self.logits(features)
+        z -= z.max(-1, keepdims=True, initial=-np.inf)
+        np.exp(z, out=z)
+        z /= z.sum(-1, keepdims=True)
+        return z
+
+    def labels(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Most probable object id, uint16 [...], and its probability, float32 [...]; 0 and 0 without classes."""
+        shape = features.shape[:-1]
+        if not len(self):
+            return np.zeros(shape, np.uint16), np.zeros(shape, np.float32)
+        z = self.logits(features)
+        best = z.argmax(-1)
+        z -= np.take_along_axis(z, best[..., None], -1)
+        return self.class_ids[best], 1 / np.exp(z, out=z).sum(-1)
+
+    def class_of(self, object_id: int) -> int:
+        """Number of the class of an object id.
+
+        Raises:
+            KeyError: no such class.
+        """
+        found = np.flatnonzero(self.class_ids == object_id)
+        if not len(found):
+            raise KeyError(object_id)
+        return int(found[0])
+
+    def without(self, object_ids: list[int]) -> IdentityClassifier:
+        """The same without the classes of some objects."""
+        keep = ~np.isin(self.class_ids, object_ids)
+        return IdentityClassifier(self.class_ids[keep], self.weight[keep], self.bias[keep])
+
+    def to_bytes(self) -> bytes:
+        """Content of a file that `from_file` reads (NumPy's .npz)."""
+        out = io.BytesIO()
+        np.savez(out, class_ids=self.class_ids, weight=self.weight, bias=self.bias)
+        return out.getvalue()
+
+    @staticmethod
+    def from_file(path: str | Path) -> IdentityClassifier:
+        """Reads a classifier.
+
+        Raises:
+            FormatError: missing, damaged, or arrays that do not fit together.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                ids, weight, bias = arrays["class_ids"], arrays["weight"], arrays["bias"]
+        except FileNotFoundError:
+            raise FormatError(f"{path}: file is missing") from None
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise FormatError(f"{path}: not a classifier written by ggslam: {error}") from None
+        if weight.ndim != 2 or ids.shape != (len(weight),) or bias.shape != ids.shape or not np.isfinite(weight).all():
+            raise FormatError(
+                f"{path}: shapes do not fit or values are not finite: {ids.shape}, {weight.shape}, {bias.shape}"
+            )
+        return IdentityClassifier(ids.astype(np.uint16), weight.astype(np.float32), bias.astype(np.float32))
