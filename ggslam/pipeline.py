@@ -157,12 +157,13 @@ def describe(request: SequenceRequest, sequence: Sequence) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def open_recording_of(folder: RunFolder, path: Path | None = None) -> Sequence:
+def open_recording_of(folder: RunFolder, path: Path | None = None, masks: Path | None = None) -> Sequence:
     """Opens the recording of a run again, as the run did.
 
     Args:
         folder: of the run.
         path: where the recording is now, if it was moved.
+        masks: folder of masks to use instead of those that the run had.
 
     Raises:
         SequenceError: it is not there any more.
@@ -172,7 +173,8 @@ def open_recording_of(folder: RunFolder, path: Path | None = None) -> Sequence:
         record = folder.read_json("sequence.json")
         values = dict(record["open"])
         values["path"] = Path(path if path is not None else values["path"])
-        values["masks"] = None if values["masks"] is None else Path(values["masks"])
+        used = masks if masks is not None else values["masks"]
+        values["masks"] = None if used is None else Path(used)
         request = SequenceRequest(**values)
     except (KeyError, TypeError) as error:
         raise RunFolderError(f"{folder.path / 'sequence.json'}: not as ggslam writes it: {error!r}") from None

@@ -9,15 +9,29 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, RenderError
 from ggslam.formats.atomic import make_folder
+from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.reporting.pictures import color_of_depth, color_to_uint8, depth_range, write_picture
+from ggslam.rendering.labels import label_image, vote_label_image
+from ggslam.rendering.types import RenderBuffers
+from ggslam.reporting.pictures import (
+    IdentityColors,
+    color_of_depth,
+    color_of_ids,
+    color_to_uint8,
+    depth_range,
+    legend,
+    write_picture,
+)
 from ggslam.run_folder import RunFolder
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 
-KINDS = ("color", "depth", "alpha")
+KINDS = ("color", "depth", "alpha", "ids", "pca")
+OBJECT_KINDS = ("ids", "pca")
+"""Pictures of a run with objects only: each object in its colour; identity vectors by principal components."""
+Painter = Callable[[RenderBuffers], np.ndarray]
 
 
 def frame_poses(record: dict[str, Any]) -> dict[int, np.ndarray]:
@@ -62,10 +76,11 @@ def render_frames(
     folder: RunFolder, frames: list[int], what: list[str], out: Path, width: int | None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Path]:  # fmt: skip
-    """Renders frames to `out`/frame000123_color.png and so on; returns the files.
+    """Renders frames to `out`/frame000123_color.png and so on, with ids a legend.png, too; returns the files.
 
     Raises:
-        ConfigError: `what` names something else than color, depth, alpha.
+        ConfigError: `what` names something that is not in `KINDS`.
+        RunFolderError: objects are asked of a run that has none.
     """
     unknown = [kind for kind in what if kind not in KINDS]
     if unknown:
@@ -73,22 +88,59 @@ def render_frames(
     camera = run_camera(folder)
     if width is not None:
         camera = camera.resized(width, round(camera.height * width / camera.width))
+    segmented = folder.segmented_map() if set(what) & set(OBJECT_KINDS) else None
+    gaussians = folder.gaussians() if segmented is None else segmented.gaussians
     make_folder(out)
-    gaussians, rasterizer = folder.gaussians(), CpuRasterizer()
+    rasterizer = CpuRasterizer()
+    painters = _painters() if segmented is None else {**_painters(), **_object_painters(segmented, rasterizer)}
     poses = frame_poses(folder.read_json("keyframes.json"))
     written = []
     for done, frame in enumerate(frames):
-        view = rasterizer.forward(gaussians, camera, inverse(poses[frame]), features=False)
-        pictures = {
-            "color": lambda v=view: color_to_uint8(v.image.numpy()),
-            "depth": lambda v=view: _depth_picture(v.expected_depth.numpy(), v.alpha.numpy()),
-            "alpha": lambda v=view: (255 * np.clip(v.alpha.numpy(), 0, 1) + 0.5).astype(np.uint8),
-        }
+        view = rasterizer.forward(gaussians, camera, inverse(poses[frame]), features=segmented is not None)
         for kind in what:
             written.append(out / f"frame{frame:06d}_{kind}.png")
-            write_picture(written[-1], pictures[kind]())
+            write_picture(written[-1], painters[kind](view))
         progress(done + 1)
+    if segmented is not None and "ids" in what:
+        written.append(out / "legend.png")
+        write_picture(written[-1], legend([(f"{o.id} {o.name or ''}", o.color) for o in segmented.table.objects]))
     return written
+
+
+def object_ids(rasterizer: CpuRasterizer, view: RenderBuffers, segmented: SegmentedMap) -> np.ndarray:
+    """Object ids uint16 [H, W] of the view that was rendered last: by the classifier, or where it has no classes by the
+    weights of the Gaussians' own ids."""
+    if len(segmented.classifier) and view.features is not None:
+        return label_image(view.features, view.alpha, segmented.classifier)[0]
+    return vote_label_image(rasterizer, view, segmented.gaussians.object_id.numpy().astype(np.uint16))
+
+
+def identity_picture(view: RenderBuffers, colors: IdentityColors) -> np.ndarray:
+    """The rendered identity vectors as colours, uint8 [H, W, 3]."""
+    if view.features is None:
+        raise RenderError("the view was rendered without features")
+    return colors.picture(view.features.numpy(), view.alpha.numpy())
+
+
+def identity_colors(segmented: SegmentedMap) -> IdentityColors:
+    """Colours of the identity vectors of a map, fitted to its labelled Gaussians."""
+    return IdentityColors(segmented.gaussians.features.numpy()[segmented.gaussians.object_id.numpy() > 0])
+
+
+def _painters() -> dict[str, Painter]:
+    return {
+        "color": lambda view: color_to_uint8(view.image.numpy()),
+        "depth": lambda view: _depth_picture(view.expected_depth.numpy(), view.alpha.numpy()),
+        "alpha": lambda view: (255 * np.clip(view.alpha.numpy(), 0, 1) + 0.5).astype(np.uint8),
+    }
+
+
+def _object_painters(segmented: SegmentedMap, rasterizer: CpuRasterizer) -> dict[str, Painter]:
+    palette, colors = segmented.table.palette(), identity_colors(segmented)
+    return {
+        "ids": lambda view: color_of_ids(object_ids(rasterizer, view, segmented), palette, outlines=True),
+        "pca": lambda view: identity_picture(view, colors),
+    }
 
 
 def _depth_picture(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:

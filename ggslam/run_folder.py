@@ -7,6 +7,9 @@
     points.ply       coloured cloud sampled from the map, metres; points_grid.ply: the same in integer grid cells
     config.yaml      all settings; sequence.json: where the recording was and how it was read
     timing.json      seconds by part; metrics.json: scores; renders/: pictures
+of a run with objects, whose map.ply also holds each Gaussian's object id and identity vector:
+    objects.json     the objects: ids, names, boxes, ...; there if and only if the other files of the objects are whole
+    classifier.npz   turns identity vectors into objects; votes.npz: mask ids that each Gaussian was seen under
 """
 
 from __future__ import annotations
@@ -26,16 +29,21 @@ import yaml
 from ggslam import __version__
 from ggslam.config import Config, config_from_dict, save_config
 from ggslam.errors import RunFolderError
-from ggslam.formats.atomic import write_text
+from ggslam.formats.atomic import write_bytes, write_text
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from ggslam.formats.point_ply import write_points
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
+from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
+from ggslam.objects.table import ObjectTable
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam import SlamResult
 
 MARKER = "run.json"
 """Is there if and only if a folder is a run of ggslam."""
+OBJECT_FILES = ("objects.json", "classifier.npz", "votes.npz")
+"""Files of a run with objects, in the order in which they are removed; they are written in the opposite one."""
 
 
 class RunFolder:
@@ -109,7 +117,7 @@ class RunFolder:
         """
         mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish"}
         self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
-        for stale in ("metrics.json", "frames.csv", "points.ply", "points_grid.ply"):
+        for stale in ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", *OBJECT_FILES):
             (self.path / stale).unlink(missing_ok=True)
         shutil.rmtree(self.path / "renders", ignore_errors=True)
         save_config(config, self.path / "config.yaml")
@@ -122,6 +130,16 @@ class RunFolder:
         # Last and largest; `ggslam export --format points` makes them again from the map.
         write_points(self.path, sample_points(result.gaussians))
         self.write_json("timing.json", timing(result))  # once more: peak memory is that of the whole run
+
+    def save_objects(self, segmented: SegmentedMap) -> None:
+        """Writes a map with its objects: map.ply with object ids and identity vectors, and the files beside it."""
+        for stale in OBJECT_FILES:
+            (self.path / stale).unlink(missing_ok=True)
+        write_gaussian_ply(self.path / "map.ply", segmented.gaussians, extra=("object_id", "identity"))
+        if segmented.votes is not None:
+            write_bytes(self.path / "votes.npz", segmented.votes.to_bytes())
+        write_bytes(self.path / "classifier.npz", segmented.classifier.to_bytes())
+        segmented.table.save(self.path / "objects.json")
 
     def write_json(self, name: str, values: Any) -> Path:
         """Writes `values` as JSON; numbers that are not finite become null."""
@@ -159,6 +177,50 @@ class RunFolder:
     def trajectory(self) -> Trajectory:
         """Camera poses of all frames."""
         return read_tum(self.path / "trajectory.txt")
+
+    def has_objects(self) -> bool:
+        """Whether the run has objects."""
+        return (self.path / "objects.json").is_file()
+
+    def object_table(self) -> ObjectTable:
+        """The objects alone, without the map.
+
+        Raises:
+            RunFolderError: the run has no objects.
+            FormatError: objects.json is damaged.
+        """
+        if not self.has_objects():
+            raise RunFolderError(f"{self.path}: this run has no objects: it learned none, its map is not segmented")
+        return ObjectTable.load(self.path / "objects.json")
+
+    def segmented_map(self) -> SegmentedMap:
+        """The map with its objects, without optimizer state.
+
+        Raises:
+            RunFolderError: the run has no objects, or its files do not belong together.
+            FormatError: a file is missing or damaged.
+        """
+        table, gaussians = self.object_table(), self.gaussians()
+        classifier = IdentityClassifier.from_file(self.path / "classifier.npz")
+        channels = classifier.weight.shape[1]
+        if gaussians.features.shape[1] != channels:
+            found = gaussians.features.shape[1]
+            raise RunFolderError(f"{self.path / 'map.ply'}: expected {channels} properties identity_*, found {found}")
+        votes = self.votes()
+        if votes is not None and len(votes) != len(gaussians):
+            raise RunFolderError(
+                f"{self.path / 'votes.npz'}: expected votes of {len(gaussians)} Gaussians, found {len(votes)}"
+            )
+        return SegmentedMap(gaussians, classifier, table, votes)
+
+    def votes(self) -> ObjectVotes | None:
+        """Votes of the Gaussians of map.ply, None if they were not counted.
+
+        Raises:
+            FormatError: the file is damaged.
+        """
+        path = self.path / "votes.npz"
+        return ObjectVotes.from_file(path) if path.is_file() else None
 
 
 def json_ready(value: Any) -> Any:

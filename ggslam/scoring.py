@@ -8,6 +8,7 @@ import io
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from ggslam.evaluation.images import ImageScores
 from ggslam.evaluation.lpips import Lpips
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.formats.atomic import make_folder, write_text
+from ggslam.object_scoring import ObjectScorer
 from ggslam.progress import Observer
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering_jobs import frame_poses
@@ -32,8 +34,9 @@ PICTURES = 6
 
 
 def score_run(
-    folder: RunFolder, sequence: Sequence, observer: Observer, lpips: bool = True, every: int = 1
-) -> dict[str, Any]:
+    folder: RunFolder, sequence: Sequence, observer: Observer, lpips: bool = True, every: int = 1,
+    masks: Path | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Scores a run against its recording and writes the results into the run folder.
 
     Args:
@@ -42,12 +45,16 @@ def score_run(
         observer: is told of the progress.
         lpips: score LPIPS too, if its weights are there.
         every: score the images of every n-th frame only.
+        masks: where the masks of `sequence` come from, if they are not those that the run had; for the notes.
 
     Returns:
         What `metrics.json` holds:
             trajectory: see `TrajectoryScores`; null without ground truth.
             images: for `keyframes` (trained on), `held_out` (never trained on) and `all` frames, see `ImageScores`:
                 plain names count pixels with measured depth, `_unmasked` all pixels.
+            segmentation: for the same sets of frames, see `SegmentationScores`, `votes_miou` being that of labels by
+                votes (at a quarter of the pixels); how ids were matched, scores `per_object`, labels of `gaussians`
+                (see `GaussianLabelScores`); null without objects or without masks.
             speed, map, memory: of the run.
             notes: what could not be scored, and why.
     """
@@ -55,9 +62,12 @@ def score_run(
     metric = _lpips(notes) if lpips else None
     record = folder.read_json("keyframes.json")
     poses = frame_poses(record)
+    sets = _sets(folder, record, every)
+    scorer = _object_scorer(folder, sequence, sets)
     metrics: dict[str, Any] = {
         "trajectory": _trajectory(sequence, poses),
-        "images": _images(folder, record, sequence, metric, observer, every),
+        "images": _images(folder, record, sequence, sets, scorer, metric, observer),
+        "segmentation": None if scorer is None else scorer.to_dict(),
         "tracking": dict(Counter(f["status"] for f in record["frames"])),
         **_performance(folder),
         "scored_every": every,
@@ -74,6 +84,7 @@ def score_run(
         known = sequence.ground_truth is not None
         reason = "fewer than 3 frames have both poses" if known else "the recording has no ground-truth poses"
         notes.append(f"{reason}; no trajectory scores")
+    notes.extend(_segmentation_notes(folder, metrics["segmentation"], masks))
     folder.write_json("metrics.json", metrics)
     return json_ready(metrics)
 
@@ -94,19 +105,47 @@ def _trajectory(sequence: Sequence, poses: dict[int, np.ndarray]) -> dict[str, A
     return None if scores is None else asdict(scores)
 
 
-def _images(
-    folder: RunFolder, record: dict[str, Any], sequence: Sequence, lpips: Lpips | None, observer: Observer, every: int
-) -> dict[str, Any]:
-    poses = frame_poses(record)
+def _sets(folder: RunFolder, record: dict[str, Any], every: int) -> dict[str, set[int]]:
+    """Frames that each kind of score is about."""
     keyframes = {k["frame"] for k in record["keyframes"]}
     evaluation = folder.config().evaluation
-    chosen = [i for i in range(max(poses, default=-1) + 1) if i % every == 0]
+    chosen = {i for i in range(max(frame_poses(record), default=-1) + 1) if i % every == 0}
     held_out = {i for i in chosen if evaluation.is_held_out(i) and i not in keyframes}
-    sets = {"keyframes": keyframes & set(chosen), "held_out": held_out, "all": set(chosen)}
+    return {"keyframes": keyframes & chosen, "held_out": held_out, "all": chosen}
+
+
+def _object_scorer(folder: RunFolder, sequence: Sequence, sets: dict[str, set[int]]) -> ObjectScorer | None:
+    if not folder.has_objects():
+        return None
+    return ObjectScorer(folder.segmented_map(), sets, sequence.instance_names)
+
+
+def _segmentation_notes(folder: RunFolder, scores: dict[str, Any] | None, masks: Path | None) -> list[str]:
+    """Which masks served as truth, or why there are no scores of objects."""
+    if not folder.has_objects():
+        return ["the run has no objects; the masks are not used"] if masks is not None else []
+    if scores is None:
+        return ["the recording has no masks; objects are not scored (true masks from elsewhere: ggslam eval --masks)"]
+    supervised = folder.object_table().supervision in ("masks", "associated masks")
+    own = folder.read_json("sequence.json")["open"].get("masks")
+    same = masks is None or (own is not None and Path(own).resolve() == masks.resolve())
+    if supervised and same:
+        return ["objects are scored against the masks that supervised the map: this tells how well they were learned, "
+                "not how true they are (true masks from elsewhere: ggslam eval --masks)"]  # fmt: skip
+    return [f"objects are scored against the masks in {masks}" if masks else
+            "objects are scored against the masks of the recording, which did not supervise the map"]  # fmt: skip
+
+
+def _images(
+    folder: RunFolder, record: dict[str, Any], sequence: Sequence, sets: dict[str, set[int]],
+    scorer: ObjectScorer | None, lpips: Lpips | None, observer: Observer,
+) -> dict[str, Any]:  # fmt: skip
+    poses = frame_poses(record)
+    keyframes, held_out = sets["keyframes"], sets["held_out"]
     spread = np.linspace(0, len(poses) - 1, min(PICTURES, len(poses))).round().astype(int)
     pictured = set(np.array(sorted(poses))[spread].tolist())
     make_folder(folder.path / "renders")
-    show = _shower(folder, poses, pictured)
+    show = _shower(folder, poses, pictured, scorer)
     rows: list[dict[str, Any]] = []
     observer.begin("score", len(sequence))
 
@@ -115,38 +154,43 @@ def _images(
         kind = "keyframe" if frame.index in keyframes else "held_out" if frame.index in held_out else "other"
         rows.append({"frame": frame.index, "kind": kind, **(scores or ImageScores()).to_dict()})
 
-    means = score_images(show, _up_to(max(poses, default=-1), sequence), sets, lpips, note)
+    frames = _up_to(max(poses, default=-1), sequence, masks=scorer is not None and sequence.has_masks)
+    means = score_images(show, frames, sets, lpips, note)
     observer.advance(len(sequence), len(sequence))
     _write_rows(folder, rows)
     return {name: mean.to_dict() for name, mean in means.items()}
 
 
-def _up_to(last: int, sequence: Sequence) -> Iterator[Frame]:
+def _up_to(last: int, sequence: Sequence, masks: bool) -> Iterator[Frame]:
     """Frames 0 to `last`: a run that stopped early is not asked about what it never saw, least of all about the damaged
     frame that stopped it."""
     if last < 0:
         return
-    for frame in sequence.stream(masks=False):
+    for frame in sequence.stream(masks=masks):
         yield frame
         if frame.index >= last:
             return
 
 
 def _shower(
-    folder: RunFolder, poses: dict[int, np.ndarray], pictured: set[int]
+    folder: RunFolder, poses: dict[int, np.ndarray], pictured: set[int], scorer: ObjectScorer | None
 ) -> Callable[[Frame], tuple[np.ndarray, np.ndarray] | None]:
     """A function that renders the map as a frame's camera sees it, and keeps some of the pictures."""
-    gaussians, rasterizer = folder.gaussians(), CpuRasterizer()
+    gaussians = folder.gaussians() if scorer is None else scorer.gaussians
+    rasterizer = CpuRasterizer()
 
     def show(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
         if frame.index not in poses:
             return None
         T_camera_world = inverse(poses[frame.index])
-        view = rasterizer.forward(gaussians, frame.camera, T_camera_world, features=False)
+        view = rasterizer.forward(gaussians, frame.camera, T_camera_world, features=scorer is not None)
         color = np.clip(view.image.numpy(), 0, 1).transpose(1, 2, 0)
         depth = np.where(view.alpha.numpy() > 0.5, view.expected_depth.numpy(), 0)
+        row = None
+        if scorer is not None:
+            row = scorer.add(frame, rasterizer, view, T_camera_world, frame.index in pictured)
         if frame.index in pictured:
-            picture = compare(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth)
+            picture = compare(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth, row)
             write_picture(folder.path / "renders" / f"compare{frame.index:06d}.png", picture)
         return color, depth
 

@@ -198,6 +198,7 @@ class Slam:
         finally:  # an interrupted refinement counts for what it did
             self.refine_iterations = self.mapper.times.iterations - before
             self.times.refinement = time.perf_counter() - start
+        self.mapper.finish_identity()
         return self.result()
 
     def result(self) -> SlamResult:

@@ -13,7 +13,15 @@ from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
 from ggslam.cli.summary import print_scores
 
-EPILOG = "[bold]Examples[/]  ggslam eval runs/kitchen    ggslam eval runs/kitchen --sequence elsewhere/kitchen"
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam eval runs/kitchen
+
+  ggslam eval runs/kitchen --sequence elsewhere/kitchen
+
+  ggslam eval runs/kitchen --masks kitchen/true_masks
+"""
 
 
 def evaluate(
@@ -21,15 +29,18 @@ def evaluate(
     sequence: Annotated[Path | None, typer.Option(help="The recording, if it is not where it was.")] = None,
     lpips: Annotated[bool, typer.Option("--lpips/--no-lpips", help="Also LPIPS (needs its weights).")] = True,
     every: Annotated[int, typer.Option(help="Score every n-th frame only.", min=1)] = 1,
+    masks: Annotated[
+        Path | None, typer.Option(help="Folder with true instance masks, if not the recording's own.")
+    ] = None,
 ) -> None:
-    """Score a run against its recording: trajectory, images of keyframes, held-out and all frames."""
+    """Score a run against its recording: trajectory, images and objects of keyframes, held-out and all frames."""
     from ggslam.pipeline import open_recording_of
     from ggslam.run_folder import RunFolder
     from ggslam.scoring import score_run
 
     folder = RunFolder.open(run)
-    recording = open_recording_of(folder, sequence)
+    recording = open_recording_of(folder, sequence, masks)
     with progress_bar() as bar:
-        metrics = score_run(folder, recording, ProgressObserver(bar), lpips=lpips, every=every)
+        metrics = score_run(folder, recording, ProgressObserver(bar), lpips=lpips, every=every, masks=masks)
     print_scores(metrics)
     console.print(f"wrote {folder.path / 'metrics.json'}", highlight=False, markup=False)

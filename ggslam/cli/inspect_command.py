@@ -26,6 +26,7 @@ def inspect(
     scale: options.Scale = 1.0,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
+    masks: options.Masks = None,
     samples: int = typer.Option(8, help="Frames to read and look at.", min=1),
 ) -> None:
     """Print what was recognised in a recording, and likely mistakes."""
@@ -33,8 +34,9 @@ def inspect(
     from ggslam.sequences.inspection import inspect_sequence
 
     recording = open_sequence(
-        sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale
-    )
+        sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, masks=masks,
+        depth_scale=depth_scale,
+    )  # fmt: skip
     report = inspect_sequence(recording, samples=samples)
     for name, value in _lines(report):
         console.print(f"[bold]{name:<13}[/] {escape(value)}", highlight=False)
@@ -65,7 +67,8 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
                                 f"(median), {step[2] * 100:.1f} cm and {turn[2]:.1f} deg (most)"))  # fmt: skip
     if r.pose_depth_error is not None:
         lines.append(("consistency", f"depth agrees with the poses to {r.pose_depth_error:.1%}"))
-    if r.masked_frames:
+    if r.mask_kinds:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in r.mask_kinds.items())
         masks = f"{len(r.mask_ids)} ids, {r.named_ids} named, {r.labelled_share:.0%} of pixels"
-        lines.append(("masks", f"in {r.masked_frames:.0%} of the frames looked at: {masks}"))
+        lines.append(("masks", f"{kinds}; in {r.masked_frames:.0%} of the frames looked at: {masks}"))
     return lines

@@ -17,6 +17,8 @@ EPILOG = """
   ggslam render runs/kitchen --frames 0,50,100
 
   ggslam render runs/kitchen --what color,depth --every 5 --width 1280 --out pictures
+
+  ggslam render runs/kitchen --what color,ids,pca
 """
 
 
@@ -25,7 +27,7 @@ def render(
     out: Annotated[Path | None, typer.Option(help="Folder for the pictures; default RUN/renders.")] = None,
     frames: Annotated[str | None, typer.Option(help="Frame numbers, e.g. 0,50,100; default: 8 spread evenly.")] = None,
     every: Annotated[int | None, typer.Option(help="Every n-th frame instead.", min=1)] = None,
-    what: Annotated[str, typer.Option(help="Of color, depth, alpha; separated by commas.")] = "color,depth",
+    what: Annotated[str, typer.Option(help="Of color, depth, alpha, ids, pca; by commas.")] = "color,depth",
     width: Annotated[
         int | None, typer.Option(help="Width of the pictures; default: as the run saw them.", min=16, max=8192)
     ] = None,

@@ -39,7 +39,7 @@ def run(
     scale: options.Scale = 1.0,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
-    masks: Annotated[Path | None, typer.Option(help="Folder with instance masks, if not the recording's own.")] = None,
+    masks: options.Masks = None,
     iterations: Annotated[int | None, typer.Option(help="Mapping iterations per frame (default 4).")] = None,
     refine: Annotated[int | None, typer.Option(help="Iterations of final refinement after the last frame.")] = None,
     realtime: Annotated[

@@ -13,22 +13,51 @@ _IMAGE_COLUMNS = [
 ]  # fmt: skip
 
 
+_SEGMENTATION_COLUMNS = [
+    ("objects", "objects", 1.0, "d"), ("mIoU", "miou", 100.0, ".1f"), ("boundary", "boundary_miou", 100.0, ".1f"),
+    ("accuracy", "accuracy", 100.0, ".1f"), ("precision", "precision", 100.0, ".0f"),
+    ("recall", "recall", 100.0, ".0f"), ("votes", "votes_miou", 100.0, ".1f"),
+]  # fmt: skip
+_LOWEST = 5
+
+
 def _text(value: float | None, factor: float, form: str) -> str:
     return "-" if value is None else format(value if form == "d" else factor * value, form)
 
 
 def print_scores(metrics: dict[str, Any]) -> None:
-    """A table of the image scores and a line each for trajectory and speed."""
+    """A table of the image scores, one of the objects, and a line each for trajectory and speed."""
     rows = [
         [name.replace("_", " "), *(_text(scores.get(key), factor, form) for _, key, factor, form in _IMAGE_COLUMNS)]
         for name, scores in metrics["images"].items()
     ]
     columns = ["scores", *(title for title, *_ in _IMAGE_COLUMNS)]
     console.print(table("images; all but 'unmasked' over pixels with measured depth", columns, rows))
+    if metrics.get("segmentation"):
+        _print_segmentation(metrics["segmentation"])
     console.print(_trajectory_line(metrics.get("trajectory")), highlight=False)
     console.print(_speed_line(metrics), highlight=False)
     for note in metrics.get("notes", []):
         console.print(f"note: {note}", highlight=False, markup=False)
+
+
+def _print_segmentation(s: dict[str, Any]) -> None:
+    rows = [
+        [name.replace("_", " "), *(_text(s[name][key], factor, form) for _, key, factor, form in _SEGMENTATION_COLUMNS)]
+        for name in ("keyframes", "held_out", "all")
+    ]
+    matched = "equal ids" if s["matching"] == "same" else "ids matched one to one"
+    columns = ["scores", *(title for title, *_ in _SEGMENTATION_COLUMNS)]
+    console.print(table(f"objects against masks, %; {matched}", columns, rows))
+    lowest = sorted(s["per_object"].items(), key=lambda item: item[1]["iou"])[:_LOWEST]
+    texts = [f"{o['name'] or 'object'} ({i}) {_text(o['iou'], 100, '.1f')} %" for i, o in lowest]
+    console.print(f"lowest IoU: {', '.join(texts)}", highlight=False, markup=False)
+    g = s["gaussians"]
+    right, by_opacity = (_text(g[key], 100, ".1f") for key in ("accuracy", "accuracy_by_opacity"))
+    console.print(
+        f"Gaussians: {right} % ({by_opacity} % by opacity) labelled right of {g['labelled']} with a true label",
+        highlight=False,
+    )
 
 
 def _trajectory_line(t: dict[str, Any] | None) -> str:

@@ -36,6 +36,8 @@ MANY_CLASSES = 128
 """Beyond so many classes a step's softmax runs over those in its sample and this many others, drawn at random."""
 POOL_STEPS = 8
 """Steps' worth of pixels that are drawn from a keyframe at once."""
+TERMS, MIN_WEIGHT = 32, 5e-3
+"""Contributions to a pixel that training looks at: at most so many, none lighter."""
 BIRTH_VOTE = 0.1
 """Weight of the vote that a Gaussian gets for the pixel it is born from."""
 
@@ -142,9 +144,13 @@ class IdentityLearner:
         return has and self._iterations % self.settings.every == 0
 
     def step(
-        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: Keyframe, view: RenderBuffers
-    ) -> torch.Tensor | None:
+        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: Keyframe, view: RenderBuffers,
+        rate_factor: float = 1.0,
+    ) -> torch.Tensor | None:  # fmt: skip
         """One step on the view that `rasterizer` rendered last, which must be that of `keyframe`.
+
+        Args:
+            rate_factor: multiplies the learning rates (of the sampled schedule).
 
         Returns:
             With the dense schedule the gradient of the rendered features [F, H, W], for the caller's backward pass;
@@ -158,10 +164,10 @@ class IdentityLearner:
         if len(pixels):
             assert keyframe.mask is not None
             labels = self.current(keyframe.mask.reshape(-1)[pixels])
-            terms = rasterizer.pixel_terms(pixels)
+            terms = rasterizer.pixel_terms(pixels, TERMS, MIN_WEIGHT)
             terms.vote(gaussians, labels, vote_weights)
             if self.settings.schedule == "sampled":
-                self._train(gaussians, terms, self.table.classes(labels))
+                self._train(gaussians, terms, self.table.classes(labels), rate_factor)
         self.times.steps += time.perf_counter() - start
         self.times.count += 1
         return gradient
@@ -186,7 +192,7 @@ class IdentityLearner:
             terms.step(gaussians, pull, FeatureAdamSettings(rate=s.rate))
         return torch.from_numpy(out.reshape(view.features.shape))
 
-    def _train(self, gaussians: GaussianMap, terms: PixelTerms, classes: np.ndarray) -> None:
+    def _train(self, gaussians: GaussianMap, terms: PixelTerms, classes: np.ndarray, rate_factor: float) -> None:
         s = self.settings
         chosen = self._competing(classes)
         features = terms.features(gaussians)
@@ -196,8 +202,8 @@ class IdentityLearner:
             pulled, pull = self._pull_together(gaussians)
             terms = terms.joined(PixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
             gradient = np.concatenate([gradient, pull])
-        terms.step(gaussians, gradient, FeatureAdamSettings(rate=s.rate))
-        self.table.step(chosen, s.weight * rows, s.classifier_rate)
+        terms.step(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate))
+        self.table.step(chosen, s.weight * rows, rate_factor * s.classifier_rate)
 
     def _competing(self, classes: np.ndarray) -> np.ndarray:
         """Classes that a step's softmax runs over: all, or with very many those that appear and some others."""
@@ -222,9 +228,9 @@ class IdentityLearner:
         pool = self._pools.get(keyframe.index)
         if pool is None or pool.used + self.settings.pixels > len(pool.pixels):
             assert keyframe.mask is not None
-            ids = self.current(keyframe.mask.reshape(-1))
             wanted = POOL_STEPS * self.settings.pixels
-            pool = self._pools[keyframe.index] = draw_pool(ids, wanted, self.settings.balance, self._rng)
+            pool = draw_pool(self.current(keyframe.mask), wanted, self.settings, self._rng)
+            self._pools[keyframe.index] = pool
         part = slice(pool.used, pool.used + self.settings.pixels)
         pool.used = part.stop
         return pool.pixels[part], pool.vote_weights[part]
@@ -272,26 +278,51 @@ def cross_entropy(
     return loss, z @ weight, np.concatenate([z.T @ features, z.sum(0)[:, None]], 1)
 
 
-def draw_pool(ids: np.ndarray, wanted: int, balance: float, rng: np.random.Generator) -> PixelPool:
-    """Draws labelled pixels, an object of n pixels with a share that goes with n^(1 - balance).
+def draw_pool(
+    ids: np.ndarray, wanted: int, settings: IdentitySettings, rng: np.random.Generator
+) -> PixelPool:
+    """Draws labelled pixels: a share `settings.boundary` of them at the boundaries of objects, where nearly all errors
+    are, the others anywhere; in both parts an object of n pixels comes with a share that goes with n^(1 - balance).
 
     Args:
-        ids: object of each pixel, uint16 [n]; 0 is never drawn.
+        ids: object of each pixel, uint16 [H, W]; 0 is never drawn.
         wanted: how many; a pixel may come twice.
     """
-    counts = np.bincount(ids)
-    counts[0] = 0
-    present = np.flatnonzero(counts)
-    if not len(present):
+    flat = ids.reshape(-1)
+    edge = at_boundary(ids).reshape(-1)
+    parts, density = [], np.zeros(len(flat))
+    for share, strata in ((1 - settings.boundary, flat), (settings.boundary, np.where(edge, flat, 0))):
+        counts = np.bincount(strata)
+        counts[0] = 0
+        present = np.flatnonzero(counts)
+        number = round(share * wanted)
+        if not len(present) or not number:
+            continue
+        odds = counts[present].astype(np.float64) ** (1 - settings.balance)
+        odds /= odds.sum()
+        by_object = np.argsort(strata, kind="stable").astype(np.int32)  # a radix sort for 16 bits
+        starts = np.concatenate([[0], np.cumsum(np.bincount(strata))])[present]
+        drawn = rng.choice(len(present), number, p=odds)
+        parts.append(by_object[starts[drawn] + (rng.random(number) * counts[present][drawn]).astype(np.int64)])
+        per_pixel = np.zeros(len(counts))
+        per_pixel[present] = number * odds / counts[present]
+        density += per_pixel[strata]
+    if not parts:
         return PixelPool(np.zeros(0, np.int32), np.zeros(0, np.float32))
-    share = counts[present].astype(np.float64) ** (1 - balance)
-    share /= share.sum()
-    by_object = np.argsort(ids, kind="stable").astype(np.int32)  # a radix sort for 16 bits
-    starts = np.concatenate([[0], np.cumsum(np.bincount(ids))])[present]
-    drawn = rng.choice(len(present), wanted, p=share)
-    pixels = by_object[starts[drawn] + (rng.random(wanted) * counts[present][drawn]).astype(np.int64)]
-    vote_weights = (counts[present] / counts.sum() / share)[drawn]
-    return PixelPool(pixels, vote_weights.astype(np.float32))
+    pixels = rng.permutation(np.concatenate(parts))
+    weights = 1 / density[pixels]
+    return PixelPool(pixels, (weights / weights.mean()).astype(np.float32))
+
+
+def at_boundary(ids: np.ndarray) -> np.ndarray:
+    """Pixels with a pixel of another object beside, above or below them, bool [H, W]."""
+    edge = np.zeros(ids.shape, bool)
+    across, down = ids[:, 1:] != ids[:, :-1], ids[1:] != ids[:-1]
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= down
+    edge[:-1] |= down
+    return edge
 
 
 def vote_labels(gaussians: GaussianMap) -> np.ndarray:

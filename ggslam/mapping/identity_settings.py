@@ -40,14 +40,19 @@ class IdentitySettings:
     enabled: bool = True
     """Learn objects when there are masks, or segments to be had (`masks.source`)."""
     schedule: Literal["sampled", "dense", "votes"] = "sampled"
-    """sampled: cross-entropy on sampled pixels of the view that is rendered for its colours anyway; dense: on all pixels
-    of rendered identity images, as published; votes: count only, learn nothing."""
-    every: int = 2
+    """sampled: cross-entropy on sampled pixels of the view that is rendered for its colours anyway; dense: on all
+    pixels of rendered identity images, as published; votes: count only, learn nothing."""
+    every: int = 4
     """An identity step in every n-th mapping iteration."""
+    final_passes: int = 4
+    """After the last frame all keyframes are visited so many times more for identity alone, with falling steps: what
+    was inserted last has hardly been trained by then."""
     pixels: int = 2048
     """Pixels sampled in a step."""
     balance: float = 0.5
     """An object of n pixels gets a share of the sample that goes with n^(1 - balance): 0 as they come, 1 all alike."""
+    boundary: float = 0.5
+    """Share of the sample that is drawn at the boundaries of objects."""
     detach: bool = True
     """Identity gradients do not reach geometry and opacity. False needs the dense schedule."""
     initialisation: Literal["votes", "random"] = "votes"
@@ -64,7 +69,7 @@ class IdentitySettings:
 
     def __post_init__(self) -> None:
         ranges = {
-            "every": (1, 10**6), "pixels": (1, 10**7), "balance": (0, 1), "rate": (0, 10), "classifier_rate": (0, 10),
-            "weight": (0, 1e6), "min_confidence": (0, 1),
+            "every": (1, 10**6), "pixels": (1, 10**7), "balance": (0, 1), "boundary": (0, 1), "rate": (0, 10),
+            "classifier_rate": (0, 10), "weight": (0, 1e6), "min_confidence": (0, 1), "final_passes": (0, 10**4),
         }  # fmt: skip
         check_ranges(self, ranges)

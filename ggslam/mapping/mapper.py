@@ -26,6 +26,10 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 
 
+FINAL_DECAY = 0.2
+"""The last identity steps fall to this share of their length."""
+
+
 @dataclass(frozen=True)
 class MapLabels:
     """What the map shows from a new keyframe's pose before anything is inserted there.
@@ -55,6 +59,7 @@ class MapperTimes:
     loss: float = 0.0
     backward: float = 0.0
     identity: float = 0.0
+    identity_finish: float = 0.0
     iterations: int = 0
     keyframes: int = 0
 
@@ -210,6 +215,22 @@ class Mapper:
             self.iterate(self.keyframes[self._sampler.draw(len(self.keyframes))], factor)
             if progress is not None and (i % 20 == 19 or i + 1 == iterations):
                 progress(i + 1, iterations)
+
+    def finish_identity(self) -> None:
+        """The last identity steps, see `IdentitySettings.final_passes`, and every Gaussian's object. Colours, shapes and
+        poses stay as they are."""
+        if self.identity is None:
+            return
+        start, settings = time.perf_counter(), self.identity.settings
+        visits = settings.final_passes * len(self.keyframes) if settings.schedule == "sampled" else 0
+        for i in range(visits):
+            keyframe = self.keyframes[self._sampler.draw(len(self.keyframes))]
+            if keyframe.mask is None:
+                continue
+            view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
+            self.identity.step(self.map, self._rasterizer, keyframe, view, FINAL_DECAY ** (i / visits))
+        self.identity.label(self.map)
+        self.times.identity_finish += time.perf_counter() - start
 
     def _adam(self, rate_factor: float) -> AdamSettings:
         r = self.settings.rates

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The 3-D regularisation of identity vectors, on an index of neighbours that is refreshed as the map changes.
 
-Ye et al., "Gaussian Grouping", 2024, eq. 4: L = (l_val / C) mean over sampled Gaussians j and their k nearest neighbours
-i of KL(P_j || Q_i), P and Q being softmax(classifier(identity)).
+Ye et al., "Gaussian Grouping", 2024, eq. 4: L = (l_val / C) mean over sampled Gaussians j and their k nearest
+neighbours i of KL(P_j || Q_i), P and Q being softmax(classifier(identity)).
 """
 
 from __future__ import annotations

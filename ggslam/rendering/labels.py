@@ -17,8 +17,9 @@ from ggslam.scene.identity import IdentityClassifier
 
 MIN_ALPHA = 0.5
 """Pixels that are covered less than this show no object."""
-_VALUES_AT_ONCE = 1 << 21
-"""Logits held at a time (8 MB): with 1,000 classes a whole image of them would take more than a gigabyte."""
+_VALUES_AT_ONCE = 1 << 18
+"""Logits held at a time (1 MB, which stays in the cache): with 1,000 classes a whole image of them would take more than
+a gigabyte."""
 _PIXELS_AT_ONCE = 1 << 15
 """Pixels whose terms are held at a time (12 MB)."""
 
@@ -53,16 +54,17 @@ def label_image(
     ids, confidence = np.zeros(shape, np.uint16), np.zeros(shape, np.float32)
     if not len(classifier):
         return ids, confidence
-    weight, bias = torch.from_numpy(classifier.weight), torch.from_numpy(classifier.bias)[:, None]
-    columns = features.reshape(len(features), -1)
+    weight, bias = torch.from_numpy(classifier.weight).T, torch.from_numpy(classifier.bias)
+    vectors = features.reshape(len(features), -1).T
     step = max(1, _VALUES_AT_ONCE // len(classifier))
     with torch.inference_mode():
-        for start in range(0, columns.shape[1], step):
+        for start in range(0, len(vectors), step):
             part = slice(start, start + step)
-            logits = torch.addmm(bias, weight, columns[:, part])
-            highest, best = logits.max(0)
-            confidence.reshape(-1)[part] = logits.sub_(highest).exp_().sum(0).reciprocal_().numpy()
-            ids.reshape(-1)[part] = classifier.class_ids[best.numpy()]
+            logits = torch.addmm(bias, vectors[part], weight)
+            best = logits.numpy().argmax(1)  # torch's own takes several times longer
+            highest = logits.gather(1, torch.from_numpy(best)[:, None])
+            confidence.reshape(-1)[part] = logits.sub_(highest).exp_().sum(1).reciprocal_().numpy()
+            ids.reshape(-1)[part] = classifier.class_ids[best]
     empty = (alpha < min_alpha).numpy()
     ids[empty], confidence[empty] = 0, 0
     return ids, confidence
@@ -87,22 +89,33 @@ def render_labels(
 
 
 def vote_label_image(
-    rasterizer: CpuRasterizer, view: RenderBuffers, labels: np.ndarray, min_alpha: float = MIN_ALPHA
+    rasterizer: CpuRasterizer,
+    view: RenderBuffers,
+    labels: np.ndarray,
+    min_alpha: float = MIN_ALPHA,
+    stride: int = 1,
 ) -> np.ndarray:
     """For every pixel the label with the largest rendering weight, uint16 [H, W]; 0 where alpha is below `min_alpha` or
-    unlabelled Gaussians weigh most. Costs no rendering beside the one that is there.
+    unlabelled Gaussians weigh most. Nothing is rendered beside the view that is there.
 
     Args:
         rasterizer: which rendered `view` last.
         view: what its last `forward` gave.
         labels: uint16 [N], one for each rendered Gaussian, 0 = unlabelled.
+        min_alpha: pixels below it get label 0.
+        stride: look only at every n-th pixel of every n-th row; the image is that much smaller.
 
     Raises:
         RenderError: nothing was rendered, or out of memory.
     """
-    ids = np.zeros(tuple(view.alpha.shape), np.uint16)
-    pixels = np.flatnonzero(view.alpha.numpy() >= min_alpha).astype(np.int32)
+    height, width = view.alpha.shape
+    looked_at = np.arange(height * width, dtype=np.int32).reshape(height, width)[::stride, ::stride]
+    covered = (view.alpha[::stride, ::stride] >= min_alpha).numpy()
+    pixels = looked_at[covered]
+    found = np.zeros(len(pixels), np.uint16)
     for start in range(0, len(pixels), _PIXELS_AT_ONCE):
-        part = pixels[start : start + _PIXELS_AT_ONCE]
-        ids.reshape(-1)[part] = rasterizer.pixel_terms(part).labels(labels)[0]
+        part = slice(start, start + _PIXELS_AT_ONCE)
+        found[part] = rasterizer.pixel_terms(pixels[part]).labels(labels)[0]
+    ids = np.zeros(covered.shape, np.uint16)
+    ids[covered] = found
     return ids

@@ -11,6 +11,9 @@ import numpy as np
 from ggslam.errors import RunFolderError
 from ggslam.formats.atomic import write_bytes
 
+FITTED = 20_000
+"""Identity vectors that principal components are fitted to, at most about twice as many."""
+
 
 def color_to_uint8(image: np.ndarray) -> np.ndarray:
     """uint8 [H, W, 3] of a planar float image [3, H, W] in [0, 1], clipped."""
@@ -38,6 +41,65 @@ def color_of_error(difference: np.ndarray, full_scale: float) -> np.ndarray:
     return cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1].copy()
 
 
+def color_of_ids(ids: np.ndarray, palette: np.ndarray, outlines: bool = False) -> np.ndarray:
+    """Object ids uint16 [H, W] as colours, uint8 [H, W, 3].
+
+    Args:
+        ids: the ids.
+        palette: uint8 [65536, 3], the colour of each.
+        outlines: draw a black line of one pixel where one object meets another.
+    """
+    picture = palette[ids]
+    if outlines:
+        square = np.ones((2, 2), np.uint8)
+        picture[cv2.erode(ids, square) != cv2.dilate(ids, square)] = 0
+    return picture
+
+
+class IdentityColors:
+    """Identity vectors as colours: their first three principal components as red, green and blue. Fitted once, so that
+    a vector has the same colour in all pictures.
+
+    Args:
+        features: float32 [N, F], identity vectors of Gaussians.
+    """
+
+    def __init__(self, features: np.ndarray) -> None:
+        from sklearn.decomposition import PCA  # slow to import
+
+        sample = features[:: max(1, len(features) // FITTED)]
+        if len(sample) < 3:  # too few to have components
+            sample = np.concatenate([sample, np.zeros((3, features.shape[1]), np.float32)])
+        with np.errstate(invalid="ignore"):  # vectors that are all one have no variance to share out
+            self._pca = PCA(min(3, *sample.shape), svd_solver="full").fit(sample)
+        self._low, self._high = np.percentile(self._pca.transform(sample), [1, 99], axis=0)
+
+    def picture(self, features: np.ndarray, alpha: np.ndarray, min_alpha: float = 0.5) -> np.ndarray:
+        """Colours uint8 [H, W, 3] of a rendered identity image [F, H, W]; black where alpha [H, W] is too low."""
+        vectors = (features / np.maximum(alpha, 1e-3)).reshape(len(features), -1).T
+        level = (self._pca.transform(vectors) - self._low) / np.maximum(self._high - self._low, 1e-6)
+        picture = np.zeros((*alpha.shape, 3), np.uint8)
+        values = (255 * np.clip(level, 0, 1) + 0.5).astype(np.uint8).reshape(*alpha.shape, -1)
+        picture[..., : values.shape[2]] = values
+        picture[alpha < min_alpha] = 0
+        return picture
+
+
+def legend(entries: list[tuple[str, tuple[int, int, int]]], rows: int = 24) -> np.ndarray:
+    """A picture, uint8 [H, W, 3], of names beside their colours, in columns of `rows`. Letters that are not ASCII
+    become question marks."""
+    height, width, box = 22, 280, 14
+    columns = max(1, -(-len(entries) // rows))
+    picture = np.full((height * max(1, min(len(entries), rows)), width * columns, 3), 255, np.uint8)
+    for number, (text, color) in enumerate(entries):
+        x, y = width * (number // rows) + 6, height * (number % rows) + 4
+        cv2.rectangle(picture, (x, y), (x + box, y + box), color, cv2.FILLED)
+        shown = text.encode("ascii", "replace").decode()[:32]
+        place = (x + box + 8, y + 12)
+        cv2.putText(picture, shown, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    return picture
+
+
 def side_by_side(pictures: list[np.ndarray], gap: int = 4) -> np.ndarray:
     """Pictures of equal height in a row with white gaps."""
     height = pictures[0].shape[0]
@@ -47,7 +109,11 @@ def side_by_side(pictures: list[np.ndarray], gap: int = 4) -> np.ndarray:
 
 
 def compare(
-    truth: np.ndarray, rendered: np.ndarray, true_depth: np.ndarray, rendered_depth: np.ndarray
+    truth: np.ndarray,
+    rendered: np.ndarray,
+    true_depth: np.ndarray,
+    rendered_depth: np.ndarray,
+    more: list[np.ndarray] | None = None,
 ) -> np.ndarray:
     """Truth, render and colour error; measured depth, rendered depth and depth error: two rows of three.
 
@@ -55,6 +121,7 @@ def compare(
         truth: uint8 [H, W, 3].
         rendered: uint8 [H, W, 3].
         true_depth, rendered_depth: float [H, W], metres, 0 = none.
+        more: three pictures uint8 [H, W, 3] for a third row.
     """
     near, far = depth_range(true_depth)
     error = np.abs(truth.astype(np.float32) - rendered.astype(np.float32)).mean(-1) / 255
@@ -64,7 +131,9 @@ def compare(
         [color_of_depth(true_depth, near, far), color_of_depth(rendered_depth, near, far),
          color_of_error(depth_error, 0.1)]
     )  # fmt: skip
-    return np.concatenate([upper, np.full((4, upper.shape[1], 3), 255, np.uint8), lower])
+    gap = np.full((4, upper.shape[1], 3), 255, np.uint8)
+    third = [] if more is None else [gap, side_by_side(more)]
+    return np.concatenate([upper, gap, lower, *third])
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:

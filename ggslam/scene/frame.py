@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -21,8 +22,9 @@ class Frame:
         color: uint8 [H, W, 3], RGB.
         depth: float32 [H, W], metres along the optical axis, 0 where unknown; registered to `color`.
         camera: intrinsics of both images.
-        mask: uint16 [H, W] instance ids, 0 = unlabelled; None when the recording has none.
+        mask: uint16 [H, W] instance ids, 0 = unlabelled; None when the recording has none, or it was not read.
         T_world_camera: float64 [4, 4] true pose if the recording tells it. Used for scores only, never for tracking.
+        mask_loader: reads the mask when it is needed; see `load_mask`.
     """
 
     index: int
@@ -33,3 +35,14 @@ class Frame:
     camera: Camera
     mask: np.ndarray | None = None
     T_world_camera: np.ndarray | None = None
+    mask_loader: Callable[[], np.ndarray | None] | None = field(default=None, repr=False, compare=False)
+
+    def load_mask(self) -> np.ndarray | None:
+        """The mask, read now if it was not read before (nothing keeps it: every call reads it again).
+
+        Raises:
+            SequenceError: it is damaged.
+        """
+        if self.mask is not None or self.mask_loader is None:
+            return self.mask
+        return self.mask_loader()

@@ -48,9 +48,10 @@ def open_sequence(
         start, stop, stride: frames start, start + stride, ... below stop (None: to the end). A stop past the end means
             the end.
         scale: size of the delivered images, in (0, 1].
-        masks: folder of instance masks to use instead of the recording's own.
+        masks: folder of instance masks to use instead of the recording's own; see `masks.find_masks`.
         depth_scale: depth units per metre, instead of the recording's own.
-        on_bad_frame: "error": a damaged frame raises; "skip": `stream` passes over it and lists it in `skipped`.
+        on_bad_frame: "error": a damaged frame or mask raises; "skip": `stream` passes over the frame and lists it in
+            `skipped`; a frame whose mask alone is damaged comes without it and is listed in `mask_problems`.
 
     Raises:
         SequenceError: the recording cannot be read; the message names the file, what was expected and what was found.
@@ -60,14 +61,21 @@ def open_sequence(
     if not recording.files:
         raise SequenceError(f"{folder}: holds no frames")
     if masks is not None:
-        found = find_masks(Path(masks), [entry.color for entry in recording.files])
-        pairs = zip(recording.files, found, strict=True)
-        recording.files = [dataclasses.replace(entry, mask=mask) for entry, mask in pairs]
+        _use_masks(recording, Path(masks).expanduser())
     if depth_scale is not None:
         recording.depth_scale = depth_scale
     if not (math.isfinite(recording.depth_scale) and recording.depth_scale > 0):
         raise SequenceError(f"{folder}: depth scale must be a positive number, found {recording.depth_scale}")
     return Sequence(recording, _selection(recording, start, stop, stride), scale=scale, on_bad_frame=on_bad_frame)
+
+
+def _use_masks(recording: Recording, folder: Path) -> None:
+    """Takes the masks of another folder; names of the recording's own ids would be wrong for them."""
+    found = find_masks(folder, [entry.color for entry in recording.files])
+    if any(mask is not None and mask != entry.mask for mask, entry in zip(found, recording.files, strict=True)):
+        recording.instance_names = {}
+    pairs = zip(recording.files, found, strict=True)
+    recording.files = [dataclasses.replace(entry, mask=mask) for entry, mask in pairs]
 
 
 def recognise_format(path: str | Path) -> str | None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def read_color(path: Path) -> np.ndarray:
@@ -25,7 +25,7 @@ def read_color(path: Path) -> np.ndarray:
         SequenceError: missing, truncated, or not an image.
     """
     # The orientation tag is ignored: depth and calibration refer to the pixels as stored.
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decode(path, read_content(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -40,33 +40,27 @@ def read_depth(path: Path, depth_scale: float, invalid: int | None = None) -> np
     Raises:
         SequenceError: missing, truncated, not an image, or not 16-bit with one channel.
     """
-    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    raw = decode(path, read_content(path), cv2.IMREAD_UNCHANGED)
     if raw.ndim != 2 or raw.dtype != np.uint16:
-        raise SequenceError(f"{path}: expected a 16-bit depth image with one channel, found {_kind(raw)}")
+        raise SequenceError(f"{path}: expected a 16-bit depth image with one channel, found {describe_channels(raw)}")
     depth = raw.astype(np.float32) / np.float32(depth_scale)
     if invalid is not None:
         depth[raw == invalid] = 0
     return depth
 
 
-def read_ids(path: Path) -> np.ndarray:
-    """Instance ids, uint16 [H, W], of an 8- or 16-bit image with one channel.
-
-    Raises:
-        SequenceError: missing, truncated, not an image, or coloured.
-    """
-    raw = _decode(path, cv2.IMREAD_UNCHANGED)
-    if raw.ndim != 2 or raw.dtype not in (np.uint8, np.uint16):
-        raise SequenceError(f"{path}: expected a mask of grey 8- or 16-bit instance ids, found {_kind(raw)}")
-    return raw.astype(np.uint16)
-
-
-def _kind(image: np.ndarray) -> str:
+def describe_channels(image: np.ndarray) -> str:
+    """Channels and bits of an image, for messages."""
     channels = 1 if image.ndim == 2 else image.shape[2]
     return f"{channels} channel{'s' if channels > 1 else ''} of {8 * image.dtype.itemsize}-bit {image.dtype.kind}"
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
+def read_content(path: Path) -> bytes:
+    """The bytes of a PNG or JPEG file, whole.
+
+    Raises:
+        SequenceError: missing, truncated, damaged, or not an image.
+    """
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -76,6 +70,15 @@ def _decode(path: Path, flags: int) -> np.ndarray:
     damage = find_damage(content)
     if damage:
         raise SequenceError(f"{path}: {damage}")
+    return content
+
+
+def decode(path: Path, content: bytes, flags: int) -> np.ndarray:
+    """Image of the bytes of `path` (named in errors), as OpenCV decodes it with `flags`.
+
+    Raises:
+        SequenceError: OpenCV cannot decode it.
+    """
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error as error:
@@ -89,7 +92,7 @@ def find_damage(content: bytes) -> str | None:
     """What is wrong with the bytes of a PNG or JPEG file; None when nothing was found."""
     if not content:
         return "file is empty"
-    if content.startswith(_PNG_SIGNATURE):
+    if content.startswith(PNG_SIGNATURE):
         return _find_png_damage(content)
     if content.startswith(b"\xff\xd8"):
         return _find_jpeg_damage(content)
@@ -97,7 +100,7 @@ def find_damage(content: bytes) -> str | None:
 
 
 def _find_png_damage(content: bytes) -> str | None:
-    view, position = memoryview(content), len(_PNG_SIGNATURE)
+    view, position = memoryview(content), len(PNG_SIGNATURE)
     while position + 12 <= len(content):
         length = int.from_bytes(view[position : position + 4], "big")
         kind = bytes(view[position + 4 : position + 8])

@@ -43,6 +43,7 @@ class SequenceReport:
         motion: None without two successive true poses.
         pose_depth_error: median relative difference between the depth seen in a frame and the depth predicted from the
             frame before by the true poses; None when it cannot be told.
+        mask_kinds: how the masks of all frames are stored ("grey", "palette", "RGB-coded", ...) -> number of frames.
         masked_frames: share of sampled frames with a mask; mask_ids: ids seen in them; labelled_share: of their pixels.
         named_ids: how many ids have names.
         damaged: reasons of sampled frames that could not be read.
@@ -64,6 +65,7 @@ class SequenceReport:
     posed_frames: int = 0
     motion: Motion | None = None
     pose_depth_error: float | None = None
+    mask_kinds: dict[str, int] = field(default_factory=dict)
     masked_frames: float = 0.0
     mask_ids: list[int] = field(default_factory=list)
     labelled_share: float = 0.0
@@ -84,6 +86,10 @@ def inspect_sequence(sequence: Sequence, samples: int = 8) -> SequenceReport:
     chosen = np.unique(np.linspace(0, len(sequence) - 1, max(1, min(samples, len(sequence)))).round().astype(int))
     frames = [frame for i in chosen if (frame := _try(sequence, int(i), report)) is not None]
     _describe_images(report, frames)
+    try:
+        report.mask_kinds = dict(sequence.mask_kinds())
+    except SequenceError as error:
+        report.warnings.append(str(error))
     if sequence.ground_truth is not None:
         report.posed_frames = int(np.isfinite(sequence.ground_truth).all((1, 2)).sum())
         report.motion = _motion(sequence.ground_truth)

@@ -48,9 +48,10 @@ class ScanNetFormat:
         return recording
 
     def _masks(self, folder: Path, root: Path, colors: list[Path]) -> list[Path | None]:
-        for where in (root / "instance-filt", folder / "instance-filt"):
-            if where.is_dir():
-                return find_masks(where, colors)
+        for name in ("instance-filt", "instance"):  # the first is the cleaner one
+            for place in (root / name, folder / name):
+                if place.is_dir():
+                    return find_masks(place, colors)
         return [None] * len(colors)
 
     def _calibrations(self, root: Path) -> tuple[Calibration, Calibration | None, list[str]]:

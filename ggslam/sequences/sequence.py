@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -17,11 +19,15 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.geometry import ImageGeometry, image_size
 from ggslam.sequences.images import read_color, read_depth
-from ggslam.sequences.masks import read_mask
-from ggslam.sequences.recording import Recording
+from ggslam.sequences.masks import MaskReader
+from ggslam.sequences.recording import FrameFiles, Recording
 from ggslam.sequences.stream import ReadAhead
 
 OnBadFrame = Literal["error", "skip"]
+ReadMasks = bool | Literal["lazy"]
+"""True: masks are read with the frame; "lazy": when `Frame.load_mask` is called; False: never."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,8 @@ class Sequence:
         ground_truth: float64 [n, 4, 4] T_world_camera, rows of NaN where the recording tells none; None when it
             never does.
         has_masks: whether any selected frame has a mask.
+        mask_problems: damaged masks met so far (only with on_bad_frame="skip": their frames are delivered without):
+            index of the frame -> reason.
         instance_names: mask id -> name, as far as known.
         pose_source, time_source: what told poses and times, for reports.
         warnings: what a user should know about this recording.
@@ -78,7 +86,12 @@ class Sequence:
         chosen = np.arange(len(recording.files))[selection.start : selection.stop : selection.step]
         self.timestamps: np.ndarray = recording.timestamps[chosen].astype(np.float64)
         self.ground_truth: np.ndarray | None = None if recording.poses is None else recording.poses[chosen]
-        self.has_masks: bool = any(recording.files[i].mask is not None for i in selection)
+        masked = sum(recording.files[i].mask is not None for i in selection)
+        self.has_masks: bool = masked > 0
+        self.mask_problems: dict[int, str] = {}
+        self._masks = MaskReader(entry.mask for entry in recording.files)
+        if masked < len(self) and any(entry.mask is not None for entry in recording.files):
+            self.warnings.append(f"{len(self) - masked} of {len(self)} frames have no mask")
         self._skipped: dict[int, SkippedFrame] = {}
         known = [i for i in selection if i in recording.problems]
         if on_bad_frame == "error" and known:
@@ -96,24 +109,38 @@ class Sequence:
         """Damaged frames passed over by `stream` so far, in order."""
         return [self._skipped[i] for i in sorted(self._skipped)]
 
-    def frame(self, index: int, masks: bool = True) -> Frame:
-        """Reads frame `index` of the selection (0 to len - 1); `masks=False` leaves its mask unread.
+    def files(self, index: int) -> FrameFiles:
+        """The files of frame `index` of the selection (0 to len - 1).
 
         Raises:
-            SequenceError: no such frame, or it is damaged (whatever `on_bad_frame` says).
+            SequenceError: no such frame.
         """
         if not 0 <= index < len(self):
             raise SequenceError(f"{self.path}: expected a frame from 0 to {len(self) - 1}, found {index}")
+        return self._recording.files[self._selection[index]]
+
+    def mask_kinds(self) -> Counter[str]:
+        """How the masks of the selected frames are stored: "grey", "palette", "RGB-coded", ... -> number of frames.
+
+        Raises:
+            SequenceError: they hold more than 65535 ids.
+        """
+        masks = (self.files(index).mask for index in range(len(self)))
+        return self._masks.kinds(mask for mask in masks if mask is not None)
+
+    def frame(self, index: int, masks: ReadMasks = True) -> Frame:
+        """Reads frame `index` of the selection (0 to len - 1), its mask as `masks` says.
+
+        Raises:
+            SequenceError: no such frame, or it is damaged (whatever `on_bad_frame` says), or, unless
+                on_bad_frame="skip", its mask is.
+        """
+        files = self.files(index)
         source = self._selection[index]
         if source in self._recording.problems:
             raise SequenceError(self._recording.problems[source])
-        files = self._recording.files[source]
         color, depth = self._read(source)
         self._geometry.check(color, depth, files)
-        mask = None
-        if masks and files.mask is not None:
-            # Masks drawn on the aligned depth image are as good as masks on the colour image.
-            mask = self._geometry.mask(read_mask(files.mask, self._geometry.color_size, self._geometry.depth_size))
         pose = None if self.ground_truth is None else self.ground_truth[index]
         return Frame(
             index=index,
@@ -122,13 +149,14 @@ class Sequence:
             color=self._geometry.color(color),
             depth=self._geometry.depth(depth),
             camera=self.camera,
-            mask=mask,
+            mask=self._mask(index) if masks is True else None,
             T_world_camera=pose.copy() if pose is not None and np.isfinite(pose).all() else None,
+            mask_loader=partial(self._mask, index) if masks == "lazy" and files.mask is not None else None,
         )
 
-    def stream(self, prefetch: int = 4, masks: bool = True) -> Iterator[Frame]:
+    def stream(self, prefetch: int = 4, masks: ReadMasks = True) -> Iterator[Frame]:
         """All frames in order, at most `prefetch` of them read ahead by one background thread (0: no thread).
-        `masks=False` leaves masks unread, which saves a quarter of the time.
+        Masks are read as `masks` says; leaving them saves a quarter of the time.
 
         The thread ends when the iterator is used up, closed or garbage collected.
 
@@ -143,7 +171,7 @@ class Sequence:
             for attempt in attempts:
                 yield from self._passed(attempt)
 
-    def _attempt(self, index: int, masks: bool) -> Frame | SkippedFrame:
+    def _attempt(self, index: int, masks: ReadMasks) -> Frame | SkippedFrame:
         try:
             return self.frame(index, masks)
         except SequenceError as error:
@@ -156,6 +184,24 @@ class Sequence:
             self._skipped[attempt.index] = attempt
         else:
             yield attempt
+
+    def _mask(self, index: int) -> np.ndarray | None:
+        """Mask of a frame, uint16 [H, W]; None when it has none or, with on_bad_frame="skip", a damaged one."""
+        path = self.files(index).mask
+        if path is None:
+            return None
+        self._masks.prepare()  # what is wrong with all masks is not forgiven
+        try:
+            # Masks drawn on the aligned depth image are as good as masks on the colour image.
+            ids = self._masks.read(path, self._geometry.color_size, self._geometry.depth_size)
+        except SequenceError as error:
+            if self._on_bad_frame == "error":
+                raise
+            if index not in self.mask_problems:
+                _log.warning("frame %d goes without its mask: %s", index, error)
+            self.mask_problems[index] = str(error)
+            return None
+        return self._geometry.mask(ids)
 
     def _read(self, source: int) -> tuple[np.ndarray, np.ndarray]:
         files = self._recording.files[source]

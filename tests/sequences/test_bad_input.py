@@ -71,12 +71,6 @@ def break_frame(folder: Path, damage: str) -> str:
     if damage == "8-bit depth":
         assert cv2.imwrite(str(depth), np.ones((24, 32), np.uint8))
         return r"depth000003\.png: expected a 16-bit depth image with one channel, found 1 channel of 8-bit"
-    if damage == "coloured mask":
-        assert cv2.imwrite(
-            str(folder / "semantic_instance" / "semantic_instance_3.png"),
-            np.eye(24, 32, dtype=np.uint8)[..., None] * [1, 2, 3],
-        )
-        return r"semantic_instance_3\.png: expected a mask of grey 8- or 16-bit instance ids, found 3 channels"
     lines = (folder / "traj.txt").read_text().splitlines()
     lines[3] = lines[3].replace(lines[3].split()[3], "nan")
     (folder / "traj.txt").write_text("\n".join(lines))
@@ -85,7 +79,7 @@ def break_frame(folder: Path, damage: str) -> str:
 
 DAMAGES = (
     "missing depth", "truncated png", "truncated in the last bytes", "flipped bit", "truncated jpg", "empty file",
-    "text file", "depth of another size", "8-bit depth", "coloured mask", "nan pose",
+    "text file", "depth of another size", "8-bit depth", "nan pose",
 )  # fmt: skip
 
 

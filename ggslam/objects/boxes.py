@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a set of points is: its middle and the box around it along its own axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import pydantic
+
+Number = Annotated[float, pydantic.Field(allow_inf_nan=False)]
+Vector = tuple[Number, Number, Number]
+TRIMMED = 0.01
+"""Share of the points, the farthest from the middle, that a box need not hold: floaters would inflate it."""
+
+
+@dataclass(frozen=True)
+class OrientedBox:
+    """A box in any orientation.
+
+    Attributes:
+        center: metres, world frame.
+        axes: three orthogonal unit vectors (right-handed), the directions of `size`; the longest spread first.
+        size: metres along the axes.
+    """
+
+    center: Vector
+    axes: tuple[Vector, Vector, Vector]
+    size: Vector
+
+
+def middle_of(points: np.ndarray, weights: np.ndarray) -> Vector:
+    """Weighted mean of points [M, 3] without the farthest (`TRIMMED`)."""
+    kept = _kept(points)
+    return _vector(np.average(points[kept].astype(np.float64), axis=0, weights=weights[kept].astype(np.float64)))
+
+
+def oriented_box(points: np.ndarray) -> OrientedBox:
+    """Box along the principal axes of points [M, 3], M >= 1, without the farthest (`TRIMMED`). Fewer than three points
+    leave axes undetermined: these are chosen along the coordinates."""
+    from sklearn.decomposition import PCA  # slow to import
+
+    inner = points[_kept(points)].astype(np.float64)
+    axes = np.eye(3)
+    if len(inner) >= 3:
+        with np.errstate(invalid="ignore"):  # points that are all one have no variance to share out
+            axes = PCA(3, svd_solver="full").fit(inner).components_
+    elif len(inner) == 2 and np.any(inner[1] != inner[0]):
+        axes = np.linalg.qr(np.column_stack([inner[1] - inner[0], np.eye(3)]))[0].T
+    # Signs are free: make each axis' largest part positive, and the three right-handed.
+    axes = axes * np.sign(axes[np.arange(3), np.abs(axes).argmax(1)])[:, None]
+    axes[2] *= np.sign(np.linalg.det(axes))
+    along = inner @ axes.T
+    low, high = along.min(0), along.max(0)
+    first, second, third = map(_vector, axes)
+    return OrientedBox(_vector((low + high) / 2 @ axes), (first, second, third), _vector(high - low))
+
+
+def _kept(points: np.ndarray) -> np.ndarray:
+    """bool [M]: all but the share `TRIMMED` of points that are farthest from the median."""
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return distance <= np.quantile(distance, 1 - TRIMMED, method="higher")
+
+
+def _vector(values: np.ndarray) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Segments from a user's own model: a YOLO-seg or SAM-family export in ONNX, run by onnxruntime."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ggslam.errors import ConfigError, MissingDependency, check_ranges
+from ggslam.objects.mask_painting import distinct_masks, paint_segments
+from ggslam.objects.onnx_outputs import PROTOTYPE_GREY, Candidates, Letterbox, mask_candidates, yolo_candidates
+
+IMAGENET_MEAN = np.array((0.485, 0.456, 0.406), np.float32)
+IMAGENET_DEVIATION = np.array((0.229, 0.224, 0.225), np.float32)
+_INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
+
+
+@dataclass(frozen=True)
+class OnnxSegmenterSettings:
+    """How a model is fed and which of its masks are believed."""
+
+    detection_score: float = 0.25
+    """Lowest class score of a detection (YOLO family)."""
+    mask_quality: float = 0.7
+    """Lowest score of a mask (SAM family: the intersection over union that the model predicts for it)."""
+    overlap: float = 0.7
+    """Of two masks whose intersection over union is above this, the one with the lower score goes."""
+    min_area: float = 5e-4
+    """Segments smaller than this share of the image are left out."""
+    max_masks: int = 300
+    """So many masks of the highest scores are looked at."""
+    input_size: int = 640
+    """Width and height of the model's input in pixels, if the model leaves them open."""
+    pixels: Literal["unit", "imagenet"] = "unit"
+    """What a model with real numbers as input expects: values from 0 to 1, or these less ImageNet's mean, divided by
+    its standard deviation."""
+    threads: int = 0
+    """Threads of the model; 0: as many as onnxruntime likes."""
+
+    def __post_init__(self) -> None:
+        if self.pixels not in ("unit", "imagenet"):
+            raise ConfigError(f"OnnxSegmenterSettings.pixels: expected unit or imagenet, found '{self.pixels}'")
+        ranges = {
+            "detection_score": (0, 1), "mask_quality": (0, 1), "overlap": (0, 1), "min_area": (0, 1),
+            "max_masks": (1, 65535), "input_size": (32, 8192), "threads": (0, 1024),
+        }  # fmt: skip
+        check_ranges(self, ranges)
+
+
+class OnnxSegmenter:
+    """Class-agnostic segments of single images. Ids mean nothing from one image to the next.
+
+    Understood are models with one image as input, [1, 3, H, W] in RGB, and as outputs
+
+    - masks and their scores (names with "mask", and "score" or "iou"): exports of the SAM family with a grid of points
+      inside; the image is put in the upper left corner of the input;
+    - detections and prototypes (an output of rank 3 and one of rank 4): exports of the YOLO-seg family, FastSAM among
+      them, with or without non-maximum suppression inside; the image is put in the middle of the input.
+    """
+
+    def __init__(self, path: str | Path, settings: OnnxSegmenterSettings | None = None) -> None:
+        """Loads a model.
+
+        Raises:
+            MissingDependency: onnxruntime is not installed.
+            ConfigError: no such file, no ONNX model, or inputs and outputs that are not understood.
+        """
+        self.path, self.settings = Path(path), settings or OnnxSegmenterSettings()
+        self._session = _open_session(self.path, self.settings.threads)
+        self._input = self._find_input()
+        self._outputs, self._gives_masks = self._find_outputs()
+        height, width = (n if isinstance(n, int) else self.settings.input_size for n in self._input.shape[2:])
+        self._size = width, height
+
+    def segment(self, color: np.ndarray) -> np.ndarray:
+        """Segments uint16 [H, W] of an image uint8 [H, W, 3] RGB: 1, 2, ... by falling area, 0 where there is none.
+
+        Where masks overlap the smaller one is on top.
+
+        Raises:
+            ConfigError: the model fails, or its outputs are not what their names and ranks say.
+        """
+        height, width = color.shape[:2]
+        letterbox = Letterbox.fit(width, height, self._size, centred=not self._gives_masks)
+        candidates = self._candidates(self._feed(letterbox.place(color, 0 if self._gives_masks else PROTOTYPE_GREY)))
+        kept = distinct_masks(candidates.coarse(self._size), candidates.scores, self.settings.overlap)
+        if len(kept) == 0:
+            return np.zeros((height, width), np.uint16)
+        masks = [candidates.mask(index, letterbox, width, height) for index in kept]
+        return paint_segments(masks, self.settings.min_area * height * width)
+
+    def _feed(self, image: np.ndarray) -> np.ndarray:
+        """The tensor [1, 3, h, w] of an image uint8 [h, w, 3], as the model wants it."""
+        dtype = _INPUT_TYPES[self._input.type]
+        if dtype is not np.uint8:
+            image = image.astype(np.float32) / 255
+            if self.settings.pixels == "imagenet":
+                image = (image - IMAGENET_MEAN) / IMAGENET_DEVIATION
+        return np.ascontiguousarray(image.transpose(2, 0, 1)[None], dtype)
+
+    def _candidates(self, tensor: np.ndarray) -> Candidates:
+        settings = self.settings
+        try:
+            first, second = self._session.run(self._outputs, {self._input.name: tensor})
+        except Exception as error:  # onnxruntime has no common class of errors
+            raise ConfigError(f"{self.path}: the model failed on an input {tensor.shape}: {error}") from None
+        try:
+            if self._gives_masks:
+                return mask_candidates(first, second, self._size, settings.mask_quality, settings.max_masks)
+            return yolo_candidates(first, second, settings.detection_score, settings.max_masks)
+        except ConfigError as error:
+            raise ConfigError(f"{self.path}: {error}") from None
+
+    def _find_input(self) -> Any:
+        inputs = self._session.get_inputs()
+        if len(inputs) == 1:
+            shape = inputs[0].shape
+            if inputs[0].type in _INPUT_TYPES and len(shape) == 4 and (shape[1] == 3 or isinstance(shape[1], str)):
+                return inputs[0]
+        raise self._not_understood()
+
+    def _find_outputs(self) -> tuple[list[str], bool]:
+        """Names of (masks, scores) and true, or of (detections, prototypes) and false."""
+        outputs = {output.name: output.shape for output in self._session.get_outputs()}
+        masks = [name for name, shape in outputs.items() if "mask" in name.lower() and len(shape) in (3, 4)]
+        scores = [name for name in outputs if name not in masks and any(w in name.lower() for w in ("score", "iou"))]
+        if masks and scores:
+            # Beside the masks some exports give the same ones smaller: "low_res_masks".
+            return [min(masks, key=lambda name: ("low" in name.lower(), len(name))), scores[0]], True
+        detections = [name for name, shape in outputs.items() if len(shape) == 3]
+        prototypes = [name for name, shape in outputs.items() if len(shape) == 4]
+        if len(detections) == 1 and len(prototypes) == 1:
+            return [detections[0], prototypes[0]], False
+        raise self._not_understood()
+
+    def _not_understood(self) -> ConfigError:
+        def text(values: Any) -> str:
+            return ", ".join(f"{value.name} {value.type} {value.shape}" for value in values)
+
+        return ConfigError(
+            f"{self.path}: not a segmentation model that is understood. Expected one image [1, 3, H, W] as input, and "
+            "masks with scores, or YOLO-seg detections with prototypes, as outputs; found inputs "
+            f"{text(self._session.get_inputs())}; outputs {text(self._session.get_outputs())}"
+        )
+
+
+def _open_session(path: Path, threads: int) -> Any:
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise MissingDependency(
+            f"to segment with {path} the package onnxruntime is needed: `pip install 'ggslam[masks]'` ({error})"
+        ) from None
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such model file")
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    options.intra_op_num_threads = threads
+    # Threads that wait for work must not take the processors from tracking and mapping.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has no common class of errors
+        raise ConfigError(f"{path}: cannot be loaded as an ONNX model: {error}") from None

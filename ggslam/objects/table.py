@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The list of the objects of a map: what each is called, where it is, how large, how sure, when it was seen."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pydantic
+
+from ggslam.errors import ConfigError, FormatError
+from ggslam.formats.atomic import write_text
+from ggslam.objects.boxes import OrientedBox, Vector, middle_of, oriented_box
+from ggslam.objects.colors import id_palette
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IdentityClassifier
+
+Supervision = Literal["masks", "associated masks", "geometry", "model"]
+"""Where the ids came from: masks whose ids are constant in time; masks made consistent by association; the geometric
+segmenter; a segmentation model."""
+
+Byte = Annotated[int, pydantic.Field(ge=0, le=255)]
+Count = Annotated[int, pydantic.Field(ge=0)]
+ObjectId = Annotated[int, pydantic.Field(ge=1, le=65535)]
+_VALUES_AT_ONCE = 1 << 22
+
+
+@dataclass(frozen=True)
+class Observation:
+    """When an object was seen: first and last frame, and in how many views (keyframes)."""
+
+    first_frame: int
+    last_frame: int
+    views: int
+
+
+@dataclass(frozen=True)
+class ObjectRecord:
+    """One object.
+
+    Attributes:
+        id: 1 to 65535.
+        name: None if nobody named it.
+        color: RGB in pictures.
+        gaussians: how many belong to it.
+        confidence: mean probability of this object over its Gaussians, by the classifier; None where the classifier
+            does not know the object.
+        centroid: mean of its Gaussians' centres by opacity, metres, world frame.
+        box: around its Gaussians' centres.
+        first_frame, last_frame: frames it was seen in; None if it was never observed.
+        views: how many views it was seen in.
+    """
+
+    id: ObjectId
+    name: str | None
+    color: tuple[Byte, Byte, Byte]
+    gaussians: Count
+    confidence: Annotated[float, pydantic.Field(ge=0, le=1)] | None
+    centroid: Vector
+    box: OrientedBox
+    first_frame: Count | None = None
+    last_frame: Count | None = None
+    views: Count = 0
+
+    def label(self) -> str:
+        """For people: the name and id, or the id alone."""
+        return f"{self.name} ({self.id})" if self.name else f"object {self.id}"
+
+
+@dataclass(frozen=True)
+class ObjectTable:
+    """The objects of a map, by rising id.
+
+    Attributes:
+        supervision: where the ids came from.
+        unlabelled_gaussians: Gaussians that belong to none.
+        objects: the records.
+    """
+
+    supervision: Supervision
+    unlabelled_gaussians: Count
+    objects: list[ObjectRecord] = field(default_factory=list)
+
+    @staticmethod
+    def build(
+        gaussians: GaussianMap,
+        classifier: IdentityClassifier,
+        supervision: Supervision,
+        names: Mapping[int, str] | None = None,
+        observations: Mapping[int, Observation] | None = None,
+    ) -> ObjectTable:
+        """Describes the objects of a map.
+
+        Args:
+            gaussians: with `object_id` and, for the confidence, identity vectors in `features`.
+            classifier: of the identity vectors.
+            supervision: see `Supervision`.
+            names: of ids, where known.
+            observations: of ids, where known.
+
+        Raises:
+            ValueError: an object id outside 0 to 65535.
+        """
+        ids = gaussians.object_id.numpy()
+        if len(ids) and not 0 <= ids.min() <= ids.max() < 1 << 16:
+            raise ValueError(f"object ids must be 0 to 65535, found {ids.min()} to {ids.max()}")
+        order = np.argsort(ids, kind="stable")
+        present, starts = np.unique(ids[order], return_index=True)
+        rows = dict(zip(present.tolist(), np.split(order, starts[1:]), strict=True)) if len(ids) else {}
+        unlabelled = len(rows.pop(0, []))
+        known, seen = names or {}, observations or {}
+        means, opacities, features = gaussians.means.numpy(), gaussians.opacities.numpy(), gaussians.features.numpy()
+        records = []
+        for name, own in rows.items():
+            observed = asdict(seen[name]) if name in seen else {}
+            records.append(
+                ObjectRecord(
+                    name, known.get(name), _color(name), len(own), _confidence(features[own], name, classifier),
+                    middle_of(means[own], opacities[own]), oriented_box(means[own]), **observed,
+                )
+            )  # fmt: skip
+        return ObjectTable(supervision, unlabelled, records)
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+    def ids(self) -> list[int]:
+        """Ids of all objects, rising."""
+        return [record.id for record in self.objects]
+
+    def record(self, object_id: int) -> ObjectRecord:
+        """The object of an id.
+
+        Raises:
+            ConfigError: no such object.
+        """
+        found = [record for record in self.objects if record.id == object_id]
+        if not found:
+            raise self._unknown(str(object_id))
+        return found[0]
+
+    def find(self, name_or_id: str) -> list[int]:
+        """Ids that "mug" or "7" stand for; a name that several objects share stands for all of them. Case and spaces
+        around do not matter; an id goes before a name of the same digits.
+
+        Raises:
+            ConfigError: no object is called so; the message lists near names.
+        """
+        wanted = name_or_id.strip().casefold()
+        if wanted.isdecimal() and int(wanted) in self.ids():
+            return [int(wanted)]
+        found = [record.id for record in self.objects if record.name is not None and record.name.casefold() == wanted]
+        if not found:
+            raise self._unknown(name_or_id)
+        return found
+
+    def select(self, text: str) -> list[int]:
+        """Ids that a list like "mug,7" or "all" stands for, each once, in the order given.
+
+        Raises:
+            ConfigError: no object is called so, or the list is empty.
+        """
+        if text.strip().casefold() == "all":
+            return self.ids()
+        return list(dict.fromkeys(i for part in text.split(",") for i in self.find(part)))
+
+    def palette(self) -> np.ndarray:
+        """Colour of every id, uint8 [65536, 3] RGB: the table's for its objects, the usual one for others."""
+        colors = id_palette().copy()
+        for record in self.objects:
+            colors[record.id] = record.color
+        return colors
+
+    def _unknown(self, wanted: str) -> ConfigError:
+        names = sorted({record.name for record in self.objects if record.name})
+        folded = {name.casefold(): name for name in names}
+        near = [folded[name] for name in difflib.get_close_matches(wanted.strip().casefold(), folded, 3, 0.5)]
+        if near:
+            hint = f"did you mean {' or '.join(near)}?"
+        else:
+            shown = [record.label() for record in self.objects[:12]]
+            rest = len(self.objects) - len(shown)
+            hint = f"there are: {', '.join(shown) or 'none'}" + (f" and {rest} more" if rest else "")
+        return ConfigError(f"no object {wanted.strip()!r}; {hint}")
+
+    # --- on disk -----------------------------------------------------------------------------------------------------
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, as `from_dict` reads it."""
+        return asdict(self)
+
+    def save(self, path: str | Path) -> None:
+        """Writes the table as JSON, atomically."""
+        write_text(path, json.dumps(self.to_dict(), indent=1) + "\n")
+
+    @staticmethod
+    def load(path: str | Path) -> ObjectTable:
+        """Reads a table.
+
+        Raises:
+            FormatError: missing, no JSON, or not as `save` writes it; the message names the object and the field.
+        """
+        try:
+            values = json.loads(Path(path).read_text(encoding="utf-8"))
+            table = pydantic.TypeAdapter(ObjectTable).validate_python(values)
+        except FileNotFoundError:
+            raise FormatError(f"{path}: file is missing") from None
+        except pydantic.ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(str(part) for part in first["loc"]) or "top level"
+            raise FormatError(f"{path}: {place}: {first['msg']}, found {first['input']!r:.60}") from None
+        except (OSError, ValueError) as error:
+            raise FormatError(f"{path}: cannot be read: {error}") from None
+        twice = [name for name, times in Counter(table.ids()).items() if times > 1]
+        if twice:
+            raise FormatError(f"{path}: object {twice[0]} is listed twice")
+        return table
+
+
+def _color(object_id: int) -> tuple[int, int, int]:
+    red, green, blue = id_palette()[object_id].tolist()
+    return red, green, blue
+
+
+def _confidence(features: np.ndarray, object_id: int, classifier: IdentityClassifier) -> float | None:
+    """Mean probability of an object over identity vectors [M, F]; None if the classifier has no class for it."""
+    try:
+        number = classifier.class_of(object_id)
+    except KeyError:
+        return None
+    step, total = max(1, _VALUES_AT_ONCE // len(classifier)), 0.0
+    for start in range(0, len(features), step):
+        total += float(classifier.probabilities(features[start : start + step])[:, number].sum(dtype=np.float64))
+    confidence = total / len(features)
+    return min(confidence, 1.0) if math.isfinite(confidence) else None
