@@ -22,6 +22,7 @@ from ggslam.errors import ConfigError, check_ranges
 from ggslam.formats.atomic import write_text
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.settings import MapperSettings
+from ggslam.object_masks import MaskSettings
 from ggslam.tracking.keyframes import KeyframeSettings
 from ggslam.tracking.tracker import TrackerSettings
 
@@ -62,6 +63,7 @@ class Config:
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     mapping: MapperSettings = field(default_factory=MapperSettings)
     identity: IdentitySettings = field(default_factory=IdentitySettings)
+    masks: MaskSettings = field(default_factory=MaskSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
 
     def __post_init__(self) -> None:

@@ -101,8 +101,11 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
         raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
     for skipped in sequence.skipped:
         observer.note(f"skipped: {skipped.reason}")
+    for problem in sequence.mask_problems.values():
+        observer.note(f"mask not used: {problem}")
     with uninterrupted():
-        folder.save(config, describe(request.sequence, sequence), result, None if error is None else repr(error))
+        names = sequence.instance_names
+        folder.save(config, describe(request.sequence, sequence), result, None if error is None else repr(error), names)
     outcome = RunOutcome(folder, result, error=error)
     if request.evaluate and error is None:
         outcome.metrics = score_run(folder, sequence, observer)
@@ -129,10 +132,10 @@ def run_slam(sequence: Sequence, config: Config, observer: Observer) -> tuple[Sl
     """The loop over a recording, synchronous or in real time as the settings say."""
     observer.begin("track + map", len(sequence))
     error: BaseException | None = None
-    slam = Slam(sequence.camera, config)
+    slam = Slam(sequence.camera, config, sequence.has_masks)
     try:
         if config.realtime_fps > 0:
-            RealtimeSlam(slam, config.realtime_fps).run(sequence.stream(masks=False), observer.frame)
+            RealtimeSlam(slam, config.realtime_fps).run(sequence.stream(masks="lazy"), observer.frame)
         else:
             _run_synchronous(slam, sequence, observer)
         if config.refine_iterations:
@@ -144,16 +147,18 @@ def run_slam(sequence: Sequence, config: Config, observer: Observer) -> tuple[Sl
 
 
 def _run_synchronous(slam: Slam, sequence: Sequence, observer: Observer) -> None:
-    for frame in sequence.stream(masks=False):  # nothing here looks at masks yet
+    for frame in sequence.stream(masks="lazy"):  # only those of keyframes are read
         observer.frame(slam.step(frame))
 
 
 def describe(request: SequenceRequest, sequence: Sequence) -> dict[str, Any]:
     """What `sequence.json` holds: how to open the recording again, and its camera."""
-    values = {**asdict(request), "path": request.path.absolute()}
+    masks = None if request.masks is None else request.masks.absolute()
+    values = {**asdict(request), "path": request.path.absolute(), "masks": masks}
     return {
         "open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence),
         "warnings": sequence.warnings, "skipped": [asdict(skipped) for skipped in sequence.skipped],
+        "mask_problems": sequence.mask_problems,
     }  # fmt: skip
 
 

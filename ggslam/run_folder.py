@@ -19,6 +19,7 @@ import os
 import resource
 import shutil
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -106,7 +107,10 @@ class RunFolder:
 
     # --- writing -----------------------------------------------------------------------------------------------------
 
-    def save(self, config: Config, sequence: dict[str, Any], result: SlamResult, error: str | None = None) -> None:
+    def save(
+        self, config: Config, sequence: dict[str, Any], result: SlamResult, error: str | None = None,
+        names: Mapping[int, str] | None = None,
+    ) -> None:  # fmt: skip
         """Writes everything but scores and pictures.
 
         Args:
@@ -114,6 +118,7 @@ class RunFolder:
             sequence: how the recording was read, as keyword arguments of `open_sequence`, for scoring later.
             result: of the run.
             error: why the run stopped early, if it did.
+            names: of object ids, as far as the recording knows them.
         """
         mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish"}
         self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
@@ -125,7 +130,10 @@ class RunFolder:
         self.write_json("timing.json", timing(result))
         self.write_json("keyframes.json", _keyframes(result))
         write_tum(self.path / "trajectory.txt", result.timestamps(), result.trajectory())
-        write_gaussian_ply(self.path / "map.ply", result.gaussians)
+        if result.objects is None:
+            write_gaussian_ply(self.path / "map.ply", result.gaussians)
+        else:
+            self.save_objects(segmented(result, names))
         self.write_json(MARKER, {**mark, "complete": error is None, "stopped_by": error})
         # Last and largest; `ggslam export --format points` makes them again from the map.
         write_points(self.path, sample_points(result.gaussians))
@@ -221,6 +229,15 @@ class RunFolder:
         """
         path = self.path / "votes.npz"
         return ObjectVotes.from_file(path) if path.is_file() else None
+
+
+def segmented(result: SlamResult, names: Mapping[int, str] | None = None) -> SegmentedMap:
+    """A run's map with its objects. Names are taken only where ids are the masks' own."""
+    assert result.objects is not None
+    found = result.objects
+    known = names if found.supervision == "masks" else None
+    table = ObjectTable.build(result.gaussians, found.classifier, found.supervision, known, found.observations)
+    return SegmentedMap(result.gaussians, found.classifier, table, ObjectVotes.of(result.gaussians))
 
 
 def json_ready(value: Any) -> Any:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -22,10 +23,12 @@ from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper, MapperTimes
 from ggslam.native.loader import NativeContext
+from ggslam.object_masks import ObjectMasks, observations
+from ggslam.objects.table import Observation, Supervision
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import IDENTITY_CHANNELS
+from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
 from ggslam.scene.poses import inverse
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.surface import MeasuredSurface
@@ -93,6 +96,21 @@ class SlamTimes:
             self.wall = time.perf_counter() - self._started
 
 
+@dataclass(frozen=True)
+class LearnedObjects:
+    """Objects of a run; the Gaussians' `object_id`, `features` and votes belong to them.
+
+    Attributes:
+        classifier: of identity vectors.
+        supervision: what taught them.
+        observations: where each object was seen.
+    """
+
+    classifier: IdentityClassifier
+    supervision: Supervision
+    observations: dict[int, Observation]
+
+
 @dataclass
 class SlamResult:
     """A run.
@@ -105,6 +123,7 @@ class SlamResult:
         mapper_times: seconds spent mapping, by part.
         dropped_frames: indices of frames that were not tracked (real-time runs that fell behind).
         refine_iterations: optimisation steps of the final refinement.
+        objects: what was learned about objects; None if nothing was.
     """
 
     gaussians: GaussianMap
@@ -114,6 +133,7 @@ class SlamResult:
     mapper_times: MapperTimes
     dropped_frames: list[int] = field(default_factory=list)
     refine_iterations: int = 0
+    objects: LearnedObjects | None = None
 
     def trajectory(self) -> np.ndarray:
         """T_world_camera of every frame, float64 [n, 4, 4], NaN for lost ones; the world is the first keyframe's
@@ -149,13 +169,16 @@ class Slam:
     Args:
         camera: of all frames.
         config: all settings.
+        has_masks: whether the recording has object masks; None: judged by the first keyframe's frame.
     """
 
-    def __init__(self, camera: Camera, config: Config | None = None) -> None:
+    def __init__(self, camera: Camera, config: Config | None = None, has_masks: bool | None = None) -> None:
         self.camera = camera
         self.config = config or Config()
         self.context = NativeContext(self.config.threads or None)
-        learner = IdentityLearner(self.config.identity, self.config.seed) if self.config.identity.enabled else None
+        self.masks = ObjectMasks(self.config.masks, has_masks)
+        wanted = self.config.identity.enabled and self.masks.active
+        learner = IdentityLearner(self.config.identity, self.config.seed) if wanted else None
         self.map = GaussianMap(self.config.sh_degree, IDENTITY_CHANNELS if learner else 0)
         self.tracker = Tracker(camera, self.config.tracking, self.context)
         self.surface = MeasuredSurface(self.config.tracking.target, self.context)
@@ -198,15 +221,26 @@ class Slam:
         finally:  # an interrupted refinement counts for what it did
             self.refine_iterations = self.mapper.times.iterations - before
             self.times.refinement = time.perf_counter() - start
-        self.mapper.finish_identity()
         return self.result()
 
     def result(self) -> SlamResult:
-        """What there is so far."""
+        """What there is so far. Objects are settled here: to be called once, at the end."""
         return SlamResult(
             self.map, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
-            self.refine_iterations,
+            self.refine_iterations, self._objects(),
         )  # fmt: skip
+
+    def _objects(self) -> LearnedObjects | None:
+        """The last identity steps, and every Gaussian's object."""
+        identity = self.mapper.identity
+        if identity is None or not identity.table.count:
+            return None
+        seen = observations(self.mapper.keyframes, identity.current)
+        noise = self.masks.noise(seen)
+        identity.forget(self.map, noise)
+        self.mapper.finish_identity()
+        kept = {i: observation for i, observation in seen.items() if i not in noise}
+        return LearnedObjects(identity.classifier, self.masks.supervision, kept)
 
     # --- its parts, also used by the real-time loop ------------------------------------------------------------------
 
@@ -234,7 +268,7 @@ class Slam:
 
     def insert(self, frame: Frame, tracking: TrackingResult) -> None:
         """A keyframe goes into the map and into what the tracker aligns to."""
-        self.mapper.add_keyframe(frame, tracking.T_world_camera, lambda keyframe, show: frame.mask)
+        self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
         self.tracker.set_target(self.surface.add(tracking.points, tracking.T_world_camera))
 
     def anchor_to(self, T_world_camera: np.ndarray) -> None:

@@ -85,6 +85,8 @@ class IdentityLearner:
         self._rng = np.random.default_rng([self.seed, 16])
         self.table = ClassTable(self._rng)
         self._alias = np.arange(65536, dtype=np.uint16)
+        self._whole_of = np.zeros(65536, np.uint16)
+        self._shown: np.ndarray | None = None  # labels by votes, of the last keyframe's time
         self._pools: dict[int, PixelPool] = {}
         self._index = NeighbourIndex(self.settings.neighbours.growth)
         self._iterations = 0
@@ -102,6 +104,7 @@ class IdentityLearner:
 
     def observe(self, mask: np.ndarray) -> None:
         """A keyframe with this mask (uint16 [H, W]) arrives: its objects get classes."""
+        self._shown = None
         self.table.add(np.flatnonzero(np.bincount(self.current(mask).reshape(-1), minlength=1)).astype(np.uint16))
 
     def merge(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
@@ -118,6 +121,40 @@ class IdentityLearner:
             wrong = self.table.classifier.labels(gaussians.features.numpy())[0] == dropped
             self.table.remove(dropped)
             gaussians.features.numpy()[wrong] = self.table.codes(np.where(labels[wrong] > 0, labels[wrong], kept))
+
+    def split(
+        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, mask: np.ndarray, whole: int, part: int
+    ) -> None:
+        """An object turned out to be two: what the last rendering shows where `mask` [H, W] has the part, and more of it
+        there than elsewhere, now votes for the part as it did for the whole. In older keyframes the map decides from
+        now on which pixels of the whole are the part's (`_as_mapped`)."""
+        whole, part = int(self._alias[whole]), int(self._alias[part])
+        if whole == part:
+            return
+        self._whole_of[part] = whole
+        terms = rasterizer.pixel_terms(np.arange(mask.size))
+        inside = self.current(mask.reshape(-1)) == part
+        used = np.arange(terms.weights.shape[1]) < terms.counts[:, None]
+        weights = np.where(used, terms.weights, 0)
+        size = len(gaussians)
+        here = np.bincount(terms.gaussians[inside][used[inside]], terms.weights[inside][used[inside]], size)
+        everywhere = np.bincount(terms.gaussians[used], weights[used], size)
+        rows = np.flatnonzero(here > 0.5 * np.maximum(everywhere, 1e-9))
+        ids = gaussians.vote_ids.numpy()
+        ids[rows] = np.where(ids[rows] == whole, part, ids[rows])
+        merge_votes(gaussians, self._alias)
+        self._shown = None
+        if self.settings.initialisation == "votes" and len(rows):
+            gaussians.features.numpy()[rows] = self.table.codes(vote_labels(gaussians)[rows])
+
+    def _as_mapped(self, gaussians: GaussianMap, terms: PixelTerms, labels: np.ndarray) -> np.ndarray:
+        """Labels of pixels, those of a whole replaced by its part's where the map shows the part."""
+        if not self._whole_of.any():
+            return labels
+        if self._shown is None or len(self._shown) != len(gaussians):
+            self._shown = vote_labels(gaussians)
+        shown, _ = terms.labels(self._shown)
+        return np.where((self._whole_of[shown] == labels) & (shown > 0), shown, labels)
 
     def begin(self, gaussians: GaussianMap, rows: slice, labels: np.ndarray) -> None:
         """New Gaussians get their first identity vectors and votes.
@@ -165,6 +202,7 @@ class IdentityLearner:
             assert keyframe.mask is not None
             labels = self.current(keyframe.mask.reshape(-1)[pixels])
             terms = rasterizer.pixel_terms(pixels, TERMS, MIN_WEIGHT)
+            labels = self._as_mapped(gaussians, terms, labels)
             terms.vote(gaussians, labels, vote_weights)
             if self.settings.schedule == "sampled":
                 self._train(gaussians, terms, self.table.classes(labels), rate_factor)
@@ -234,6 +272,13 @@ class IdentityLearner:
         part = slice(pool.used, pool.used + self.settings.pixels)
         pool.used = part.stop
         return pool.pixels[part], pool.vote_weights[part]
+
+    def forget(self, gaussians: GaussianMap, object_ids: list[int]) -> None:
+        """Objects that were none: their class goes, their Gaussians become what else they look like."""
+        for object_id in object_ids:
+            self.table.remove(object_id)
+            self._alias[self._alias == object_id] = 0
+        merge_votes(gaussians, self._alias)
 
     # --- results ------------------------------------------------------------------------------------------------------
 
@@ -337,6 +382,7 @@ def merge_votes(gaussians: GaussianMap, alias: np.ndarray) -> None:
     """Replaces ids in the votes by `alias` [65536]; slots that then name one object become one."""
     ids, weights = gaussians.vote_ids.numpy(), gaussians.vote_weights.numpy()
     ids[:] = alias[ids]
+    weights[ids == 0] = 0
     for a in range(ids.shape[1]):
         for b in range(a + 1, ids.shape[1]):
             same = (ids[:, a] == ids[:, b]) & (ids[:, a] != 0)

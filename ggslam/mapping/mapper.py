@@ -15,6 +15,7 @@ from ggslam.mapping.exposure import ExposureAdam
 from ggslam.mapping.identity import IdentityLearner, vote_labels
 from ggslam.mapping.insertion import fill_gaussians, new_gaussians, unexplained
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
+from ggslam.mapping.labelling import KeyframeLabels, Labeller, MapLabels
 from ggslam.mapping.losses import ImageLoss, KeyframeImages
 from ggslam.mapping.pruning import prune
 from ggslam.mapping.sampling import KeyframeSampler
@@ -28,26 +29,6 @@ from ggslam.scene.gaussian_map import GaussianMap
 
 FINAL_DECAY = 0.2
 """The last identity steps fall to this share of their length."""
-
-
-@dataclass(frozen=True)
-class MapLabels:
-    """What the map shows from a new keyframe's pose before anything is inserted there.
-
-    Attributes:
-        ids: uint16 [H, W], object with the largest rendering weight by votes, 0 = none.
-        confidence: float32 [H, W], its share of the pixel's weight, 0 where nothing is rendered.
-        depth: float32 [H, W], metres, 0 = nothing.
-    """
-
-    ids: np.ndarray
-    confidence: np.ndarray
-    depth: np.ndarray
-
-
-Labeller = Callable[[Keyframe, "Callable[[], MapLabels] | None"], "np.ndarray | None"]
-"""Gives the object mask (uint16 [H, W], 0 = unlabelled) of a new keyframe, or None. The second argument shows the map
-from there; None for the first keyframe. Called once, during insertion."""
 
 
 @dataclass
@@ -136,9 +117,7 @@ class Mapper:
             where = unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
         if self.identity is not None and labeller is not None:
-            keyframe.mask = labeller(keyframe, show)
-            if keyframe.mask is not None:
-                self.identity.observe(keyframe.mask)
+            self._take_labels(self.identity, keyframe, labeller(keyframe, show))
         parts = [new_gaussians(keyframe.color, depth, keyframe.camera, T_world_camera, where, s)]
         if s.fill_stride:
             parts.append(fill_gaussians(keyframe.color, depth, alpha, keyframe.camera, T_world_camera, s))
@@ -152,6 +131,17 @@ class Mapper:
                 mask = keyframe.mask
                 labels = np.zeros(len(new.pixels), np.uint16) if mask is None else mask.reshape(-1)[new.pixels]
                 self.identity.begin(self.map, rows, labels)
+
+    def _take_labels(self, identity: IdentityLearner, keyframe: Keyframe, labels: KeyframeLabels) -> None:
+        """The rasterizer's last rendering is the map as the keyframe sees it (if there was a map)."""
+        keyframe.mask = labels.mask
+        if labels.mask is None:
+            return
+        for kept, dropped in labels.merges:
+            identity.merge(self.map, kept, dropped)
+        identity.observe(labels.mask)
+        for whole, part in labels.splits:
+            identity.split(self.map, self._rasterizer, labels.mask, whole, part)
 
     def _show_labels(self, alpha: np.ndarray, depth: np.ndarray, stride: int = 2) -> MapLabels:
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""

@@ -193,7 +193,7 @@ class CpuRasterizer:
         last = self._require_last()
         pixels = np.ascontiguousarray(pixels, np.int32)
         size = last.buffers.alpha.numel()
-        if len(pixels) and not (0 <= int(pixels.min()) and int(pixels.max()) < size):
+        if len(pixels) and (int(pixels.min()) < 0 or int(pixels.max()) >= size):
             raise RenderError(f"pixel_terms: pixels must be 0 to {size - 1}, found {pixels.min()} to {pixels.max()}")
         terms = PixelTerms.empty(len(pixels), capacity, self.context)
         self._check(

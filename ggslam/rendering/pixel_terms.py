@@ -168,6 +168,9 @@ class PixelTerms:
             gaussian_labels: label of each Gaussian of the map, uint16 [N].
         """
         gaussian_labels = np.ascontiguousarray(gaussian_labels, np.uint16)
+        used = np.arange(self.gaussians.shape[1]) < self.counts[:, None]
+        if self.gaussians.max(initial=-1, where=used) >= len(gaussian_labels):
+            raise RenderError(f"gaussian_labels: a label for every Gaussian of the map, found {len(gaussian_labels)}")
         ids, shares = np.empty(len(self), np.uint16), np.empty(len(self), np.float32)
         _native.rasterizer_library().ggslam_terms_label(
             self.context.handle, ctypes.byref(self.native()), gaussian_labels.ctypes.data, ids.ctypes.data,

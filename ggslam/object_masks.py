@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the object masks of keyframes come from: the recording's masks, a model's or a geometric segmenter's segments,
+cleaned and, unless their ids prove consistent over time, matched with the objects that the map already shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from ggslam.errors import SequenceError, check_ranges
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.labelling import KeyframeLabels, MapLabels
+from ggslam.objects.association import Associator, MapView
+from ggslam.objects.geometric_segmenter import GeometricSegmenter
+from ggslam.objects.onnx_segmenter import OnnxSegmenter, OnnxSegmenterSettings
+from ggslam.objects.segments import boundary_trust, clean_segments
+from ggslam.objects.settings import AssociationSettings, CleaningSettings, GeometricSettings
+from ggslam.objects.table import Observation, Supervision
+from ggslam.scene.frame import Frame
+
+Source = Literal["auto", "recording", "geometry", "model", "none"]
+
+
+@dataclass(frozen=True)
+class MaskSettings:
+    """Where object masks come from and what is done to them."""
+
+    source: Source = "auto"
+    """auto: `model` if one is named, else the recording's masks if it has any, else geometry; none: learn no objects."""
+    model: str = ""
+    """ONNX file of a segmentation model (YOLO-seg or SAM family); needs the extra [masks]."""
+    min_views: int = 2
+    """Objects found by a segmenter or by association on fewer keyframes than this are noise (short runs: on any)."""
+    cleaning: CleaningSettings = field(default_factory=CleaningSettings)
+    association: AssociationSettings = field(default_factory=AssociationSettings)
+    geometry: GeometricSettings = field(default_factory=GeometricSettings)
+    onnx: OnnxSegmenterSettings = field(default_factory=OnnxSegmenterSettings)
+
+    def __post_init__(self) -> None:
+        check_ranges(self, {"min_views": (1, 10**6)})
+
+
+class ObjectMasks:
+    """Gives each keyframe its object mask.
+
+    Args:
+        settings: see there.
+        has_masks: whether the recording has masks; None: judged by the first keyframe.
+
+    Raises:
+        ConfigError: the model cannot be read.
+        MissingDependency: onnxruntime is not installed.
+    """
+
+    def __init__(self, settings: MaskSettings, has_masks: bool | None = None) -> None:
+        self.settings = settings
+        self._source: Source | None = _choose(settings, has_masks)
+        self._segment: Callable[[Frame], np.ndarray] | None = None
+        if self._source == "model":
+            model = OnnxSegmenter(settings.model, settings.onnx)
+            self._segment = lambda frame: model.segment(frame.color)
+        self._associator = Associator(settings.association)
+
+    @property
+    def active(self) -> bool:
+        """Whether any keyframe may get a mask."""
+        return self._source != "none"
+
+    @property
+    def supervision(self) -> Supervision:
+        """What the masks were."""
+        if self._source == "geometry":
+            return "geometry"
+        if self._source == "model":
+            return "model"
+        return "masks" if self._associator.uses_own_ids is not False else "associated masks"
+
+    def labels(
+        self, frame: Frame, keyframe: Keyframe, show: Callable[[], MapLabels] | None
+    ) -> KeyframeLabels:
+        """Objects of a new keyframe.
+
+        Args:
+            frame: that it is made of.
+            keyframe: with its pose.
+            show: what the map shows from there; None when it is empty.
+
+        Raises:
+            SequenceError: the frame's mask is damaged or of another size than its images.
+        """
+        segments = self._segments(frame)
+        if segments is None or not segments.any():
+            return KeyframeLabels(segments)
+        own_ids = self._source == "recording" and self._associator.uses_own_ids
+        if own_ids:
+            return KeyframeLabels(segments)
+        depth, view = keyframe.depth_m(), None
+        if show is not None:
+            shown = show()
+            view = MapView(shown.ids, shown.confidence, shown.depth)
+        # Ids that are consistent over time are taken as they are: only an association needs clean segments.
+        cleaned = segments if self._source == "geometry" else clean_segments(segments, self.settings.cleaning)
+        found = self._associator.associate(cleaned, view, depth, keyframe.camera, keyframe.T_world_camera)
+        if self._source == "recording" and self._associator.uses_own_ids is not False:
+            return KeyframeLabels(segments, found.merges)
+        trusted = boundary_trust(found.ids, depth, self.settings.cleaning)
+        return KeyframeLabels(np.where(trusted, found.ids, 0).astype(np.uint16), found.merges, found.splits)
+
+    def _segments(self, frame: Frame) -> np.ndarray | None:
+        if self._source in (None, "recording"):
+            mask = frame.load_mask()
+            if self._source is None:
+                self._source = "geometry" if mask is None else "recording"
+            if self._source == "recording":
+                return mask if mask is None else _checked(mask, frame)
+        if self._segment is None:
+            segmenter = GeometricSegmenter(self.settings.geometry)
+            self._segment = lambda frame: segmenter.segment(frame.color, frame.depth, frame.camera)
+        return self._segment(frame)
+
+    def noise(self, observations: dict[int, Observation]) -> list[int]:
+        """Objects that were seen too rarely to be believed."""
+        if self.supervision == "masks":
+            return []
+        most = max((o.views for o in observations.values()), default=0)
+        return [i for i, o in observations.items() if o.views < min(self.settings.min_views, most)]
+
+
+def _choose(settings: MaskSettings, has_masks: bool | None) -> Source | None:
+    if settings.source == "auto":
+        if settings.model:
+            return "model"
+        return None if has_masks is None else "recording" if has_masks else "geometry"
+    if settings.source == "recording" and has_masks is False:
+        raise SequenceError("masks.source=recording: the recording has no masks")
+    return settings.source
+
+
+def _checked(mask: np.ndarray, frame: Frame) -> np.ndarray:
+    if mask.shape != frame.depth.shape or mask.dtype != np.uint16:
+        raise SequenceError(
+            f"frame {frame.source_index}: mask is {mask.dtype} {list(mask.shape)}, expected uint16 "
+            f"{list(frame.depth.shape)}"
+        )
+    return mask
+
+
+def observations(keyframes: list[Keyframe], current: Callable[[np.ndarray], np.ndarray]) -> dict[int, Observation]:
+    """First and last frame and number of keyframes in which each object was seen.
+
+    Args:
+        keyframes: with masks or without.
+        current: object ids -> ids after merges.
+    """
+    seen: dict[int, list[int]] = {}
+    for keyframe in keyframes:
+        if keyframe.mask is not None:
+            for i in np.flatnonzero(np.bincount(current(keyframe.mask).reshape(-1))).tolist():
+                seen.setdefault(i, []).append(keyframe.frame_index)
+    return {i: Observation(min(frames), max(frames), len(frames)) for i, frames in seen.items() if i}

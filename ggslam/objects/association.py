@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From segments of single frames to objects that keep their ids: matching with what the map already shows.
+
+The map's labels, rendered into the keyframe, take the place of a tracker: a segment belongs to the object it overlaps
+where map and measurement show the same surface. Wrong beginnings are repaired by evidence that gathers over keyframes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ggslam.objects.consistency import ConsistencyJudge
+from ggslam.objects.evidence import PairEvidence, touching
+from ggslam.objects.fragments import Fragment, FragmentMemory
+from ggslam.objects.overlap import MapView, Overlap, numbered, overlap_of
+from ggslam.objects.settings import AssociationSettings
+from ggslam.scene.camera import Camera
+
+__all__ = ["Association", "Associator", "MapView"]
+
+_log = logging.getLogger(__name__)
+_IDS = 1 << 16
+_MIN_SHARED = 5
+_DOMINANT = 0.8
+_CANDIDATE = 0.3
+_SHARE_OF_BIG = 0.2
+
+
+@dataclass(frozen=True)
+class Association:
+    """Object ids of one keyframe.
+
+    Attributes:
+        ids: uint16 [H, W], object id of each pixel, 0 = leave unlabelled.
+        merges: (kept, dropped) pairs, in order, of objects that turned out to be one: relabel the map.
+        created: ids that appear for the first time.
+        splits: (whole, part) pairs: the map still shows the whole where `ids` has the part. Votes that the whole has
+            on those pixels were wrong; without taking them back, the part prevails once it has more of its own.
+    """
+
+    ids: np.ndarray
+    merges: list[tuple[int, int]] = field(default_factory=list)
+    created: list[int] = field(default_factory=list)
+    splits: list[tuple[int, int]] = field(default_factory=list)
+
+
+class Associator:
+    """Gives the segments of keyframe after keyframe ids that stay with their objects.
+
+    Args:
+        settings: thresholds and mode.
+        reserved: ids that are not given to new objects (because they carry names), unless the mask says so itself.
+
+    Attributes:
+        sightings: object id -> keyframes in which it was given to a segment. What was seen once is mostly noise of the
+            segmenter.
+    """
+
+    def __init__(self, settings: AssociationSettings | None = None, reserved: Collection[int] = ()) -> None:
+        self._settings = settings or AssociationSettings()
+        self._judge = ConsistencyJudge()
+        self._evidence = PairEvidence(self._settings)
+        self._fragments = FragmentMemory(self._settings)
+        self._current = np.arange(_IDS).astype(np.uint16)
+        """Id -> id of the object that it is part of by now."""
+        self._used = np.zeros(_IDS, bool)
+        self._blocked = np.zeros(_IDS, bool)
+        self._blocked[[0, *reserved]] = True
+        self._ran_out = False
+        self.sightings: dict[int, int] = {}
+
+    @property
+    def uses_own_ids(self) -> bool | None:
+        """Whether the masks' own ids are handed through; None: not settled yet."""
+        if self._settings.mode == "auto":
+            return self._judge.consistent
+        return self._settings.mode == "never"
+
+    def associate(
+        self, segments: np.ndarray, view: MapView | None, depth: np.ndarray, camera: Camera | None = None,
+        T_world_camera: np.ndarray | None = None,
+    ) -> Association:  # fmt: skip
+        """Ids for the segments of the next keyframe.
+
+        Args:
+            segments: uint16 [H, W], ids of this frame's segments, 0 = unlabelled; cleaned (see `clean_segments`).
+            view: what the map shows from here; None before there is a map.
+            depth: float32 [H, W], measured depth in metres, 0 = unknown.
+            camera, T_world_camera: where the keyframe was taken. Without them objects are never split.
+
+        Raises:
+            ValueError: images of different size.
+        """
+        sizes = {image.shape for image in (segments, depth, *((view.ids, view.confidence, view.depth) if view else ()))}
+        if len(sizes) > 1:
+            raise ValueError(f"segments, depth and view must have one size, found {sorted(sizes)}")
+        if view is None:
+            view = MapView(np.zeros_like(segments), np.zeros_like(depth), np.zeros_like(depth))
+        view = MapView(self._current[view.ids], view.confidence, view.depth)
+        overlap = overlap_of(segments, view, depth, self._settings)
+        if self._settings.mode == "auto" and len(overlap.objects):
+            before = self._judge.consistent
+            if self._judge.observe(segments, overlap) != before:
+                _log.info("ids of the masks are %sconsistent over time", "" if self._judge.consistent else "not ")
+        if self.uses_own_ids:
+            result = self._own_ids(segments, overlap)
+        else:
+            result = self._matched(view, overlap, *self._choose(overlap, depth, camera, T_world_camera))
+        for i in numbered(result.ids)[0].tolist():
+            self.sightings[i] = self.sightings.get(i, 0) + 1
+        for kept, dropped in result.merges:
+            self.sightings[kept] = max(self.sightings.get(kept, 0), self.sightings.pop(dropped, 0))
+        return result
+
+    def _choose(
+        self, overlap: Overlap, depth: np.ndarray, camera: Camera | None, T_world_camera: np.ndarray | None
+    ) -> tuple[np.ndarray, dict[int, Fragment]]:
+        best = self._best(overlap)
+        parts: dict[int, Fragment] = {}
+        if camera is not None and T_world_camera is not None:
+            parts = self._fragments.observe(overlap, best, depth, camera, T_world_camera)
+        return best, parts
+
+    def _own_ids(self, segments: np.ndarray, overlap: Overlap) -> Association:
+        new = overlap.segments[~self._used[overlap.segments]].tolist()
+        self._used[new] = True
+        # Own ids prove that what was merged before the verdict was not one.
+        self._current = np.arange(_IDS).astype(np.uint16)
+        return Association(segments.copy(), [], new)
+
+    def _matched(self, view: MapView, overlap: Overlap, best: np.ndarray, parts: dict[int, Fragment]) -> Association:
+        covered = self._covered(overlap)
+        created: list[int] = []
+        ids = np.zeros(len(overlap.segments) + 1, np.uint16)  # the last one: no segment
+        for k in range(len(overlap.segments)):
+            if k in parts and parts[k].object_id:
+                ids[k] = parts[k].object_id
+            elif best[k] >= 0 and k not in parts:
+                ids[k] = overlap.objects[best[k]]
+            else:
+                ids[k] = self._new_id(int(overlap.segments[k]))
+                created += [int(ids[k])] if ids[k] else []
+            if k in parts:
+                parts[k].object_id = int(ids[k])
+                covered[k] = False
+        image = ids[overlap.row]
+        self._keep_known(image, overlap, covered, best, parts)
+        shown = np.where(overlap.column >= 0, view.ids, np.uint16(0))
+        self._evidence.observe(overlap, touching(shown))
+        merges = self._evidence.merges()
+        for kept, dropped in merges:
+            self._current[self._current == dropped] = kept
+            self._fragments.rename(kept, dropped)
+        splits = [(part.parent, part.object_id) for part in parts.values() if part.object_id]
+        return Association(self._current[image] if merges else image, merges, created, splits)
+
+    def _covered(self, overlap: Overlap) -> np.ndarray:
+        """bool [S, O]: objects that a segment has as a whole, or with a large share of both."""
+        within, covers, visible = overlap.within, overlap.covers, overlap.shared.sum(0)
+        seen = visible >= self._settings.min_visible * overlap.row.size
+        return ((covers >= self._settings.whole) & seen) | ((within >= _CANDIDATE) & (covers >= _SHARE_OF_BIG))
+
+    def _best(self, overlap: Overlap) -> np.ndarray:
+        """int [S]: number of the object a segment belongs to, -1 = none that the map shows."""
+        best = np.full(len(overlap.segments), -1)
+        if not len(overlap.objects):
+            return best
+        s, shared, within, covers = self._settings, overlap.shared, overlap.within, overlap.covers
+        # Both shares count: a mug is not its table's although its rim may show the table, nor is the table the mug's.
+        score = np.where(within >= _CANDIDATE, within + covers, within - 2)
+        chosen = score.argmax(1)
+        rows = np.arange(len(chosen))
+        share = shared[rows, chosen] / overlap.area
+        continues = (share >= s.min_continuation) & (covers[rows, chosen] >= 0.5) & (within[rows, chosen] >= 0.5)
+        accepted = (shared[rows, chosen] >= _MIN_SHARED) & ((share >= s.min_overlap) | continues)
+        best[accepted] = chosen[accepted]
+        return best
+
+    def _keep_known(
+        self, image: np.ndarray, overlap: Overlap, covered: np.ndarray, best: np.ndarray, parts: Collection[int]
+    ) -> None:
+        """Where a segment has several objects, the map's labels stand, and new ground is nobody's unless one object
+        dominates."""
+        rows = np.array([k for k in np.flatnonzero(best >= 0) if k not in parts], int)
+        covered[rows, best[rows]] = True
+        for k in np.flatnonzero(covered.sum(1) > 1):
+            inside = overlap.row == k
+            column = overlap.column[inside]
+            keep = (column >= 0) & covered[k, column]
+            label = np.where(keep, overlap.objects[column], image[inside])
+            if overlap.within[k].max() < _DOMINANT:
+                label[column < 0] = 0
+            image[inside] = label
+
+    def _new_id(self, wanted: int) -> int:
+        """The mask's own id if no object ever had it, else the next one free; 0 when none is left."""
+        if self._used[wanted]:
+            top = int(np.flatnonzero(self._used)[-1]) + 1
+            free = np.flatnonzero(~(self._used | self._blocked))
+            later = free[free >= top]
+            if not len(free):
+                if not self._ran_out:
+                    _log.warning("more than 65535 objects: further ones stay unlabelled")
+                self._ran_out = True
+                return 0
+            wanted = int(later[0] if len(later) else free[0])
+        self._used[wanted] = True
+        return wanted

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the ids of a recording's masks mean the same object in every frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ggslam.objects.overlap import Overlap
+
+_MIN_PIXELS = 20
+_MIN_CHANGE = 0.02
+_AGREE, _DISAGREE = 0.9, 0.6
+
+
+class ConsistencyJudge:
+    """Compares the masks' ids with those of the map, keyframe by keyframe.
+
+    Consistent ids agree with the map about as well as the best one-to-one renaming of them would. The share is taken
+    both of pixels and of segments, the smaller counts: floor and wall keep their ids in many a mask whose small
+    segments do not. Keyframes in which hardly a label changed prove nothing, a resting camera's segments may come in
+    the same order again.
+
+    Attributes:
+        consistent: the verdict; None: not settled. True may be taken back, False is final.
+    """
+
+    def __init__(self) -> None:
+        self.consistent: bool | None = None
+        self._agreement: list[float] = []
+        self._previous: np.ndarray | None = None
+
+    def observe(self, segments: np.ndarray, overlap: Overlap) -> bool | None:
+        """Takes one keyframe into account; returns the verdict.
+
+        Args:
+            segments: uint16 [H, W], the mask as stored.
+            overlap: of this mask with the map.
+        """
+        changed = self._changed(segments)
+        if self.consistent is False or not changed:
+            return self.consistent
+        agreement = agreement_of(overlap)
+        if agreement is not None:
+            self._agreement = [*self._agreement[-2:], agreement]
+            self._settle()
+        return self.consistent
+
+    def _changed(self, segments: np.ndarray) -> bool:
+        previous, self._previous = self._previous, segments
+        if previous is None or previous.shape != segments.shape:
+            return True
+        return float((previous != segments).mean()) >= _MIN_CHANGE
+
+    def _settle(self) -> None:
+        recent = self._agreement
+        if len(recent) >= 2 and min(recent[-2:]) >= _AGREE:
+            self.consistent = True
+        elif len(recent) >= 2 and max(recent[-2:]) < _DISAGREE:
+            self.consistent = False
+        elif len(recent) >= 3 and self.consistent is None:
+            self.consistent = sum(recent) / len(recent) >= (_AGREE + _DISAGREE) / 2
+
+
+def agreement_of(overlap: Overlap) -> float | None:
+    """How well ids agree with the map's, 0 to 1 = as well as their best renaming; None: nothing to compare."""
+    shared = overlap.shared
+    seen = shared.sum(1) >= _MIN_PIXELS
+    if not seen.any():
+        return None
+    equal = overlap.segments[:, None] == overlap.objects[None, :]
+    rows, columns = linear_sum_assignment(-shared)
+    best = shared[rows, columns].sum()
+    pixels = shared[equal].sum() / max(best, 1)
+    own = (shared * equal).sum(1)[seen]
+    segments = float((own >= 0.5 * shared.max(1)[seen]).mean())
+    return float(min(pixels, segments))

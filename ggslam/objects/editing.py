@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Editing a segmented map: remove, keep, move, duplicate, recolour, merge and rename objects.
+
+Every function changes the map it is given and returns what it did. Objects are named by ids; `ObjectTable.select` finds
+those of names. An unknown id raises ConfigError before anything is changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from ggslam.errors import ConfigError
+from ggslam.objects.encoding import assign, code_of, with_class
+from ggslam.objects.membership import MembershipSettings, members
+from ggslam.objects.recoloring import recolor
+from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
+from ggslam.objects.table import ObjectTable, Observation
+from ggslam.rendering.types import PARAMETERS, GaussianTensors
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import quaternion_to_matrix
+
+Vector = Sequence[float]
+
+
+@dataclass(frozen=True)
+class Change:
+    """What an edit did.
+
+    Attributes:
+        text: for people.
+        before: the Gaussians concerned as they were; empty if nothing can be seen of the edit.
+        after: as they are now; empty if they are gone.
+        vacated: whether `before` left its place, so that there may be a hole.
+    """
+
+    text: str
+    before: GaussianTensors
+    after: GaussianTensors
+    vacated: bool = False
+
+
+def remove_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
+    """Removes objects with their floaters. Single Gaussians on other objects that carry a removed label take that of
+    their neighbours."""
+    what = _labels(scene, ids)
+    gone = members(scene.gaussians, scene.classifier, list(ids))
+    before = _copies(scene.gaussians, gone)
+    _keep_rows(scene, ~gone)
+    _forget(scene, ids)
+    _rebuild(scene)
+    return Change(f"removed {what}: {int(gone.sum())} Gaussians", before, _nothing(scene), vacated=True)
+
+
+def keep_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
+    """Removes everything but these objects."""
+    what = _labels(scene, ids)
+    own = {i: members(scene.gaussians, scene.classifier, [i], MembershipSettings(floaters=False)) for i in ids}
+    kept = np.logical_or.reduce(list(own.values()))
+    before = _copies(scene.gaussians, ~kept)
+    _claim(scene, own)
+    _keep_rows(scene, kept)
+    _forget(scene, [i for i in scene.table.ids() if i not in ids])
+    _rebuild(scene)
+    return Change(f"kept {what}: {int(kept.sum())} Gaussians, {len(before.means)} removed", before, _nothing(scene))
+
+
+def move_objects(
+    scene: SegmentedMap, ids: Sequence[int], shift: Vector, rotate_degrees: Vector = (0.0, 0.0, 0.0)
+) -> Change:
+    """Moves objects rigidly, as one group.
+
+    Args:
+        scene: the map.
+        ids: of the objects.
+        shift: metres along the world's axes (those of the first camera: x right, y down, z forward).
+        rotate_degrees: about lines through the group's centroid along the world's x, then y, then z axis, before the
+            shift. Floaters far from the objects stay where they are and lose their label.
+    """
+    what = _labels(scene, ids)
+    rows, stray = _claimed_rows(scene, ids)
+    before = _copies(scene.gaussians, rows)
+    T = rigid_motion(_centroid(before), shift, rotate_degrees)
+    scene.gaussians.object_id[torch.from_numpy(stray)] = 0
+    scene.gaussians.move(torch.from_numpy(rows), torch.from_numpy(T))
+    _rebuild(scene)
+    left = f", {int(stray.sum())} floaters stay unlabelled" if stray.any() else ""
+    text = f"moved {what} by {_numbers(shift)} m"
+    text += f", turned by {_numbers(rotate_degrees)} degrees" if any(rotate_degrees) else ""
+    return Change(f"{text}: {int(rows.sum())} Gaussians{left}", before, _copies(scene.gaussians, rows), vacated=True)
+
+
+def duplicate_objects(scene: SegmentedMap, ids: Sequence[int], shift: Vector) -> Change:
+    """Copies objects to another place. Each copy is an object of its own, with the next free id and its own class.
+
+    Raises:
+        ConfigError: no id is left.
+    """
+    what = _labels(scene, ids)
+    names, T, first = _names(scene.table), rigid_motion(np.zeros(3), shift), len(scene.gaussians)
+    made: list[int] = []
+    before: list[GaussianTensors] = []
+    for object_id in ids:
+        rows, _ = _claimed_rows(scene, [object_id])
+        new_id = max([*scene.table.ids(), *scene.classifier.class_ids.tolist(), *made], default=0) + 1
+        if new_id > 65535:
+            raise ConfigError("no object id is left for a duplicate: ids end at 65535")
+        before.append(_copies(scene.gaussians, rows))
+        copies = _append(scene, rows)
+        scene.gaussians.move(torch.from_numpy(copies), torch.from_numpy(T))
+        _enrol(scene, copies, new_id)
+        if object_id in names:
+            names[new_id] = f"{names[object_id]} copy"
+        made.append(new_id)
+    _rebuild(scene, names)
+    after = _copies(scene.gaussians, np.arange(len(scene.gaussians)) >= first)
+    copies_are = ", ".join(scene.table.record(i).label() for i in made)
+    return Change(f"duplicated {what} by {_numbers(shift)} m: {copies_are}", _joined(before), after)
+
+
+def recolor_objects(scene: SegmentedMap, ids: Sequence[int], color: tuple[int, int, int]) -> Change:
+    """Gives objects a mean colour (0 to 255); see `recoloring.recolor`."""
+    what = _labels(scene, ids)
+    rows = members(scene.gaussians, scene.classifier, list(ids))
+    before = _copies(scene.gaussians, rows)
+    recolor(scene.gaussians, rows, color)
+    text = f"recoloured {what} to #{''.join(f'{value:02x}' for value in color)}: {int(rows.sum())} Gaussians"
+    return Change(text, before, _copies(scene.gaussians, rows))
+
+
+def merge_objects(scene: SegmentedMap, kept: int, merged: int) -> Change:
+    """Makes the object `merged` a part of `kept`: labels, identity vectors, votes and the table.
+
+    Raises:
+        ConfigError: unknown ids, or the same twice.
+    """
+    what = f"{_labels(scene, [merged])} into {_labels(scene, [kept])}"
+    if kept == merged:
+        raise ConfigError(f"object {kept} cannot be merged with itself")
+    rows = scene.gaussians.object_id.numpy() == merged
+    names, seen = _names(scene.table), _observations(scene.table)
+    both = [seen[i] for i in (kept, merged) if i in seen]
+    if both:
+        # Views in which both were seen cannot be told from the table: the larger number is a lower bound.
+        seen[kept] = Observation(
+            min(o.first_frame for o in both), max(o.last_frame for o in both), max(o.views for o in both)
+        )
+    scene.classifier = scene.classifier.without([merged])
+    assign(scene.gaussians, scene.classifier, rows, kept)
+    if scene.votes is not None:
+        scene.votes = _votes_with(scene.votes, merged, kept)
+    _rebuild(scene, names, seen)
+    return Change(f"merged {what}: {int(rows.sum())} Gaussians", _nothing(scene), _nothing(scene))
+
+
+def rename_object(scene: SegmentedMap, object_id: int, name: str) -> Change:
+    """Names an object.
+
+    Raises:
+        ConfigError: unknown id; or a name that would be taken for an id or a list, or is "all", empty or another's.
+    """
+    what, name = _labels(scene, [object_id]), name.strip()
+    if not name or name.isdecimal() or "," in name or name.casefold() == "all":
+        raise ConfigError(f"name {name!r}: expected a word that is no number, without commas, and not 'all'")
+    taken = [i for i, other in _names(scene.table).items() if other.casefold() == name.casefold() and i != object_id]
+    if taken:
+        raise ConfigError(f"name {name!r}: object {taken[0]} has it already")
+    records = [replace(r, name=name) if r.id == object_id else r for r in scene.table.objects]
+    scene.table = replace(scene.table, objects=records)
+    return Change(f"renamed {what} to {name}", _nothing(scene), _nothing(scene))
+
+
+def rigid_motion(centre: np.ndarray, shift: Vector, rotate_degrees: Vector = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """Transform [4, 4]: turns about axes through `centre` along x, then y, then z, then shifts by `shift` metres."""
+    T = np.eye(4)
+    for axis, angle in zip(np.eye(3), np.radians(rotate_degrees), strict=True):
+        T[:3, :3] = quaternion_to_matrix(np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])) @ T[:3, :3]
+    T[:3, 3] = centre - T[:3, :3] @ centre + np.asarray(shift, float)
+    return T
+
+
+# --- who belongs to what --------------------------------------------------------------------------------------------
+
+
+def _labels(scene: SegmentedMap, ids: Sequence[int]) -> str:
+    """Names of objects for people; raises ConfigError for unknown ids."""
+    if not ids:
+        raise ConfigError("no object is named")
+    return ", ".join(scene.table.record(i).label() for i in ids)
+
+
+def _claimed_rows(scene: SegmentedMap, ids: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Members of objects without floaters, labelled as theirs from now on; and the floaters. bool [N] both."""
+    own = {i: members(scene.gaussians, scene.classifier, [i], MembershipSettings(floaters=False)) for i in ids}
+    _claim(scene, own)
+    rows = np.logical_or.reduce(list(own.values()))
+    return rows, np.isin(scene.gaussians.object_id.numpy(), ids) & ~rows
+
+
+def _claim(scene: SegmentedMap, own: Mapping[int, np.ndarray]) -> None:
+    """Labels the members of objects that had another label or none."""
+    for object_id, rows in own.items():
+        assign(scene.gaussians, scene.classifier, rows & (scene.gaussians.object_id.numpy() != object_id), object_id)
+
+
+def _forget(scene: SegmentedMap, ids: Sequence[int]) -> None:
+    """Takes objects that are gone from the classifier, the votes and the labels."""
+    scene.classifier = scene.classifier.without(list(ids))
+    if scene.votes is not None:
+        gone = np.isin(scene.votes.ids, ids)
+        scene.votes = ObjectVotes(np.where(gone, 0, scene.votes.ids), np.where(gone, 0, scene.votes.weights))
+    g, labels = scene.gaussians, scene.gaussians.object_id.numpy()
+    stray, others = np.flatnonzero(np.isin(labels, ids)), np.flatnonzero((labels > 0) & ~np.isin(labels, ids))
+    if len(stray) and len(others):
+        nearest = others[cKDTree(g.means.numpy()[others]).query(g.means.numpy()[stray])[1]]
+        g.object_id[torch.from_numpy(stray)] = g.object_id[torch.from_numpy(nearest)]
+        g.features[torch.from_numpy(stray)] = g.features[torch.from_numpy(nearest)]
+    elif len(stray):
+        g.object_id[torch.from_numpy(stray)] = 0
+
+
+def _enrol(scene: SegmentedMap, rows: np.ndarray, object_id: int) -> None:
+    """Gives Gaussians (bool [N]) a new object id, a class of it, and identity vectors of that class."""
+    g = scene.gaussians
+    g.object_id[torch.from_numpy(rows)] = object_id
+    if len(scene.classifier) and g.features.shape[1] == scene.classifier.weight.shape[1]:
+        scene.classifier = with_class(scene.classifier, object_id, g.features.numpy()[~rows])
+        g.features[torch.from_numpy(rows)] = torch.from_numpy(code_of(g, scene.classifier, object_id))
+    if scene.votes is not None:
+        scene.votes.ids[rows] = 0
+        scene.votes.ids[rows, 0] = object_id
+
+
+# --- rows of the map and what goes with them ------------------------------------------------------------------------
+
+
+def _keep_rows(scene: SegmentedMap, rows: np.ndarray) -> None:
+    scene.gaussians.keep(torch.from_numpy(rows))
+    if scene.votes is not None:
+        scene.votes = ObjectVotes(scene.votes.ids[rows], scene.votes.weights[rows])
+
+
+def _append(scene: SegmentedMap, rows: np.ndarray) -> np.ndarray:
+    """Appends copies of Gaussians (bool [N]); returns which they are, bool of the new length."""
+    g, index = scene.gaussians, torch.from_numpy(np.flatnonzero(rows))
+    new = g.insert(
+        g.means[index], g.quaternions[index], g.log_scales[index], g.opacity_logits[index], g.rgb[index],
+        g.features[index], object_id=g.object_id[index],
+    )  # fmt: skip
+    g.sh[new] = g.sh[index]
+    g.birth_keyframe[new] = g.birth_keyframe[index]
+    if scene.votes is not None:
+        own = scene.votes
+        scene.votes = ObjectVotes(
+            np.concatenate([own.ids, own.ids[rows]]), np.concatenate([own.weights, own.weights[rows]])
+        )
+    return np.arange(len(g)) >= new.start
+
+
+def _copies(gaussians: GaussianMap, rows: np.ndarray) -> GaussianTensors:
+    index = torch.from_numpy(np.flatnonzero(rows))
+    return GaussianTensors(**{name: getattr(gaussians, name)[index].clone() for name in PARAMETERS})
+
+
+def _nothing(scene: SegmentedMap) -> GaussianTensors:
+    return _copies(scene.gaussians, np.zeros(len(scene.gaussians), bool))
+
+
+def _joined(parts: Sequence[GaussianTensors]) -> GaussianTensors:
+    return GaussianTensors(**{name: torch.cat([getattr(part, name) for part in parts]) for name in PARAMETERS})
+
+
+def _votes_with(votes: ObjectVotes, merged: int, kept: int) -> ObjectVotes:
+    """Votes for `merged` counted for `kept`, in one slot."""
+    ids, weights = np.where(votes.ids == merged, kept, votes.ids).astype(np.uint16), votes.weights.copy()
+    own = ids == kept
+    total, first = np.where(own, weights, 0).sum(1), own.argmax(1)
+    weights[own], ids[own] = 0, 0
+    rows = np.flatnonzero(own.any(1))
+    ids[rows, first[rows]], weights[rows, first[rows]] = kept, total[rows]
+    return ObjectVotes(ids, weights)
+
+
+# --- the table ------------------------------------------------------------------------------------------------------
+
+
+def _names(table: ObjectTable) -> dict[int, str]:
+    return {record.id: record.name for record in table.objects if record.name}
+
+
+def _observations(table: ObjectTable) -> dict[int, Observation]:
+    return {
+        r.id: Observation(r.first_frame, r.last_frame, r.views)
+        for r in table.objects
+        if r.first_frame is not None and r.last_frame is not None
+    }
+
+
+def _rebuild(
+    scene: SegmentedMap, names: Mapping[int, str] | None = None, seen: Mapping[int, Observation] | None = None
+) -> None:
+    """Lists the objects anew, with the names and observations of the former table unless others are given."""
+    scene.table = ObjectTable.build(
+        scene.gaussians, scene.classifier, scene.table.supervision,
+        _names(scene.table) if names is None else names, _observations(scene.table) if seen is None else seen,
+    )  # fmt: skip
+
+
+def _centroid(gaussians: GaussianTensors) -> np.ndarray:
+    weights = torch.sigmoid(gaussians.opacity_logits).double()
+    return (weights @ gaussians.means.double() / weights.sum()).numpy()
+
+
+def _numbers(values: Vector) -> str:
+    return " ".join(f"{value:g}" for value in values)

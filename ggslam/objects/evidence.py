@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evidence over keyframes on which objects are one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.objects.overlap import Overlap
+from ggslam.objects.settings import AssociationSettings
+
+_MIN_WEIGHT = 0.05
+_FULLY_VISIBLE = 0.5
+
+
+@dataclass
+class _Pair:
+    together: float = 0.0
+    apart: float = 0.0
+    observations: int = 0
+
+
+class PairEvidence:
+    """How often two objects lay together in one segment, and how often in segments of their own.
+
+    An observation weighs as much as the objects are visible compared with the largest view of them so far: from afar,
+    or by a sliver at the border of the image, much looks like one.
+    """
+
+    def __init__(self, settings: AssociationSettings) -> None:
+        self._settings = settings
+        self._pairs: dict[tuple[int, int], _Pair] = {}
+        self._largest: dict[int, int] = {}
+
+    def observe(self, overlap: Overlap, neighbours: set[tuple[int, int]]) -> None:
+        """Takes a keyframe into account.
+
+        Args:
+            overlap: of its segments with the objects.
+            neighbours: pairs of ids (smaller first) that touch each other in the map's view. Other pairs are noted
+                only once they have been seen together.
+        """
+        if not overlap.shared.size:
+            return
+        visible = overlap.shared.sum(0)
+        weight = self._weights(overlap.objects, visible, overlap.row.size)
+        covers = overlap.covers
+        home = covers.argmax(0)
+        whole = (covers.max(0) >= self._settings.whole) & (weight >= _MIN_WEIGHT)
+        found = {int(overlap.objects[k]): (int(home[k]), float(weight[k])) for k in np.flatnonzero(whole)}
+        for segment in np.unique(home[whole]):
+            inside = overlap.objects[whole & (home == segment)].tolist()
+            for k, a in enumerate(inside):
+                for b in inside[k + 1 :]:
+                    pair = self._pairs.setdefault((a, b), _Pair())
+                    pair.together += min(found[a][1], found[b][1])
+                    pair.observations += 1
+        for key in neighbours:
+            self._pairs.setdefault(key, _Pair())
+        for (a, b), pair in self._pairs.items():
+            if a in found and b in found and found[a][0] != found[b][0]:
+                pair.apart += min(found[a][1], found[b][1])
+
+    def _weights(self, ids: np.ndarray, visible: np.ndarray, pixels: int) -> np.ndarray:
+        for i, n in zip(ids.tolist(), visible.tolist(), strict=True):
+            self._largest[i] = max(self._largest.get(i, 0), n)
+        largest = np.array([self._largest[i] for i in ids.tolist()], float)
+        weight = np.minimum(1.0, visible / np.maximum(_FULLY_VISIBLE * largest, 1))
+        return np.where(visible >= self._settings.min_visible * pixels, weight, 0.0)
+
+    def merges(self) -> list[tuple[int, int]]:
+        """Pairs (kept, dropped) that the evidence makes one; the larger object keeps its id. They are merged here."""
+        done: list[tuple[int, int]] = []
+        while True:
+            ripe = [key for key, pair in self._pairs.items() if self._is_one(pair)]
+            if not ripe:
+                return done
+            a, b = max(ripe, key=lambda key: (self._pairs[key].together - self._pairs[key].apart, key))
+            kept, dropped = (a, b) if self._largest.get(a, 0) >= self._largest.get(b, 0) else (b, a)
+            self._join(kept, dropped)
+            done.append((kept, dropped))
+
+    def _is_one(self, pair: _Pair) -> bool:
+        enough = pair.observations >= self._settings.merge_observations
+        return enough and pair.together > self._settings.merge_ratio * pair.apart
+
+    def _join(self, kept: int, dropped: int) -> None:
+        self._largest[kept] = self._largest.get(kept, 0) + self._largest.pop(dropped, 0)
+        for key in [key for key in self._pairs if dropped in key]:
+            pair = self._pairs.pop(key)
+            other = key[0] if key[1] == dropped else key[1]
+            if other == kept:
+                continue
+            into = self._pairs.setdefault((min(kept, other), max(kept, other)), _Pair())
+            into.together += pair.together
+            into.apart += pair.apart
+            into.observations += pair.observations
+
+
+def touching(ids: np.ndarray) -> set[tuple[int, int]]:
+    """Pairs of different ids (smaller first, 0 left out) on neighbouring pixels of a uint16 image."""
+    pairs = []
+    for a, b in ((ids[:, :-1], ids[:, 1:]), (ids[:-1], ids[1:])):
+        edge = (a != b) & (a > 0) & (b > 0)
+        low, high = np.minimum(a[edge], b[edge]).astype(np.int64), np.maximum(a[edge], b[edge])
+        pairs.append(low << 16 | high)
+    return {(int(code >> 16), int(code & 0xFFFF)) for code in np.unique(np.concatenate(pairs))}

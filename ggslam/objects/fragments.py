@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of an object that prove to be objects of their own.
+
+A segment inside an object is either a piece of it, cut off this once, or something that was taken for a part of it
+when both were first seen (in one segment, or from too far). The one comes at another place every time, the other
+comes back at its place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.objects.overlap import Overlap
+from ggslam.objects.settings import AssociationSettings
+from ggslam.scene.camera import Camera
+
+_INSIDE = 0.6
+_MINOR = 0.5
+_NEAR = 0.5
+_SIZE_RATIO = 1.6
+
+
+@dataclass
+class Fragment:
+    """A place in the world where a part of an object was a segment of its own.
+
+    Attributes:
+        parent: id of the object that it is part of.
+        centre: float64 [3], world, metres.
+        radius: root mean square distance of its points from the centre.
+        apart, together: keyframes in which it was a segment of its own, and in which it lay in the parent's.
+        object_id: the id it got when it became an object; 0 before.
+    """
+
+    parent: int
+    centre: np.ndarray
+    radius: float
+    apart: int = 1
+    together: int = 0
+    object_id: int = 0
+
+    def is_like(self, other: Fragment) -> bool:
+        """Whether both are the same part of the same object."""
+        larger, smaller = max(self.radius, other.radius), min(self.radius, other.radius)
+        near = float(np.linalg.norm(self.centre - other.centre)) < _NEAR * smaller
+        return self.parent == other.parent and near and larger < _SIZE_RATIO * smaller
+
+
+class FragmentMemory:
+    """Collects fragments over keyframes."""
+
+    def __init__(self, settings: AssociationSettings) -> None:
+        self._settings = settings
+        self._fragments: list[Fragment] = []
+
+    def observe(
+        self, overlap: Overlap, best: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
+    ) -> dict[int, Fragment]:
+        """Takes a keyframe into account.
+
+        Args:
+            overlap: of its segments with the objects.
+            best: int [S], number of the object each segment belongs to, -1 = none.
+            depth: float32 [H, W], metres.
+            camera, T_world_camera: where the keyframe was taken.
+
+        Returns:
+            Segment number -> fragment, of the segments that are or have become objects of their own
+            (`object_id` is still 0 for the latter).
+        """
+        found: dict[int, Fragment] = {}
+        seen: list[Fragment] = []
+        minor = self._minor_segments(overlap, best)
+        for k in minor:
+            now = _fragment(int(overlap.objects[best[k]]), overlap.row == k, depth, camera, T_world_camera)
+            if now is None:
+                continue
+            known = next((old for old in self._fragments if old.is_like(now)), None)
+            if known is None:
+                self._fragments.append(now)
+                seen.append(now)
+                continue
+            known.apart += 1
+            share = 1 / known.apart
+            known.centre = (1 - share) * known.centre + share * now.centre
+            known.radius = (1 - share) * known.radius + share * now.radius
+            seen.append(known)
+            if known.object_id or self._is_proven(known):
+                found[k] = known
+        self._note_absent(seen, minor, overlap, best, depth, camera, T_world_camera)
+        return found
+
+    def rename(self, kept: int, dropped: int) -> None:
+        """An object became part of another one; a fragment that became an object and returned to its parent is
+        forgotten."""
+        for fragment in self._fragments:
+            fragment.parent = kept if fragment.parent == dropped else fragment.parent
+            fragment.object_id = kept if fragment.object_id == dropped else fragment.object_id
+        self._fragments = [f for f in self._fragments if f.parent != f.object_id]
+
+    def _is_proven(self, fragment: Fragment) -> bool:
+        enough = fragment.apart >= self._settings.split_observations
+        return enough and fragment.apart > self._settings.split_ratio * fragment.together
+
+    def _minor_segments(self, overlap: Overlap, best: np.ndarray) -> list[int]:
+        """Segments that lie in an object of which another segment has more."""
+        rows = np.flatnonzero(best >= 0)
+        within, covers = overlap.within[rows, best[rows]], overlap.covers[rows, best[rows]]
+        large = overlap.shared[rows, best[rows]] >= self._settings.min_visible * overlap.row.size
+        largest = overlap.shared.max(0, initial=0)[best[rows]]
+        minor = overlap.shared[rows, best[rows]] < largest
+        return rows[minor & large & (within >= _INSIDE) & (covers < _MINOR)].tolist()
+
+    def _note_absent(
+        self, seen: list[Fragment], minor: list[int], overlap: Overlap, best: np.ndarray, depth: np.ndarray,
+        camera: Camera, T_world_camera: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Fragments whose place is in view, but in the segment of the rest of their object."""
+        absent = [f for f in self._fragments if not f.object_id and not any(f is other for other in seen)]
+        if not absent:
+            return
+        R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
+        points = (np.stack([f.centre for f in absent]) - t) @ R
+        z = np.maximum(points[:, 2], 1e-6)
+        u = np.rint(camera.fx * points[:, 0] / z + camera.cx)
+        v = np.rint(camera.fy * points[:, 1] / z + camera.cy)
+        inside = (points[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        for k in np.flatnonzero(inside):
+            y, x = int(v[k]), int(u[k])
+            segment, fragment = int(overlap.row[y, x]), absent[k]
+            if segment < 0 or segment in minor or abs(depth[y, x] - z[k]) > 2 * fragment.radius:
+                continue
+            if best[segment] >= 0 and overlap.objects[best[segment]] == fragment.parent:
+                fragment.together += 1
+
+
+def _fragment(
+    parent: int, inside: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
+) -> Fragment | None:
+    inside = inside & (depth > 0)
+    if not inside.any():
+        return None
+    points = (camera.rays()[inside] * depth[inside][:, None]).astype(np.float64)
+    centre = points.mean(0)
+    radius = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))
+    return Fragment(parent, T_world_camera[:3, :3] @ centre + T_world_camera[:3, 3], radius)

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Segments from one depth image without any learned model.
+
+Large planes are taken out first: they are what things stand on and hang on. What remains falls apart at depth jumps
+and at concave edges (Tateno et al., "Real-time and scalable incremental segmentation on dense SLAM", IROS 2015), and
+pieces that meet in a convex edge are put together again (Stein et al., "Object Partitioning using Local Convexity",
+CVPR 2014).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from ggslam.objects.depth_surfaces import DepthSurface, surface_of
+from ggslam.objects.planes import find_planes
+from ggslam.objects.regions import Borders, Groups, find_borders, gap_tolerance
+from ggslam.objects.segments import connected_pieces
+from ggslam.objects.settings import GeometricSettings
+from ggslam.scene.camera import Camera
+
+_CONVEX_CLOSED = 0.6
+_CONVEX_BENT = 0.25
+_FLAKE = 6
+_FLAKE_CLOSED = 0.6
+_GROWTH = 4
+_SQUARE = np.ones((3, 3), np.uint8)
+
+
+class GeometricSegmenter:
+    """Class-agnostic segments of single RGB-D frames. Keeps nothing from frame to frame."""
+
+    def __init__(self, settings: GeometricSettings | None = None) -> None:
+        self._settings = settings or GeometricSettings()
+
+    def segment(self, color: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+        """Segments of one frame.
+
+        Args:
+            color: uint8 [H, W, 3].
+            depth: float32 [H, W], metres, 0 = unknown.
+            camera: intrinsics of both.
+
+        Returns:
+            uint16 [H, W], 1 to n by size, largest first; 0 = no depth, or too small to tell.
+        """
+        surface = surface_of(depth, camera, self._settings.max_depth_m)
+        if not surface.valid.any():
+            return np.zeros(depth.shape, np.uint16)
+        plane_of, planes = find_planes(surface, camera, self._settings)
+        normals = surface.normals.copy()
+        on_plane = plane_of > 0
+        if len(planes):
+            unit = -planes / np.linalg.norm(planes, axis=1, keepdims=True)
+            normals[on_plane] = unit[plane_of[on_plane] - 1]
+        regions = self._regions(surface, plane_of)
+        regions = self._joined(regions, len(planes), surface, normals)
+        return _by_size(regions, surface.valid, self._settings.min_area)
+
+    def _regions(self, surface: DepthSurface, plane_of: np.ndarray) -> np.ndarray:
+        """Planes, and the smooth pieces of the rest: int32 [H, W] from 1 on, 0 = no depth or a crumb."""
+        rest = surface.valid & (plane_of == 0)
+        links = [self._smooth_links(surface, rest, axis) for axis in (1, 0)]
+        pieces = connected_pieces(rest.astype(np.uint8), (links[0], links[1]))
+        area = np.bincount(pieces[rest], minlength=int(pieces.max()) + 1)
+        # Strips along edges, where normals are blurred, are left to be grown over.
+        inner = cv2.erode(rest.astype(np.uint8), _SQUARE) > 0
+        wide = pieces.astype(np.float32)
+        inner &= cv2.erode(wide, _SQUARE) == cv2.dilate(wide, _SQUARE)
+        has_inner = np.bincount(pieces[inner], minlength=len(area)) > 0
+        kept = np.flatnonzero(has_inner & (area >= self._settings.min_area * rest.size))
+        number = np.zeros(len(area), np.int32)
+        number[kept] = int(plane_of.max()) + 1 + np.arange(len(kept))
+        regions = np.where(rest, number[pieces], plane_of)
+        return _grown(regions, surface, gap_tolerance(surface, self._settings), _GROWTH * surface.step)
+
+    def _smooth_links(self, surface: DepthSurface, rest: np.ndarray, axis: int) -> np.ndarray:
+        """bool [H, W-1] (axis 1) or [H-1, W] (axis 0): neighbours of the rest without a gap or a concave edge."""
+        first, second = _ends(axis, 1)
+        z, tolerance = surface.depth, gap_tolerance(surface, self._settings)
+        connected = rest[first] & rest[second]
+        connected &= np.abs(z[first] - z[second]) < tolerance[first]
+        # Concavity is looked at across a few pixels, where the edge itself does not blur the normals.
+        before, after = _ends(axis, 2 * surface.step + 1)
+        middle = _middle(axis, surface.step)
+        comparable = rest[before] & rest[after] & connected[middle]
+        way = surface.points[after][comparable] - surface.points[before][comparable]
+        n, m = surface.normals[before][comparable], surface.normals[after][comparable]
+        concave = (_dot(n, m) < np.cos(np.radians(self._settings.concave_degrees))) & (_dot(m - n, way) < 0)
+        concave &= np.abs(way[:, 2]) < 0.05 * z[before][comparable]
+        connected[middle][comparable] = ~concave
+        return connected
+
+    def _joined(self, regions: np.ndarray, planes: int, surface: DepthSurface, normals: np.ndarray) -> np.ndarray:
+        """Regions with convex and smooth neighbours joined."""
+        borders = find_borders(regions, surface, normals, surface.step + 1, self._settings)
+        groups = Groups(int(regions.max()) + 1)
+        for k in np.flatnonzero(_is_convex(borders)):
+            groups.join(*borders.pairs[k].tolist())
+        regions = groups.roots().astype(np.int32)[regions]
+        return _without_flakes(regions, planes, borders, groups, self._settings.min_area)
+
+
+def _without_flakes(regions: np.ndarray, planes: int, borders: Borders, groups: Groups, min_area: float) -> np.ndarray:
+    """Small regions that lie on one neighbour without a gap for most of their rim join it: noise that rose above the
+    tolerance of a plane."""
+    area = np.bincount(regions.ravel(), minlength=int(regions.max()) + 1)
+    roots = groups.roots()
+    ends = roots[borders.pairs]
+    rim = np.zeros(len(roots), np.int64)
+    best: dict[int, tuple[int, int]] = {}
+    outer = ends[:, 0] != ends[:, 1]
+    for (a, b), length, closed, concave in zip(
+        ends[outer].tolist(), borders.length[outer].tolist(), borders.closed[outer].tolist(),
+        borders.concave[outer].tolist(), strict=True,
+    ):  # fmt: skip
+        for flake, other in ((a, b), (b, a)):
+            rim[flake] += length
+            if closed - concave > best.get(flake, (0, 0))[0]:
+                best[flake] = (closed - concave, other)
+    for flake in sorted(best, key=lambda k: area[k]):
+        joined, other = best[flake]
+        small = flake > planes and area[flake] < _FLAKE * min_area * regions.size
+        if small and joined >= _FLAKE_CLOSED * rim[flake]:
+            groups.join(flake, other)
+    return groups.roots().astype(np.int32)[regions]
+
+
+def _is_convex(borders: Borders) -> np.ndarray:
+    """bool [n]: borders mostly without a gap and hardly anywhere concave."""
+    closed = borders.closed >= _CONVEX_CLOSED * borders.length
+    judged = (borders.judged >= 3) & (borders.judged >= 0.3 * borders.length)
+    return closed & judged & (borders.concave <= _CONVEX_BENT * borders.judged)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->i", a, b)
+
+
+def _ends(axis: int, distance: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Index of all pixels, and of those `distance` further along `axis`."""
+    if axis:
+        return np.s_[:, :-distance], np.s_[:, distance:]
+    return np.s_[:-distance, :], np.s_[distance:, :]
+
+
+def _middle(axis: int, margin: int) -> tuple[slice, ...]:
+    return np.s_[:, margin:-margin] if axis else np.s_[margin:-margin, :]
+
+
+def _grown(regions: np.ndarray, surface: DepthSurface, tolerance: np.ndarray, passes: int) -> np.ndarray:
+    """Regions grown over valid pixels without region, one pixel a pass, where no gap is in between."""
+    width = regions.shape[1] + 2
+    label, depth = np.pad(regions, 1).ravel(), np.pad(surface.depth, 1).ravel()
+    limit = np.pad(tolerance, 1).ravel()
+    free = np.flatnonzero(np.pad((regions == 0) & surface.valid, 1).ravel())
+    for _ in range(passes):
+        found = np.zeros(len(free), label.dtype)
+        for offset in (-1, 1, -width, width):
+            other = label[free + offset]
+            near = np.abs(depth[free + offset] - depth[free]) < limit[free]
+            found = np.where((found == 0) & near, other, found)
+        label[free] = found
+        free = free[found == 0]
+    return label.reshape(-1, width)[1:-1, 1:-1]
+
+
+def _by_size(regions: np.ndarray, valid: np.ndarray, min_area: float) -> np.ndarray:
+    area = np.bincount(regions[valid], minlength=int(regions.max()) + 1)
+    area[0] = 0
+    order = np.argsort(-area, kind="stable")
+    order = order[area[order] >= max(1, min_area * regions.size)]
+    number = np.zeros(len(area), np.uint16)
+    number[order] = np.arange(1, len(order) + 1)
+    return np.where(valid, number[regions], np.uint16(0))

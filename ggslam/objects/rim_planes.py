@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The planes around a hole: RANSAC on the surface that is seen along the removed object's outline."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ggslam.objects.hole_views import HoleView
+
+_POINTS = 4000
+_TRIALS = 300
+_LARGEST = 6
+_LEAST_SHARE = 0.03
+_PARALLEL = 0.85
+"""Cosine of the largest angle between a plane and the surface at its points."""
+_RING_SHARE = 0.4
+
+
+@dataclass(frozen=True)
+class RimPlane:
+    """A plane n . x = offset with the points it was found from.
+
+    Attributes:
+        normal: unit [3], towards the cameras.
+        offset: metres.
+        points: [M, 3], the rim's points on it.
+        tolerance: metres; distance within which something lies on it.
+    """
+
+    normal: np.ndarray
+    offset: float
+    points: np.ndarray
+    tolerance: float
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed distances [M] of points [M, 3], positive towards the cameras."""
+        return points @ self.normal - self.offset
+
+    def is_met(self, points: np.ndarray, depth: float) -> np.ndarray:
+        """Whether points [M, 3] are just behind the known part of the plane, up to `depth` metres: another plane ends
+        there. bool [M]"""
+        axes = np.linalg.svd(self.normal[None])[2][1:]
+        low, high = np.percentile(self.points @ axes.T, [1, 99], axis=0)
+        flat, distance = points @ axes.T, self.distance(points) + self.tolerance
+        return (distance < 0) & (distance > -depth) & ((flat >= low) & (flat <= high)).all(1)
+
+
+def rim_points(views: Sequence[HoleView]) -> tuple[np.ndarray, np.ndarray]:
+    """World points [M, 3] of the surfaces seen around the object's outlines, from all views together, and their unit
+    normals [M, 3] (of either sign; meaningless at edges)."""
+    points, normals = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
+    for v in views:
+        covered = v.covered.astype(np.uint8)
+        width = int(np.clip(_RING_SHARE * np.sqrt(covered.sum()), 4, 40))
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * width + 1, 2 * width + 1))
+        ring = (cv2.dilate(covered, disc) > 0) & (cv2.dilate(covered, np.ones((3, 3), np.uint8)) == 0) & (v.now > 0)
+        surface = v.view.points(v.now)
+        smooth = cv2.blur(surface, (5, 5))
+        normal = np.cross(np.gradient(smooth, axis=1), np.gradient(smooth, axis=0))[ring]
+        points.append(surface[ring])
+        normals.append(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
+    pick = np.random.default_rng(0).permutation(sum(len(part) for part in points))[:_POINTS]
+    return np.concatenate(points)[pick], np.concatenate(normals)[pick]
+
+
+def find_planes(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, tolerance: float) -> list[RimPlane]:
+    """Planes that many points lie on, the largest first.
+
+    Args:
+        points, normals: [M, 3], see `rim_points`.
+        cameras: positions [V, 3], to tell the front of a plane.
+        tolerance: metres.
+    """
+    rng, planes = np.random.default_rng(0), []
+    left, facing = points.astype(np.float64), normals.astype(np.float64)
+    least = max(30, _LEAST_SHARE * len(points))
+    while len(left) >= least and len(planes) < _LARGEST:
+        plane = _best_plane(left, facing, tolerance, rng)
+        near = _on(plane, left, facing, tolerance)
+        if near.sum() < least:
+            break
+        if (cameras @ plane[:3] - plane[3]).mean() < 0:
+            plane = -plane
+        planes.append(RimPlane(plane[:3], float(plane[3]), left[near], tolerance))
+        stays = ~_on(plane, left, facing, 1.5 * tolerance)
+        left, facing = left[stays], facing[stays]
+    return planes
+
+
+def _on(plane: np.ndarray, points: np.ndarray, normals: np.ndarray, tolerance: float) -> np.ndarray:
+    """Whether points lie on a plane (nx, ny, nz, offset) and their surface runs along it, bool [M]."""
+    return (np.abs(points @ plane[:3] - plane[3]) <= tolerance) & (np.abs(normals @ plane[:3]) >= _PARALLEL)
+
+
+def _best_plane(
+    points: np.ndarray, normals: np.ndarray, tolerance: float, rng: np.random.Generator
+) -> np.ndarray:
+    """(nx, ny, nz, offset) of the best of many planes through a point along its surface, fitted to all its inliers."""
+    seeds = rng.integers(0, len(points), _TRIALS)
+    offsets = np.einsum("ti,ti->t", normals[seeds], points[seeds])
+    close = np.abs(points @ normals[seeds].T - offsets) <= tolerance
+    best = (close & (np.abs(normals @ normals[seeds].T) >= _PARALLEL)).sum(0).argmax()
+    plane = np.append(normals[seeds[best]], offsets[best])
+    for _ in range(4):
+        inliers = points[_on(plane, points, normals, tolerance)]
+        if len(inliers) < 3:
+            break
+        plane = _fitted(inliers)
+    return plane
+
+
+def _fitted(points: np.ndarray) -> np.ndarray:
+    """(nx, ny, nz, offset) of the plane through points with the least squared distances."""
+    centre = points.mean(0)
+    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    return np.append(normal, normal @ centre)

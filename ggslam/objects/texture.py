@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Filling a gap in a picture with texture like that around it.
+
+Criminisi, Perez, Toyama: "Region Filling and Object Removal by Exemplar-Based Image Inpainting", 2004: patch by patch
+from the rim inwards, lines first, each patch the known one that fits best. The light, which changes slowly over a
+surface, is then taken from a smooth interpolation (Telea 2004), so that a copied patch does not bring that of its place.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+_HALF = 4
+"""Patches are 2 * 4 + 1 pixels wide."""
+_TREND = 0.05
+"""How much a patch's new part must agree with the smooth interpolation, against its known part with what is there."""
+_LIGHT = 0.1
+"""Largest correction of brightness, in [0, 1]."""
+_MOST = 400
+"""Patches a gap may need; a larger gap is filled smoothly."""
+
+
+def fill_gap(picture: np.ndarray, known: np.ndarray, gap: np.ndarray) -> np.ndarray:
+    """Colours in the gap, float32 [M, 3] in its row-major order.
+
+    Args:
+        picture: float32 [H, W, 3] in [0, 1].
+        known: bool [H, W], where the picture may be copied from; at least one pixel.
+        gap: bool [H, W], where colours are wanted.
+    """
+    pixels = (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
+    smooth = cv2.inpaint(pixels, (~known).astype(np.uint8), 5, cv2.INPAINT_TELEA).astype(np.float32) / 255
+    textured = _copied(picture.astype(np.float32), known & ~gap, gap, smooth)
+    if textured is None:
+        return smooth[gap]
+    width = 2 * _HALF + 1
+    light = cv2.GaussianBlur(smooth.mean(2) - textured.mean(2), (0, 0), width).clip(-_LIGHT, _LIGHT)
+    return (textured + light[..., None])[gap].clip(0, 1)
+
+
+def _copied(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, smooth: np.ndarray) -> np.ndarray | None:
+    """The picture with the gap filled by known patches; what is neither known nor gap is `smooth`. None if no whole
+    patch is known or the gap is too large."""
+    size = 2 * _HALF + 1
+    whole = cv2.erode(known.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0) > 0
+    if not whole.any() or gap.sum() > _MOST * size * size / 3:
+        return None
+    canvas = cv2.copyMakeBorder(np.where(known[..., None], picture, smooth), *[_HALF] * 4, cv2.BORDER_REFLECT_101)
+    trend = cv2.copyMakeBorder(smooth, *[_HALF] * 4, cv2.BORDER_REFLECT_101)
+    done = np.pad(known, _HALF)
+    todo = np.pad(gap, _HALF)
+    confidence = done.astype(np.float32)
+    candidates = whole[_HALF:-_HALF, _HALF:-_HALF]  # by the upper left corner of the patch in the picture
+    while todo.any():
+        row, column = _next_place(canvas, done, todo, confidence)
+        window = (slice(row - _HALF, row + _HALF + 1), slice(column - _HALF, column + _HALF + 1))
+        mask = np.repeat(done[window].astype(np.float32)[..., None], 3, 2)
+        cost = cv2.matchTemplate(picture, canvas[window], cv2.TM_SQDIFF, mask=mask)
+        cost += _TREND * cv2.matchTemplate(picture, trend[window], cv2.TM_SQDIFF, mask=1 - mask)
+        y, x = np.unravel_index(np.where(candidates, cost, np.inf).argmin(), cost.shape)
+        fresh = todo[window]
+        canvas[window][fresh] = picture[y : y + size, x : x + size][fresh]
+        confidence[window][fresh] = confidence[window].mean()
+        done[window] |= fresh
+        todo[window] = False
+    return canvas[_HALF:-_HALF, _HALF:-_HALF]
+
+
+def _next_place(
+    canvas: np.ndarray, done: np.ndarray, todo: np.ndarray, confidence: np.ndarray
+) -> tuple[int, int]:
+    """Row and column of the gap's rim pixel to continue at: much is known around it, and a line runs into it."""
+    rim = todo & (cv2.dilate(done.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    if not rim.any():  # nothing known touches what is left
+        rim = todo
+    size = 2 * _HALF + 1
+    sure = cv2.blur(confidence, (size, size))
+    grey = np.where(done, canvas.mean(2), 0).astype(np.float32)
+    solid = cv2.erode(done.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    edges = np.where(solid, np.abs(cv2.Sobel(grey, -1, 1, 0)) + np.abs(cv2.Sobel(grey, -1, 0, 1)), 0)
+    lines = cv2.dilate(edges.astype(np.float32), np.ones((size, size), np.uint8))
+    row, column = np.unravel_index(np.where(rim, sure * (0.1 + lines), -1).argmax(), rim.shape)
+    return int(row), int(column)

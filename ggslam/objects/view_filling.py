@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Closes what planes leave open: depth and colour are continued in a view's image and put back into space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from ggslam.objects.hole_views import SOLID, HoleView, could_be_hidden
+from ggslam.objects.plane_filling import discs
+from ggslam.objects.texture import fill_gap
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.types import Gaussians, GaussianTensors
+
+LEAST_PIXELS = 6
+"""Smaller gaps in a view are left alone."""
+
+
+def open_pixels(kept: Gaussians, view: HoleView) -> np.ndarray:
+    """Pixels of the object that show nothing solid now, bool [H, W]: the black blots."""
+    out = CpuRasterizer().forward(kept, view.view.camera, view.view.T_camera_world, features=False)
+    covered = cv2.dilate(view.covered.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return covered & (out.alpha.numpy() < SOLID)
+
+
+def close(kept: Gaussians, view: HoleView, views: Sequence[HoleView]) -> GaussianTensors | None:
+    """Gaussians for the open pixels of a view; None if there are none or nothing may be put there.
+
+    Args:
+        kept: the map without the object, with what was filled so far.
+        view: the view to mend.
+        views: all views of the hole: nothing is put where one of them saw empty space.
+    """
+    gap = open_pixels(kept, view)
+    camera, T = view.view.camera, view.view.T_camera_world
+    out = CpuRasterizer().forward(kept, camera, T, features=False)
+    alpha, depth = out.alpha.numpy(), out.expected_depth.numpy()
+    known = (alpha >= SOLID) & ~view.covered & ~gap
+    if gap.sum() < LEAST_PIXELS or not known.any():
+        return None
+    inverse_depth = np.where(known, 1 / np.maximum(depth, 1e-3), 0).astype(np.float32)
+    inverse_depth = cv2.inpaint(inverse_depth, (~known).astype(np.uint8), 5, cv2.INPAINT_NS)
+    filled_depth = 1 / np.maximum(inverse_depth, 1e-3)
+    picture = (out.image.numpy() / np.maximum(alpha, 1e-3)).transpose(1, 2, 0).clip(0, 1)
+    colors = fill_gap(picture, known, gap)
+    points, spacing = view.view.points(filled_depth)[gap], filled_depth[gap] / camera.fx
+    possible = could_be_hidden(points, views)
+    if not possible.any():
+        return None
+    axes = T[:3, :3] * np.array([[1.0], [-1.0], [-1.0]])  # right, up, towards the camera
+    return discs(points[possible], axes, spacing[possible], colors[possible])
