@@ -122,12 +122,13 @@ class ObjectMasks:
             self._segment = lambda frame: segmenter.segment(frame.color, frame.depth, frame.camera)
         return self._segment(frame)
 
-    def noise(self, observations: dict[int, Observation]) -> list[int]:
-        """Objects that were seen too rarely to be believed."""
+    def noise(self, object_ids: np.ndarray, seen: dict[int, Observation]) -> list[int]:
+        """Of `object_ids`, those that were seen too rarely to be believed."""
         if self.supervision == "masks":
             return []
-        most = max((o.views for o in observations.values()), default=0)
-        return [i for i, o in observations.items() if o.views < min(self.settings.min_views, most)]
+        views = {i: seen[i].views if i in seen else 0 for i in object_ids.tolist()}
+        enough = min(self.settings.min_views, max(views.values(), default=0))
+        return [i for i, count in views.items() if count < enough]
 
 
 def _choose(settings: MaskSettings, has_masks: bool | None) -> Source | None:

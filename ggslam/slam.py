@@ -189,6 +189,8 @@ class Slam:
         self.refine_iterations = 0
         self.times = SlamTimes()
         self._anchor = Anchor(-1, np.eye(4))
+        self._settled = False
+        self._objects: LearnedObjects | None = None
 
     # --- the loop ----------------------------------------------------------------------------------------------------
 
@@ -224,23 +226,25 @@ class Slam:
         return self.result()
 
     def result(self) -> SlamResult:
-        """What there is so far. Objects are settled here: to be called once, at the end."""
+        """What there is so far. The first call settles the objects: it is for the end."""
         return SlamResult(
             self.map, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
-            self.refine_iterations, self._objects(),
+            self.refine_iterations, self._learned_objects(),
         )  # fmt: skip
 
-    def _objects(self) -> LearnedObjects | None:
-        """The last identity steps, and every Gaussian's object."""
+    def _learned_objects(self) -> LearnedObjects | None:
+        """The last identity steps, and every Gaussian's object; once."""
         identity = self.mapper.identity
-        if identity is None or not identity.table.count:
-            return None
+        if self._settled or identity is None or not identity.table.count:
+            return self._objects
+        self._settled = True  # if it fails below, the map can still be had by another call
         seen = observations(self.mapper.keyframes, identity.current)
-        noise = self.masks.noise(seen)
+        noise = self.masks.noise(identity.classifier.class_ids, seen)
         identity.forget(self.map, noise)
         self.mapper.finish_identity()
         kept = {i: observation for i, observation in seen.items() if i not in noise}
-        return LearnedObjects(identity.classifier, self.masks.supervision, kept)
+        self._objects = LearnedObjects(identity.classifier, self.masks.supervision, kept)
+        return self._objects
 
     # --- its parts, also used by the real-time loop ------------------------------------------------------------------
 

@@ -62,11 +62,11 @@ class ClassTable:
         number, last = int(self._class_of[object_id]), self.count - 1
         if number < 0:
             return
+        self._class_of[self._ids[last]] = number
+        self._class_of[object_id] = -1
         for array in (self._rows, self._ids, self._moments[0], self._moments[1]):
             array[number] = array[last]
             array[last] = 0
-        self._class_of[self._ids[number]] = number
-        self._class_of[object_id] = -1
         self.count = last
 
     def codes(self, object_ids: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ nearest neighbours. Otherwise than there
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -113,6 +112,8 @@ class IdentityLearner:
         if kept == dropped:
             return
         self._alias[self._alias == dropped] = kept
+        self._whole_of[dropped] = 0
+        self._shown = None
         merge_votes(gaussians, self._alias)
         self.table.add(np.array([kept], np.uint16))
         was = self.table.classes(np.array([dropped]))[0] >= 0
@@ -125,9 +126,9 @@ class IdentityLearner:
     def split(
         self, gaussians: GaussianMap, rasterizer: CpuRasterizer, mask: np.ndarray, whole: int, part: int
     ) -> None:
-        """An object turned out to be two: what the last rendering shows where `mask` [H, W] has the part, and more of it
-        there than elsewhere, now votes for the part as it did for the whole. In older keyframes the map decides from
-        now on which pixels of the whole are the part's (`_as_mapped`)."""
+        """An object turned out to be two: what the last rendering shows where `mask` [H, W] has the part, and more of
+        it there than elsewhere, now votes for the part as it did for the whole. In older keyframes the map decides
+        from now on which pixels of the whole are the part's (`_as_mapped`)."""
         whole, part = int(self._alias[whole]), int(self._alias[part])
         if whole == part:
             return
@@ -218,6 +219,7 @@ class IdentityLearner:
         assert keyframe.mask is not None and view.features is not None
         pixels = np.flatnonzero(keyframe.mask)
         classes = self.table.classes(self.current(keyframe.mask.reshape(-1)[pixels]))
+        pixels, classes = pixels[classes >= 0], classes[classes >= 0]
         features = view.features.numpy().reshape(IDENTITY_CHANNELS, -1)
         chosen = np.arange(self.table.count)
         self.last_loss, gradient, rows = cross_entropy(features[:, pixels].T, self.classifier, classes, chosen)
@@ -231,11 +233,14 @@ class IdentityLearner:
         return torch.from_numpy(out.reshape(view.features.shape))
 
     def _train(self, gaussians: GaussianMap, terms: PixelTerms, classes: np.ndarray, rate_factor: float) -> None:
-        s = self.settings
-        chosen = self._competing(classes)
+        s, known = self.settings, classes >= 0  # an object may have been taken back since its pixels were drawn
+        if not known.any():
+            return
+        chosen = self._competing(classes[known])
         features = terms.features(gaussians)
-        self.last_loss, gradient, rows = cross_entropy(features, self.classifier, classes, chosen)
-        gradient *= s.weight
+        gradient = np.zeros_like(features)
+        self.last_loss, of_known, rows = cross_entropy(features[known], self.classifier, classes[known], chosen)
+        gradient[known] = s.weight * of_known
         if s.neighbours.weight > 0 and self.times.count % s.neighbours.every == 0 and len(gaussians) > 1:
             pulled, pull = self._pull_together(gaussians)
             terms = terms.joined(PixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
@@ -278,20 +283,24 @@ class IdentityLearner:
         for object_id in object_ids:
             self.table.remove(object_id)
             self._alias[self._alias == object_id] = 0
+        self._whole_of[object_ids] = 0
+        self._shown = None
         merge_votes(gaussians, self._alias)
 
     # --- results ------------------------------------------------------------------------------------------------------
 
     def label(self, gaussians: GaussianMap) -> None:
-        """Writes each Gaussian's object into `object_id`: the learned one, or with the schedule "votes" the one with
-        the most votes; 0 where nothing was ever seen of it or the most probable object is not probable enough."""
+        """Writes each Gaussian's object into `object_id`: the one with a share of `min_confidence` of its votes, else
+        the learned one if it is as probable, else 0. Votes first: what is rendered is learned as a whole, and single
+        Gaussians in it may be wrong (in a rendered room 95 % of Gaussians were right by votes, 91 % as learned)."""
         start = time.perf_counter()
-        seen = gaussians.vote_weights.numpy().sum(1) > 0
-        if self.settings.schedule == "votes":
-            ids = vote_labels(gaussians)
-        else:
-            ids = by_parts(self.classifier, gaussians.features.numpy(), self.settings.min_confidence)
-        gaussians.object_id.numpy()[:] = np.where(seen, ids, 0)
+        ids, share = vote_shares(gaussians)
+        sure = share >= self.settings.min_confidence
+        if self.settings.schedule != "votes":
+            seen = share > 0
+            learned = by_parts(self.classifier, gaussians.features.numpy(), self.settings.min_confidence)
+            ids = np.where(sure, ids, np.where(seen, learned, 0))
+        gaussians.object_id.numpy()[:] = ids
         self.times.labelling += time.perf_counter() - start
 
 
@@ -372,10 +381,17 @@ def at_boundary(ids: np.ndarray) -> np.ndarray:
 
 def vote_labels(gaussians: GaussianMap) -> np.ndarray:
     """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none."""
+    return vote_shares(gaussians)[0]
+
+
+def vote_shares(gaussians: GaussianMap) -> tuple[np.ndarray, np.ndarray]:
+    """Object with the most votes of each Gaussian, uint16 [N], and its share of all votes there, [N]; 0 where there are
+    none."""
     ids, weights = gaussians.vote_ids.numpy(), gaussians.vote_weights.numpy()
-    best = weights.argmax(1)
-    rows = np.arange(len(ids))
-    return np.where(weights[rows, best] > 0, ids[rows, best], 0).astype(np.uint16)
+    best = weights.argmax(1)[:, None]
+    most = np.take_along_axis(weights, best, 1)[:, 0]
+    label = np.where(most > 0, np.take_along_axis(ids, best, 1)[:, 0], 0)
+    return label.astype(np.uint16), most / np.maximum(weights.sum(1), 1e-12)
 
 
 def merge_votes(gaussians: GaussianMap, alias: np.ndarray) -> None:
@@ -391,15 +407,12 @@ def merge_votes(gaussians: GaussianMap, alias: np.ndarray) -> None:
 
 
 def by_parts(
-    classifier: IdentityClassifier, features: np.ndarray, min_confidence: float, part: int = 16384,
-    progress: Callable[[int], None] | None = None,
-) -> np.ndarray:  # fmt: skip
+    classifier: IdentityClassifier, features: np.ndarray, min_confidence: float, part: int = 16384
+) -> np.ndarray:
     """Most probable object of each identity vector, uint16 [N], 0 below `min_confidence`; a part at a time, because N
     times C logits may not fit into memory."""
     out = np.zeros(len(features), np.uint16)
     for begin in range(0, len(features), part):
         ids, confidence = classifier.labels(features[begin : begin + part])
         out[begin : begin + part] = np.where(confidence >= min_confidence, ids, 0)
-        if progress is not None:
-            progress(begin)
     return out

@@ -26,7 +26,6 @@ from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 
-
 FINAL_DECAY = 0.2
 """The last identity steps fall to this share of their length."""
 
@@ -207,8 +206,8 @@ class Mapper:
                 progress(i + 1, iterations)
 
     def finish_identity(self) -> None:
-        """The last identity steps, see `IdentitySettings.final_passes`, and every Gaussian's object. Colours, shapes and
-        poses stay as they are."""
+        """The last identity steps, see `IdentitySettings.final_passes`, and every Gaussian's object. Colours, shapes
+        and poses stay as they are."""
         if self.identity is None:
             return
         start, settings = time.perf_counter(), self.identity.settings

@@ -70,6 +70,7 @@ class Associator:
         self._used = np.zeros(_IDS, bool)
         self._blocked = np.zeros(_IDS, bool)
         self._blocked[[0, *reserved]] = True
+        self._highest = 0
         self._ran_out = False
         self.sightings: dict[int, int] = {}
 
@@ -128,6 +129,7 @@ class Associator:
     def _own_ids(self, segments: np.ndarray, overlap: Overlap) -> Association:
         new = overlap.segments[~self._used[overlap.segments]].tolist()
         self._used[new] = True
+        self._highest = max([self._highest, *new])
         # Own ids prove that what was merged before the verdict was not one.
         self._current = np.arange(_IDS).astype(np.uint16)
         return Association(segments.copy(), [], new)
@@ -199,9 +201,8 @@ class Associator:
     def _new_id(self, wanted: int) -> int:
         """The mask's own id if no object ever had it, else the next one free; 0 when none is left."""
         if self._used[wanted]:
-            top = int(np.flatnonzero(self._used)[-1]) + 1
             free = np.flatnonzero(~(self._used | self._blocked))
-            later = free[free >= top]
+            later = free[free > self._highest]
             if not len(free):
                 if not self._ran_out:
                     _log.warning("more than 65535 objects: further ones stay unlabelled")
@@ -209,4 +210,5 @@ class Associator:
                 return 0
             wanted = int(later[0] if len(later) else free[0])
         self._used[wanted] = True
+        self._highest = max(self._highest, wanted)
         return wanted

@@ -8,6 +8,7 @@ comes back at its place.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +45,7 @@ class Fragment:
     def is_like(self, other: Fragment) -> bool:
         """Whether both are the same part of the same object."""
         larger, smaller = max(self.radius, other.radius), min(self.radius, other.radius)
-        near = float(np.linalg.norm(self.centre - other.centre)) < _NEAR * smaller
+        near = math.dist(self.centre, other.centre) < _NEAR * smaller
         return self.parent == other.parent and near and larger < _SIZE_RATIO * smaller
 
 
@@ -53,7 +54,8 @@ class FragmentMemory:
 
     def __init__(self, settings: AssociationSettings) -> None:
         self._settings = settings
-        self._fragments: list[Fragment] = []
+        self._of: dict[int, list[Fragment]] = {}
+        """Parent -> its fragments."""
 
     def observe(
         self, overlap: Overlap, best: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
@@ -73,13 +75,14 @@ class FragmentMemory:
         found: dict[int, Fragment] = {}
         seen: list[Fragment] = []
         minor = self._minor_segments(overlap, best)
-        for k in minor:
-            now = _fragment(int(overlap.objects[best[k]]), overlap.row == k, depth, camera, T_world_camera)
-            if now is None:
+        extents = _extents(minor, overlap.row, depth, camera, T_world_camera)
+        for k, (centre, radius) in zip(minor, extents, strict=True):
+            now = Fragment(int(overlap.objects[best[k]]), centre, radius)
+            if radius == 0:
                 continue
-            known = next((old for old in self._fragments if old.is_like(now)), None)
+            known = next((old for old in self._of.get(now.parent, []) if old.is_like(now)), None)
             if known is None:
-                self._fragments.append(now)
+                self._of.setdefault(now.parent, []).append(now)
                 seen.append(now)
                 continue
             known.apart += 1
@@ -95,10 +98,13 @@ class FragmentMemory:
     def rename(self, kept: int, dropped: int) -> None:
         """An object became part of another one; a fragment that became an object and returned to its parent is
         forgotten."""
-        for fragment in self._fragments:
-            fragment.parent = kept if fragment.parent == dropped else fragment.parent
-            fragment.object_id = kept if fragment.object_id == dropped else fragment.object_id
-        self._fragments = [f for f in self._fragments if f.parent != f.object_id]
+        for fragment in self._of.pop(dropped, []):
+            fragment.parent = kept
+            self._of.setdefault(kept, []).append(fragment)
+        for parent, fragments in self._of.items():
+            for fragment in fragments:
+                fragment.object_id = kept if fragment.object_id == dropped else fragment.object_id
+            self._of[parent] = [fragment for fragment in fragments if fragment.object_id != parent]
 
     def _is_proven(self, fragment: Fragment) -> bool:
         enough = fragment.apart >= self._settings.split_observations
@@ -118,7 +124,9 @@ class FragmentMemory:
         camera: Camera, T_world_camera: np.ndarray,
     ) -> None:  # fmt: skip
         """Fragments whose place is in view, but in the segment of the rest of their object."""
-        absent = [f for f in self._fragments if not f.object_id and not any(f is other for other in seen)]
+        present = {id(fragment) for fragment in seen}
+        visible = [f for parent in overlap.objects.tolist() for f in self._of.get(parent, [])]
+        absent = [f for f in visible if not f.object_id and id(f) not in present]
         if not absent:
             return
         R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
@@ -136,13 +144,17 @@ class FragmentMemory:
                 fragment.together += 1
 
 
-def _fragment(
-    parent: int, inside: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
-) -> Fragment | None:
-    inside = inside & (depth > 0)
-    if not inside.any():
-        return None
-    points = (camera.rays()[inside] * depth[inside][:, None]).astype(np.float64)
-    centre = points.mean(0)
-    radius = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))
-    return Fragment(parent, T_world_camera[:3, :3] @ centre + T_world_camera[:3, 3], radius)
+def _extents(
+    segments: list[int], row: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
+) -> list[tuple[np.ndarray, float]]:
+    """Centre (world) and radius of the points of some segments; radius 0: no depth."""
+    place = np.full(int(row.max(initial=0)) + 2, -1)  # the last one: no segment
+    place[segments] = np.arange(len(segments))
+    inside = np.flatnonzero((place[row] >= 0) & (depth > 0))
+    which, n = place[row.ravel()[inside]], len(segments)
+    points = camera.rays().reshape(-1, 3)[inside] * depth.ravel()[inside][:, None].astype(np.float64)
+    count = np.maximum(np.bincount(which, minlength=n), 1)
+    centre = np.stack([np.bincount(which, points[:, k], n) / count for k in range(3)], 1)
+    square = np.bincount(which, ((points - centre[which]) ** 2).sum(1), n) / count
+    world = centre @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return list(zip(world, np.sqrt(square).tolist(), strict=True))

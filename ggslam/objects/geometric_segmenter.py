@@ -83,12 +83,16 @@ class GeometricSegmenter:
         # Concavity is looked at across a few pixels, where the edge itself does not blur the normals.
         before, after = _ends(axis, 2 * surface.step + 1)
         middle = _middle(axis, surface.step)
-        comparable = rest[before] & rest[after] & connected[middle]
-        way = surface.points[after][comparable] - surface.points[before][comparable]
-        n, m = surface.normals[before][comparable], surface.normals[after][comparable]
+        rows, columns = np.nonzero(rest[before] & rest[after] & connected[middle])
+        width = rest.shape[1]
+        start = rows * width + columns
+        end = start + (2 * surface.step + 1) * (1 if axis else width)
+        points, normals = surface.points.reshape(-1, 3), surface.normals.reshape(-1, 3)
+        way = points.take(end, 0) - points.take(start, 0)
+        n, m = normals.take(start, 0), normals.take(end, 0)
         concave = (_dot(n, m) < np.cos(np.radians(self._settings.concave_degrees))) & (_dot(m - n, way) < 0)
-        concave &= np.abs(way[:, 2]) < 0.05 * z[before][comparable]
-        connected[middle][comparable] = ~concave
+        concave &= np.abs(way[:, 2]) < 0.05 * z.ravel()[start]
+        connected[middle][rows[concave], columns[concave]] = False
         return connected
 
     def _joined(self, regions: np.ndarray, planes: int, surface: DepthSurface, normals: np.ndarray) -> np.ndarray:

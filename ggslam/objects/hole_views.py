@@ -19,6 +19,8 @@ COVERED = 0.3
 SOLID = 0.8
 """Alpha from which a pixel is said to show a surface; the rest of it would be black."""
 _RESIDUE_VIEWS = 64
+_SELDOM = 0.15
+"""Weight without the object, as a share of what it has now in the object's pixels, up to which it was just hidden."""
 _CLEAR = 0.5
 """Share of its weight in pixels without the object up to which a Gaussian is a trace of it."""
 
@@ -132,24 +134,34 @@ def residue(kept: Gaussians, removed: Gaussians, views: Sequence[View]) -> np.nd
 
     What such a Gaussian adds to the views goes mostly to pixels that the object covers, or nowhere: it was trained to
     look like the object or to mend its colour from behind, or is the object's under a wrong label (masks are wrong by a
-    pixel along outlines), or was hidden all the time. Those far from the object, by its own size, stay.
+    pixel along outlines), or was hidden nearly all the time and only shows now. Those far from the object, by its own
+    size, stay.
     """
     own, means = removed.means.numpy(), kept.means.numpy()
     reach = float(np.linalg.norm(np.ptp(own, axis=0)))
     near = np.isfinite(cKDTree(own).query(means, distance_upper_bound=reach)[0])
     both, rasterizer = marked(kept, removed), CpuRasterizer()
-    weights = torch.zeros(len(near), 2)
+    alone = GaussianTensors(**{name: getattr(both, name)[: len(near)] for name in PARAMETERS})
+    weights = torch.zeros(len(near), 3)
     for view in spread([view for view in views if view.project(means[near])[2].any()], _RESIDUE_VIEWS):
         image = rasterizer.forward(both, view.camera, view.T_camera_world).features
         assert image is not None
         covered = (image[0] > COVERED).float()
         covered = torch.nn.functional.max_pool2d(covered[None, None], 3, 1, 1)[0, 0]
-        # The derivative of the sum of a feature's image over pixels is the Gaussian's weight in them.
-        gradients = rasterizer.backward(None, grad_features=torch.stack([1 - covered, covered]))
-        if gradients.features is not None:
-            weights += gradients.features[: len(near)]
-    clear, covered = weights.numpy().T
-    return near & (clear <= _CLEAR * (clear + covered))
+        weights[:, :2] += _pixel_weights(rasterizer, [1 - covered, covered])[: len(near)]
+        if covered.any():
+            rasterizer.forward(alone, view.camera, view.T_camera_world)
+            weights[:, 2] += _pixel_weights(rasterizer, [covered, covered])[:, 0]
+    clear, through, now = weights.numpy().T
+    return near & ((clear <= _CLEAR * (clear + through)) | (clear <= _SELDOM * now))
+
+
+def _pixel_weights(rasterizer: CpuRasterizer, areas: Sequence[torch.Tensor]) -> torch.Tensor:
+    """What each Gaussian of the last rendering added to some areas (images of 0 and 1), float32 [N, areas]: the
+    derivative of a feature image's sum over an area is the sum of the Gaussian's weights there."""
+    gradients = rasterizer.backward(None, grad_features=torch.stack(list(areas)))
+    assert gradients.features is not None
+    return gradients.features
 
 
 def spread(views: Sequence[View], most: int) -> list[View]:

@@ -20,7 +20,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 
 _LARGEST_CHART = 360
-_ENCLOSED, _KNOWN = 5, 4
+_ENCLOSED, _KNOWN = 6, 5
 """Of eight directions along the plane, how many must meet known surface or another plane, and how many the former."""
 _OCCUPIED = 0.7
 """Alpha from which a cell is known."""

@@ -161,13 +161,13 @@ def _claim(
     label = np.zeros(surface.valid.shape, np.int32)
     nearest = settings.tolerance_sigmas * surface.sigma + settings.tolerance_m * surface.inverse**2
     nearest[~surface.valid] = 0
-    limit = np.cos(np.radians(_NORMAL_DEGREES))
+    limit, normals = np.cos(np.radians(_NORMAL_DEGREES)), surface.normals.reshape(-1, 3)
     for number, plane in enumerate(planes, 1):
         away = np.abs(surface.inverse - (plane[0] * x + (plane[1] * y + plane[2])))
-        chosen = away < nearest
-        chosen[chosen] = surface.normals[chosen] @ (-plane / np.linalg.norm(plane)) > limit
-        label[chosen] = number
-        nearest[chosen] = away[chosen]
+        chosen = np.flatnonzero(away < nearest)
+        chosen = chosen[normals.take(chosen, 0) @ (-plane / np.linalg.norm(plane)) > limit]
+        label.ravel()[chosen] = number
+        nearest.ravel()[chosen] = away.ravel()[chosen]
     support = np.zeros(label.shape, np.int32)
     blocks = sum((k * members for k, members in enumerate(supports, 1)), np.zeros((1, 1), np.int32))
     grown = blocks.repeat(size, 0).repeat(size, 1)

@@ -78,10 +78,10 @@ def clean_segments(segments: np.ndarray, settings: CleaningSettings | None = Non
 def boundary_trust(segments: np.ndarray, depth: np.ndarray, settings: CleaningSettings | None = None) -> np.ndarray:
     """Where a mask can be believed: not where a label has bled over a depth jump onto another surface.
 
-    Near the boundary of its segment, a pixel whose depth does not continue the inside of its segment, in any direction
-    along a straight line, is on another surface (or a mixture of two). Boundaries that lie on the jump itself are
-    believed, so that an exact mask loses next to nothing, and so are boundaries on smooth surfaces and segments too
-    thin to have an inside.
+    Near the boundary of its segment, a pixel is on the wrong side if its depth continues the inside of another segment
+    along a straight line, but in no direction that of its own. Boundaries that lie on the jump itself are believed, so
+    that an exact mask loses next to nothing, and so are boundaries on smooth surfaces and segments too thin to have an
+    inside.
 
     Args:
         segments: uint16 [H, W], 0 = unlabelled.
@@ -105,18 +105,20 @@ def boundary_trust(segments: np.ndarray, depth: np.ndarray, settings: CleaningSe
     own, z = segments[rows, columns], depth[rows, columns]
     tolerance = np.maximum(settings.jump_m, settings.jump_relative * z)
     inner = np.where(~edge & measured, segments, np.uint16(0))
-    fits, has_inside = np.zeros(len(rows), bool), np.zeros(len(rows), bool)
+    fits_own, fits_other, has_inside = (np.zeros(len(rows), bool) for _ in range(3))
     for dy, dx in _DIRECTIONS:
         near, far = (
             ((rows + k * dy).clip(0, height - 1), (columns + k * dx).clip(0, width - 1))
             for k in (reach + 1, 2 * reach + 2)
         )
-        inside = inner[near] == own
-        has_inside |= inside
-        fits |= inside & (np.abs(depth[near] - z) < tolerance)
+        found = inner[near]
+        fits = np.abs(depth[near] - z) < tolerance
         # Inverse depth is linear on a plane: a floor seen from afar falls off fast, but straight.
-        line = inside & (inner[far] == own)
+        line = (found > 0) & (inner[far] == found)
         ahead = 2 / depth[near][line] - 1 / depth[far][line]
         fits[line] |= np.abs(1 / np.maximum(ahead, 1e-3) - z[line]) < tolerance[line]
-    trusted[rows, columns] = fits | ~has_inside
+        has_inside |= found == own
+        fits_own |= (found == own) & fits
+        fits_other |= (found > 0) & (found != own) & fits
+    trusted[rows, columns] = fits_own | ~has_inside | ~fits_other
     return trusted
