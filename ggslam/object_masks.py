@@ -5,6 +5,7 @@ cleaned and, unless their ids prove consistent over time, matched with the objec
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
@@ -33,7 +34,7 @@ class MaskSettings:
     """auto: `model` if one is named, else the recording's masks if it has any, else geometry; none: learn no objects."""
     model: str = ""
     """ONNX file of a segmentation model (YOLO-seg or SAM family); needs the extra [masks]."""
-    min_views: int = 2
+    min_views: int = 3
     """Objects found by a segmenter or by association on fewer keyframes than this are noise (short runs: on any)."""
     cleaning: CleaningSettings = field(default_factory=CleaningSettings)
     association: AssociationSettings = field(default_factory=AssociationSettings)
@@ -63,7 +64,14 @@ class ObjectMasks:
         if self._source == "model":
             model = OnnxSegmenter(settings.model, settings.onnx)
             self._segment = lambda frame: model.segment(frame.color)
-        self._associator = Associator(settings.association)
+        self._associator = self._make_associator()
+
+    def _make_associator(self) -> Associator:
+        """A segmenter's ids mean nothing from one frame to the next; a recording's may."""
+        settings = self.settings.association
+        if self._source in ("geometry", "model"):
+            settings = dataclasses.replace(settings, mode="always")
+        return Associator(settings)
 
     @property
     def active(self) -> bool:
@@ -95,8 +103,7 @@ class ObjectMasks:
         segments = self._segments(frame)
         if segments is None or not segments.any():
             return KeyframeLabels(segments)
-        own_ids = self._source == "recording" and self._associator.uses_own_ids
-        if own_ids:
+        if self._associator.uses_own_ids:
             return KeyframeLabels(segments)
         depth, view = keyframe.depth_m(), None
         if show is not None:
@@ -115,6 +122,7 @@ class ObjectMasks:
             mask = frame.load_mask()
             if self._source is None:
                 self._source = "geometry" if mask is None else "recording"
+                self._associator = self._make_associator()
             if self._source == "recording":
                 return mask if mask is None else _checked(mask, frame)
         if self._segment is None:
