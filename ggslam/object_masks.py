@@ -35,14 +35,17 @@ class MaskSettings:
     model: str = ""
     """ONNX file of a segmentation model (YOLO-seg or SAM family); needs the extra [masks]."""
     min_views: int = 3
-    """Objects found by a segmenter or by association on fewer keyframes than this are noise (short runs: on any)."""
+    """Objects that a segmenter or association found on fewer keyframes are noise. Runs of less than ten keyframes for
+    each of these views ask for less."""
+    min_gaussians: int = 20
+    """...and so are those with fewer Gaussians."""
     cleaning: CleaningSettings = field(default_factory=CleaningSettings)
     association: AssociationSettings = field(default_factory=AssociationSettings)
     geometry: GeometricSettings = field(default_factory=GeometricSettings)
     onnx: OnnxSegmenterSettings = field(default_factory=OnnxSegmenterSettings)
 
     def __post_init__(self) -> None:
-        check_ranges(self, {"min_views": (1, 10**6)})
+        check_ranges(self, {"min_views": (1, 10**6), "min_gaussians": (0, 10**9)})
 
 
 class ObjectMasks:
@@ -130,13 +133,19 @@ class ObjectMasks:
             self._segment = lambda frame: segmenter.segment(frame.color, frame.depth, frame.camera)
         return self._segment(frame)
 
-    def noise(self, object_ids: np.ndarray, seen: dict[int, Observation]) -> list[int]:
-        """Of `object_ids`, those that were seen too rarely to be believed."""
+    def noise(
+        self, object_ids: np.ndarray, seen: dict[int, Observation], keyframes: int, sizes: np.ndarray
+    ) -> list[int]:
+        """Of `object_ids`, those that are too small or were seen too rarely, in so many keyframes, to be believed.
+
+        Args:
+            sizes: number of Gaussians by id, [65536].
+        """
         if self.supervision == "masks":
             return []
         views = {i: seen[i].views if i in seen else 0 for i in object_ids.tolist()}
-        enough = min(self.settings.min_views, max(views.values(), default=0))
-        return [i for i, count in views.items() if count < enough]
+        enough = min(self.settings.min_views, 1 + keyframes // 10)
+        return [i for i, count in views.items() if count < enough or sizes[i] < self.settings.min_gaussians]
 
 
 def _choose(settings: MaskSettings, has_masks: bool | None) -> Source | None:

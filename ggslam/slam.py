@@ -19,7 +19,7 @@ import numpy as np
 
 from ggslam.config import Config
 from ggslam.errors import SequenceError
-from ggslam.mapping.identity import IdentityLearner
+from ggslam.mapping.identity import IdentityLearner, vote_labels
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper, MapperTimes
 from ggslam.native.loader import NativeContext
@@ -239,7 +239,8 @@ class Slam:
             return self._objects
         self._settled = True  # if it fails below, the map can still be had by another call
         seen = observations(self.mapper.keyframes, identity.current)
-        noise = self.masks.noise(identity.classifier.class_ids, seen)
+        sizes = np.bincount(vote_labels(self.map), minlength=65536)
+        noise = self.masks.noise(identity.classifier.class_ids, seen, len(self.mapper.keyframes), sizes)
         identity.forget(self.map, noise)
         self.mapper.finish_identity()
         kept = {i: observation for i, observation in seen.items() if i not in noise}
