@@ -31,7 +31,7 @@ class MaskSettings:
     """Where object masks come from and what is done to them."""
 
     source: Source = "auto"
-    """auto: `model` if one is named, else the recording's masks if it has any, else geometry; none: learn no objects."""
+    """auto: `model` if one is named, else the recording's masks if it has any, else geometry; none: no objects."""
     model: str = ""
     """ONNX file of a segmentation model (YOLO-seg or SAM family); needs the extra [masks]."""
     min_views: int = 3

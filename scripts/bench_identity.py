@@ -4,9 +4,9 @@
     python scripts/bench_identity.py                     # no identity, the published schedule, ours, votes only
     python scripts/bench_identity.py --ablation          # and single choices of ours
 
-Runs on a recording with exact instance masks. Every line is one run in a process of its own; nothing else should run on
-the machine. `wall` is the time from the first frame to the end of the last identity step, scoring excluded; its ratio is
-to the run without identity that was measured right before, because the speed of a shared machine drifts.
+Runs on a recording with exact instance masks. Every line is one run in a process of its own; nothing else should run
+on the machine. `wall` is the time from the first frame to the end of the last identity step, scoring excluded; its
+ratio is to the run without identity that was measured right before, because the speed of a shared machine drifts.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.pixel_terms import FeatureAdamSettings, PixelTerms
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
+from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
 
 SH_C0 = 0.28209479177387814
 MANY_CLASSES = 128
@@ -307,7 +307,7 @@ class IdentityLearner:
 def cross_entropy(
     features: np.ndarray, classifier: IdentityClassifier, classes: np.ndarray, chosen: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mean softmax cross-entropy of classified features.
+    """Mean softmax cross-entropy of classified features; being nothing competes with the classes.
 
     Args:
         features: float32 [P, F].
@@ -320,11 +320,12 @@ def cross_entropy(
     """
     weight = classifier.weight[chosen]
     z = features @ weight.T + classifier.bias[chosen]
-    z -= z.max(1, keepdims=True)
+    highest = z.max(1, keepdims=True, initial=NOTHING_LOGIT)
+    z -= highest
     rows, true = np.arange(len(z)), np.searchsorted(chosen, classes)
     right = z[rows, true]
     np.exp(z, out=z)
-    sums = z.sum(1)
+    sums = z.sum(1) + np.exp(NOTHING_LOGIT - highest[:, 0])
     loss = float((np.log(sums) - right).mean())
     z /= sums[:, None]
     z[rows, true] -= 1

@@ -2,7 +2,7 @@
 """The 3-D regularisation of identity vectors, on an index of neighbours that is refreshed as the map changes.
 
 Ye et al., "Gaussian Grouping", 2024, eq. 4: L = (l_val / C) mean over sampled Gaussians j and their k nearest
-neighbours i of KL(P_j || Q_i), P and Q being softmax(classifier(identity)).
+neighbours i of KL(P_j || Q_i), P and Q being softmax(classifier(identity)), with being nothing as one class more.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import NOTHING_LOGIT
 
 
 class NeighbourIndex:
@@ -50,10 +51,10 @@ def kl_gradient(logits: np.ndarray, neighbour_logits: np.ndarray) -> tuple[float
     Returns:
         The mean, d mean / d logits [M, C], d mean / d neighbour_logits [M, k, C].
     """
-    log_p, log_q = _log_softmax(logits)[:, None], _log_softmax(neighbour_logits)
+    (log_p, nothing_p), (log_q, nothing_q) = _log_softmax(logits[:, None]), _log_softmax(neighbour_logits)
     p = np.exp(log_p)
     difference = log_p - log_q
-    kl = (p * difference).sum(-1, keepdims=True)
+    kl = (p * difference).sum(-1, keepdims=True) + np.exp(nothing_p) * (nothing_p - nothing_q)
     pairs = kl.size
     return (
         float(kl.sum() / pairs),
@@ -62,6 +63,9 @@ def kl_gradient(logits: np.ndarray, neighbour_logits: np.ndarray) -> tuple[float
     )
 
 
-def _log_softmax(z: np.ndarray) -> np.ndarray:
-    z = z - z.max(-1, keepdims=True)
-    return z - np.log(np.exp(z).sum(-1, keepdims=True))
+def _log_softmax(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the classes [..., C] and of nothing [..., 1]."""
+    highest = z.max(-1, keepdims=True, initial=NOTHING_LOGIT)
+    z, nothing = z - highest, NOTHING_LOGIT - highest
+    log_sum = np.log(np.exp(z).sum(-1, keepdims=True) + np.exp(nothing))
+    return z - log_sum, nothing - log_sum

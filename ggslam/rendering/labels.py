@@ -13,7 +13,7 @@ from ggslam.errors import RenderError
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import Gaussians, RenderBuffers
 from ggslam.scene.camera import Camera
-from ggslam.scene.identity import IdentityClassifier
+from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
 
 MIN_ALPHA = 0.5
 """Pixels that are covered less than this show no object."""
@@ -39,7 +39,7 @@ def label_image(
         min_alpha: pixels below it get id 0.
 
     Returns:
-        Ids uint16 [H, W] and their probabilities float32 [H, W]; 0 and 0 where alpha is too low or without classes.
+        Ids uint16 [H, W] and their probabilities float32 [H, W]; 0 and 0 where alpha is too low or no object is seen.
 
     Raises:
         RenderError: shapes that do not fit.
@@ -63,9 +63,11 @@ def label_image(
             logits = torch.addmm(bias, vectors[part], weight)
             best = logits.numpy().argmax(1)  # torch's own takes several times longer
             highest = logits.gather(1, torch.from_numpy(best)[:, None])
-            confidence.reshape(-1)[part] = logits.sub_(highest).exp_().sum(1).reciprocal_().numpy()
-            ids.reshape(-1)[part] = classifier.class_ids[best]
-    empty = (alpha < min_alpha).numpy()
+            sums = logits.sub_(highest).exp_().sum(1).add_((NOTHING_LOGIT - highest[:, 0]).exp_())
+            something = (highest[:, 0] > NOTHING_LOGIT).numpy()
+            confidence.reshape(-1)[part] = sums.reciprocal_().numpy()
+            ids.reshape(-1)[part] = np.where(something, classifier.class_ids[best], 0)
+    empty = (alpha < min_alpha).numpy() | (ids == 0)
     ids[empty], confidence[empty] = 0, 0
     return ids, confidence
 

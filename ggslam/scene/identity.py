@@ -2,7 +2,8 @@
 """The classifier that says which object an identity vector belongs to: a 1x1 convolution, in other words one matrix.
 
 Ye et al., "Gaussian Grouping: Segment and Edit Anything in 3D Scenes", 2024; GG-SLAM. Unlike there the number of
-classes is not fixed: a class is added for every object id that appears.
+classes is not fixed: a class is added for every object id that appears. And there is always one thing more that a vector
+can be: nothing, with a constant logit. Without it whatever no mask has labelled would be given to some object.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from ggslam.errors import FormatError
 
 IDENTITY_CHANNELS = 16
 """Length of an identity vector."""
+NOTHING_LOGIT = 1.0
+"""Logit of being no object. Vectors of what was never labelled stay near zero, and all logits of a zero vector too."""
 
 
 @dataclass
@@ -47,22 +50,26 @@ class IdentityClassifier:
         return features @ self.weight.T + self.bias
 
     def probabilities(self, features: np.ndarray) -> np.ndarray:
-        """Softmax of the logits, float32 [..., C]."""
+        """Softmax of the logits and that of nothing, float32 [..., C]; what they lack to 1 is nothing's."""
         z = self.logits(features)
-        z -= z.max(-1, keepdims=True, initial=-np.inf)
+        highest = z.max(-1, keepdims=True, initial=NOTHING_LOGIT)
+        z -= highest
         np.exp(z, out=z)
-        z /= z.sum(-1, keepdims=True)
+        z /= z.sum(-1, keepdims=True) + np.exp(NOTHING_LOGIT - highest)
         return z
 
     def labels(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Most probable object id, uint16 [...], and its probability, float32 [...]; 0 and 0 without classes."""
+        """Most probable object id, uint16 [...], and its probability, float32 [...]; 0 and 0 where nothing is more
+        probable than every object."""
         shape = features.shape[:-1]
         if not len(self):
             return np.zeros(shape, np.uint16), np.zeros(shape, np.float32)
         z = self.logits(features)
         best = z.argmax(-1)
-        z -= np.take_along_axis(z, best[..., None], -1)
-        return self.class_ids[best], 1 / np.exp(z, out=z).sum(-1)
+        highest = np.take_along_axis(z, best[..., None], -1)
+        probability = 1 / (np.exp(z - highest).sum(-1) + np.exp(NOTHING_LOGIT - highest[..., 0]))
+        something = highest[..., 0] > NOTHING_LOGIT
+        return np.where(something, self.class_ids[best], 0).astype(np.uint16), np.where(something, probability, 0)
 
     def class_of(self, object_id: int) -> int:
         """Number of the class of an object id.

@@ -22,14 +22,15 @@ from ggslam.rendering.labels import render_labels
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import NOTHING_LOGIT
 
 CAMERA = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
 
 
-def wall(index: int = 0) -> Frame:
-    u, v = np.meshgrid(np.arange(80), np.arange(60))
+def wall(index: int = 0, camera: Camera = CAMERA) -> Frame:
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     color = np.stack([128 + 100 * np.sin(u / 6), 128 + 100 * np.cos(v / 5), 100 + 50 * np.sin((u + v) / 9)], -1)
-    return Frame(index, index, index / 30, color.astype(np.uint8), (2.0 + 0.005 * u).astype(np.float32), CAMERA)
+    return Frame(index, index, index / 30, color.astype(np.uint8), (2.0 + 0.4 * u / camera.width).astype(np.float32), camera)
 
 
 def pictures(small: int = 300, big: int = 2) -> np.ndarray:
@@ -52,9 +53,9 @@ def trained(mask: np.ndarray | None, iterations: int = 40, **changes: object) ->
     return mapper
 
 
-def shown(mapper: Mapper) -> np.ndarray:
+def shown(mapper: Mapper, camera: Camera = CAMERA) -> np.ndarray:
     assert mapper.identity is not None
-    return render_labels(CpuRasterizer(), mapper.map, mapper.identity.classifier, CAMERA, np.eye(4))[0]
+    return render_labels(CpuRasterizer(), mapper.map, mapper.identity.classifier, camera, np.eye(4))[0]
 
 
 # --- the whole --------------------------------------------------------------------------------------------------------
@@ -99,10 +100,15 @@ def test_a_run_repeats_bit_for_bit() -> None:
 
 
 def test_a_thousand_objects() -> None:
-    mask = (np.arange(4800).reshape(60, 80) // 4 + 1).astype(np.uint16)  # 1200 ids of 4 pixels
-    mapper = trained(mask, 10)
+    mask = np.kron(np.arange(1, 1201).reshape(30, 40), np.ones((4, 4))).astype(np.uint16)  # 1200 ids of 4x4 pixels
+    camera = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
+    mapper = make_mapper(pixels=2048)
+    mapper.add_keyframe(wall(camera=camera), np.eye(4), lambda keyframe, show: KeyframeLabels(mask))
+    mapper.run(40)
+    mapper.finish_identity()
     assert mapper.identity is not None and len(mapper.identity.classifier) == 1200
-    assert (mapper.map.object_id > 0).float().mean() > 0.6 and len(torch.unique(mapper.map.object_id)) > 900
+    assert (mapper.map.object_id > 0).float().mean() > 0.75 and len(torch.unique(mapper.map.object_id)) > 1100
+    assert (shown(mapper, camera) == mask).mean() > 0.6
 
 
 @pytest.mark.parametrize("mask", [None, np.zeros((60, 80), np.uint16)])
@@ -123,6 +129,7 @@ def test_unlabelled_pixels_teach_nothing() -> None:
     mapper = trained(mask)
     right = (mapper.map.means[:, 0] / mapper.map.means[:, 2] * 70 + 39.5 > 74).numpy()
     assert right.any() and not mapper.map.object_id.numpy()[right].any()
+    assert (shown(mapper)[:, 75:] > 0).mean() < 0.2  # nor does a rendering give all of them to the objects beside
 
 
 # --- merging, splitting, taking back ----------------------------------------------------------------------------------
@@ -176,6 +183,10 @@ def test_the_map_shows_its_labels_to_the_next_keyframe() -> None:
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
+def with_nothing(logits: torch.Tensor) -> torch.Tensor:
+    return torch.cat([logits, torch.full((*logits.shape[:-1], 1), NOTHING_LOGIT, dtype=logits.dtype)], -1)
+
+
 def test_cross_entropy_has_the_gradients_of_torch() -> None:
     random = np.random.default_rng(0)
     table = ClassTable(random)
@@ -186,7 +197,7 @@ def test_cross_entropy_has_the_gradients_of_torch() -> None:
     f = torch.tensor(features, requires_grad=True)
     w = torch.tensor(table.classifier.weight, requires_grad=True)
     b = torch.tensor(table.classifier.bias, requires_grad=True)
-    expected = torch.nn.functional.cross_entropy(f @ w.T + b, torch.from_numpy(classes))
+    expected = torch.nn.functional.cross_entropy(with_nothing(f @ w.T + b), torch.from_numpy(classes))
     expected.backward()
     assert loss == pytest.approx(expected.item(), rel=1e-5)
     assert np.allclose(gradient, f.grad, atol=1e-6)
@@ -201,7 +212,7 @@ def test_cross_entropy_over_some_classes() -> None:
     chosen = np.array([3, 50, 200])
     loss, gradient, rows = cross_entropy(features, table.classifier, np.array([50, 3, 3, 200, 50]), chosen)
     logits = torch.from_numpy(table.classifier.logits(features)[:, chosen])
-    expected = torch.nn.functional.cross_entropy(logits, torch.tensor([1, 0, 0, 2, 1]))
+    expected = torch.nn.functional.cross_entropy(with_nothing(logits), torch.tensor([1, 0, 0, 2, 1]))
     assert loss == pytest.approx(float(expected), rel=1e-5) and rows.shape == (3, 17) and gradient.shape == (5, 16)
 
 
@@ -210,10 +221,10 @@ def test_kl_has_the_gradients_of_torch() -> None:
     z, q = random.normal(size=(6, 5)), random.normal(size=(6, 3, 5))
     value, own, others = kl_gradient(z, q)
     a, b = torch.tensor(z, requires_grad=True), torch.tensor(q, requires_grad=True)
-    log_p, log_q = torch.log_softmax(a, -1)[:, None], torch.log_softmax(b, -1)
+    log_p, log_q = torch.log_softmax(with_nothing(a), -1)[:, None], torch.log_softmax(with_nothing(b), -1)
     expected = (log_p.exp() * (log_p - log_q)).sum(-1).mean()
     expected.backward()
-    assert value == pytest.approx(float(expected)) and value > 0
+    assert value == pytest.approx(expected.item()) and value > 0
     assert np.allclose(own, a.grad) and np.allclose(others, b.grad)
 
 
