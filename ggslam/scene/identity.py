@@ -2,8 +2,8 @@
 """The classifier that says which object an identity vector belongs to: a 1x1 convolution, in other words one matrix.
 
 Ye et al., "Gaussian Grouping: Segment and Edit Anything in 3D Scenes", 2024; GG-SLAM. Unlike there the number of
-classes is not fixed: a class is added for every object id that appears. And there is always one thing more that a vector
-can be: nothing, with a constant logit. Without it whatever no mask has labelled would be given to some object.
+classes is not fixed: a class is added for every object id that appears. And there is one thing more that a vector can
+be: nothing, with a constant logit. Without it whatever no mask has labelled would be given to some object.
 """
 
 from __future__ import annotations

@@ -30,7 +30,8 @@ CAMERA = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
 def wall(index: int = 0, camera: Camera = CAMERA) -> Frame:
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     color = np.stack([128 + 100 * np.sin(u / 6), 128 + 100 * np.cos(v / 5), 100 + 50 * np.sin((u + v) / 9)], -1)
-    return Frame(index, index, index / 30, color.astype(np.uint8), (2.0 + 0.4 * u / camera.width).astype(np.float32), camera)
+    depth = (2.0 + 0.4 * u / camera.width).astype(np.float32)
+    return Frame(index, index, index / 30, color.astype(np.uint8), depth, camera)
 
 
 def pictures(small: int = 300, big: int = 2) -> np.ndarray:

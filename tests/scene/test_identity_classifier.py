@@ -13,7 +13,8 @@ from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
 
 
 def classifier() -> IdentityClassifier:
-    return IdentityClassifier(np.array([7, 300], np.uint16), 4 * np.eye(2, 16, dtype=np.float32), np.zeros(2, np.float32))
+    weight = 4 * np.eye(2, 16, dtype=np.float32)
+    return IdentityClassifier(np.array([7, 300], np.uint16), weight, np.zeros(2, np.float32))
 
 
 def vector(*leading: float) -> np.ndarray:
