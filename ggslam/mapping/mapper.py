@@ -28,6 +28,8 @@ from ggslam.scene.gaussian_map import GaussianMap
 
 FINAL_DECAY = 0.2
 """The last identity steps fall to this share of their length."""
+FINAL_STEPS_A_VIEW = 2
+"""Of the last identity steps so many follow each other on one rendering, which takes as long as a step."""
 
 
 @dataclass
@@ -211,13 +213,14 @@ class Mapper:
         if self.identity is None:
             return
         start, settings = time.perf_counter(), self.identity.settings
-        visits = settings.final_passes * len(self.keyframes) if settings.schedule == "sampled" else 0
-        for i in range(visits):
+        steps = settings.final_passes * len(self.keyframes) if settings.schedule == "sampled" else 0
+        for i in range(0, steps, FINAL_STEPS_A_VIEW):
             keyframe = self.keyframes[self._sampler.draw(len(self.keyframes))]
             if keyframe.mask is None:
                 continue
             view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
-            self.identity.step(self.map, self._rasterizer, keyframe, view, FINAL_DECAY ** (i / visits))
+            for _ in range(FINAL_STEPS_A_VIEW):
+                self.identity.step(self.map, self._rasterizer, keyframe, view, FINAL_DECAY ** (i / steps))
         self.identity.label(self.map)
         self.times.identity_finish += time.perf_counter() - start
 
