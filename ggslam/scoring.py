@@ -24,7 +24,7 @@ from ggslam.progress import Observer
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering_jobs import frame_poses
 from ggslam.reporting.pictures import color_to_uint8, compare, write_picture
-from ggslam.run_folder import RunFolder, json_ready
+from ggslam.run_folder import MARKER, RunFolder, json_ready
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
@@ -84,6 +84,8 @@ def score_run(
         known = sequence.ground_truth is not None
         reason = "fewer than 3 frames have both poses" if known else "the recording has no ground-truth poses"
         notes.append(f"{reason}; no trajectory scores")
+    if edits := folder.read_json(MARKER).get("edits"):
+        notes.append(f"the map was edited ({'; '.join(edits)}); the recording was not, so edits count as errors")
     notes.extend(_segmentation_notes(folder, metrics["segmentation"], masks))
     folder.write_json("metrics.json", metrics)
     return json_ready(metrics)

@@ -6,12 +6,19 @@ Quality only; speed is the benchmarks' business.
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ggslam.pipeline import RunRequest, SequenceRequest, execute
+from ggslam.pipeline import RunRequest, SequenceRequest, execute, open_recording_of
+from ggslam.progress import SilentObserver
+from ggslam.run_folder import RunFolder
+from ggslam.scoring import score_run
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from scramble_masks import scramble_recording  # noqa: E402
 
 
 def run(recording: Path, out: Path, overrides: list[str], **selection: Any) -> tuple[dict[str, Any], list[str]]:
@@ -47,6 +54,7 @@ def test_shelf_is_tracked_to_the_end(shared_data: Path, tmp_path: Path) -> None:
 def test_livingroom(shared_data: Path, tmp_path: Path) -> None:
     m, _ = run(shared_data / "livingroom", tmp_path / "run", [])
     assert m["images"]["held_out"]["psnr"] >= 35.0 and m["map"]["gaussians"] <= 120_000
+    assert m["segmentation"]["held_out"]["miou"] >= 0.97
     assert m["trajectory"]["ate_rmse_m"] <= 0.0005 and m["images"]["all"]["depth_l1_m"] <= 0.008
 
 
@@ -75,3 +83,22 @@ def test_cabinet_is_tracked_to_the_end(shared_data: Path, tmp_path: Path) -> Non
     recording = shared_data / "rgbd_dataset_freiburg3_cabinet"
     _, status = run(recording, tmp_path / "run", ["mapping.iterations_per_frame=8"])
     assert len(status) == 58 and "lost" not in status
+
+
+@pytest.mark.slow
+def test_livingroom_with_ids_shuffled_in_every_frame(shared_data: Path, tmp_path: Path) -> None:
+    """A fifth of the segments is split, a twentieth dropped, a hundredth of the pixels are dots."""
+    recording = shared_data / "livingroom"
+    scramble_recording(recording, tmp_path / "masks", 0, 0.2, 0.05, 0.01)
+    run(recording, tmp_path / "run", [], masks=tmp_path / "masks")
+    true_masks = recording / "semantic_instance"
+    folder = RunFolder(tmp_path / "run")
+    truth = open_recording_of(folder, masks=true_masks)
+    segmentation = score_run(folder, truth, SilentObserver(), lpips=False, masks=true_masks)["segmentation"]
+    assert segmentation["matching"] == "assignment" and segmentation["held_out"]["miou"] >= 0.85
+
+
+@pytest.mark.slow
+def test_redkitchen_without_masks(shared_data: Path, tmp_path: Path) -> None:
+    m, _ = run(shared_data / "redkitchen", tmp_path / "run", ["masks.source=geometry"])
+    assert m["segmentation"]["matching"] == "assignment" and m["segmentation"]["held_out"]["accuracy"] > 0.75

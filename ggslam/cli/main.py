@@ -15,7 +15,15 @@ from rich.markup import escape
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from ggslam import __version__
-from ggslam.cli import eval_command, export_command, inspect_command, render_command, run_command, synth_command
+from ggslam.cli import (
+    edit_command,
+    eval_command,
+    export_command,
+    inspect_command,
+    render_command,
+    run_command,
+    synth_command,
+)
 from ggslam.errors import GgslamError
 
 app = typer.Typer(
@@ -44,10 +52,12 @@ def _options(
 _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "run": (run_command.run, run_command.EPILOG), "eval": (eval_command.evaluate, eval_command.EPILOG),
     "render": (render_command.render, render_command.EPILOG), "export": (export_command.export, export_command.EPILOG),
+    "edit": (edit_command.edit, edit_command.EPILOG),
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
 }  # fmt: skip
 for _name, (_function, _epilog) in _COMMANDS.items():
-    app.command(_name, epilog=_epilog, no_args_is_help=True)(_function)
+    _class = edit_command.EditCommand if _name == "edit" else None
+    app.command(_name, cls=_class, epilog=_epilog, no_args_is_help=True)(_function)
 
 
 def main() -> None:

@@ -18,10 +18,10 @@ from ggslam.errors import ConfigError
 from ggslam.objects.encoding import assign, code_of, with_class
 from ggslam.objects.membership import MembershipSettings, members
 from ggslam.objects.recoloring import recolor
-from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
+from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.objects.segmented_rows import append_copies, copies_of, joined, keep_rows, merged_votes, votes_without
 from ggslam.objects.table import ObjectTable, Observation
-from ggslam.rendering.types import PARAMETERS, GaussianTensors
-from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.rendering.types import GaussianTensors
 from ggslam.scene.poses import quaternion_to_matrix
 
 Vector = Sequence[float]
@@ -36,12 +36,14 @@ class Change:
         before: the Gaussians concerned as they were; empty if nothing can be seen of the edit.
         after: as they are now; empty if they are gone.
         vacated: whether `before` left its place, so that there may be a hole.
+        displaced: ids of objects that are now where no recording shows them: moved ones and duplicates.
     """
 
     text: str
     before: GaussianTensors
     after: GaussianTensors
     vacated: bool = False
+    displaced: tuple[int, ...] = ()
 
 
 def remove_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
@@ -49,10 +51,10 @@ def remove_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
     their neighbours."""
     what = _labels(scene, ids)
     gone = members(scene.gaussians, scene.classifier, list(ids))
-    before = _copies(scene.gaussians, gone)
-    _keep_rows(scene, ~gone)
+    before = copies_of(scene.gaussians, gone)
+    keep_rows(scene, ~gone)
     _forget(scene, ids)
-    _rebuild(scene)
+    rebuild_table(scene)
     return Change(f"removed {what}: {int(gone.sum())} Gaussians", before, _nothing(scene), vacated=True)
 
 
@@ -61,11 +63,11 @@ def keep_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
     what = _labels(scene, ids)
     own = {i: members(scene.gaussians, scene.classifier, [i], MembershipSettings(floaters=False)) for i in ids}
     kept = np.logical_or.reduce(list(own.values()))
-    before = _copies(scene.gaussians, ~kept)
+    before = copies_of(scene.gaussians, ~kept)
     _claim(scene, own)
-    _keep_rows(scene, kept)
+    keep_rows(scene, kept)
     _forget(scene, [i for i in scene.table.ids() if i not in ids])
-    _rebuild(scene)
+    rebuild_table(scene)
     return Change(f"kept {what}: {int(kept.sum())} Gaussians, {len(before.means)} removed", before, _nothing(scene))
 
 
@@ -83,24 +85,33 @@ def move_objects(
     """
     what = _labels(scene, ids)
     rows, stray = _claimed_rows(scene, ids)
-    before = _copies(scene.gaussians, rows)
+    before = copies_of(scene.gaussians, rows)
     T = rigid_motion(_centroid(before), shift, rotate_degrees)
     scene.gaussians.object_id[torch.from_numpy(stray)] = 0
     scene.gaussians.move(torch.from_numpy(rows), torch.from_numpy(T))
-    _rebuild(scene)
+    rebuild_table(scene)
     left = f", {int(stray.sum())} floaters stay unlabelled" if stray.any() else ""
     text = f"moved {what} by {_numbers(shift)} m"
     text += f", turned by {_numbers(rotate_degrees)} degrees" if any(rotate_degrees) else ""
-    return Change(f"{text}: {int(rows.sum())} Gaussians{left}", before, _copies(scene.gaussians, rows), vacated=True)
+    text += f": {int(rows.sum())} Gaussians{left}"
+    return Change(text, before, copies_of(scene.gaussians, rows), vacated=True, displaced=tuple(ids))
 
 
-def duplicate_objects(scene: SegmentedMap, ids: Sequence[int], shift: Vector) -> Change:
+def duplicate_objects(scene: SegmentedMap, ids: Sequence[int], shift: Vector | None = None) -> Change:
     """Copies objects to another place. Each copy is an object of its own, with the next free id and its own class.
+
+    Args:
+        scene: the map.
+        ids: of the objects.
+        shift: metres along the world's axes; None: to the right by a little more than the widest of them measures.
 
     Raises:
         ConfigError: no id is left.
     """
     what = _labels(scene, ids)
+    if shift is None:
+        boxes = [scene.table.record(i).box for i in ids]
+        shift = (round(1.2 * max(float(np.abs(np.array(b.axes)[:, 0]) @ b.size) for b in boxes), 3), 0.0, 0.0)
     names, T, first = _names(scene.table), rigid_motion(np.zeros(3), shift), len(scene.gaussians)
     made: list[int] = []
     before: list[GaussianTensors] = []
@@ -109,27 +120,31 @@ def duplicate_objects(scene: SegmentedMap, ids: Sequence[int], shift: Vector) ->
         new_id = max([*scene.table.ids(), *scene.classifier.class_ids.tolist(), *made], default=0) + 1
         if new_id > 65535:
             raise ConfigError("no object id is left for a duplicate: ids end at 65535")
-        before.append(_copies(scene.gaussians, rows))
-        copies = _append(scene, rows)
+        before.append(copies_of(scene.gaussians, rows))
+        copies = append_copies(scene, rows)
         scene.gaussians.move(torch.from_numpy(copies), torch.from_numpy(T))
         _enrol(scene, copies, new_id)
         if object_id in names:
             names[new_id] = f"{names[object_id]} copy"
         made.append(new_id)
-    _rebuild(scene, names)
-    after = _copies(scene.gaussians, np.arange(len(scene.gaussians)) >= first)
+    rebuild_table(scene, names)
+    after = copies_of(scene.gaussians, np.arange(len(scene.gaussians)) >= first)
     copies_are = ", ".join(scene.table.record(i).label() for i in made)
-    return Change(f"duplicated {what} by {_numbers(shift)} m: {copies_are}", _joined(before), after)
+    return Change(
+        f"duplicated {what} by {_numbers(shift)} m: {copies_are}", joined(before), after, displaced=tuple(made)
+    )
 
 
 def recolor_objects(scene: SegmentedMap, ids: Sequence[int], color: tuple[int, int, int]) -> Change:
     """Gives objects a mean colour (0 to 255); see `recoloring.recolor`."""
     what = _labels(scene, ids)
-    rows = members(scene.gaussians, scene.classifier, list(ids))
-    before = _copies(scene.gaussians, rows)
+    # Floaters are left out: many are faint and wide, and would cast the new colour over what lies behind them.
+    own = [members(scene.gaussians, scene.classifier, [i], MembershipSettings(floaters=False)) for i in ids]
+    rows = np.logical_or.reduce(own)
+    before = copies_of(scene.gaussians, rows)
     recolor(scene.gaussians, rows, color)
     text = f"recoloured {what} to #{''.join(f'{value:02x}' for value in color)}: {int(rows.sum())} Gaussians"
-    return Change(text, before, _copies(scene.gaussians, rows))
+    return Change(text, before, copies_of(scene.gaussians, rows))
 
 
 def merge_objects(scene: SegmentedMap, kept: int, merged: int) -> Change:
@@ -152,8 +167,8 @@ def merge_objects(scene: SegmentedMap, kept: int, merged: int) -> Change:
     scene.classifier = scene.classifier.without([merged])
     assign(scene.gaussians, scene.classifier, rows, kept)
     if scene.votes is not None:
-        scene.votes = _votes_with(scene.votes, merged, kept)
-    _rebuild(scene, names, seen)
+        scene.votes = merged_votes(scene.votes, merged, kept)
+    rebuild_table(scene, names, seen)
     return Change(f"merged {what}: {int(rows.sum())} Gaussians", _nothing(scene), _nothing(scene))
 
 
@@ -211,8 +226,7 @@ def _forget(scene: SegmentedMap, ids: Sequence[int]) -> None:
     """Takes objects that are gone from the classifier, the votes and the labels."""
     scene.classifier = scene.classifier.without(list(ids))
     if scene.votes is not None:
-        gone = np.isin(scene.votes.ids, ids)
-        scene.votes = ObjectVotes(np.where(gone, 0, scene.votes.ids), np.where(gone, 0, scene.votes.weights))
+        scene.votes = votes_without(scene.votes, ids)
     g, labels = scene.gaussians, scene.gaussians.object_id.numpy()
     stray, others = np.flatnonzero(np.isin(labels, ids)), np.flatnonzero((labels > 0) & ~np.isin(labels, ids))
     if len(stray) and len(others):
@@ -235,57 +249,11 @@ def _enrol(scene: SegmentedMap, rows: np.ndarray, object_id: int) -> None:
         scene.votes.ids[rows, 0] = object_id
 
 
-# --- rows of the map and what goes with them ------------------------------------------------------------------------
-
-
-def _keep_rows(scene: SegmentedMap, rows: np.ndarray) -> None:
-    scene.gaussians.keep(torch.from_numpy(rows))
-    if scene.votes is not None:
-        scene.votes = ObjectVotes(scene.votes.ids[rows], scene.votes.weights[rows])
-
-
-def _append(scene: SegmentedMap, rows: np.ndarray) -> np.ndarray:
-    """Appends copies of Gaussians (bool [N]); returns which they are, bool of the new length."""
-    g, index = scene.gaussians, torch.from_numpy(np.flatnonzero(rows))
-    new = g.insert(
-        g.means[index], g.quaternions[index], g.log_scales[index], g.opacity_logits[index], g.rgb[index],
-        g.features[index], object_id=g.object_id[index],
-    )  # fmt: skip
-    g.sh[new] = g.sh[index]
-    g.birth_keyframe[new] = g.birth_keyframe[index]
-    if scene.votes is not None:
-        own = scene.votes
-        scene.votes = ObjectVotes(
-            np.concatenate([own.ids, own.ids[rows]]), np.concatenate([own.weights, own.weights[rows]])
-        )
-    return np.arange(len(g)) >= new.start
-
-
-def _copies(gaussians: GaussianMap, rows: np.ndarray) -> GaussianTensors:
-    index = torch.from_numpy(np.flatnonzero(rows))
-    return GaussianTensors(**{name: getattr(gaussians, name)[index].clone() for name in PARAMETERS})
+# --- small things ---------------------------------------------------------------------------------------------------
 
 
 def _nothing(scene: SegmentedMap) -> GaussianTensors:
-    return _copies(scene.gaussians, np.zeros(len(scene.gaussians), bool))
-
-
-def _joined(parts: Sequence[GaussianTensors]) -> GaussianTensors:
-    return GaussianTensors(**{name: torch.cat([getattr(part, name) for part in parts]) for name in PARAMETERS})
-
-
-def _votes_with(votes: ObjectVotes, merged: int, kept: int) -> ObjectVotes:
-    """Votes for `merged` counted for `kept`, in one slot."""
-    ids, weights = np.where(votes.ids == merged, kept, votes.ids).astype(np.uint16), votes.weights.copy()
-    own = ids == kept
-    total, first = np.where(own, weights, 0).sum(1), own.argmax(1)
-    weights[own], ids[own] = 0, 0
-    rows = np.flatnonzero(own.any(1))
-    ids[rows, first[rows]], weights[rows, first[rows]] = kept, total[rows]
-    return ObjectVotes(ids, weights)
-
-
-# --- the table ------------------------------------------------------------------------------------------------------
+    return copies_of(scene.gaussians, np.zeros(len(scene.gaussians), bool))
 
 
 def _names(table: ObjectTable) -> dict[int, str]:
@@ -300,7 +268,7 @@ def _observations(table: ObjectTable) -> dict[int, Observation]:
     }
 
 
-def _rebuild(
+def rebuild_table(
     scene: SegmentedMap, names: Mapping[int, str] | None = None, seen: Mapping[int, Observation] | None = None
 ) -> None:
     """Lists the objects anew, with the names and observations of the former table unless others are given."""

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 from ggslam.errors import ConfigError
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import IdentityClassifier
+from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
 
 CERTAIN = 0.9
 """Probability from which an identity vector is an example of its object."""
@@ -78,8 +78,9 @@ def _computed_code(classifier: IdentityClassifier, number: int) -> np.ndarray:
 
     def loss(vector: np.ndarray) -> tuple[float, np.ndarray]:
         logits = weight @ vector + bias
-        logits -= logits.max()
-        probabilities = np.exp(logits) / np.exp(logits).sum()
+        highest = max(logits.max(), NOTHING_LOGIT)
+        probabilities = np.exp(logits - highest)
+        probabilities /= probabilities.sum() + np.exp(NOTHING_LOGIT - highest)
         gradient = probabilities @ weight - weight[number] + 2e-4 * vector
         return float(-np.log(probabilities[number] + 1e-300) + 1e-4 * vector @ vector), gradient
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import PARAMETERS, Gaussians, GaussianTensors
@@ -18,11 +17,6 @@ COVERED = 0.3
 """Share of a pixel's colour from which the object is said to cover it."""
 SOLID = 0.8
 """Alpha from which a pixel is said to show a surface; the rest of it would be black."""
-_RESIDUE_VIEWS = 64
-_SELDOM = 0.15
-"""Weight without the object, as a share of what it has now in the object's pixels, up to which it was just hidden."""
-_CLEAR = 0.5
-"""Share of its weight in pixels without the object up to which a Gaussian is a trace of it."""
 
 
 @dataclass(frozen=True)
@@ -32,14 +26,12 @@ class View:
     Attributes:
         camera: its intrinsics.
         T_camera_world: float64 [4, 4].
-        color: recorded uint8 [H, W, 3], if the recording is at hand.
-        depth: recorded float32 [H, W], metres, 0 = none; likewise.
+        frame: number of the recorded frame it is the view of, if any.
     """
 
     camera: Camera
     T_camera_world: np.ndarray
-    color: np.ndarray | None = None
-    depth: np.ndarray | None = None
+    frame: int | None = None
 
     @property
     def position(self) -> np.ndarray:
@@ -71,12 +63,14 @@ class HoleView:
         covered: bool [H, W], pixels that the removed object covered.
         before: depth [H, W] with the object, metres, 0 where nothing is.
         now: depth [H, W] without it, likewise.
+        picture: colours float32 [H, W, 3] without it, in [0, 1].
     """
 
     view: View
     covered: np.ndarray
     before: np.ndarray
     now: np.ndarray
+    picture: np.ndarray
 
 
 def depth_tolerance(depth: np.ndarray) -> np.ndarray:
@@ -85,7 +79,7 @@ def depth_tolerance(depth: np.ndarray) -> np.ndarray:
 
 
 def look(kept: Gaussians, removed: Gaussians, views: Sequence[View], count: int) -> list[HoleView]:
-    """The views in which the removed object covered most, at most `count`; those that show little of it are left out."""
+    """The views in which the removed object covered most, at most `count`, less those that show little of it."""
     rasterizer, both = CpuRasterizer(), marked(kept, removed)
     seen = [_hole_view(kept, both, view, rasterizer) for view in facing(removed, views)]
     areas = np.array([v.covered.sum() for v in seen], int)
@@ -98,7 +92,7 @@ def looked_again(kept: Gaussians, views: Sequence[HoleView]) -> list[HoleView]:
     rasterizer, out = CpuRasterizer(), []
     for v in views:
         image = rasterizer.forward(kept, v.view.camera, v.view.T_camera_world, features=False)
-        out.append(replace(v, now=solid_depth(image.alpha, image.expected_depth)))
+        out.append(replace(v, now=solid_depth(image.alpha, image.expected_depth), picture=_picture(image.image)))
     return out
 
 
@@ -121,47 +115,17 @@ def _hole_view(kept: Gaussians, both: GaussianTensors, view: View, rasterizer: C
     covered = out.features[0].numpy() > COVERED if out.features is not None else np.zeros(out.depth.shape, bool)
     before = solid_depth(out.alpha, out.expected_depth)
     out = rasterizer.forward(kept, view.camera, view.T_camera_world, features=False)
-    return HoleView(view, covered, before, solid_depth(out.alpha, out.expected_depth))
+    return HoleView(view, covered, before, solid_depth(out.alpha, out.expected_depth), _picture(out.image))
+
+
+def _picture(image: torch.Tensor) -> np.ndarray:
+    """The caller's own copy [H, W, 3], in [0, 1], of an image [3, H, W]."""
+    return image.numpy().transpose(1, 2, 0).clip(0, 1)
 
 
 def solid_depth(alpha: torch.Tensor, depth: torch.Tensor) -> np.ndarray:
     """Depth [H, W] where a surface is shown, else 0; the caller's own."""
     return np.where(alpha.numpy() > SOLID, depth.numpy(), 0).astype(np.float32)
-
-
-def residue(kept: Gaussians, removed: Gaussians, views: Sequence[View]) -> np.ndarray:
-    """Which of the kept Gaussians are no observation of what is there without the object, bool [N].
-
-    What such a Gaussian adds to the views goes mostly to pixels that the object covers, or nowhere: it was trained to
-    look like the object or to mend its colour from behind, or is the object's under a wrong label (masks are wrong by a
-    pixel along outlines), or was hidden nearly all the time and only shows now. Those far from the object, by its own
-    size, stay.
-    """
-    own, means = removed.means.numpy(), kept.means.numpy()
-    reach = float(np.linalg.norm(np.ptp(own, axis=0)))
-    near = np.isfinite(cKDTree(own).query(means, distance_upper_bound=reach)[0])
-    both, rasterizer = marked(kept, removed), CpuRasterizer()
-    alone = GaussianTensors(**{name: getattr(both, name)[: len(near)] for name in PARAMETERS})
-    weights = torch.zeros(len(near), 3)
-    for view in spread([view for view in views if view.project(means[near])[2].any()], _RESIDUE_VIEWS):
-        image = rasterizer.forward(both, view.camera, view.T_camera_world).features
-        assert image is not None
-        covered = (image[0] > COVERED).float()
-        covered = torch.nn.functional.max_pool2d(covered[None, None], 3, 1, 1)[0, 0]
-        weights[:, :2] += _pixel_weights(rasterizer, [1 - covered, covered])[: len(near)]
-        if covered.any():
-            rasterizer.forward(alone, view.camera, view.T_camera_world)
-            weights[:, 2] += _pixel_weights(rasterizer, [covered, covered])[:, 0]
-    clear, through, now = weights.numpy().T
-    return near & ((clear <= _CLEAR * (clear + through)) | (clear <= _SELDOM * now))
-
-
-def _pixel_weights(rasterizer: CpuRasterizer, areas: Sequence[torch.Tensor]) -> torch.Tensor:
-    """What each Gaussian of the last rendering added to some areas (images of 0 and 1), float32 [N, areas]: the
-    derivative of a feature image's sum over an area is the sum of the Gaussian's weights there."""
-    gradients = rasterizer.backward(None, grad_features=torch.stack(list(areas)))
-    assert gradients.features is not None
-    return gradients.features
 
 
 def spread(views: Sequence[View], most: int) -> list[View]:
@@ -186,3 +150,14 @@ def could_be_hidden(points: np.ndarray, views: Sequence[HoleView]) -> np.ndarray
         hidden += inside & covered & (before < z + tolerance)
         shows += inside & ((now == 0) | (now > z - tolerance))
     return (hidden > 0.25 * (hidden + seen)) & (shows > 0) & (through <= 0.2 * (through + seen + hidden))
+
+
+def is_open(points: np.ndarray, views: Sequence[HoleView]) -> np.ndarray:
+    """Whether some view sees nothing, or something behind, at world points [M, 3] that the object hid in it; bool
+    [M]."""
+    out = np.zeros(len(points), bool)
+    for v in views:
+        pixel, z, inside = v.view.project(points)
+        now, covered = v.now.reshape(-1)[pixel], v.covered.reshape(-1)[pixel]
+        out |= inside & covered & ((now == 0) | (now > z + depth_tolerance(z)))
+    return out

@@ -4,20 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from ggslam.objects.hole_views import HoleView, could_be_hidden
+from ggslam.objects.hole_views import HoleView, could_be_hidden, depth_tolerance, is_open
 from ggslam.objects.rim_planes import RimPlane
 from ggslam.objects.texture import fill_gap
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import PARAMETERS, Gaussians, GaussianTensors
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import inverse
+from ggslam.scene.gaussian_map import rgb_to_sh
+from ggslam.scene.poses import inverse, matrix_to_quaternion
 
 _LARGEST_CHART = 360
 _ENCLOSED, _KNOWN = 6, 5
@@ -98,7 +99,8 @@ def _front_view(
 
 def find_hole(chart: Chart, views: Sequence[HoleView], others: Sequence[RimPlane]) -> np.ndarray:
     """Cells to fill, bool [H, W]: not known, possibly surface that was never seen, and enclosed by known surface or by
-    the planes that this one runs into.
+    the planes that this one runs into. Each connected part of them is open in some view: elsewhere the map has surface
+    that is merely thin seen from the front.
 
     Args:
         chart: the plane.
@@ -111,7 +113,9 @@ def find_hole(chart: Chart, views: Sequence[HoleView], others: Sequence[RimPlane
         ends |= other.is_met(centres, 4 * chart.cell)
     stops = chart.known | ends.reshape(chart.known.shape)
     gaps = could_be_hidden(centres, views).reshape(chart.known.shape) & ~chart.known
-    return gaps & (_directions(stops, gaps) >= _ENCLOSED) & (_directions(chart.known, gaps) >= _KNOWN)
+    gaps &= (_directions(stops, gaps) >= _ENCLOSED) & (_directions(chart.known, gaps) >= _KNOWN)
+    part = cv2.connectedComponents(gaps.astype(np.uint8))[1]
+    return gaps & np.isin(part, part[gaps & is_open(centres, views).reshape(gaps.shape)])
 
 
 def _directions(stops: np.ndarray, gaps: np.ndarray) -> np.ndarray:
@@ -147,6 +151,23 @@ def paint(chart: Chart, hole: np.ndarray, margin: int) -> np.ndarray:
     return fill_gap(chart.color, source if source.any() else chart.clean, hole)
 
 
+def as_seen(chart: Chart, views: Sequence[HoleView]) -> Chart:
+    """The chart with its colours as the views show them, each cell's from the view that shows it largest.
+
+    From the front, from where nobody looked while the map was trained, Gaussians that are thin and half transparent
+    add up to other colours.
+    """
+    centres, color = chart.centres(), chart.color.reshape(-1, 3).copy()
+    largest = np.zeros(len(centres))
+    for v in views:
+        pixel, z, inside = v.view.project(centres)
+        shown = inside & ~v.covered.reshape(-1)[pixel] & (np.abs(v.now.reshape(-1)[pixel] - z) <= depth_tolerance(z))
+        slant = np.abs((centres - v.view.position) @ chart.axes[2]) / np.maximum(z, 1e-3) ** 3
+        better = shown & (slant > largest)
+        color[better], largest[better] = v.picture.reshape(-1, 3)[pixel[better]], slant[better]
+    return replace(chart, color=color.reshape(chart.color.shape))
+
+
 def overlapped(hole: np.ndarray) -> np.ndarray:
     """The hole and one cell around it, so that no gap stays along its rim. bool [H, W]."""
     return cv2.dilate(hole.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -171,9 +192,6 @@ def discs(means: np.ndarray, axes: np.ndarray, spacing: np.ndarray, colors: np.n
         spacing: metres.
         colors: [M, 3] in [0, 1].
     """
-    from ggslam.scene.gaussian_map import rgb_to_sh
-    from ggslam.scene.poses import matrix_to_quaternion
-
     rotation = axes.T if np.linalg.det(axes) > 0 else np.stack([axes[0], -axes[1], axes[2]], 1)
     scales = np.log(np.asarray(spacing)[:, None] * np.array([0.65, 0.65, 0.2]))
     count = len(means)

@@ -75,7 +75,8 @@ def find_planes(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, to
         cameras: positions [V, 3], to tell the front of a plane.
         tolerance: metres.
     """
-    rng, planes = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    planes: list[RimPlane] = []
     left, facing = points.astype(np.float64), normals.astype(np.float64)
     least = max(30, _LEAST_SHARE * len(points))
     while len(left) >= least and len(planes) < _LARGEST:
@@ -96,9 +97,7 @@ def _on(plane: np.ndarray, points: np.ndarray, normals: np.ndarray, tolerance: f
     return (np.abs(points @ plane[:3] - plane[3]) <= tolerance) & (np.abs(normals @ plane[:3]) >= _PARALLEL)
 
 
-def _best_plane(
-    points: np.ndarray, normals: np.ndarray, tolerance: float, rng: np.random.Generator
-) -> np.ndarray:
+def _best_plane(points: np.ndarray, normals: np.ndarray, tolerance: float, rng: np.random.Generator) -> np.ndarray:
     """(nx, ny, nz, offset) of the best of many planes through a point along its surface, fitted to all its inliers."""
     seeds = rng.integers(0, len(points), _TRIALS)
     offsets = np.einsum("ti,ti->t", normals[seeds], points[seeds])

@@ -3,7 +3,7 @@
 
 Criminisi, Perez, Toyama: "Region Filling and Object Removal by Exemplar-Based Image Inpainting", 2004: patch by patch
 from the rim inwards, lines first, each patch the known one that fits best. The light, which changes slowly over a
-surface, is then taken from a smooth interpolation (Telea 2004), so that a copied patch does not bring that of its place.
+surface, is then taken from a smooth interpolation (Telea 2004): a copied patch shall not bring that of its old place.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _TREND = 0.05
 _LIGHT = 0.1
 """Largest correction of brightness, in [0, 1]."""
 _MOST = 400
-"""Patches a gap may need; a larger gap is filled smoothly."""
+"""Patches a gap may need, as a rule of thumb; a larger gap is filled in a smaller picture."""
 
 
 def fill_gap(picture: np.ndarray, known: np.ndarray, gap: np.ndarray) -> np.ndarray:
@@ -29,25 +29,41 @@ def fill_gap(picture: np.ndarray, known: np.ndarray, gap: np.ndarray) -> np.ndar
         known: bool [H, W], where the picture may be copied from; at least one pixel.
         gap: bool [H, W], where colours are wanted.
     """
+    size = 2 * _HALF + 1
+    if gap.sum() > _MOST * size * size / 3:
+        return _filled_coarsely(picture, known, gap, float(np.sqrt(gap.sum() / (_MOST * size * size / 3))))
     pixels = (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
     smooth = cv2.inpaint(pixels, (~known).astype(np.uint8), 5, cv2.INPAINT_TELEA).astype(np.float32) / 255
     textured = _copied(picture.astype(np.float32), known & ~gap, gap, smooth)
     if textured is None:
         return smooth[gap]
-    width = 2 * _HALF + 1
-    light = cv2.GaussianBlur(smooth.mean(2) - textured.mean(2), (0, 0), width).clip(-_LIGHT, _LIGHT)
+    light = cv2.GaussianBlur(smooth.mean(2) - textured.mean(2), (0, 0), size).clip(-_LIGHT, _LIGHT)
     return (textured + light[..., None])[gap].clip(0, 1)
+
+
+def _filled_coarsely(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, factor: float) -> np.ndarray:
+    """`fill_gap` in a picture smaller by `factor`."""
+    rows, columns = gap.shape
+    size = max(1, int(columns / factor)), max(1, int(rows / factor))
+    small_gap = cv2.resize(gap.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+    small_known = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    small = cv2.resize(np.where(known[..., None], picture, 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    if not small_known.any():
+        small, small_known = cv2.resize(picture.astype(np.float32), size), ~small_gap
+    small[small_gap] = fill_gap(small, small_known, small_gap)
+    return np.asarray(cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR))[gap]
 
 
 def _copied(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, smooth: np.ndarray) -> np.ndarray | None:
     """The picture with the gap filled by known patches; what is neither known nor gap is `smooth`. None if no whole
-    patch is known or the gap is too large."""
+    patch is known."""
     size = 2 * _HALF + 1
     whole = cv2.erode(known.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0) > 0
-    if not whole.any() or gap.sum() > _MOST * size * size / 3:
+    if not whole.any():
         return None
-    canvas = cv2.copyMakeBorder(np.where(known[..., None], picture, smooth), *[_HALF] * 4, cv2.BORDER_REFLECT_101)
-    trend = cv2.copyMakeBorder(smooth, *[_HALF] * 4, cv2.BORDER_REFLECT_101)
+    border = ((_HALF, _HALF), (_HALF, _HALF), (0, 0))
+    canvas = np.pad(np.where(known[..., None], picture, smooth), border, mode="symmetric")
+    trend = np.pad(smooth, border, mode="symmetric")
     done = np.pad(known, _HALF)
     todo = np.pad(gap, _HALF)
     confidence = done.astype(np.float32)
@@ -56,8 +72,9 @@ def _copied(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, smooth: np.
         row, column = _next_place(canvas, done, todo, confidence)
         window = (slice(row - _HALF, row + _HALF + 1), slice(column - _HALF, column + _HALF + 1))
         mask = np.repeat(done[window].astype(np.float32)[..., None], 3, 2)
-        cost = cv2.matchTemplate(picture, canvas[window], cv2.TM_SQDIFF, mask=mask)
-        cost += _TREND * cv2.matchTemplate(picture, trend[window], cv2.TM_SQDIFF, mask=1 - mask)
+        fit = cv2.matchTemplate(picture, canvas[window], cv2.TM_SQDIFF, mask=mask)
+        drift = cv2.matchTemplate(picture, trend[window], cv2.TM_SQDIFF, mask=1 - mask)
+        cost = np.asarray(fit) + _TREND * np.asarray(drift)
         y, x = np.unravel_index(np.where(candidates, cost, np.inf).argmin(), cost.shape)
         fresh = todo[window]
         canvas[window][fresh] = picture[y : y + size, x : x + size][fresh]
@@ -67,9 +84,7 @@ def _copied(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, smooth: np.
     return canvas[_HALF:-_HALF, _HALF:-_HALF]
 
 
-def _next_place(
-    canvas: np.ndarray, done: np.ndarray, todo: np.ndarray, confidence: np.ndarray
-) -> tuple[int, int]:
+def _next_place(canvas: np.ndarray, done: np.ndarray, todo: np.ndarray, confidence: np.ndarray) -> tuple[int, int]:
     """Row and column of the gap's rim pixel to continue at: much is known around it, and a line runs into it."""
     rim = todo & (cv2.dilate(done.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     if not rim.any():  # nothing known touches what is left

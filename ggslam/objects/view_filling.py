@@ -16,6 +16,7 @@ from ggslam.rendering.types import Gaussians, GaussianTensors
 
 LEAST_PIXELS = 6
 """Smaller gaps in a view are left alone."""
+_STEPS = (1.0, 1.03, 1.07, 1.12, 1.2, 1.33)
 
 
 def open_pixels(kept: Gaussians, view: HoleView) -> np.ndarray:
@@ -41,13 +42,27 @@ def close(kept: Gaussians, view: HoleView, views: Sequence[HoleView]) -> Gaussia
     if gap.sum() < LEAST_PIXELS or not known.any():
         return None
     inverse_depth = np.where(known, 1 / np.maximum(depth, 1e-3), 0).astype(np.float32)
-    inverse_depth = cv2.inpaint(inverse_depth, (~known).astype(np.uint8), 5, cv2.INPAINT_NS)
-    filled_depth = 1 / np.maximum(inverse_depth, 1e-3)
+    continued = np.asarray(cv2.inpaint(inverse_depth, (~known).astype(np.uint8), 5, cv2.INPAINT_NS))
+    filled_depth = (1 / np.maximum(continued, 1e-3)).astype(np.float32)
+    depths = _possible_depths(filled_depth, gap, view, views)
+    placed = depths > 0
+    if not placed.any():
+        return None
     picture = (out.image.numpy() / np.maximum(alpha, 1e-3)).transpose(1, 2, 0).clip(0, 1)
     colors = fill_gap(picture, known, gap)
-    points, spacing = view.view.points(filled_depth)[gap], filled_depth[gap] / camera.fx
-    possible = could_be_hidden(points, views)
-    if not possible.any():
-        return None
+    full = np.zeros(gap.shape, np.float32)
+    full[gap] = depths
     axes = T[:3, :3] * np.array([[1.0], [-1.0], [-1.0]])  # right, up, towards the camera
-    return discs(points[possible], axes, spacing[possible], colors[possible])
+    return discs(view.view.points(full)[gap][placed], axes, depths[placed] / camera.fx, colors[placed])
+
+
+def _possible_depths(depth: np.ndarray, gap: np.ndarray, view: HoleView, views: Sequence[HoleView]) -> np.ndarray:
+    """Depths [M] of the gap's pixels, moved away from the camera where another view saw that there is nothing, in steps
+    up to a third; 0 where that does not help."""
+    out = np.zeros(int(gap.sum()), np.float32)
+    for factor in _STEPS:
+        todo = out == 0
+        if todo.any():
+            possible = could_be_hidden(view.view.points(factor * depth)[gap], views) & todo
+            out[possible] = factor * depth[gap][possible]
+    return out

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam edit`: removes, moves, copies, recolours, joins and renames objects of a run."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from ggslam.cli import options
+from ggslam.cli.console import console
+from ggslam.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ggslam.editing_jobs import Edit
+
+EPILOG = """
+Objects are named by id or name, several separated by commas. Edits are done in the order given: a later one sees
+what an earlier one did. Distances are metres along the axes of the first camera: x right, y down, z forward.
+
+[bold]Examples[/]
+
+  ggslam edit runs/kitchen --remove mug,7 --inpaint
+
+  ggslam edit runs/kitchen --move chair "0.3 0 0.1" --rotate "0 90 0" --inpaint --out runs/kitchen_moved
+
+  ggslam edit runs/kitchen --merge 4 9 --rename 4 table --recolor table "#3060c0" --in-place
+"""
+VALUES = {"remove": 1, "keep": 1, "move": 2, "duplicate": 2, "recolor": 2, "merge": 2, "rename": 2, "rotate": 1}
+"""Edits and how many values follow each; the second of --duplicate may be left out."""
+_EDITS = "edits"
+
+
+def _is_vector(word: str) -> bool:
+    """Whether a word is meant as a shift: it starts with a number, and is not the next option or the run's folder."""
+    return re.match(r"\s*[-+]?\.?\d\S*[\s,]", word) is not None
+
+
+def _edit_option(values: str, text: str) -> Any:
+    return typer.Option(metavar=values, help=text, rich_help_panel="Edits, each as often as wanted")
+
+
+class EditCommand(TyperCommand):
+    """Takes the edits from the command line itself: the parser would lose their order, and knows no lists of pairs."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Puts the edits into the context and lets the parser see the rest."""
+        edits: list[tuple[str, list[str]]] = []
+        rest, left = [], list(args)
+        while left:
+            word = left.pop(0)
+            name, equals, first = word.partition("=")
+            count = VALUES.get(name[2:]) if name.startswith("--") else None
+            if count is None:
+                rest.append(word)
+                continue
+            left = [first, *left] if equals else left
+            if name == "--duplicate" and not (left[1:] and _is_vector(left[1])):
+                count = 1
+            values, left = left[:count], left[count:]
+            found = next((i for i, value in enumerate(values) if value.startswith("--")), len(values))
+            if found < count:
+                raise ConfigError(f"{name}: expected {count} value{'s' * (count > 1)}, found {found}")
+            edits.append((name[2:], values))
+        ctx.meta[_EDITS] = edits
+        return list(super().parse_args(ctx, rest))
+
+
+def edit(
+    ctx: typer.Context,
+    run: options.RunPath,
+    remove: Annotated[str | None, _edit_option("OBJECTS", "Remove them.")] = None,
+    keep: Annotated[str | None, _edit_option("OBJECTS", "Remove everything else.")] = None,
+    move: Annotated[str | None, _edit_option('OBJECTS "DX DY DZ"', "Move them by metres.")] = None,
+    rotate: Annotated[
+        str | None,
+        _edit_option(
+            '"RX RY RZ"', "After --move: also turn them about their middle, by degrees about x, then y, then z."
+        ),
+    ] = None,
+    duplicate: Annotated[
+        str | None, _edit_option('OBJECTS ["DX DY DZ"]', "Put copies of them there, or just beside.")
+    ] = None,
+    recolor: Annotated[str | None, _edit_option("OBJECTS COLOR", "Give them a colour: #rrggbb or a name.")] = None,
+    merge: Annotated[str | None, _edit_option("OBJECT OTHER", "Make the other a part of the first.")] = None,
+    rename: Annotated[str | None, _edit_option("OBJECT NAME", "Name it.")] = None,
+    inpaint: Annotated[
+        bool, typer.Option("--inpaint", help="Close the holes that removed and moved objects leave.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder for the edited run; default: RUN-edited.")] = None,
+    in_place: Annotated[bool, typer.Option("--in-place", help="Change the run itself.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already at --out.")] = False,
+    sequence: Annotated[
+        Path | None, typer.Option(help="Where the recording is now, if it was moved (for --inpaint).")
+    ] = None,
+) -> None:
+    """Edit a run's map: remove, keep, move, duplicate, recolour, merge and rename objects."""
+    from ggslam.editing_jobs import edit_run
+    from ggslam.run_folder import RunFolder
+
+    edits = _edits(ctx.meta[_EDITS])
+    if in_place and out is not None:
+        raise ConfigError("--in-place and --out contradict each other")
+    outcome = edit_run(
+        RunFolder.open(run), edits, out, in_place=in_place, overwrite=overwrite, inpainting=inpaint, sequence=sequence
+    )
+    lines = list(outcome.changes)
+    if outcome.filling is not None:
+        added = f"inpainted: {outcome.filling.added} Gaussians added, " if outcome.inpainted else ""
+        lines.append(f"{added}{outcome.filling.dropped} Gaussians dropped that were traces of what left its place")
+    lines += [f"note: {note}" for note in outcome.notes]
+    lines.append(f"wrote {outcome.folder.path}, {len(outcome.pictures)} pictures of before and after in renders/")
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _edits(words: list[tuple[str, list[str]]]) -> list[Edit]:
+    """The edits in their order; `--rotate` belongs to the `--move` before it.
+
+    Raises:
+        ConfigError: `--rotate` follows no `--move`.
+    """
+    from ggslam.editing_jobs import Edit
+
+    edits: list[Edit] = []
+    for kind, values in words:
+        if kind != "rotate":
+            edits.append(Edit(kind, *values))  # type: ignore[arg-type]
+        elif edits and edits[-1].kind == "move" and not edits[-1].rotation:
+            edits[-1] = replace(edits[-1], rotation=values[0])
+        else:
+            raise ConfigError("--rotate: expected right after the --move that it goes with")
+    return edits

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam edit` on a small run, and what the other commands make of the result."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from ggslam import edited_run
+from ggslam.cli.main import app
+from ggslam.errors import GgslamError, RunFolderError
+from ggslam.run_folder import RunFolder
+
+
+def ggslam(*arguments: object) -> Result:
+    """The command line within this process; an error of ours is in `exception`."""
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def done(*arguments: object) -> str:
+    result = ggslam(*arguments)
+    assert result.exit_code == 0 and result.exception is None, (result.output, result.exception)
+    return result.output
+
+
+def one_error(result: Result, *words: str) -> None:
+    """An error for people, of exit code 2, with these words."""
+    assert isinstance(result.exception, GgslamError) and result.exception.exit_code == 2, result
+    assert all(word in str(result.exception) for word in words), str(result.exception)
+
+
+@pytest.fixture(scope="module")
+def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the first frames of the generated room, with objects."""
+    out = tmp_path_factory.mktemp("edited") / "room"
+    done("run", room, "--out", out, "--stop", 8, "--iterations", 2, "--no-eval")
+    done("eval", out, "--no-lpips", "--every", 6)
+    return out
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy to edit in place."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_several_edits_at_once_leave_a_whole_run(finished: Path, tmp_path: Path) -> None:
+    before, out = contents(finished), tmp_path / "new"
+    text = done(
+        "edit", finished, "--remove", "vase", "--rename", "rug", "carpet", "--move", "fruit bowl", "0.1 0 -0.2",
+        "--rotate", "0 10 0", "--duplicate", "sideboard", "-0.3 0 0", "--recolor", "coffee table", "#3060c0", "--merge",
+        "floor", "west wall", "--inpaint", "--out", out,
+    )  # fmt: skip
+    assert "removed vase" in text and "inpainted" in text and str(out) in text
+    assert contents(finished) == before
+    names = {record.name for record in RunFolder.open(out).object_table().objects}
+    assert {"carpet", "sideboard copy"} <= names and not {"vase", "rug", "west wall"} & names
+    expected = {"trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "timing.json", "run.json",
+                "map.ply", "objects.json", "classifier.npz", "votes.npz", "points.ply", "points_grid.ply",
+                "renders"}  # fmt: skip
+    assert {path.name for path in out.iterdir()} == expected
+    marker = json.loads((out / "run.json").read_text())
+    assert marker["complete"] is True and len(marker["edits"]) == 6
+    assert (
+        len(RunFolder.open(out).segmented_map().gaussians) == json.loads((out / "timing.json").read_text())["gaussians"]
+    )
+    pictures = sorted((out / "renders").glob("edit*.png"))
+    image = cv2.imread(str(pictures[0]))
+    assert 1 <= len(pictures) <= 4 and image.shape[0] > 240 and image.shape[1] > 480
+    done("eval", out, "--no-lpips", "--every", 4)
+    assert "the map was edited" in " ".join(json.loads((out / "metrics.json").read_text())["notes"])
+    done("render", out, "--what", "color,ids,pca", "--frames", "3")
+    assert (out / "renders" / "frame000003_ids.png").is_file()
+    done("export", out, "--objects", "carpet", "--out", tmp_path / "objects")
+    assert [path.name.endswith("carpet.ply") for path in (tmp_path / "objects").glob("*.ply")] == [True]
+
+
+def test_removal_shows_in_the_render_and_nowhere_else(finished: Path, tmp_path: Path) -> None:
+    done("edit", finished, "--remove", "sofa", "--out", tmp_path / "new")
+    done("render", finished, "--what", "color,ids", "--frames", "0", "--out", tmp_path / "a")
+    done("render", tmp_path / "new", "--what", "color,ids", "--frames", "0", "--out", tmp_path / "b")
+    a, b = (cv2.imread(str(tmp_path / name / "frame000000_color.png")).astype(int) for name in ("a", "b"))
+    ids = cv2.imread(str(tmp_path / "a" / "frame000000_ids.png"))[..., ::-1]
+    sofa = next(r for r in RunFolder.open(finished).object_table().objects if r.name == "sofa")
+    there = (ids == sofa.color).all(2)
+    around = cv2.dilate(there.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+    changed = np.abs(a - b).max(2) > 4
+    assert there.sum() > 100 and changed[there].mean() > 0.5
+    assert changed[~around].mean() < 0.01
+
+
+def test_in_place(run: Path) -> None:
+    scored = json.loads((run / "metrics.json").read_text())
+    done("edit", run, "--rename", "sofa", "couch", "--in-place")
+    assert json.loads((run / "metrics.json").read_text()) == scored  # a name changes no score
+    assert list((run / "renders").glob("compare*.png"))
+    done("edit", run, "--remove", "couch", "--in-place")
+    assert not (run / "metrics.json").exists() and not list((run / "renders").glob("compare*.png"))
+    assert [edit.split(":")[0] for edit in json.loads((run / "run.json").read_text())["edits"]][0].startswith("renamed")
+    assert [path.name for path in run.iterdir() if path.name.startswith(".")] == []
+    assert "couch" not in {record.name for record in RunFolder.open(run).object_table().objects}
+
+
+def test_a_disk_that_fills_up_costs_nothing(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, cloud: object) -> None:
+        raise RunFolderError(f"cannot write {path}: no space left")
+
+    before = contents(run)
+    monkeypatch.setattr(edited_run, "write_points", full)
+    for target in (["--in-place"], ["--out", tmp_path / "new"]):
+        one_error(ggslam("edit", run, "--remove", "sofa", *target), "no space left")
+    assert contents(run) == before and not (tmp_path / "new").exists()
+
+
+def test_inpainting_does_without_the_recording(run: Path, tmp_path: Path) -> None:
+    record = json.loads((run / "sequence.json").read_text())
+    record["open"]["path"] = str(tmp_path / "gone")
+    (run / "sequence.json").write_text(json.dumps(record))
+    text = done("edit", run, "--remove", "vase", "--inpaint", "--in-place")
+    assert "inpainted without the recording" in text and "gone" in text
+
+
+def test_wrong_input_is_named_and_changes_nothing(run: Path, tmp_path: Path) -> None:
+    before, new = contents(run), tmp_path / "new"
+    for words, fault in [
+        (["--remove", "999"], "999"),
+        (["--remove", "sofaa"], "did you mean sofa"),
+        (["--rename", "rug", "sofa"], "has it already"),
+        (["--merge", "sofa", "sofa"], "itself"),
+        (["--move", "sofa", "1 2"], "three numbers"),
+        (["--move", "sofa", "1 2 nan"], "finite"),
+        (["--move", "sofa", "1 2 3", "--rotate", "x"], "--rotate"),
+        (["--rotate", "1 2 3"], "--rotate"),
+        (["--recolor", "sofa", "blurple"], "blurple"),
+        (["--remove"], "expected 1 value, found 0"),
+        (["--merge", "sofa"], "expected 2 values, found 1"),
+        (["--inpaint"], "no edit"),
+        (["--remove", "sofa", "--remove", "sofa"], "sofa"),
+    ]:
+        one_error(ggslam("edit", run, *words, "--out", new), fault)
+    assert not new.exists() and contents(run) == before
+    one_error(ggslam("edit", run, "--remove", "sofa", "--out", run), "--in-place")
+    one_error(ggslam("edit", run, "--remove", "sofa", "--out", new, "--in-place"), "contradict")
+    one_error(ggslam("edit", tmp_path / "nowhere", "--remove", "sofa"), "nowhere")
+    other = Path(shutil.copytree(run, tmp_path / "other"))
+    one_error(ggslam("edit", run, "--remove", "sofa", "--out", other), "--overwrite")
+    (run / "objects.json").unlink()
+    one_error(ggslam("edit", run, "--remove", "sofa", "--out", new), "no objects")
+    assert not new.exists() and contents(other) == before
+
+
+def test_help_has_an_example() -> None:
+    text = done("edit", "--help")
+    assert "Examples" in text and "--inpaint" in text and "DX DY DZ" in text
