@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from ggslam.errors import SequenceError, check_ranges
+from ggslam.errors import ConfigError, SequenceError, check_ranges
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, MapLabels
 from ggslam.objects.association import Associator, MapView
@@ -46,6 +46,8 @@ class MaskSettings:
 
     def __post_init__(self) -> None:
         check_ranges(self, {"min_views": (1, 10**6), "min_gaussians": (0, 10**9)})
+        if self.source == "model" and not self.model:
+            raise ConfigError("masks.source=model: masks.model must name an ONNX file")
 
 
 class ObjectMasks:

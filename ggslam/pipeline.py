@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ggslam.config import Config, load_config
-from ggslam.errors import RunFolderError, SequenceError
+from ggslam.errors import GgslamError, RunFolderError, SequenceError
 from ggslam.progress import Observer, SilentObserver
 from ggslam.realtime import RealtimeSlam
 from ggslam.run_folder import RunFolder, json_ready
@@ -90,11 +90,17 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
     observer = observer or SilentObserver()
     config = load_config(request.config, request.overrides)
     sequence = request.sequence.open()
+    if request.sequence.masks is not None and not sequence.has_masks:
+        raise SequenceError(f"{request.sequence.masks}: none of the masks there belongs to a frame of this run")
     out = request.out if request.out is not None else Path("runs") / sequence.name
     folder = RunFolder.create(out, overwrite=request.overwrite)
     for warning in sequence.warnings:
         observer.note(warning)
-    result, error = run_slam(sequence, config, observer)
+    try:
+        result, error = run_slam(sequence, config, observer)
+    except GgslamError:  # before the first frame: settings that do not fit the recording, a model that is none
+        folder.discard()
+        raise
     if not result.keyframes:
         folder.discard()
         reason = result.frames[0].reason if result.frames else "no frame could be read"
@@ -103,6 +109,8 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
         observer.note(f"skipped: {skipped.reason}")
     for problem in sequence.mask_problems.values():
         observer.note(f"mask not used: {problem}")
+    if sequence.has_masks and config.identity.enabled and config.masks.source != "none" and result.objects is None:
+        observer.note("no objects were learned: the masks of the keyframes label nothing")
     with uninterrupted():
         names = sequence.instance_names
         folder.save(config, describe(request.sequence, sequence), result, None if error is None else repr(error), names)

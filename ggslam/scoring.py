@@ -126,6 +126,8 @@ def _segmentation_notes(folder: RunFolder, scores: dict[str, Any] | None, masks:
     """Which masks served as truth, or why there are no scores of objects."""
     if not folder.has_objects():
         return ["the run has no objects; the masks are not used"] if masks is not None else []
+    if scores is None and masks is not None:
+        return [f"no scored frame has a mask in {masks}; objects are not scored"]
     if scores is None:
         return ["the recording has no masks; objects are not scored (true masks from elsewhere: ggslam eval --masks)"]
     supervised = folder.object_table().supervision in ("masks", "associated masks")

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from ggslam.config import load_config
-from ggslam.errors import ConfigError, SequenceError
+from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.pipeline import RunOutcome, RunRequest, SequenceRequest, execute
+from ggslam.progress import SilentObserver
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
 from ggslam.slam import Slam, SlamResult
@@ -142,3 +143,39 @@ def test_masks_that_are_asked_for_must_be_there(room: Path) -> None:
     frame = open_sequence(room).frame(0)
     with pytest.raises(SequenceError, match="no masks"):
         slam_result([frame], "masks.source=recording", has_masks=False)
+
+
+class Notes(SilentObserver):
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+
+def test_masks_that_help_nothing_are_said_so(room: Path, tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    for path in (room / "masks").glob("*.png"):
+        (empty / path.name).write_bytes(cv2.imencode(".png", np.zeros((120, 160), np.uint16))[1].tobytes())
+    notes = Notes()
+    request = SequenceRequest(room, masks=empty, stop=4)
+    execute(RunRequest(request, out=tmp_path / "run", evaluate=False, overrides=FAST), notes)
+    assert any("no objects were learned" in note for note in notes.notes)
+
+
+def test_masks_of_other_frames_are_refused_and_leave_no_folder(room: Path, tmp_path: Path) -> None:
+    late = tmp_path / "late"
+    late.mkdir()
+    last = sorted((room / "masks").glob("*.png"))[-1]
+    shutil.copy(last, late / last.name)
+    with pytest.raises(SequenceError, match="late"):
+        execute(RunRequest(SequenceRequest(room, masks=late, stop=4), out=tmp_path / "run"))
+    (tmp_path / "bad.onnx").write_bytes(b"no model")
+    with pytest.raises(GgslamError, match=r"bad\.onnx"):
+        execute(RunRequest(SequenceRequest(room), tmp_path / "run", overrides=[f"masks.model={tmp_path}/bad.onnx"]))
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(ConfigError, match=r"masks\.model"):
+        execute(RunRequest(SequenceRequest(room), tmp_path / "run", overrides=["masks.source=model"]))

@@ -42,7 +42,7 @@ class IdentitySettings:
     schedule: Literal["sampled", "dense", "votes"] = "sampled"
     """sampled: cross-entropy on sampled pixels of the view that is rendered for its colours anyway; dense: on all
     pixels of rendered identity images, as published; votes: count only, learn nothing."""
-    every: int = 4
+    every: int = 5
     """An identity step in every n-th mapping iteration."""
     final_passes: int = 4
     """After the last frame all keyframes are visited so many times more for identity alone, with falling steps: what

@@ -28,7 +28,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 
 FINAL_DECAY = 0.2
 """The last identity steps fall to this share of their length."""
-FINAL_STEPS_A_VIEW = 2
+FINAL_STEPS_A_VIEW = 4
 """Of the last identity steps so many follow each other on one rendering, which takes as long as a step."""
 
 
