@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from ggslam.errors import RunFolderError
 from ggslam.formats.atomic import make_folder
 from ggslam.formats.point_ply import write_points
 from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.staging import new_staging, publish
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
 from ggslam.run_folder import MARKER, OBJECT_FILES, RunFolder
@@ -27,36 +27,50 @@ POINTS = ("points.ply", "points_grid.ply")
 
 
 def save_edited(
-    source: RunFolder, target: RunFolder, scene: SegmentedMap, changes: list[str], pictures: Mapping[str, np.ndarray],
-    named_only: bool,
+    source: RunFolder, target: RunFolder, scene: SegmentedMap, note: Mapping[str, Any],
+    pictures: Mapping[str, np.ndarray], named_only: bool, sequence: Path | None = None,
 ) -> list[Path]:  # fmt: skip
     """Writes an edited run; returns the files of the pictures.
 
     Until all files are on the disk nothing of a run that is at the target is touched. Then its marker says that it is
-    incomplete while files change places, which takes milliseconds.
+    incomplete while files change places, which takes milliseconds; if the program is killed meanwhile, opening the run
+    finishes it.
 
     Args:
         source: the run that was edited.
         target: where to; may be the same.
         scene: the edited map.
-        changes: what was done, for the marker.
+        note: for the marker: `edits`, what was done, is added to the run's; other keys are replaced.
         pictures: by file name, for `renders/`.
         named_only: whether nothing but names changed, so that scores, points and renders stay.
+        sequence: where the recording is now, if it was moved.
 
     Raises:
-        RunFolderError: a file cannot be written; the target is as it was.
+        RunFolderError: a file cannot be written; the target is as it was, or opening it finishes the work.
     """
     mark = source.read_json(MARKER)
-    staged = RunFolder(target.path / f".edited-{os.getpid()}-{secrets.token_hex(4)}")
+    staged = RunFolder(new_staging(target.path))
     try:
         _stage(source, staged, scene, pictures, named_only)
-        staged.write_json(MARKER, {**mark, "edits": [*mark.get("edits", []), *changes]})
-        target.write_json(MARKER, {**mark, "complete": False, "stopped_by": "saving did not finish"})
-        _publish(staged, target)
-    except OSError as error:
-        raise RunFolderError(f"{target.path}: the edited run cannot be written: {error}") from None
-    finally:
+        if sequence is not None:
+            record = source.read_json("sequence.json")
+            opened = {**record["open"], "path": sequence.absolute()}
+            staged.write_json("sequence.json", {**record, "open": opened})
+        staged.write_json(MARKER, {**mark, **note, "edits": [*mark.get("edits", []), *note["edits"]]})
+        meanwhile = {**mark, "complete": False, "stopped_by": "saving did not finish"}
+    except BaseException as error:
         shutil.rmtree(staged.path, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise RunFolderError(f"{target.path}: the edited run cannot be written: {error}") from None
+        raise
+    try:
+        publish(staged.path, target.path, MARKER, (*SCORES, *POINTS, *OBJECT_FILES, "renders"), meanwhile)
+    except RunFolderError:
+        shutil.rmtree(staged.path, ignore_errors=True)
+        raise
+    except OSError as error:
+        text = f"{target.path}: not all files could be put into place; the next command on it will go on: {error}"
+        raise RunFolderError(text) from None
     return [target.path / "renders" / name for name in pictures]
 
 
@@ -76,14 +90,3 @@ def _stage(
     if not named_only:
         write_points(staged.path, sample_points(scene.gaussians))
     staged.save_objects(scene)
-
-
-def _publish(staged: RunFolder, target: RunFolder) -> None:
-    """Moves the staged files into place, the marker last; whatever else a run had there goes."""
-    for stale in (*SCORES, *POINTS, *OBJECT_FILES):
-        (target.path / stale).unlink(missing_ok=True)
-    shutil.rmtree(target.path / "renders", ignore_errors=True)
-    last = ("objects.json", MARKER)
-    names = [path.name for path in staged.path.iterdir() if path.name not in last]
-    for name in (*sorted(names), *last):
-        (staged.path / name).replace(target.path / name)

@@ -4,16 +4,18 @@ usable from Python."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ggslam.edited_run import save_edited
 from ggslam.editing_pictures import before_and_after
-from ggslam.errors import ConfigError, GgslamError
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.objects.displacement import Displacement
 from ggslam.objects.editing import (
     Change,
     duplicate_objects,
@@ -34,8 +36,9 @@ from ggslam.objects.segmented_rows import joined
 from ggslam.objects.table import ObjectTable
 from ggslam.objects.traces import drop_traces, places
 from ggslam.pipeline import open_recording_of, uninterrupted
-from ggslam.rendering_jobs import run_camera
-from ggslam.run_folder import RunFolder
+from ggslam.rendering_jobs import frame_poses, run_camera
+from ggslam.run_folder import MARKER, RunFolder
+from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 
 KINDS = ("remove", "keep", "move", "duplicate", "recolor", "merge", "rename")
@@ -101,44 +104,125 @@ def edit_run(
         overwrite: replace a run that is already at `out`.
         inpainting: close the holes that removed and moved objects leave.
         settings: of inpainting.
-        sequence: where the recording is now, if it was moved; only inpainting looks at it, and does without if it is
-            not there.
+        sequence: where the recording is now, if it was moved; only for inpainting, which does without the recording
+            if this is None and it is not where it was.
 
     Raises:
         ConfigError: unknown objects, values that cannot be read, no edits, or a folder that is the run's own.
-        RunFolderError: the run has no objects, or the folder cannot be written.
+        RunFolderError: the run has no objects, or is damaged, or the folder cannot be written.
+        SequenceError: the recording is not at `sequence`.
     """
     if not edits:
         raise ConfigError("no edit was given; there are --" + ", --".join(KINDS))
-    target = folder.path if in_place else out or folder.path.with_name(folder.path.name + "-edited")
-    if not in_place and target.resolve() == folder.path.resolve():
-        raise ConfigError(f"{target}: is the run itself; use --in-place to edit it there, or another --out")
+    if sequence is not None and not inpainting:
+        raise ConfigError("--sequence: only --inpaint looks at the recording")
+    target = _target(folder, out, in_place)
+    source = _Source.of(folder)
+    notes: list[str] = []
+    recording = _recorded(folder, sequence, notes) if inpainting else None
     scene, original = folder.segmented_map(), folder.gaussians()
-    changes = _apply_all(scene, edits)
-    written = RunFolder(target) if in_place else RunFolder.create(target, overwrite)
-    outcome = EditOutcome(written, [change.text for change in changes], inpainted=inpainting)
+    changes = _apply_all(scene, edits, source.displacement)
+    if in_place:
+        target.check_writable()
+    written = target if in_place else RunFolder.create(target.path, overwrite)
+    outcome = EditOutcome(written, [change.text for change in changes], inpainted=inpainting, notes=notes)
     try:
-        outcome.filling = _mend(folder, scene, changes, inpainting, settings, sequence, outcome.notes)
-        camera, record = run_camera(folder), folder.read_json("keyframes.json")
-        pictures = before_and_after(original, scene.gaussians, changes, camera, record)
+        outcome.filling = _mend(source, scene, recording, settings or InpaintSettings() if inpainting else None, notes)
+        pictures = before_and_after(original, scene.gaussians, changes, source.camera, source.keyframes)
         named_only = all(edit.kind == "rename" for edit in edits)
+        note = {"edits": outcome.changes, "displaced": source.displacement.to_json()}
         with uninterrupted():
-            outcome.pictures = save_edited(folder, written, scene, outcome.changes, pictures, named_only)
+            outcome.pictures = save_edited(folder, written, scene, note, pictures, named_only, sequence)
     except BaseException:
         written.discard()
         raise
     return outcome
 
 
-def _apply_all(scene: SegmentedMap, edits: Sequence[Edit]) -> list[Change]:
-    """Does the edits. What was moved or made here and then goes leaves no hole: no recording shows it there."""
-    changes: list[Change] = []
+def _target(folder: RunFolder, out: Path | None, in_place: bool) -> RunFolder:
+    """Where to.
+
+    Raises:
+        ConfigError: into the run itself without `in_place`.
+    """
+    path = folder.path if in_place else out or folder.path.with_name(folder.path.name + "-edited")
+    if not in_place and path.resolve() == folder.path.resolve():
+        raise ConfigError(f"{path}: is the run itself; use --in-place to edit it there, or another --out")
+    if folder.path.resolve() in path.resolve().parents:
+        raise ConfigError(f"{path}: lies within the run that is edited; use another --out")
+    return RunFolder(path)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What an edit needs of a run besides its map.
+
+    Attributes:
+        camera: it saw with.
+        keyframes: content of keyframes.json.
+        views: of the keyframes.
+        displacement: by earlier edits; follows this one.
+    """
+
+    camera: Camera
+    keyframes: dict[str, Any]
+    views: list[View]
+    displacement: Displacement
+
+    @staticmethod
+    def of(folder: RunFolder) -> _Source:
+        """Reads it, before any work is done.
+
+        Raises:
+            RunFolderError: a file is missing or damaged, naming it.
+        """
+        with _as_written(folder.path / MARKER):
+            mark = folder.read_json(MARKER)
+            list(mark.get("edits", []))
+            displacement = Displacement.from_json(mark.get("displaced", {}))
+        with _as_written(folder.path / "timing.json"):
+            folder.read_json("timing.json").items()
+        with _as_written(folder.path / "sequence.json"):
+            camera = run_camera(folder)
+            folder.read_json("sequence.json")["open"]["path"]
+        with _as_written(folder.path / "keyframes.json"):
+            record = folder.read_json("keyframes.json")
+            poses = {k["frame"]: np.array(k["T_world_camera"], float) for k in record["keyframes"]}
+            views = [View(camera, inverse(pose), frame) for frame, pose in sorted(poses.items())]
+            if not views or not frame_poses(record):
+                raise ValueError("it lists no keyframes or no tracked frames")
+        return _Source(camera, record, views, displacement)
+
+
+@contextmanager
+def _as_written(path: Path) -> Iterator[None]:
+    """What goes wrong in the block is the file's fault."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
+        raise RunFolderError(f"{path}: not as ggslam writes it: {error!r}") from None
+
+
+def _apply_all(scene: SegmentedMap, edits: Sequence[Edit], displacement: Displacement) -> list[Change]:
+    """Does the edits."""
+    original, changes = scene.table, list[Change]()
     for edit in edits:
-        displaced = {i for change in changes for i in change.displaced}
-        own = set(scene.table.select(edit.objects))
-        change = apply_edit(scene, edit)
-        changes.append(replace(change, vacated=change.vacated and not own & displaced))
+        try:
+            changes.append(apply_edit(scene, edit))
+        except ConfigError as error:
+            if changes and set(_named(original, edit)) - set(scene.table.ids()):
+                raise ConfigError(f"--{edit.kind} {edit.objects}: an earlier edit left none of it: {error}") from None
+            raise
+        displacement.follow(changes[-1], scene)
     return changes
+
+
+def _named(table: ObjectTable, edit: Edit) -> list[int]:
+    """Ids of an edit's objects by a table; none if it knows them not."""
+    try:
+        return table.select(edit.objects)
+    except ConfigError:
+        return []
 
 
 def apply_edit(scene: SegmentedMap, edit: Edit) -> Change:
@@ -188,36 +272,35 @@ def _vector(option: str, text: str) -> tuple[float, float, float]:
 
 
 def _mend(
-    folder: RunFolder, scene: SegmentedMap, changes: Sequence[Change], inpainting: bool,
-    settings: InpaintSettings | None, sequence: Path | None, notes: list[str],
+    source: _Source, scene: SegmentedMap, recording: Callable[[int], Recorded] | None,
+    settings: InpaintSettings | None, notes: list[str],
 ) -> Filling | None:  # fmt: skip
-    """After all edits: drops the traces of removed and moved objects and, if asked, closes the holes."""
-    left = [change for change in changes if change.vacated and len(change.before.means)]
+    """After all edits: drops the traces of removed and moved objects and, given settings, closes the holes."""
+    left, displaced = source.displacement.left(), source.displacement.ids()
     if not left:
-        if inpainting:
+        if settings is not None:
             notes.append("nothing to inpaint: no object left its place")
         return None
-    removed, views = joined([change.before for change in left]), _keyframe_views(folder)
-    displaced = sorted({i for change in changes for i in change.displaced})
-    if inpainting:
-        filling = inpaint(scene, removed, views, displaced, _recorded(folder, sequence, notes), settings)
+    removed = joined(left)
+    if settings is not None:
+        filling = inpaint(scene, removed, source.views, displaced, recording, settings)
     else:
-        filling = Filling(dropped=sum(drop_traces(scene, part, views, displaced) for part in places(removed)))
+        filling = Filling(dropped=sum(drop_traces(scene, part, source.views, displaced) for part in places(removed)))
     rebuild_table(scene)
     return filling
 
 
-def _keyframe_views(folder: RunFolder) -> list[View]:
-    keyframes, camera = folder.read_json("keyframes.json")["keyframes"], run_camera(folder)
-    poses = {k["frame"]: np.array(k["T_world_camera"]) for k in keyframes}
-    return [View(camera, inverse(pose), frame) for frame, pose in sorted(poses.items())]
-
-
 def _recorded(folder: RunFolder, sequence: Path | None, notes: list[str]) -> Callable[[int], Recorded] | None:
-    """Gives the images of a frame; None if the recording is not at hand."""
+    """Gives the images of a frame; None if the recording is not where the run had it.
+
+    Raises:
+        SequenceError, RunFolderError: it is not at `sequence`, either.
+    """
     try:
         recording = open_recording_of(folder, sequence)
     except GgslamError as error:
+        if sequence is not None:
+            raise
         notes.append(f"inpainted without the recording: {error}")
         return None
 

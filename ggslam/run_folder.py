@@ -34,6 +34,7 @@ from ggslam.formats.atomic import write_bytes, write_text
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from ggslam.formats.point_ply import write_points
 from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.staging import finish_saving, leftovers
 from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
@@ -67,7 +68,7 @@ class RunFolder:
         """
         folder = RunFolder(path)
         try:
-            if folder.path.is_dir() and any(folder.path.iterdir()):
+            if folder.path.is_dir() and set(folder.path.iterdir()) - set(leftovers(folder.path)):
                 if not (folder.path / MARKER).exists():
                     raise RunFolderError(f"{path}: not empty and not a run of ggslam; choose another folder with --out")
                 if not overwrite:
@@ -75,22 +76,30 @@ class RunFolder:
             else:
                 folder.path.mkdir(parents=True, exist_ok=True)
                 folder._made_here = True
-            folder._probe()
         except OSError as error:
             raise RunFolderError(f"{path}: cannot be written to: {error.strerror or error}") from None
+        folder.check_writable()
         return folder
 
     @staticmethod
     def open(path: Path) -> RunFolder:
-        """A run that is there.
+        """A run that is there. If saving it was interrupted while files changed places, that is finished.
 
         Raises:
-            RunFolderError: no such folder, or not a run.
+            RunFolderError: no such folder, or not a run, or one whose saving cannot be finished.
         """
         if not (Path(path) / MARKER).is_file():
             reason = "is not a run of ggslam (no run.json)" if Path(path).is_dir() else "no such folder"
             raise RunFolderError(f"{path}: {reason}")
+        finish_saving(Path(path), MARKER)
         return RunFolder(path)
+
+    def check_writable(self) -> None:
+        """Raises RunFolderError if files cannot be written to the folder."""
+        try:
+            self._probe()
+        except OSError as error:
+            raise RunFolderError(f"{self.path}: cannot be written to: {error.strerror or error}") from None
 
     def _probe(self) -> None:
         """Finds out now, not after hours of work, whether files can be written."""
@@ -167,7 +176,7 @@ class RunFolder:
             return json.loads(path.read_text())
         except FileNotFoundError:
             raise RunFolderError(f"{path}: missing") from None
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise RunFolderError(f"{path}: cannot be read: {error}") from None
 
     def config(self) -> Config:
@@ -214,6 +223,10 @@ class RunFolder:
         if gaussians.features.shape[1] != channels:
             found = gaussians.features.shape[1]
             raise RunFolderError(f"{self.path / 'map.ply'}: expected {channels} properties identity_*, found {found}")
+        lacking = sorted(set(table.ids()) - set(np.unique(gaussians.object_id.numpy()).tolist()))
+        if lacking:
+            named = f"object {lacking[0]}" + (f" and {len(lacking) - 1} more" if lacking[1:] else "")
+            raise RunFolderError(f"{self.path / 'map.ply'}: no Gaussian is of {named}, which objects.json lists")
         votes = self.votes()
         if votes is not None and len(votes) != len(gaussians):
             raise RunFolderError(

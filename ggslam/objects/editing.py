@@ -8,7 +8,7 @@ those of names. An unknown id raises ConfigError before anything is changed.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -25,6 +25,8 @@ from ggslam.rendering.types import GaussianTensors
 from ggslam.scene.poses import quaternion_to_matrix
 
 Vector = Sequence[float]
+FARTHEST_M = 1000.0
+"""Objects are not moved farther from the origin than this: clouds sampled from a map count cells in 21 bits."""
 
 
 @dataclass(frozen=True)
@@ -35,15 +37,19 @@ class Change:
         text: for people.
         before: the Gaussians concerned as they were; empty if nothing can be seen of the edit.
         after: as they are now; empty if they are gone.
-        vacated: whether `before` left its place, so that there may be a hole.
-        displaced: ids of objects that are now where no recording shows them: moved ones and duplicates.
+        left: by object id, those of `before` that left their place, where there may now be a hole.
+        motion: rigid transform [4, 4] that the objects of `left` did; None if they are gone.
+        made: ids of new objects.
+        merged: the id of the object that stays and that of the one that became a part of it.
     """
 
     text: str
     before: GaussianTensors
     after: GaussianTensors
-    vacated: bool = False
-    displaced: tuple[int, ...] = ()
+    left: Mapping[int, GaussianTensors] = field(default_factory=dict)
+    motion: np.ndarray | None = None
+    made: tuple[int, ...] = ()
+    merged: tuple[int, int] | None = None
 
 
 def remove_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
@@ -51,11 +57,11 @@ def remove_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
     their neighbours."""
     what = _labels(scene, ids)
     gone = members(scene.gaussians, scene.classifier, list(ids))
-    before = copies_of(scene.gaussians, gone)
+    before, left = copies_of(scene.gaussians, gone), _by_object(scene, gone, ids)
     keep_rows(scene, ~gone)
     _forget(scene, ids)
     rebuild_table(scene)
-    return Change(f"removed {what}: {int(gone.sum())} Gaussians", before, _nothing(scene), vacated=True)
+    return Change(f"removed {what}: {int(gone.sum())} Gaussians", before, _nothing(scene), left)
 
 
 def keep_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
@@ -82,19 +88,23 @@ def move_objects(
         shift: metres along the world's axes (those of the first camera: x right, y down, z forward).
         rotate_degrees: about lines through the group's centroid along the world's x, then y, then z axis, before the
             shift. Floaters far from the objects stay where they are and lose their label.
+
+    Raises:
+        ConfigError: unknown ids, or farther than `FARTHEST_M`.
     """
     what = _labels(scene, ids)
+    _check_near(scene, "move", ids, shift)
     rows, stray = _claimed_rows(scene, ids)
-    before = copies_of(scene.gaussians, rows)
+    before, left = copies_of(scene.gaussians, rows), _by_object(scene, rows, ids)
     T = rigid_motion(_centroid(before), shift, rotate_degrees)
     scene.gaussians.object_id[torch.from_numpy(stray)] = 0
     scene.gaussians.move(torch.from_numpy(rows), torch.from_numpy(T))
     rebuild_table(scene)
-    left = f", {int(stray.sum())} floaters stay unlabelled" if stray.any() else ""
+    rest = f", {int(stray.sum())} floaters stay unlabelled" if stray.any() else ""
     text = f"moved {what} by {_numbers(shift)} m"
     text += f", turned by {_numbers(rotate_degrees)} degrees" if any(rotate_degrees) else ""
-    text += f": {int(rows.sum())} Gaussians{left}"
-    return Change(text, before, copies_of(scene.gaussians, rows), vacated=True, displaced=tuple(ids))
+    text += f": {int(rows.sum())} Gaussians{rest}"
+    return Change(text, before, copies_of(scene.gaussians, rows), left, motion=T)
 
 
 def duplicate_objects(scene: SegmentedMap, ids: Sequence[int], shift: Vector | None = None) -> Change:
@@ -106,19 +116,21 @@ def duplicate_objects(scene: SegmentedMap, ids: Sequence[int], shift: Vector | N
         shift: metres along the world's axes; None: to the right by a little more than the widest of them measures.
 
     Raises:
-        ConfigError: no id is left.
+        ConfigError: unknown ids, or farther than `FARTHEST_M`, or no id is left.
     """
     what = _labels(scene, ids)
     if shift is None:
         boxes = [scene.table.record(i).box for i in ids]
         shift = (round(1.2 * max(float(np.abs(np.array(b.axes)[:, 0]) @ b.size) for b in boxes), 3), 0.0, 0.0)
+    _check_near(scene, "duplicate", ids, shift)
     names, T, first = _names(scene.table), rigid_motion(np.zeros(3), shift), len(scene.gaussians)
     made: list[int] = []
     before: list[GaussianTensors] = []
     for object_id in ids:
         rows, _ = _claimed_rows(scene, [object_id])
-        new_id = max([*scene.table.ids(), *scene.classifier.class_ids.tolist(), *made], default=0) + 1
-        if new_id > 65535:
+        taken = {*scene.table.ids(), *scene.classifier.class_ids.tolist(), *made}
+        new_id = max(taken) + 1 if max(taken) < 65535 else next((i for i in range(1, 65536) if i not in taken), 0)
+        if not new_id:
             raise ConfigError("no object id is left for a duplicate: ids end at 65535")
         before.append(copies_of(scene.gaussians, rows))
         copies = append_copies(scene, rows)
@@ -130,9 +142,7 @@ def duplicate_objects(scene: SegmentedMap, ids: Sequence[int], shift: Vector | N
     rebuild_table(scene, names)
     after = copies_of(scene.gaussians, np.arange(len(scene.gaussians)) >= first)
     copies_are = ", ".join(scene.table.record(i).label() for i in made)
-    return Change(
-        f"duplicated {what} by {_numbers(shift)} m: {copies_are}", joined(before), after, displaced=tuple(made)
-    )
+    return Change(f"duplicated {what} by {_numbers(shift)} m: {copies_are}", joined(before), after, made=tuple(made))
 
 
 def recolor_objects(scene: SegmentedMap, ids: Sequence[int], color: tuple[int, int, int]) -> Change:
@@ -169,7 +179,8 @@ def merge_objects(scene: SegmentedMap, kept: int, merged: int) -> Change:
     if scene.votes is not None:
         scene.votes = merged_votes(scene.votes, merged, kept)
     rebuild_table(scene, names, seen)
-    return Change(f"merged {what}: {int(rows.sum())} Gaussians", _nothing(scene), _nothing(scene))
+    nothing = _nothing(scene)
+    return Change(f"merged {what}: {int(rows.sum())} Gaussians", nothing, nothing, merged=(kept, merged))
 
 
 def rename_object(scene: SegmentedMap, object_id: int, name: str) -> Change:
@@ -208,12 +219,37 @@ def _labels(scene: SegmentedMap, ids: Sequence[int]) -> str:
     return ", ".join(scene.table.record(i).label() for i in ids)
 
 
+def _check_near(scene: SegmentedMap, kind: str, ids: Sequence[int], shift: Vector) -> None:
+    for record in map(scene.table.record, ids):
+        place = np.add(record.centroid, shift)
+        if not np.abs(place).max() <= FARTHEST_M:
+            raise ConfigError(
+                f"--{kind} {record.label()} by {_numbers(shift)} m: it would be farther than {FARTHEST_M:g} m away"
+            )
+
+
 def _claimed_rows(scene: SegmentedMap, ids: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Members of objects without floaters, labelled as theirs from now on; and the floaters. bool [N] both."""
     own = {i: members(scene.gaussians, scene.classifier, [i], MembershipSettings(floaters=False)) for i in ids}
     _claim(scene, own)
     rows = np.logical_or.reduce(list(own.values()))
     return rows, np.isin(scene.gaussians.object_id.numpy(), ids) & ~rows
+
+
+def _by_object(scene: SegmentedMap, rows: np.ndarray, ids: Sequence[int]) -> dict[int, GaussianTensors]:
+    """The members `rows` (bool [N]) of some objects, each object's own; one of another label is its neighbour's."""
+    index = np.flatnonzero(rows)
+    owner = scene.gaussians.object_id.numpy()[index].copy()
+    other = ~np.isin(owner, ids)
+    if other.all():
+        owner[:] = ids[0]
+    elif other.any():
+        means = scene.gaussians.means.numpy()[index]
+        owner[other] = owner[~other][cKDTree(means[~other]).query(means[other])[1]]
+    parts = {object_id: np.zeros(len(rows), bool) for object_id in ids}
+    for object_id, part in parts.items():
+        part[index[owner == object_id]] = True
+    return {object_id: copies_of(scene.gaussians, part) for object_id, part in parts.items()}
 
 
 def _claim(scene: SegmentedMap, own: Mapping[int, np.ndarray]) -> None:

@@ -144,7 +144,7 @@ class _Hole:
             hole = None if chart is None else find_hole(chart, views, [p for p in planes if p is not plane])
             if chart is not None and hole is not None and hole.any():
                 hole = overlapped(hole)
-                patches.append((cover(chart, hole, paint(as_seen(chart, views), hole, 1), plane), plane))
+                patches.append((cover(chart, hole, paint(as_seen(chart, views), hole), plane), plane))
         for patch, plane in patches:
             self._insert(patch, plane)
         return len(patches)

@@ -27,6 +27,12 @@ _OCCUPIED = 0.7
 """Alpha from which a cell is known."""
 _BELOW = 0.4
 """Cells by which the new surface lies under the old one, which thus covers it where they overlap."""
+_MARGIN = 4
+"""Cells along the hole's rim that are not copied from."""
+_OUTLINE = 9
+"""Width in pixels of the square by which the object's pixels grow before a view is asked for colours."""
+_RARE, _LEAST_RARE = 4.0, 0.08
+"""Distance of a colour from the median, in median distances but at least so much of [0, 1], from which it is rare."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,7 @@ def _meets(stops: np.ndarray, gap: np.ndarray, diagonal: bool) -> np.ndarray:
     return met
 
 
-def paint(chart: Chart, hole: np.ndarray, margin: int) -> np.ndarray:
+def paint(chart: Chart, hole: np.ndarray, margin: int = _MARGIN) -> np.ndarray:
     """Colours of the hole's cells [M, 3], from the known cells around it.
 
     Args:
@@ -147,12 +153,25 @@ def paint(chart: Chart, hole: np.ndarray, margin: int) -> np.ndarray:
         margin: cells along the hole's rim that may still bear traces of the object and are not copied from.
     """
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
-    source = chart.clean & ~(cv2.dilate(hole.astype(np.uint8), disc) > 0)
-    return fill_gap(chart.color, source if source.any() else chart.clean, hole)
+    beside = chart.clean & ~(cv2.dilate(hole.astype(np.uint8), disc) > 0)
+    usual = beside & usual_colors(chart.color, beside)
+    source = next((cells for cells in (usual, beside) if cells.any()), chart.clean)
+    return fill_gap(chart.color, source, hole)
+
+
+def usual_colors(color: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Where a picture [H, W, 3] has no colour that is rare `among` some of its pixels (bool [H, W]): shadows, and
+    outlines of things that stand there, are rare. bool [H, W]"""
+    if not among.any():
+        return among
+    middle = np.median(color[among], axis=0)
+    spread = np.median(np.abs(color[among] - middle), axis=0)
+    return (np.abs(color - middle) <= np.maximum(_RARE * spread, _LEAST_RARE)).all(2)
 
 
 def as_seen(chart: Chart, views: Sequence[HoleView]) -> Chart:
-    """The chart with its colours as the views show them, each cell's from the view that shows it largest.
+    """The chart with its colours as the views show them, each cell's from the view that shows it largest. Clean are
+    then the cells that some view shows, a few pixels off the object: there pixels mix with those of its outline.
 
     From the front, from where nobody looked while the map was trained, Gaussians that are thin and half transparent
     add up to other colours.
@@ -161,11 +180,13 @@ def as_seen(chart: Chart, views: Sequence[HoleView]) -> Chart:
     largest = np.zeros(len(centres))
     for v in views:
         pixel, z, inside = v.view.project(centres)
-        shown = inside & ~v.covered.reshape(-1)[pixel] & (np.abs(v.now.reshape(-1)[pixel] - z) <= depth_tolerance(z))
+        covered = cv2.dilate(v.covered.astype(np.uint8), np.ones((_OUTLINE, _OUTLINE), np.uint8)) > 0
+        shown = inside & ~covered.reshape(-1)[pixel] & (np.abs(v.now.reshape(-1)[pixel] - z) <= depth_tolerance(z))
         slant = np.abs((centres - v.view.position) @ chart.axes[2]) / np.maximum(z, 1e-3) ** 3
         better = shown & (slant > largest)
         color[better], largest[better] = v.picture.reshape(-1, 3)[pixel[better]], slant[better]
-    return replace(chart, color=color.reshape(chart.color.shape))
+    seen = cv2.erode((largest > 0).reshape(chart.known.shape).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return replace(chart, color=color.reshape(chart.color.shape), clean=seen if seen.any() else chart.clean)
 
 
 def overlapped(hole: np.ndarray) -> np.ndarray:

@@ -167,8 +167,11 @@ class ObjectTable:
         Raises:
             ConfigError: no object is called so, or the list is empty.
         """
-        if text.strip().casefold() == "all":
+        wanted = text.strip().casefold()
+        if wanted == "all":
             return self.ids()
+        if any(record.name is not None and record.name.casefold() == wanted for record in self.objects):
+            return self.find(text)  # a name may hold commas
         return list(dict.fromkeys(i for part in text.split(",") for i in self.find(part)))
 
     def palette(self) -> np.ndarray:
@@ -216,7 +219,7 @@ class ObjectTable:
             first = error.errors()[0]
             place = ".".join(str(part) for part in first["loc"]) or "top level"
             raise FormatError(f"{path}: {place}: {first['msg']}, found {first['input']!r:.60}") from None
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise FormatError(f"{path}: cannot be read: {error}") from None
         twice = [name for name, times in Counter(table.ids()).items() if times > 1]
         if twice:

@@ -122,6 +122,57 @@ def test_a_disk_that_fills_up_costs_nothing(run: Path, tmp_path: Path, monkeypat
     assert contents(run) == before and not (tmp_path / "new").exists()
 
 
+class Killed(BaseException):
+    """Stands for a kill that lets nothing be tidied up."""
+
+
+@pytest.mark.parametrize("moves", [0, 1, 3, 7])
+def test_an_edit_killed_while_files_change_places_is_finished(
+    run: Path, monkeypatch: pytest.MonkeyPatch, moves: int
+) -> None:
+    real, done_moves = Path.replace, []
+
+    def replace(path: Path, target: Path) -> Path:
+        if ".staged-" in str(path.parent.name) and target.parent == run:
+            if len(done_moves) == moves:
+                raise Killed
+            done_moves.append(path)
+        return real(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", replace)
+        patch.setattr(shutil, "rmtree", _only_in_place)
+        with pytest.raises(Killed):
+            ggslam("edit", run, "--recolor", "sofa", "red", "--in-place")
+    names = {path.name for path in run.iterdir()}
+    assert {"map.ply", "objects.json", "classifier.npz", "votes.npz"} <= names
+    assert json.loads((run / "run.json").read_text())["complete"] is False
+    done("export", run, "--objects", "sofa", "--out", run.parent / "sofa")
+    marker = json.loads((run / "run.json").read_text())
+    assert marker["complete"] is True and len(marker["edits"]) == 1 and "saving" not in marker
+    assert not (run / "metrics.json").exists()
+    assert [path.name for path in run.iterdir() if path.name.startswith(".")] == []
+    RunFolder.open(run).segmented_map()
+
+
+_rmtree = shutil.rmtree
+
+
+def _only_in_place(path: Path, ignore_errors: bool = False) -> None:
+    if not Path(path).name.startswith(".staged-"):
+        _rmtree(path, ignore_errors)
+
+
+def test_what_a_killed_edit_left_is_no_obstacle(run: Path, tmp_path: Path) -> None:
+    out, left = tmp_path / "new", ".staged-4194304-0123abcd"  # larger than any process id
+    for folder in (out, run):
+        (folder / left).mkdir(parents=True)
+        (folder / left / "map.ply").write_text("half")
+    done("edit", run, "--rename", "sofa", "couch", "--out", out)
+    done("edit", run, "--rename", "sofa", "couch", "--in-place")
+    assert not (out / left).exists() and not (run / left).exists()
+
+
 def test_inpainting_does_without_the_recording(run: Path, tmp_path: Path) -> None:
     record = json.loads((run / "sequence.json").read_text())
     record["open"]["path"] = str(tmp_path / "gone")
@@ -145,11 +196,17 @@ def test_wrong_input_is_named_and_changes_nothing(run: Path, tmp_path: Path) -> 
         (["--remove"], "expected 1 value, found 0"),
         (["--merge", "sofa"], "expected 2 values, found 1"),
         (["--inpaint"], "no edit"),
-        (["--remove", "sofa", "--remove", "sofa"], "sofa"),
+        (["--remove", "sofa", "--remove", "sofa"], "earlier edit"),
+        (["--move", "sofa", "1e6 0 0"], "1000 m"),
+        (["--move", "sofa", "1e300 0 0"], "--move"),
+        (["--duplicate", "sofa", "0 0 1e300"], "--duplicate"),
+        (["--remove", "sofa", "--sequence", tmp_path], "--inpaint"),
+        (["--remove", "sofa", "--inpaint", "--sequence", tmp_path / "none"], "none"),
     ]:
         one_error(ggslam("edit", run, *words, "--out", new), fault)
     assert not new.exists() and contents(run) == before
     one_error(ggslam("edit", run, "--remove", "sofa", "--out", run), "--in-place")
+    one_error(ggslam("edit", run, "--remove", "sofa", "--out", run / "inner"), "within the run")
     one_error(ggslam("edit", run, "--remove", "sofa", "--out", new, "--in-place"), "contradict")
     one_error(ggslam("edit", tmp_path / "nowhere", "--remove", "sofa"), "nowhere")
     other = Path(shutil.copytree(run, tmp_path / "other"))
@@ -157,6 +214,42 @@ def test_wrong_input_is_named_and_changes_nothing(run: Path, tmp_path: Path) -> 
     (run / "objects.json").unlink()
     one_error(ggslam("edit", run, "--remove", "sofa", "--out", new), "no objects")
     assert not new.exists() and contents(other) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("keyframes.json", "{}"), ("keyframes.json", '{"keyframes": [], "frames": []}'), ("sequence.json", "{}"),
+     ("timing.json", "[]"), ("run.json", "[]"), ("run.json", '{"displaced": {"1": [1]}}'),
+     ("objects.json", "[" * 100000 + "]" * 100000)],
+)  # fmt: skip
+def test_a_damaged_file_is_named_before_the_work(run: Path, tmp_path: Path, name: str, content: str) -> None:
+    (run / name).write_text(content)
+    one_error(ggslam("edit", run, "--remove", "sofa", "--out", tmp_path / "new"), str(run / name))
+    assert not (tmp_path / "new").exists()
+
+
+def test_objects_that_the_map_lacks_are_refused(run: Path, tmp_path: Path) -> None:
+    table = json.loads((run / "objects.json").read_text())
+    table["objects"].append({**table["objects"][0], "id": 4242, "name": "ghost"})
+    (run / "objects.json").write_text(json.dumps(table))
+    for words in (["edit", run, "--remove", "ghost"], ["export", run, "--objects", "ghost"]):
+        one_error(ggslam(*words, "--out", tmp_path / "new"), "map.ply", "object 4242")
+
+
+def test_where_the_recording_was_moved_to_is_remembered(run: Path, room: Path, tmp_path: Path) -> None:
+    record = json.loads((run / "sequence.json").read_text())
+    record["open"]["path"] = str(tmp_path / "gone")
+    (run / "sequence.json").write_text(json.dumps(record))
+    text = done("edit", run, "--rename", "sofa", "couch", "--inpaint", "--sequence", room, "--in-place")
+    assert "without the recording" not in text
+    assert json.loads((run / "sequence.json").read_text())["open"]["path"] == str(room.absolute())
+
+
+def test_what_an_earlier_edit_placed_leaves_no_hole(run: Path) -> None:
+    done("edit", run, "--move", "sofa", "0 0.5 -0.5", "--in-place")
+    text = done("edit", run, "--remove", "sofa", "--inpaint", "--in-place")
+    assert "nothing to inpaint" in text
+    assert json.loads((run / "run.json").read_text())["displaced"] == {}
 
 
 def test_help_has_an_example() -> None:

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +14,13 @@ import torch
 
 from ggslam.editing_jobs import Edit, apply_edit
 from ggslam.errors import ConfigError
+from ggslam.objects.displacement import Displacement
 from ggslam.objects.editing import (
     duplicate_objects,
     keep_objects,
     merge_objects,
     move_objects,
+    rebuild_table,
     recolor_objects,
     remove_objects,
     rename_object,
@@ -24,7 +28,9 @@ from ggslam.objects.editing import (
 )
 from ggslam.objects.recoloring import parse_color
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
+from ggslam.objects.segmented_rows import copies_of
 from ggslam.objects.table import ObjectTable
+from ggslam.rendering.types import GaussianTensors
 
 
 @pytest.fixture
@@ -61,7 +67,7 @@ def test_remove_takes_the_object_and_leaves_the_others_as_they_were(scene: Segme
     sofa, labels, means = largest(scene, "sofa"), scene.gaussians.object_id.clone(), scene.gaussians.means.clone()
     change = remove_objects(scene, [sofa])
     consistent(scene)
-    assert sofa not in scene.table.ids() and change.vacated
+    assert sofa not in scene.table.ids() and list(change.left) == [sofa]
     assert len(change.before.means) == len(labels) - len(scene.gaussians) >= 0.95 * (labels == sofa).sum()
     left = {row.tobytes() for row in scene.gaussians.means.numpy()}
     others = [row.tobytes() in left for row in means[(labels > 0) & (labels != sofa)].numpy()]
@@ -99,7 +105,7 @@ def test_a_duplicate_is_an_object_of_its_own(scene: SegmentedMap) -> None:
     mug, count, told_before = largest(scene, "mug"), len(scene.gaussians), told(scene)
     change = duplicate_objects(scene, [mug], (0, -0.3, 0))
     consistent(scene)
-    (copy,) = change.displaced
+    (copy,) = change.made
     assert scene.table.record(copy).name == "mug copy"
     rows = scene.gaussians.object_id.numpy() == copy
     assert not rows[:count].any() and rows[count:].all()
@@ -107,6 +113,20 @@ def test_a_duplicate_is_an_object_of_its_own(scene: SegmentedMap) -> None:
     assert (told(scene)[:count] == told_before).mean() > 0.99  # the new class takes nobody's members
     before, after = scene.table.record(mug).centroid, scene.table.record(copy).centroid
     assert np.allclose(np.subtract(after, before), [0, -0.3, 0], atol=0.02)
+
+
+def test_a_duplicate_finds_an_id_that_is_free(scene: SegmentedMap) -> None:
+    merge_objects(scene, largest(scene, "sofa"), largest(scene, "cushion"))
+    scene.gaussians.object_id[scene.gaussians.object_id == largest(scene, "rug")] = 65535
+    rebuild_table(scene)
+    (copy,) = duplicate_objects(scene, [largest(scene, "mug")]).made
+    assert 1 <= copy < 65535
+    assert copy in scene.table.ids()
+
+
+def test_a_name_with_a_comma_can_be_addressed(scene: SegmentedMap) -> None:
+    record = replace(scene.table.record(largest(scene, "sofa")), name="a,b")
+    assert replace(scene.table, objects=[record]).select("A,b") == [record.id]
 
 
 def test_a_duplicate_without_a_shift_stands_beside(scene: SegmentedMap) -> None:
@@ -149,6 +169,55 @@ def test_rename(scene: SegmentedMap) -> None:
     assert scene.table.find("Couch") == [sofa]
 
 
+def followed(scene: SegmentedMap, *edits: Edit, earlier: Displacement | None = None) -> Displacement:
+    displacement = Displacement.from_json(json.loads(json.dumps((earlier or Displacement()).to_json())))
+    for edit in edits:
+        displacement.follow(apply_edit(scene, edit), scene)
+    return displacement
+
+
+def lying_at(parts: list[GaussianTensors], centroid: Any) -> list[bool]:
+    return [bool(np.linalg.norm(part.means.numpy().mean(0) - centroid) < 0.1) for part in parts]
+
+
+def test_a_moved_object_in_a_list_keeps_no_other_hole_open(scene: SegmentedMap) -> None:
+    mug, sofa = largest(scene, "mug"), largest(scene, "sofa")
+    homes = [part.means.numpy().mean(0) for part in copies(scene, mug, sofa)]
+    after = followed(scene, Edit("move", str(mug), "0.8 0 0"), Edit("remove", f"{mug},{sofa}"))
+    assert [sum(lying_at(after.left(), home)) for home in homes] == [1, 1] and len(after.left()) == 2
+    assert after.ids() == []
+
+
+def test_what_an_earlier_edit_placed_leaves_no_hole(scene: SegmentedMap) -> None:
+    mug = largest(scene, "mug")
+    earlier = followed(scene, Edit("move", str(mug), "0.8 0 0"), Edit("duplicate", "sofa", "0 -2 0"))
+    copied = next(i for i in earlier.ids() if i != mug)
+    assert followed(scene, Edit("remove", f"{mug},{copied}"), earlier=earlier).left() == []
+
+
+def test_there_and_back_leaves_no_hole(scene: SegmentedMap) -> None:
+    mug = str(largest(scene, "mug"))
+    there, back = Edit("move", mug, "0.8 0 0", "0 30 0"), Edit("move", mug, "-0.8 0 0", "0 -30 0")
+    after = followed(scene, there, back)
+    assert after.left() == [] and after.ids() == []
+    earlier = followed(scene, there)
+    after = followed(scene, back, earlier=earlier)
+    assert after.left() == [] and after.ids() == []
+    assert len(followed(scene, Edit("remove", mug), earlier=after).left()) == 1
+
+
+def test_a_merged_object_stays_displaced(scene: SegmentedMap) -> None:
+    mug, sofa = str(largest(scene, "mug")), str(largest(scene, "sofa"))
+    after = followed(scene, Edit("move", mug, "0.8 0 0"), Edit("merge", sofa, mug))
+    assert after.ids() == [int(sofa)]
+    after = followed(scene, Edit("remove", sofa), earlier=after)
+    assert after.left() == []
+
+
+def copies(scene: SegmentedMap, *ids: int) -> list[GaussianTensors]:
+    return [copies_of(scene.gaussians, scene.gaussians.object_id.numpy() == i) for i in ids]
+
+
 FAULTS: list[tuple[Callable[[SegmentedMap], object], str]] = [
     (lambda s: remove_objects(s, [999]), "999"),
     (lambda s: remove_objects(s, []), "no object"),
@@ -159,6 +228,8 @@ FAULTS: list[tuple[Callable[[SegmentedMap], object], str]] = [
     (lambda s: rename_object(s, 1, "Sofa"), "has it already"),
     (lambda s: apply_edit(s, Edit("move", "sofa", "1 2")), "three numbers"),
     (lambda s: apply_edit(s, Edit("move", "sofa", "1 2 nan")), "finite"),
+    (lambda s: move_objects(s, [1], (1e4, 0, 0)), "--move"),
+    (lambda s: duplicate_objects(s, [1], (0, -1e9, 0)), "--duplicate"),
     (lambda s: apply_edit(s, Edit("rename", "mug", "cup")), "expected one object"),
     (lambda s: apply_edit(s, Edit("recolor", "sofa", "blurple")), "blurple"),
     (lambda s: apply_edit(s, Edit("paint", "sofa")), "paint"),  # type: ignore[arg-type]

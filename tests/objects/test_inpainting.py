@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,11 +16,14 @@ from ggslam.errors import ConfigError
 from ggslam.objects import texture
 from ggslam.objects.editing import move_objects, remove_objects
 from ggslam.objects.hole_refinement import Recorded
+from ggslam.objects.hole_views import HoleView, View
 from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
+from ggslam.objects.plane_filling import Chart, as_seen, paint
 from ggslam.objects.segmented_rows import copies_of, joined
 from ggslam.objects.traces import drop_traces, places
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import RenderBuffers
+from ggslam.scene.camera import Camera
 
 
 @dataclass
@@ -170,6 +174,33 @@ def test_stripes_run_on_through_a_gap(patches: int, monkeypatch: pytest.MonkeyPa
     filled = texture.fill_gap(np.where(gap[..., None], 0, image).astype(np.float32), ~gap, gap)
     wrong = (np.abs(filled - image[gap]).mean(1) > 0.25).mean()
     assert wrong < 0.15
+
+
+def chart_with_a_hole() -> tuple[Chart, np.ndarray]:
+    """A light plane with a hole that has a dark shadow along one side, seen from a metre."""
+    hole = np.zeros((90, 120), bool)
+    hole[30:60, 40:80] = True
+    color = np.random.default_rng(0).normal((0.8, 0.65, 0.45), 0.02, (90, 120, 3)).clip(0, 1).astype(np.float32)
+    color[30:60, 68:92] = (0.2, 0.15, 0.1)
+    axes = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]])
+    return Chart(np.array([-0.6, -0.45, 1.0]), axes, 0.01, color, ~hole, ~hole), hole
+
+
+def test_a_shadow_beside_the_hole_is_no_texture_of_the_plane() -> None:
+    chart, hole = chart_with_a_hole()
+    assert np.abs(paint(chart, hole) - [0.8, 0.65, 0.45]).max() < 0.15
+
+
+def test_colours_come_from_views_off_the_object_s_outline() -> None:
+    chart, hole = chart_with_a_hole()
+    camera = Camera(120, 90, 100.0, 100.0, 60.0, 45.0)
+    now, picture = np.ones((90, 120), np.float32), np.full((90, 120, 3), 0.5, np.float32)
+    outline = cv2.dilate(hole.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    picture[outline] = 0.0
+    view = HoleView(View(camera, np.eye(4)), hole, now, now, picture)
+    seen = as_seen(replace(chart, clean=np.zeros_like(hole)), [view])
+    assert seen.clean.sum() > 0.6 * seen.clean.size and not (seen.clean & outline).any()
+    assert (seen.color[seen.clean] == 0.5).all()
 
 
 def test_nothing_removed_is_nothing_to_do(table: TableScene) -> None:
