@@ -1,25 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ggslam inspect`: what a recording is."""
+"""`ggslam inspect`: what a recording is, or what a coded stream is made of."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
 from ggslam.cli import options
-from ggslam.cli.console import console
+from ggslam.cli.console import console, table
 
 if TYPE_CHECKING:
     from ggslam.scene.camera import Camera
     from ggslam.sequences.inspection import SequenceReport
 
-EPILOG = "[bold]Example[/]  ggslam inspect data/rgbd_dataset_freiburg3_cabinet"
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam inspect data/rgbd_dataset_freiburg3_cabinet
+
+  ggslam inspect kitchen.bin
+"""
 
 
 def inspect(
-    sequence: options.SequencePath,
+    sequence: Annotated[
+        Path,
+        typer.Argument(metavar="SEQUENCE|STREAM", help="Folder of a recording, or file that `ggslam encode` wrote."),
+    ],
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
@@ -29,7 +39,10 @@ def inspect(
     masks: options.Masks = None,
     samples: int = typer.Option(8, help="Frames to read and look at.", min=1),
 ) -> None:
-    """Print what was recognised in a recording, and likely mistakes."""
+    """Print what was recognised in a recording, and likely mistakes; of a G-PCC stream, print every unit."""
+    if sequence.is_file():
+        _print_stream(sequence)
+        return
     from ggslam.sequences import open_sequence
     from ggslam.sequences.inspection import inspect_sequence
 
@@ -44,6 +57,24 @@ def inspect(
         console.print(f"[red]damaged:[/] {escape(reason)}", highlight=False)
     for warning in report.warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}", highlight=False)
+
+
+def _print_stream(path: Path) -> None:
+    from ggslam.coding_jobs import list_stream
+
+    listing = list_stream(path)
+    for unit in listing.units:
+        rate = "" if unit.bits_per_point is None else f"{unit.bits_per_point:8.3f} bits a point"
+        console.print(f"[bold]{unit.offset:>9}  {unit.kind:<19}[/] {unit.size:>9} bytes {rate:<21}", highlight=False)
+        console.print(f"           {escape(unit.fields)}", highlight=False, soft_wrap=True)
+    total, points = sum(listing.parts.values()), listing.points
+    rows = [
+        [name, str(size), f"{8 * size / points:.3f}" if points else "-"]
+        for name, size in [*listing.parts.items(), ("total", total)]
+    ]
+    console.print(table(f"{points} points, slices: {listing.slices}", ["part", "bytes", "bits a point"], rows))
+    for problem in listing.problems:
+        console.print(f"[red]damaged or not supported:[/] {escape(problem)}", highlight=False)
 
 
 def _camera(c: Camera) -> str:

@@ -17,6 +17,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from ggslam import __version__
 from ggslam.cli import (
     edit_command,
+    decode_command,
+    encode_command,
     eval_command,
     export_command,
     inspect_command,
@@ -53,6 +55,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "run": (run_command.run, run_command.EPILOG), "eval": (eval_command.evaluate, eval_command.EPILOG),
     "render": (render_command.render, render_command.EPILOG), "export": (export_command.export, export_command.EPILOG),
     "edit": (edit_command.edit, edit_command.EPILOG),
+    "encode": (encode_command.encode, encode_command.EPILOG), "decode": (decode_command.decode, decode_command.EPILOG),
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
 }  # fmt: skip
 for _name, (_function, _epilog) in _COMMANDS.items():

@@ -16,6 +16,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.formats.atomic import atomic_write
 from ggslam.formats.ply_header import FORMATS, PLY_NAMES, Element, Header, read_header
+from ggslam.formats.text_numbers import fitted, parse_numbers
 
 
 @dataclass(frozen=True)
@@ -212,26 +213,28 @@ def _read_ascii(file: BinaryIO, header: Header, path: Path) -> dict[str, np.ndar
         position += len(found)
         if len(found) < element.count * columns:
             raise _truncated(path, element, len(found) // max(columns, 1))
-        table = _numbers(found, element, path).reshape(element.count, columns)
+        table = parse_numbers(found, f"element '{element.name}'", path).reshape(element.count, columns)
         rows = np.empty(element.count, [(p.name, p.code) for p in element.properties])
         for column, p in enumerate(element.properties):
-            rows[p.name] = _fitted(table[:, column], p.code, p.name, path)
+            rows[p.name] = fitted(table[:, column], p.code, p.name, path)
         out[element.name] = rows
     return out
 
 
 def _ascii_rows_with_lists(words: list[bytes], position: int, element: Element, path: Path) -> tuple[np.ndarray, int]:
+    what = f"element '{element.name}'"
     out = np.empty(element.count, [(p.name, object if p.count_code else p.code) for p in element.properties])
     for row in range(element.count):
         for p in element.properties:
             length = 1
             if p.count_code:
-                found = _numbers(words[position : position + 1], element, path)
+                found = parse_numbers(words[position : position + 1], what, path)
                 length = int(found[0]) if len(found) and np.isfinite(found[0]) else -1
                 position += 1
             if length < 0 or position + length > len(words):
                 raise _truncated(path, element, row)
-            values = _fitted(_numbers(words[position : position + length], element, path), p.code, p.name, path)
+            values = parse_numbers(words[position : position + length], what, path)
+            values = fitted(values, p.code, p.name, path)
             position += length
             out[row][p.name] = values if p.count_code else values[0]
     return _with_equal_lists_as_arrays(out, element), position
@@ -248,25 +251,6 @@ def _with_equal_lists_as_arrays(rows: np.ndarray, element: Element) -> np.ndarra
         stacked = len(out.dtype[p.name].shape) == 1
         out[p.name] = np.stack(list(rows[p.name])) if stacked else rows[p.name]
     return out
-
-
-def _numbers(words: list[bytes], element: Element, path: Path) -> np.ndarray:
-    try:
-        return np.fromiter(map(float, words), np.float64, len(words))
-    except ValueError as error:
-        raise FormatError(f"{path}: element '{element.name}': {error}") from None
-
-
-def _fitted(values: np.ndarray, code: str, name: str, path: Path) -> np.ndarray:
-    """Values in their declared type; an integer property must hold integers of its range."""
-    if code.startswith("f"):
-        with np.errstate(over="ignore"):
-            return values.astype(code)
-    limits = np.iinfo(code)
-    fits = (values >= limits.min) & (values <= limits.max) & (values == np.rint(values))
-    if not fits.all():
-        raise FormatError(f"{path}: property '{name}': {values[~fits][0]} does not fit its type {PLY_NAMES[code]}")
-    return values.astype(code)
 
 
 def _truncated(path: Path, element: Element, found: int) -> FormatError:

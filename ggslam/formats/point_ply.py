@@ -15,8 +15,8 @@ from ggslam.errors import FormatError
 from ggslam.formats.ply import read_ply, write_ply
 from ggslam.formats.point_sampling import VoxelCloud, sample_points
 
-__all__ = ["GRID_FILE", "METRIC_FILE", "VoxelCloud", "read_points", "sample_points", "write_grid_points",
-           "write_metric_points", "write_points"]  # fmt: skip
+__all__ = ["GRID_FILE", "METRIC_FILE", "VoxelCloud", "grid_positions", "read_points", "sample_points",
+           "write_grid_points", "write_metric_points", "write_points"]  # fmt: skip
 
 METRIC_FILE, GRID_FILE = "points.ply", "points_grid.ply"
 _COLORS = ("red", "green", "blue")
@@ -53,14 +53,28 @@ def read_points(path: str | Path) -> VoxelCloud:
     vertex = ply.elements.get("vertex")
     if vertex is None or not {"x", "y", "z", *_COLORS} <= set(vertex.dtype.names or ()):
         raise FormatError(f"{path}: expected a 'vertex' element with x y z red green blue")
-    voxel_size = float(_comment(path, ply.comments, "voxel_size", 1)[0])
-    origin = _comment(path, ply.comments, "origin", 3)
-    position = np.stack([vertex[name] for name in "xyz"], 1)
-    if position.dtype.kind == "f":
-        position = np.rint((position - origin) / voxel_size)
+    grid, voxel_size, origin = grid_positions(path, ply.comments, np.stack([vertex[name] for name in "xyz"], 1))
     colors = np.stack([vertex[name] for name in _COLORS], 1).astype(np.uint8)
     object_id = vertex["object_id"].astype(np.int32) if "object_id" in (vertex.dtype.names or ()) else None
-    return VoxelCloud(position.astype(np.int32), colors, object_id, voxel_size, origin)
+    return VoxelCloud(grid, colors, object_id, voxel_size, origin)
+
+
+def grid_positions(path: str | Path, comments: list[str], position: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    """Grid coordinates int32 [N, 3], voxel size and origin (float64 [3], metres) of either variant.
+
+    Args:
+        path: the file, for messages.
+        comments: of its header.
+        position: [N, 3] as stored: metres if floating-point numbers, else grid coordinates.
+
+    Raises:
+        FormatError: the comments with scale and origin are missing or damaged.
+    """
+    voxel_size = float(_comment(path, comments, "voxel_size", 1)[0])
+    origin = _comment(path, comments, "origin", 3)
+    if position.dtype.kind == "f":
+        position = np.rint((position - origin) / voxel_size)
+    return position.astype(np.int32), voxel_size, origin
 
 
 def _vertices(position: np.ndarray, code: str, cloud: VoxelCloud) -> np.ndarray:

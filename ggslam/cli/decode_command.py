@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam decode`: a G-PCC stream as a cloud or a map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ggslam.cli.console import console
+from ggslam.errors import ConfigError
+
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam decode kitchen.bin kitchen.ply
+
+  ggslam decode kitchen.bin corner.ply --box "0 0 0 1.5 1 2"
+
+  ggslam decode kitchen.bin part.pcd --slice 2
+"""
+
+
+def decode(
+    source: Annotated[Path, typer.Argument(metavar="STREAM", help="Stream of the first edition of G-PCC.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="PLY or PCD file to write; of Gaussians a 3DGS PLY.")],
+    slice_id: Annotated[int | None, typer.Option("--slice", help="Decode this slice alone.", min=0)] = None,
+    box: Annotated[
+        str | None, typer.Option(help='Decode the points in a box alone: "x0 y0 z0 x1 y1 z1", metres.')
+    ] = None,
+    workers: Annotated[int | None, typer.Option(help="Threads; default: one per processor.", min=1, max=1024)] = None,
+) -> None:
+    """Decode an MPEG G-PCC stream, or one slice or box of it."""
+    from ggslam.coding_jobs import decode_file
+
+    corners = None if box is None else _corners(box)
+    done = decode_file(source, out, slice_id, corners, workers)
+    console.print(f"wrote {done.path}: {done.count} {done.what}", highlight=False, markup=False)
+
+
+def _corners(text: str) -> tuple[list[float], list[float]]:
+    try:
+        values = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        values = []
+    if len(values) != 6 or not all(low <= high for low, high in zip(values[:3], values[3:], strict=True)):
+        raise ConfigError(f'--box: expected "x0 y0 z0 x1 y1 z1" with x0 <= x1, y0 <= y1, z0 <= z1, found {text!r}')
+    return values[:3], values[3:]

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam encode`: a cloud or a map as a G-PCC stream."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ggslam.cli.console import console, progress_bar, table
+from ggslam.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ggslam.coding import CodecSettings, CodingReport
+    from ggslam.coding.study import StudyRow
+
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam encode runs/kitchen kitchen.bin
+
+  ggslam encode scan.pcd scan.bin --voxel 0.01 --qp 28 --slices 4 --split interval
+
+  ggslam encode runs/kitchen kitchen_map.bin --preset splat --rate r03
+
+  ggslam encode runs/kitchen study/ --sweep both
+"""
+
+
+class Split(str, Enum):
+    """How slices are cut."""
+
+    by_count = "count"
+    by_interval = "interval"
+    by_octree = "octree"
+
+
+class Preset(str, Enum):
+    """What is coded."""
+
+    pointcloud = "pointcloud"
+    splat = "splat"
+
+
+class Rate(str, Enum):
+    """Quality of the splat preset."""
+
+    r01 = "r01"
+    r02 = "r02"
+    r03 = "r03"
+    r04 = "r04"
+
+
+class Sweep(str, Enum):
+    """What to vary in a study."""
+
+    qp = "qp"
+    geometry = "geometry"
+    both = "both"
+
+
+def encode(
+    source: Annotated[
+        Path, typer.Argument(metavar="INPUT", help="PLY, 3DGS PLY or PCD file, or folder that `ggslam run` wrote.")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Stream to write; with --sweep a folder.")],
+    qp: Annotated[int, typer.Option(help="Quantiser of the colours; 6 more double the step.", min=4, max=51)] = 22,
+    chroma_offset: Annotated[int, typer.Option(help="Added to --qp for chroma.", min=-51, max=51)] = 0,
+    geometry_scale: Annotated[float, typer.Option(help="Resolution of the positions; 0.5: half.", min=1e-6)] = 1.0,
+    voxel: Annotated[
+        float | None, typer.Option(help="Voxel size in metres; default: the cloud's own grid, else --bits.", min=1e-9)
+    ] = None,
+    bits: Annotated[
+        int, typer.Option(help="Bits of the longest side of a cloud without a grid.", min=1, max=21)
+    ] = 10,
+    slices: Annotated[int, typer.Option(help="Slices, coded side by side.", min=1, max=65536)] = 1,
+    split: Annotated[
+        Split, typer.Option(help="Equal numbers of points or equal intervals of the longest axis, or octree cubes.")
+    ] = Split.by_count,
+    workers: Annotated[int | None, typer.Option(help="Threads; default: one per processor.", min=1, max=1024)] = None,
+    preset: Annotated[
+        Preset, typer.Option(help="pointcloud: positions, colours, labels; splat: whole Gaussians of a 3DGS PLY.")
+    ] = Preset.pointcloud,
+    rate: Annotated[Rate, typer.Option(help="Quality of splat, r01 smallest; instead of --qp and --bits.")] = Rate.r03,
+    sweep: Annotated[
+        Sweep | None, typer.Option(help="Write a study over QPs or geometry scales: tables, plots, pictures.")
+    ] = None,
+    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw a study's plots (needs matplotlib).")] = True,
+) -> None:
+    """Encode a point cloud or a Gaussian map as an MPEG G-PCC stream (ISO/IEC 23090-9), in parallel slices."""
+    from ggslam.coding import CodecSettings
+    from ggslam.coding_jobs import encode_file
+
+    settings = CodecSettings(
+        qp=qp, chroma_offset=chroma_offset, geometry_scale=geometry_scale, voxel_size=voxel, geometry_bits=bits,
+        slices=slices, split="cube" if split is Split.by_octree else split.value, workers=workers,
+    )  # fmt: skip
+    if sweep is not None:
+        if preset is Preset.splat:
+            raise ConfigError("--sweep goes with the preset pointcloud")
+        _study(source, out, settings, ["qp", "geometry"] if sweep is Sweep.both else [sweep.value], plots)
+        return
+    done = encode_file(source, out, settings, preset.value, rate.value)
+    _print_report(done.report)
+    for note in done.notes:
+        console.print(f"note: {note}", highlight=False, markup=False)
+    console.print(f"wrote {done.path}", highlight=False, markup=False)
+
+
+def _print_report(report: CodingReport) -> None:
+    parts = {"geometry": report.geometry_bytes, **report.attribute_bytes}
+    parts["headers"] = report.total_bytes - sum(parts.values())
+    rows = [[name, str(size), _rate(size, report.input_points)] for name, size in parts.items()]
+    rows.append(["total", str(report.total_bytes), _rate(report.total_bytes, report.input_points)])
+    console.print(table("coded", ["part", "bytes", "bits a point"], rows))
+    merged = "" if report.points == report.input_points else f", {report.points} after those in one voxel were merged"
+    speed = report.input_points / max(report.seconds, 1e-9) / 1e6
+    console.print(
+        f"{report.input_points} points{merged}; slices: {len(report.slices)}; {report.seconds:.2f} s, "
+        f"{speed:.2f} million points/s", highlight=False,
+    )  # fmt: skip
+
+
+def _rate(size: int, points: int) -> str:
+    return f"{8 * size / points:.3f}"
+
+
+def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], plots: bool) -> None:
+    from ggslam.coding.study import sweep_steps
+    from ggslam.coding_jobs import study_cloud
+    from ggslam.coding_study import write_study
+
+    steps = sweep_steps(kinds)
+    cloud = study_cloud(source, settings)
+    with progress_bar() as bar:
+        task = bar.add_task("sweep", total=len(steps), info="")
+
+        def show(row: StudyRow) -> None:
+            bar.update(task, advance=1, info=f"QP {row.step.qp} scale {row.step.geometry_scale:g}")
+
+        study = write_study(cloud, steps, settings, out, plots, show)
+    columns = ["step", "points", "bits", "Y dB", "D1 dB", "D2 dB", "enc. s", "dec. s", "J"]
+    title = f"{len(cloud.grid)} points; bits per point of these"
+    console.print(table(title, columns, [_study_cells(row) for row in study.rows]))
+    for note in study.notes:
+        console.print(f"note: {note}", highlight=False, markup=False)
+    console.print(f"wrote {len(study.files)} files and the pictures to {out}", highlight=False, markup=False)
+
+
+def _study_cells(row: StudyRow) -> list[str]:
+    step = row.step
+    name = f"QP {step.qp}" if step.sweep == "qp" else f"scale {step.geometry_scale:g}"
+    return [
+        name, str(row.decoded_points), _rate(row.total_bytes, row.input_points), f"{row.color.y:.2f}",
+        f"{row.d1:.2f}", f"{row.d2:.2f}", f"{row.encode_s:.2f}", f"{row.decode_s:.2f}",
+        "-" if row.joules is None else f"{row.joules:.1f}",
+    ]  # fmt: skip

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Attributes as the caller has them, and as components for the coder: colour spaces, bit depths, ids.
+
+Ids must come back exactly, which the transform does not promise at any quantiser parameter. They are therefore coded as
+their rank in the sorted table of ids times a stride, with a step well below the stride: rounding then undoes the error.
+The encoder knows what a decoder will reconstruct and lists the ranks that come out wrong. Up to some hundred ids there
+are none; with thousands there are, as the transform's 15-bit factors let large values shrink by up to a thousandth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ggslam.coding.native import rgb_to_ycbcr, ycbcr_to_rgb
+from ggslam.coding.sequence_parameters import (
+    KNOWN_LABELS,
+    MATRIX_BT709,
+    MATRIX_IDENTITY,
+    AttributeDescription,
+)
+from ggslam.coding.settings import AttributeSettings, CodecSettings
+from ggslam.coding.syntax import AttributeParameters
+from ggslam.errors import ConfigError, FormatError
+
+_GBR = [1, 2, 0]  # where G, B, R are in R, G, B
+_RGB = [2, 0, 1]  # and back
+
+
+@dataclass(frozen=True)
+class IdTable:
+    """The ids of a lossless attribute: ids[rank], coded as rank times stride."""
+
+    ids: np.ndarray
+    stride: int
+
+    @staticmethod
+    def of(values: np.ndarray) -> IdTable:
+        ids = np.unique(values).astype(np.uint16)
+        return IdTable(ids, 65535 // max(1, len(ids) - 1))
+
+    def qp(self) -> int:
+        """Quantiser parameter of a step at most three tenths of the stride, at least 4 (a step of one)."""
+        return int(np.clip(4 + np.floor(6 * np.log2(max(1.0, 0.3 * self.stride))), 4, 99))
+
+    def components(self, values: np.ndarray) -> np.ndarray:
+        return (np.searchsorted(self.ids, values) * self.stride).astype(np.int32)
+
+    def ranks(self, components: np.ndarray) -> np.ndarray:
+        return np.minimum((components + self.stride // 2) // self.stride, len(self.ids) - 1)
+
+
+@dataclass(frozen=True)
+class CodedAttribute:
+    """One attribute of a stream: its place in the parameter sets, and how components become values."""
+
+    name: str
+    index: int
+    description: AttributeDescription
+    table: IdTable | None = None
+
+    def components(self, values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Components int32 [M, C] of the values in `rows`, uint32 [M]."""
+        if self.description.matrix == MATRIX_BT709:
+            return rgb_to_ycbcr(values, rows)
+        picked = values[rows].reshape(len(rows), -1)
+        if self.table is not None:
+            return self.table.components(picked)
+        if self.description.matrix == MATRIX_IDENTITY:
+            picked = picked[:, _GBR]
+        return np.ascontiguousarray(picked, np.int32)
+
+    def merged_components(self, values: np.ndarray, rows: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        """The same, with one row for each run of `counts` rows: the mean, or of ids the most frequent one."""
+        starts = np.cumsum(counts, dtype=np.int64) - counts
+        if self.table is not None:
+            return self.components(values, rows[_most_frequent(values.reshape(-1)[rows], starts, counts)])
+        sums = np.add.reduceat(values[rows].reshape(len(rows), -1), starts, axis=0, dtype=np.int64)
+        means = (2 * sums + counts[:, None]) // (2 * counts[:, None].astype(np.int64))
+        return self.components(means.astype(values.dtype), np.arange(len(counts), dtype=np.uint32))
+
+    def values(self, components: np.ndarray, corrections: Mapping[str, Any] | None = None) -> np.ndarray:
+        """What the caller sees: uint8, above 8 bits uint16, [N, 3] or [N].
+
+        Raises:
+            FormatError: corrections of ids that are none.
+        """
+        description = self.description
+        if self.table is not None:
+            return self._ids(components[:, 0], corrections)
+        if description.matrix == MATRIX_BT709:
+            return ycbcr_to_rgb(components)
+        values = components.astype(np.uint8 if description.bit_depth <= 8 else np.uint16)
+        if description.components == 1:
+            return values[:, 0]
+        return np.ascontiguousarray(values[:, _RGB]) if description.matrix == MATRIX_IDENTITY else values
+
+    def corrections(self, components: np.ndarray, reconstructed: np.ndarray) -> dict[str, list[int]] | None:
+        """The ids that a decoder would get wrong; None if there are none."""
+        if self.table is None:
+            return None
+        true, found = self.table.ranks(components[:, 0]), self.table.ranks(reconstructed[:, 0])
+        wrong = np.flatnonzero(true != found)
+        if len(wrong) == 0:
+            return None
+        return {"steps": np.diff(wrong, prepend=0).tolist(), "differences": (true - found)[wrong].tolist()}
+
+    def _ids(self, components: np.ndarray, corrections: Mapping[str, Any] | None) -> np.ndarray:
+        assert self.table is not None
+        ranks = self.table.ranks(components)
+        if corrections is not None:
+            try:
+                where = np.cumsum(np.asarray(corrections["steps"], np.int64))
+                right = ranks[where] + np.asarray(corrections["differences"], np.int64)
+                if len(where) and (where.min() < 0 or right.min() < 0 or right.max() >= len(self.table.ids)):
+                    raise IndexError
+                ranks[where] = right
+            except (KeyError, ValueError, TypeError, IndexError, OverflowError):
+                raise FormatError(f"corrections of attribute {self.name} do not fit it") from None
+        return self.table.ids[ranks]
+
+
+def _most_frequent(values: np.ndarray, starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Place of the most frequent value in each run; of equals the smallest value."""
+    run = np.repeat(np.arange(len(counts)), counts)
+    pairs, first, frequency = np.unique(
+        run.astype(np.int64) << 16 | values.astype(np.int64), return_index=True, return_counts=True
+    )
+    best = np.lexsort((pairs & 0xFFFF, -frequency, pairs >> 16))
+    of_run = np.searchsorted((pairs >> 16)[best], np.arange(len(counts)))
+    return first[best][of_run]
+
+
+def plan_attributes(
+    attributes: Mapping[str, np.ndarray], count: int, settings: CodecSettings
+) -> list[tuple[CodedAttribute, AttributeParameters]]:
+    """How each of the attributes is coded.
+
+    Raises:
+        ConfigError: an array of wrong shape, type or range, or settings that do not fit it.
+    """
+    unknown = set(settings.attributes) - set(attributes)
+    if unknown:
+        raise ConfigError(f"CodecSettings.attributes: there is no attribute {sorted(unknown)[0]!r}")
+    plans: list[tuple[CodedAttribute, AttributeParameters]] = []
+    for index, (name, values) in enumerate(attributes.items()):
+        own = settings.attribute(name)
+        values = np.asarray(values)
+        _check_array(name, values, count)
+        description = _describe(name, values, own)
+        instance = sum(plan.description.label == description.label for plan, _ in plans)
+        table = IdTable.of(values) if own.lossless else None
+        plan = CodedAttribute(name, index, replace(description, instance=instance), table)
+        plans.append((plan, _parameters(index, own, settings, table)))
+    if len(plans) > 16:
+        raise ConfigError(f"{len(plans)} attributes; a stream has parameter sets for 16")
+    return plans
+
+
+def _check_array(name: str, values: np.ndarray, count: int) -> None:
+    if values.shape not in ((count,), (count, 1), (count, 3)):
+        raise ConfigError(f"attribute {name!r}: expected [{count}] or [{count}, 3] values, found {list(values.shape)}")
+    if not np.issubdtype(values.dtype, np.integer):
+        raise ConfigError(f"attribute {name!r}: expected whole numbers, found {values.dtype}")
+
+
+def _describe(name: str, values: np.ndarray, own: AttributeSettings) -> AttributeDescription:
+    components = 3 if values.ndim == 2 and values.shape[1] == 3 else 1
+    depth = own.bit_depth or (8 if values.dtype == np.uint8 else 16)
+    space = own.color_space or ("ycbcr" if components == 3 and values.dtype == np.uint8 and depth == 8 else "none")
+    if own.lossless:
+        depth, space = 16, "none"
+    if own.lossless and components != 1:
+        raise ConfigError(f"attribute {name!r}: only attributes of one component can be lossless")
+    if space != "none" and components != 3:
+        raise ConfigError(f"attribute {name!r}: colour space {space} needs 3 components")
+    if space == "ycbcr" and depth != 8:
+        raise ConfigError(f"attribute {name!r}: colour space ycbcr needs 8 bits, found {depth}")
+    narrow = values.dtype == np.uint8 and depth >= 8
+    if not narrow and (values.min() < 0 or values.max() >= 1 << depth):
+        raise ConfigError(f"attribute {name!r}: values {values.min()} to {values.max()} do not fit in {depth} bits")
+    default = "material" if own.lossless else "color" if components == 3 else "reflectance"
+    label = own.label or (name if name in KNOWN_LABELS else default)
+    if label not in KNOWN_LABELS:
+        raise ConfigError(f"attribute {name!r}: label {label!r} is none of {', '.join(KNOWN_LABELS)}")
+    matrix = {"ycbcr": MATRIX_BT709, "identity": MATRIX_IDENTITY}.get(space)
+    return AttributeDescription(label, components, depth, 0, matrix)
+
+
+def _parameters(
+    index: int, own: AttributeSettings, settings: CodecSettings, table: IdTable | None
+) -> AttributeParameters:
+    qp = settings.qp if own.qp is None else own.qp
+    offset = settings.chroma_offset if own.chroma_offset is None else own.chroma_offset
+    if table is not None:
+        qp, offset = table.qp(), 0
+    return AttributeParameters(qp, offset, settings.raht_prediction, attribute_id=index)

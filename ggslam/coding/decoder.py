@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`decode_cloud` and partial decoding: G-PCC streams (ISO/IEC 23090-9, first edition) become point clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.coding.cloud import PointCloud
+from ggslam.coding.native import SliceCoder, raht_settings
+from ggslam.coding.stream import CodedSliceUnits, CodedStream, read_stream
+from ggslam.errors import FormatError
+from ggslam.native.loader import available_processors
+
+
+@dataclass(frozen=True)
+class SliceInfo:
+    """What a stream says of a slice before it is decoded: `low` and `high` bound its points, in metres."""
+
+    slice_id: int
+    points: int
+    size_bytes: int
+    low: np.ndarray
+    high: np.ndarray
+
+
+def decode_cloud(data: bytes | memoryview, workers: int | None = None) -> PointCloud:
+    """Decodes a stream. Slices come in the order of the stream, points of a slice in Morton order.
+
+    Args:
+        workers: threads that decode slices; None: one for each processor.
+
+    Raises:
+        FormatError: the stream is damaged, or uses a tool that this decoder lacks (the message names it).
+    """
+    stream = read_stream(data)
+    return _decode(stream, stream.slices, workers)
+
+
+def list_slices(data: bytes | memoryview) -> list[SliceInfo]:
+    """The slices of a stream; nothing is decoded but headers."""
+    stream = read_stream(data)
+    boxes = [stream.quantization.restore(np.stack(units.grid_box)) for units in stream.slices]
+    return [
+        SliceInfo(units.header.slice_id, units.header.points, units.size, box[0], box[1])
+        for units, box in zip(stream.slices, boxes, strict=True)
+    ]
+
+
+def decode_slice(data: bytes | memoryview, slice_id: int) -> PointCloud:
+    """Decodes the slice of this id (all of them, if several share it) and no other.
+
+    Raises:
+        FormatError: the stream is damaged or has no such slice.
+    """
+    stream = read_stream(data)
+    chosen = [units for units in stream.slices if units.header.slice_id == slice_id]
+    if not chosen:
+        ids = sorted({units.header.slice_id for units in stream.slices})
+        raise FormatError(f"the stream has no slice {slice_id}; it has {ids[0]} to {ids[-1]}")
+    return _decode(stream, chosen, 1)
+
+
+def decode_box(data: bytes | memoryview, low: Sequence[float], high: Sequence[float]) -> PointCloud:
+    """The points within a box, metres, both ends included; slices that lie outside are not decoded."""
+    stream = read_stream(data)
+    first, last = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    chosen = []
+    for units in stream.slices:
+        corners = stream.quantization.restore(np.stack(units.grid_box))
+        if (corners[0] <= last).all() and (corners[1] >= first).all():
+            chosen.append(units)
+    cloud = _decode(stream, chosen, None)
+    points = cloud.points
+    inside = ((points >= first) & (points <= last)).all(1)
+    attributes = {name: values[inside] for name, values in cloud.attributes.items()}
+    return PointCloud(cloud.grid_points[inside], attributes, cloud.quantization, cloud.metadata)
+
+
+def _decode(stream: CodedStream, slices: list[CodedSliceUnits], workers: int | None) -> PointCloud:
+    count = min(workers or available_processors(), len(slices))
+    if count <= 1:
+        parts = [_decode_slice(stream, units) for units in slices]
+    else:
+        with ThreadPoolExecutor(count, thread_name_prefix="slice") as pool:
+            futures = [pool.submit(_decode_slice, stream, units) for units in slices]
+            try:
+                parts = [future.result() for future in futures]
+            finally:
+                for future in futures:
+                    future.cancel()
+    grid = _concatenate([part[0] for part in parts], (0, 3), np.int32)
+    attributes = {}
+    for attribute in stream.attributes:
+        wide = np.uint16 if attribute.description.bit_depth > 8 else np.uint8
+        shape = (0,) if attribute.description.components == 1 else (0, 3)
+        attributes[attribute.name] = _concatenate([part[1][attribute.name] for part in parts], shape, wide)
+    metadata = stream.side.get("metadata")
+    return PointCloud(grid, attributes, stream.quantization, metadata if isinstance(metadata, dict) else {})
+
+
+def _concatenate(parts: list[np.ndarray], empty: tuple[int, ...], dtype: type) -> np.ndarray:
+    if len(parts) == 1:
+        return parts[0]
+    return np.concatenate(parts) if parts else np.empty(empty, dtype)
+
+
+def _decode_slice(stream: CodedStream, units: CodedSliceUnits) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    header = units.header
+    try:
+        coder = SliceCoder()
+        grid = coder.decode_geometry(units.geometry, header.depth, units.payload, header.points)
+        grid += np.asarray(header.grid_origin, np.int32)
+        attributes = {}
+        for attribute in stream.attributes:
+            coded, description = units.attributes[attribute.index], attribute.description
+            settings = raht_settings(
+                coded.parameters, description.components, description.bit_depth, coded.header.qp_deltas
+            )
+            components = coder.decode_attribute(settings, coded.payload)
+            attributes[attribute.name] = attribute.values(components, units.corrections.get(attribute.name))
+    except FormatError as error:
+        raise FormatError(f"slice {header.slice_id}: {error}") from None
+    return grid, attributes

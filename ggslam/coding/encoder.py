@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`encode_cloud`: a cloud as a G-PCC stream (ISO/IEC 23090-9, first edition), coded in parallel slices."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from ggslam.coding.attribute_values import CodedAttribute, plan_attributes
+from ggslam.coding.cloud import CodingReport, EncodedCloud, PointCloud
+from ggslam.coding.container import UnitType, unit_bytes
+from ggslam.coding.quantization import Quantization, choose_quantization
+from ggslam.coding.sequence_parameters import SequenceParameters
+from ggslam.coding.settings import CodecSettings
+from ggslam.coding.slice_encoder import CloudToCode, CodedSlice, encode_slice
+from ggslam.coding.slices import assign_slices
+from ggslam.coding.user_data import write_user_data
+from ggslam.errors import ConfigError, FormatError
+from ggslam.native.loader import available_processors
+
+
+def encode_cloud(
+    points: np.ndarray,
+    attributes: Mapping[str, np.ndarray] | None = None,
+    settings: CodecSettings | None = None,
+    *,
+    reconstruct: bool = False,
+) -> EncodedCloud:
+    """Codes a cloud. The same input gives the same bytes, whatever the number of workers.
+
+    Args:
+        points: [N, 3], float (metres) or integer (voxels).
+        attributes: by name, whole numbers [N, 3] or [N].
+        settings: every choice; None: the defaults.
+        reconstruct: also return what a decoder makes of the stream.
+
+    Raises:
+        ConfigError: settings or arrays that do not fit together.
+        FormatError: no points, or positions that are no numbers.
+    """
+    start = time.perf_counter()
+    settings = settings or CodecSettings()
+    points = _checked_points(points)
+    arrays = {name: np.asarray(values) for name, values in (attributes or {}).items()}
+    plans = plan_attributes(arrays, len(points), settings)
+    quantization = choose_quantization(
+        points, settings.voxel_size, settings.geometry_bits, settings.geometry_scale, settings.box
+    )
+    numbers = assign_slices(points, quantization, settings)
+    sequence = _sequence_parameters(quantization, [plan for plan, _ in plans])
+    cloud = CloudToCode(points, arrays, numbers, plans, sequence, quantization, settings, reconstruct)
+    slices = _encode_slices(cloud, 1 if numbers is None else int(numbers.max()) + 1)
+    data = _parameter_units(cloud, slices) + b"".join(coded.data for coded in slices)
+    report = CodingReport(
+        len(points), sum(coded.report.points for coded in slices), len(data),
+        tuple(coded.report for coded in slices), time.perf_counter() - start,
+    )  # fmt: skip
+    return EncodedCloud(data, report, _reconstruction(cloud, slices) if reconstruct else None)
+
+
+def _checked_points(points: np.ndarray) -> np.ndarray:
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ConfigError(f"points: expected [N, 3], found {list(points.shape)}")
+    if len(points) == 0:
+        raise FormatError("a cloud without points cannot be coded")
+    if not np.issubdtype(points.dtype, np.integer) and not np.isfinite(points).all():
+        raise FormatError("the cloud has positions that are not finite numbers")
+    return points
+
+
+def _sequence_parameters(quantization: Quantization, plans: list[CodedAttribute]) -> SequenceParameters:
+    resolution, _ = quantization.resolution()
+    return SequenceParameters(
+        tuple(plan.description for plan in plans), False, quantization.origin, 0, quantization.size,
+        resolution, quantization.metres,
+    )  # fmt: skip
+
+
+def _encode_slices(cloud: CloudToCode, count: int) -> list[CodedSlice]:
+    """A worker holds the arrays of the slice in its hands and no other."""
+    workers = min(cloud.settings.workers or available_processors(), count)
+    if workers == 1:
+        return [encode_slice(cloud, number) for number in range(count)]
+    with ThreadPoolExecutor(workers, thread_name_prefix="slice") as pool:
+        futures = [pool.submit(encode_slice, cloud, number) for number in range(count)]
+        try:
+            return [future.result() for future in futures]
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def _parameter_units(cloud: CloudToCode, slices: list[CodedSlice]) -> bytes:
+    """Parameter sets, once for all slices, and the unit of what they cannot hold."""
+    geometry = {coded.geometry.geometry_id: coded.geometry for coded in slices}
+    units = [unit_bytes(UnitType.SEQUENCE_PARAMETERS, cloud.sequence.write())]
+    units += [unit_bytes(UnitType.GEOMETRY_PARAMETERS, geometry[identity].write()) for identity in sorted(geometry)]
+    units += [unit_bytes(UnitType.ATTRIBUTE_PARAMETERS, parameters.write()) for _, parameters in cloud.plans]
+    content = _side_information(cloud)
+    if content:
+        units.append(unit_bytes(UnitType.USER_DATA, write_user_data(content)))
+    return b"".join(units)
+
+
+def _side_information(cloud: CloudToCode) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    if not cloud.quantization.resolution()[1]:
+        content["scale"] = cloud.quantization.scale
+    if cloud.quantization.centre:
+        content["centre"] = cloud.quantization.centre
+    if any(plan.name != plan.description.label or plan.description.instance for plan, _ in cloud.plans):
+        content["names"] = [plan.name for plan, _ in cloud.plans]
+    tables = {
+        plan.name: {"ids": plan.table.ids.tolist(), "stride": plan.table.stride}
+        for plan, _ in cloud.plans
+        if plan.table is not None
+    }
+    if tables:
+        content["tables"] = tables
+    if cloud.settings.metadata:
+        content["metadata"] = dict(cloud.settings.metadata)
+    return content
+
+
+def _reconstruction(cloud: CloudToCode, slices: list[CodedSlice]) -> PointCloud:
+    grid = np.concatenate([coded.grid_points for coded in slices if coded.grid_points is not None])
+    attributes = {
+        plan.name: np.concatenate([coded.attributes[plan.name] for coded in slices if coded.attributes is not None])
+        for plan, _ in cloud.plans
+    }
+    return PointCloud(grid, attributes, cloud.quantization, dict(cloud.settings.metadata))

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The codec's functions in the compiled core: structures of ggslam/native/src/gpcc.hpp, field by field, and one slice's
+octree with what is coded over it. The functions release the interpreter's lock, so slices are coded side by side."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import POINTER, Structure, c_float, c_int32, c_int64, c_size_t, c_uint32, c_void_p
+from functools import lru_cache
+
+import numpy as np
+
+from ggslam.coding.syntax import AttributeParameters, GeometryParameters
+from ggslam.errors import FormatError
+from ggslam.native.loader import NativeContext, load_library
+
+_OUT_OF_MEMORY = 1
+_REASONS = {
+    2: "the payload ends early or is damaged",
+    3: "the payload holds another number of points than its unit says",
+    4: "the octree has more nodes than the decoder is willing to hold",
+}
+MAX_SLICE_POINTS = 1 << 24
+
+
+class OctreeSettings(Structure):
+    _fields_ = [
+        (name, c_int32)
+        for name in ("depth", "neighbour_boundary", "adjacent_child", "intra_prediction", "unique_points")
+    ]
+
+
+class RahtSettings(Structure):
+    _fields_ = [
+        (name, c_int32)
+        for name in (
+            "components", "bit_depth", "qp", "qp_secondary", "prediction", "min_parent_neighbours", "min_neighbours",
+        )
+    ] + [("rdoq", c_float)]  # fmt: skip
+
+
+@lru_cache(maxsize=1)
+def _library() -> ctypes.CDLL:
+    core = load_library()
+    octree, raht = POINTER(OctreeSettings), POINTER(RahtSettings)
+    signatures = {
+        "slice_create": (c_void_p, []),
+        "slice_destroy": (None, [c_void_p]),
+        "build": (c_int64, [c_void_p, c_void_p, c_void_p, c_uint32, c_int32, c_void_p]),
+        "leaves": (c_uint32, [c_void_p]),
+        "nodes": (c_uint32, [c_void_p, c_int32]),
+        "leaf_points": (None, [c_void_p, c_void_p]),
+        "merge": (c_int64, [c_void_p]),
+        "encode_geometry": (c_int64, [c_void_p, c_void_p, octree]),
+        "encode_attribute": (c_int64, [c_void_p, c_void_p, raht, c_void_p]),
+        "take": (None, [c_void_p, c_void_p]),
+        "decode_geometry": (c_int64, [c_void_p, c_void_p, octree, c_void_p, c_size_t, c_uint32]),
+        "positions": (c_int64, [c_void_p, c_void_p, c_void_p]),
+        "decode_attribute": (c_int64, [c_void_p, c_void_p, raht, c_void_p, c_size_t, c_void_p]),
+        "to_ycbcr": (None, [c_void_p, c_void_p, c_void_p, c_uint32, c_void_p]),
+        "from_ycbcr": (None, [c_void_p, c_void_p, c_uint32, c_void_p]),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(core, f"ggslam_gpcc_{name}")
+        function.restype, function.argtypes = result, arguments
+    return core
+
+
+@lru_cache(maxsize=1)
+def _context() -> NativeContext:
+    """Names the instruction set; its pool is not used, so all threads may share it."""
+    return NativeContext(threads=1)
+
+
+def _check(status: int) -> int:
+    """Sizes pass; negative values are errors."""
+    if status >= 0:
+        return status
+    if -status == _OUT_OF_MEMORY:
+        raise MemoryError("the codec ran out of memory")
+    raise FormatError(_REASONS[-status])
+
+
+def _bytes_view(data: bytes | memoryview) -> np.ndarray:
+    return np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
+
+
+class SliceCoder:
+    """The octree of one slice in the compiled core, made from points or from a geometry payload.
+
+    Attributes are int32 [points, components] in coding order: Morton order of the positions, x most significant; points
+    at one place keep the order they were given in.
+    """
+
+    def __init__(self) -> None:
+        self._core = _library()
+        self._context = _context()
+        self._handle = self._core.ggslam_gpcc_slice_create()
+        if not self._handle:
+            raise MemoryError("the codec ran out of memory")
+        self.points = 0
+        self.depth = 0
+
+    def __del__(self) -> None:
+        if getattr(self, "_handle", None):
+            self._core.ggslam_gpcc_slice_destroy(self._handle)
+
+    @property
+    def leaves(self) -> int:
+        """Number of occupied places."""
+        return self._core.ggslam_gpcc_leaves(self._handle)
+
+    def build(self, points: np.ndarray, depth: int) -> np.ndarray:
+        """Makes the octree of points int32 [N, 3] in [0, 2^depth); returns their coding order uint32 [N]."""
+        points = np.ascontiguousarray(points, np.int32)
+        order = np.empty(len(points), np.uint32)
+        _check(
+            self._core.ggslam_gpcc_build(
+                self._context.handle, self._handle, points.ctypes.data, len(points), depth, order.ctypes.data
+            )
+        )
+        self.points, self.depth = len(points), depth
+        return order
+
+    def nodes(self, level: int) -> int:
+        """Number of octree nodes at a level; the root is level 0."""
+        return self._core.ggslam_gpcc_nodes(self._handle, level)
+
+    def leaf_points(self) -> np.ndarray:
+        """Number of points at each occupied place, uint32 [leaves]."""
+        counts = np.empty(self.leaves, np.uint32)
+        self._core.ggslam_gpcc_leaf_points(self._handle, counts.ctypes.data)
+        return counts
+
+    def merge(self) -> None:
+        """Leaves one point at each place."""
+        _check(self._core.ggslam_gpcc_merge(self._handle))
+        self.points = self.leaves
+
+    def encode_geometry(self, parameters: GeometryParameters) -> bytes:
+        """The arithmetic payload."""
+        settings = _octree_settings(parameters, self.depth)
+        return self._take(
+            _check(self._core.ggslam_gpcc_encode_geometry(self._context.handle, self._handle, ctypes.byref(settings)))
+        )
+
+    def encode_attribute(self, settings: RahtSettings, values: np.ndarray) -> bytes:
+        """The arithmetic payload; `values`, int32 [points, components], become what a decoder reconstructs."""
+        _check_values(values, self.points, settings.components)
+        size = self._core.ggslam_gpcc_encode_attribute(
+            self._context.handle, self._handle, ctypes.byref(settings), values.ctypes.data
+        )
+        return self._take(_check(size))
+
+    def decode_geometry(
+        self, parameters: GeometryParameters, depth: int, payload: bytes | memoryview, points: int
+    ) -> np.ndarray:
+        """Makes the octree of a payload of `points` points; returns their positions int32 [points, 3].
+
+        Raises:
+            FormatError: the payload is damaged.
+        """
+        settings, data = _octree_settings(parameters, depth), _bytes_view(payload)
+        _check(
+            self._core.ggslam_gpcc_decode_geometry(
+                self._context.handle, self._handle, ctypes.byref(settings), data.ctypes.data, len(data), points
+            )
+        )
+        self.points, self.depth = points, depth
+        return self.positions()
+
+    def positions(self) -> np.ndarray:
+        """Positions int32 [points, 3] in coding order."""
+        positions = np.empty((self.points, 3), np.int32)
+        _check(self._core.ggslam_gpcc_positions(self._context.handle, self._handle, positions.ctypes.data))
+        return positions
+
+    def decode_attribute(self, settings: RahtSettings, payload: bytes | memoryview) -> np.ndarray:
+        """Values int32 [points, components].
+
+        Raises:
+            FormatError: the payload is damaged.
+        """
+        values, data = np.empty((self.points, settings.components), np.int32), _bytes_view(payload)
+        _check(
+            self._core.ggslam_gpcc_decode_attribute(
+                self._context.handle, self._handle, ctypes.byref(settings), data.ctypes.data, len(data),
+                values.ctypes.data,
+            )
+        )  # fmt: skip
+        return values
+
+    def _take(self, size: int) -> bytes:
+        out = np.empty(size, np.uint8)
+        self._core.ggslam_gpcc_take(self._handle, out.ctypes.data)
+        return out.tobytes()
+
+
+def raht_settings(
+    parameters: AttributeParameters,
+    components: int,
+    bit_depth: int,
+    deltas: tuple[int, int] = (0, 0),
+    rdoq: float = 0.0,
+) -> RahtSettings:
+    """What the attribute coder depends on, of an attribute with these components."""
+    first, others = parameters.qps(bit_depth, deltas)
+    return RahtSettings(
+        components, bit_depth, first, others, int(parameters.prediction), *parameters.thresholds, rdoq
+    )  # fmt: skip
+
+
+def rgb_to_ycbcr(rgb: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """BT.709 full-range Y, Cb, Cr int32 [M, 3] of the colours uint8 [N, 3] picked by `order` uint32 [M]."""
+    rgb = np.ascontiguousarray(rgb, np.uint8)
+    out = np.empty((len(order), 3), np.int32)
+    _library().ggslam_gpcc_to_ycbcr(_context().handle, rgb.ctypes.data, order.ctypes.data, len(order), out.ctypes.data)
+    return out
+
+
+def ycbcr_to_rgb(components: np.ndarray) -> np.ndarray:
+    """The inverse: uint8 [N, 3] of int32 [N, 3] in [0, 255]."""
+    rgb = np.empty(components.shape, np.uint8)
+    _library().ggslam_gpcc_from_ycbcr(_context().handle, components.ctypes.data, len(components), rgb.ctypes.data)
+    return rgb
+
+
+def _octree_settings(parameters: GeometryParameters, depth: int) -> OctreeSettings:
+    near = parameters.neighbour_boundary > 0
+    return OctreeSettings(
+        depth, parameters.neighbour_boundary, int(near and parameters.adjacent_child),
+        min(parameters.intra_prediction, 32) if near else 0, int(parameters.unique_points),
+    )  # fmt: skip
+
+
+def _check_values(values: np.ndarray, points: int, components: int) -> None:
+    if values.shape != (points, components) or values.dtype != np.int32 or not values.flags.c_contiguous:
+        raise ValueError(f"expected contiguous int32 [{points}, {components}], found {values.dtype} {values.shape}")

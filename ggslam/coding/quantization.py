@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Positions to grid and back: p~ = clip(floor(s p) - o, c_min, c_max), as in the slice-parallel G-PCC encoder for
+embedded systems whose equations 4 and 5 these are. The scale s is a number of voxels per metre, o an integer origin.
+
+The sequence parameter set holds s as a quotient of integers and o as the offset of its box. A scale that is no such
+quotient, and the place of a point within its voxel, travel exactly in a user data unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from ggslam.errors import ConfigError
+
+GRID_BITS = 21
+_MAX_FIELD = (1 << 32) - 2
+
+
+@dataclass(frozen=True)
+class Quantization:
+    """How positions lie on the grid.
+
+    scale: voxels per unit of the positions (metres, or steps of an integer grid).
+    origin: subtracted from floor(scale p), voxels.
+    size: voxels along each axis; grid positions are clipped to [0, size - 1].
+    centre: added to grid positions when they are restored, in voxels: 0.5 for the centres of the voxels.
+    metres: whether the unit is a metre.
+    """
+
+    scale: float
+    origin: tuple[int, int, int] = (0, 0, 0)
+    size: tuple[int, int, int] | None = None
+    centre: float = 0.0
+    metres: bool = False
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Grid positions int32 [N, 3] of points [N, 3]."""
+        grid = np.empty(points.shape, np.int32)
+        for axis in range(3):
+            grid[:, axis] = self.apply_along(axis, points[:, axis])
+        return grid
+
+    def apply_along(self, axis: int, values: np.ndarray) -> np.ndarray:
+        """Grid coordinates int32 [N] of the coordinates [N] along one axis."""
+        first = self.origin[axis]
+        last = None if self.size is None else first + self.size[axis] - 1
+        if self.scale == 1 and np.issubdtype(values.dtype, np.integer):
+            grid = values if values.dtype == np.int32 and _is_int32(first, last) else values.astype(np.int64)
+        else:
+            grid = np.multiply(values, self.scale, dtype=np.float64)
+            np.floor(grid, out=grid)
+        if last is not None:
+            grid = np.clip(grid, first, last)
+        return (grid - first).astype(np.int32, copy=False)
+
+    def restore(self, grid: np.ndarray) -> np.ndarray:
+        """Positions float64 [N, 3] of grid positions."""
+        points = grid.astype(np.float64)
+        points += np.asarray(self.origin, np.float64) + self.centre
+        points /= self.scale
+        return points
+
+    def resolution(self) -> tuple[Fraction, bool]:
+        """The scale as the sequence parameter set holds it, and whether that is exact."""
+        exact = Fraction(self.scale)
+        if max(exact.numerator, exact.denominator) <= _MAX_FIELD:
+            return exact, True
+        if not 1 / _MAX_FIELD <= self.scale <= _MAX_FIELD / 2:
+            raise ConfigError(f"{self.scale:g} voxels per unit of length is outside the range of the format")
+        return exact.limit_denominator(min(_MAX_FIELD, int(_MAX_FIELD / 2 / self.scale))), False
+
+
+def _is_int32(first: int, last: int | None) -> bool:
+    """Whether coordinates clipped to this range can be handled in 32 bits."""
+    return last is not None and first >= -(1 << 31) and last < 1 << 31
+
+
+def choose_quantization(
+    points: np.ndarray,
+    voxel_size: float | None,
+    bits: int,
+    geometry_scale: float,
+    box: tuple[tuple[float, float, float], tuple[float, float, float]] | None,
+) -> Quantization:
+    """The grid for points [N, 3], float (metres) or integer (voxels already).
+
+    Args:
+        voxel_size: edge of a voxel before scaling; None: 1 for integers, else the cloud's longest side over 2^bits - 1.
+        geometry_scale: finer (above 1) or coarser.
+        box: lowest and highest corner to clip to; None: that of the points.
+
+    Raises:
+        ConfigError: a grid of more than 21 bits.
+    """
+    columns = [points[:, axis] for axis in range(3)]  # much faster than a reduction over axis 0
+    low = np.asarray(box[0] if box else [c.min() for c in columns], np.float64)
+    high = np.asarray(box[1] if box else [c.max() for c in columns], np.float64)
+    integers = np.issubdtype(points.dtype, np.integer)
+    if voxel_size is None:
+        longest = float((high - low).max())
+        voxel_size = 1.0 if integers or longest == 0 else longest / ((1 << bits) - 1)
+    scale = geometry_scale / voxel_size
+    first, last = np.floor(low * scale), np.floor(high * scale)
+    if not np.isfinite(first).all() or not np.isfinite(last).all() or np.abs([first, last]).max() >= 1 << 52:
+        raise ConfigError(f"voxels of {1 / scale:g} are too small for positions up to {np.abs([low, high]).max():g}")
+    extent = (last - first).astype(np.int64) + 1
+    if extent.max() > 1 << GRID_BITS:
+        raise ConfigError(
+            f"the grid is {extent.max()} voxels long, more than 2^{GRID_BITS}: choose larger voxels "
+            f"(now {1 / scale:g}) or a smaller geometry scale"
+        )
+    # A point of an integer grid stands for itself; at a coarser scale, a voxel for the mean of the integers in it.
+    centre = max(0.0, 0.5 * (1 - scale)) if integers else 0.5
+    x, y, z = (int(v) for v in first)
+    return Quantization(scale, (x, y, z), (int(extent[0]), int(extent[1]), int(extent[2])), centre, not integers)

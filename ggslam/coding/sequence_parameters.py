@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sequence parameter set (ISO/IEC 23090-9, first edition): profile, coordinate system, list of attributes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+
+from ggslam.coding.bits import BitReader, BitWriter
+from ggslam.errors import FormatError
+
+KNOWN_LABELS = ("color", "reflectance", "opacity", "frame_index", "frame_number", "material", "normal")
+CICP_PARAMETER = 2
+MATRIX_IDENTITY, MATRIX_BT709 = 0, 1
+_SECOND_EDITION = "a damaged stream, or one of a draft of the second edition, which is not supported"
+
+
+@dataclass(frozen=True)
+class AttributeDescription:
+    """One attribute as the sequence parameter set lists it.
+
+    `matrix` is the colour matrix (ISO/IEC 23091-2): 0 components are G, B, R; 1 BT.709 Y, Cb, Cr; None: not said.
+    """
+
+    label: str
+    components: int
+    bit_depth: int
+    instance: int = 0
+    matrix: int | None = None
+    full_range: bool = True
+
+
+@dataclass(frozen=True)
+class SequenceParameters:
+    """The sequence parameter set.
+
+    A point of the grid stands at (grid + offset 2^offset_log2_scale) / resolution, in metres if `metres`.
+    """
+
+    attributes: tuple[AttributeDescription, ...] = ()
+    unique_points: bool = False
+    offset: tuple[int, int, int] = (0, 0, 0)
+    offset_log2_scale: int = 0
+    size: tuple[int, int, int] | None = None
+    resolution: Fraction = field(default_factory=lambda: Fraction(1))
+    metres: bool = False
+    global_scale: Fraction = field(default_factory=lambda: Fraction(1))
+    sequence_id: int = 0
+    level: int = 120
+    profiles: tuple[bool, bool, bool, bool] = (False, False, False, True)
+    frame_counter_bits: int = 0
+    slice_tag_bits: int = 0
+    cabac_bypass_stream: bool = False
+    entropy_continuation: bool = False
+
+    def write(self) -> bytes:
+        """The payload of the unit. The axes are coded in the order x, y, z; the global scale is 1."""
+        w = BitWriter()
+        for profile in self.profiles:
+            w.flag(profile)
+        w.u(18, 0)
+        w.flag(False)  # slices may come in any order
+        w.flag(self.unique_points)
+        w.u(8, self.level)
+        w.u(4, self.sequence_id)
+        w.u(5, self.frame_counter_bits)
+        w.u(5, self.slice_tag_bits)
+        self._write_box(w)
+        w.ue(self.resolution.numerator - 1)
+        w.ue(self.resolution.denominator - 1)
+        w.flag(self.metres)
+        w.ue(0)
+        w.ue(0)
+        w.ue(len(self.attributes))
+        for attribute in self.attributes:
+            _write_attribute(w, attribute)
+        w.u(3, 1)
+        w.flag(self.cabac_bypass_stream)
+        w.flag(self.entropy_continuation)
+        w.flag(False)
+        return w.data()
+
+    def _write_box(self, w: BitWriter) -> None:
+        bits = max(1, max(abs(v).bit_length() for v in self.offset))
+        w.ue(bits)
+        for v in self.offset:
+            w.s(bits, v)
+        w.ue(self.offset_log2_scale)
+        if self.size is None:
+            w.ue(0)
+            return
+        bits = max(1, max((v - 1).bit_length() for v in self.size))
+        w.ue(bits)
+        for v in self.size:
+            w.u(bits, v - 1)
+
+    @staticmethod
+    def read(payload: bytes | memoryview) -> SequenceParameters:
+        """Parses the unit.
+
+        Raises:
+            FormatError: damaged, or a tool that this decoder lacks.
+        """
+        r = BitReader(payload, "the sequence parameter set")
+        profiles = (r.flag(), r.flag(), r.flag(), r.flag())
+        if r.u(18) != 0 or not any(profiles):
+            raise FormatError(f"the sequence parameter set names no profile of the first edition: {_SECOND_EDITION}")
+        r.flag()
+        unique, level = r.flag(), r.u(8)
+        identity, frame_bits, tag_bits = r.u(4), r.u(5), r.u(5)
+        offset, offset_scale, size = _read_box(r)
+        numerator, denominator = r.ue() + 1, r.ue() + 1
+        metres = r.flag()
+        global_scale = _read_global_scale(r)
+        count = r.ue()
+        if count > 255:
+            raise FormatError(f"the sequence parameter set lists {count} attributes: {_SECOND_EDITION}")
+        parameters = SequenceParameters(
+            tuple(_read_attribute(r) for _ in range(count)), unique, offset, offset_scale, size,
+            Fraction(numerator, denominator), metres, global_scale, identity, level, profiles, frame_bits, tag_bits,
+        )  # fmt: skip
+        axes = r.u(3)
+        parameters = replace(parameters, cabac_bypass_stream=r.flag(), entropy_continuation=r.flag())
+        extension = r.flag()
+        if extension:
+            raise FormatError("the sequence parameter set has an extension, which is not supported")
+        r.finish()
+        if axes != 1:
+            raise FormatError(f"axis order {axes} is not supported (only 1: x, y, z)")
+        if parameters.cabac_bypass_stream:
+            raise FormatError("a separate stream of bypass bins is not supported")
+        if parameters.entropy_continuation:
+            raise FormatError("entropy continuation between slices is not supported")
+        return parameters
+
+
+def _read_box(r: BitReader) -> tuple[tuple[int, int, int], int, tuple[int, int, int] | None]:
+    bits = r.ue()
+    offset, scale = (0, 0, 0), 0
+    if bits > 64:
+        raise FormatError(f"the sequence parameter set has a box offset of {bits} bits: {_SECOND_EDITION}")
+    if bits:
+        offset, scale = (r.s(bits), r.s(bits), r.s(bits)), r.ue()
+        if scale > 32:
+            raise FormatError(f"the sequence parameter set scales its box by 2^{scale}: {_SECOND_EDITION}")
+    bits = r.ue()
+    if bits > 64:
+        raise FormatError(f"the sequence parameter set has a box size of {bits} bits: {_SECOND_EDITION}")
+    return offset, scale, (r.u(bits) + 1, r.u(bits) + 1, r.u(bits) + 1) if bits else None
+
+
+def _read_global_scale(r: BitReader) -> Fraction:
+    shift, bits = r.ue(), r.ue()
+    if shift > 32 or bits > 32:
+        raise FormatError(f"the sequence parameter set has an impossible global scale: {_SECOND_EDITION}")
+    return Fraction((1 << bits) + r.u(bits), 1 << bits) * (1 << shift)
+
+
+def _write_attribute(w: BitWriter, attribute: AttributeDescription) -> None:
+    w.ue(attribute.components - 1)
+    w.ue(attribute.instance)
+    w.ue(attribute.bit_depth - 1)
+    w.flag(True)
+    w.ue(KNOWN_LABELS.index(attribute.label))
+    w.ue(0 if attribute.matrix is None else 1)
+    w.align()
+    if attribute.matrix is not None:
+        body = BitWriter()
+        body.ue(2)  # colour primaries and transfer characteristics: unspecified
+        body.ue(2)
+        body.ue(attribute.matrix)
+        body.flag(attribute.full_range)
+        w.u(8, CICP_PARAMETER)
+        w.u(8, len(body.data()))
+        for byte in body.data():
+            w.u(8, byte)
+
+
+def _read_attribute(r: BitReader) -> AttributeDescription:
+    components, instance, bit_depth = r.ue() + 1, r.ue(), r.ue() + 1
+    if not r.flag():
+        raise FormatError("an attribute is labelled by an object identifier, which is not supported")
+    label, count = r.ue(), r.ue()
+    if label >= len(KNOWN_LABELS):
+        raise FormatError(f"an attribute has the unknown label {label}: {_SECOND_EDITION}")
+    name = KNOWN_LABELS[label]
+    if components not in (1, 3) or not 1 <= bit_depth <= 16:
+        raise FormatError(f"attribute {name}: {components} components of {bit_depth} bits, not 1 or 3 of 1 to 16")
+    if count > 255:
+        raise FormatError(f"attribute {name} has {count} parameters: {_SECOND_EDITION}")
+    r.align()
+    matrix, full_range = None, True
+    for _ in range(count):
+        kind, body = r.u(8), b""
+        body = bytes(r.u(8) for _ in range(r.u(8)))
+        if kind == CICP_PARAMETER:
+            matrix, full_range = _read_cicp(body)
+        elif kind == 3:
+            raise FormatError(f"attribute {name} is scaled by the stream (attribute scaling), which is not supported")
+    return AttributeDescription(name, components, bit_depth, instance, matrix, full_range)
+
+
+def _read_cicp(body: bytes) -> tuple[int, bool]:
+    r = BitReader(body, "the colour description of an attribute")
+    r.ue()
+    r.ue()
+    matrix, full_range = r.ue(), r.flag()
+    r.finish()
+    return matrix, full_range

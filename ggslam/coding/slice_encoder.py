@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coding of one slice: its geometry unit, its attribute units, and what must be said beside them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ggslam.coding.attribute_values import CodedAttribute
+from ggslam.coding.cloud import SliceReport
+from ggslam.coding.container import UnitType, unit_bytes
+from ggslam.coding.native import MAX_SLICE_POINTS, SliceCoder, raht_settings
+from ggslam.coding.quantization import Quantization
+from ggslam.coding.sequence_parameters import SequenceParameters
+from ggslam.coding.settings import CodecSettings
+from ggslam.coding.syntax import AttributeHeader, AttributeParameters, GeometryHeader, GeometryParameters
+from ggslam.coding.user_data import write_user_data
+from ggslam.errors import ConfigError
+
+DENSE_POINTS_PER_NODE = 1.5
+"""Occupied voxels per occupied cube of 4 x 4 x 4 above which neighbours give useful contexts."""
+
+
+@dataclass(frozen=True)
+class CloudToCode:
+    """What all slices share. Arrays are read, never changed."""
+
+    points: np.ndarray
+    attributes: Mapping[str, np.ndarray]
+    slice_numbers: np.ndarray | None
+    plans: list[tuple[CodedAttribute, AttributeParameters]]
+    sequence: SequenceParameters
+    quantization: Quantization
+    settings: CodecSettings
+    reconstruct: bool
+
+
+@dataclass(frozen=True)
+class CodedSlice:
+    """Units of a slice and what they hold. Reconstruction only if it was asked for."""
+
+    data: bytes
+    report: SliceReport
+    geometry: GeometryParameters
+    grid_points: np.ndarray | None
+    attributes: dict[str, np.ndarray] | None
+
+
+def geometry_parameters(settings: CodecSettings, unique: bool, dense: bool) -> GeometryParameters:
+    """The parameter set for slices of a kind; each kind has its own id."""
+    boundary = settings.neighbour_boundary
+    if boundary is None:
+        boundary = 8 if dense else 0
+    near = boundary > 0
+    identity = 2 * int(not unique) + int(not near)
+    return GeometryParameters(
+        unique, boundary, near and settings.adjacent_child, settings.intra_prediction_size if near else 0, identity
+    )
+
+
+def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
+    """Codes the points of slice `number`."""
+    start = time.perf_counter()
+    settings = cloud.settings
+    rows = None if cloud.slice_numbers is None else np.flatnonzero(cloud.slice_numbers == number)
+    grid = cloud.quantization.apply(cloud.points if rows is None else np.take(cloud.points, rows, axis=0))
+    origin = np.array([grid[:, axis].min() for axis in range(3)], np.int32)
+    for axis in range(3):
+        grid[:, axis] -= origin[axis]
+    depth = max(1, int(grid.max()).bit_length())
+    coder = SliceCoder()
+    order = coder.build(grid, depth)
+    counts = None
+    if coder.leaves < coder.points and settings.duplicates == "merge":
+        counts = coder.leaf_points()
+        coder.merge()
+    if coder.points > MAX_SLICE_POINTS:
+        raise ConfigError(f"{coder.points} points lie in one voxel: merge duplicates or choose smaller voxels")
+    geometry = geometry_parameters(settings, coder.leaves == coder.points, _is_dense(coder))
+    header = GeometryHeader(number, (int(origin[0]), int(origin[1]), int(origin[2])), depth, coder.points)
+    header = replace(header, geometry_id=geometry.geometry_id)
+    payload = header.write(cloud.sequence, geometry) + coder.encode_geometry(geometry) + header.footer()
+    units = [unit_bytes(UnitType.GEOMETRY, payload)]
+    if rows is not None:
+        order = np.take(rows.astype(np.uint32), order)
+    sizes, reconstructed, corrections = _encode_attributes(cloud, number, coder, order, counts, units)
+    attribute_end = sum(map(len, units))
+    if corrections:
+        content = write_user_data({"slice": number, "corrections": corrections})
+        units.append(unit_bytes(UnitType.USER_DATA, content))
+    positions = None
+    if cloud.reconstruct:
+        positions = coder.positions() + origin
+    data = b"".join(units)
+    report = SliceReport(
+        number, coder.points, len(units[0]), sizes, len(data) - attribute_end, time.perf_counter() - start
+    )
+    return CodedSlice(data, report, geometry, positions, reconstructed if cloud.reconstruct else None)
+
+
+def _is_dense(coder: SliceCoder) -> bool:
+    return coder.depth < 3 or coder.leaves > DENSE_POINTS_PER_NODE * coder.nodes(coder.depth - 2)
+
+
+def _encode_attributes(
+    cloud: CloudToCode,
+    number: int,
+    coder: SliceCoder,
+    order: np.ndarray,
+    counts: np.ndarray | None,
+    units: list[bytes],
+) -> tuple[dict[str, int], dict[str, np.ndarray], dict[str, Any]]:
+    """Appends a unit for each attribute; returns sizes, values that a decoder will see, and corrections of ids."""
+    sizes, reconstructed, corrections = {}, {}, {}
+    for plan, parameters in cloud.plans:
+        values = cloud.attributes[plan.name]
+        if counts is None:
+            components = plan.components(values, order)
+        else:
+            components = plan.merged_components(values, order, counts)
+        original = components.copy() if plan.table is not None else components
+        description = plan.description
+        settings = raht_settings(
+            parameters, description.components, description.bit_depth, rdoq=0.0 if plan.table else cloud.settings.rdoq
+        )
+        payload = coder.encode_attribute(settings, components)
+        header = AttributeHeader(number, plan.index, parameters.attribute_id)
+        units.append(unit_bytes(UnitType.ATTRIBUTE, header.write(parameters) + payload))
+        sizes[plan.name] = len(units[-1])
+        wrong = plan.corrections(original, components)
+        if wrong is not None:
+            corrections[plan.name] = wrong
+        if cloud.reconstruct:
+            reconstructed[plan.name] = plan.values(components, wrong)
+    return sizes, reconstructed, corrections

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A coded stream taken apart: parameter sets, slices and what was said beside them. Payloads are not decoded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ggslam.coding.attribute_values import CodedAttribute, IdTable
+from ggslam.coding.container import Unit, UnitType, read_units
+from ggslam.coding.native import MAX_SLICE_POINTS
+from ggslam.coding.quantization import Quantization
+from ggslam.coding.sequence_parameters import MATRIX_BT709, MATRIX_IDENTITY, SequenceParameters
+from ggslam.coding.syntax import AttributeHeader, AttributeParameters, GeometryHeader, GeometryParameters
+from ggslam.coding.user_data import read_user_data
+from ggslam.errors import FormatError
+
+# An adaptive bin costs at least 0.0056 bits, and a point of a slice without duplicates at least a bin: no stream can
+# say more than 1,431 points a byte. Counts of duplicates are not bounded so, which the first summand allows for.
+_FREE_POINTS = 1 << 20
+_POINTS_PER_BYTE = 1536
+
+
+@dataclass(frozen=True)
+class AttributePayload:
+    """One attribute of a slice, not yet decoded."""
+
+    header: AttributeHeader
+    parameters: AttributeParameters
+    payload: memoryview
+
+
+@dataclass
+class CodedSliceUnits:
+    """The units of one slice."""
+
+    header: GeometryHeader
+    geometry: GeometryParameters
+    payload: memoryview
+    attributes: dict[int, AttributePayload] = field(default_factory=dict)
+    corrections: dict[str, Any] = field(default_factory=dict)
+    size: int = 0
+
+    @property
+    def grid_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest grid position that the slice can hold: its octree's root."""
+        low = np.asarray(self.header.grid_origin, np.int64)
+        return low, low + (1 << self.header.depth) - 1
+
+
+@dataclass
+class CodedStream:
+    """A stream's parameter sets and slices."""
+
+    sequence: SequenceParameters
+    slices: list[CodedSliceUnits]
+    side: dict[str, Any]
+    attributes: list[CodedAttribute]
+    quantization: Quantization
+
+
+class _Parser:
+    def __init__(self) -> None:
+        self.sequence: SequenceParameters | None = None
+        self.geometry: dict[int, GeometryParameters] = {}
+        self.attribute: dict[int, AttributeParameters] = {}
+        self.slices: list[CodedSliceUnits] = []
+        self.side: dict[str, Any] = {}
+
+    def unit(self, unit: Unit) -> None:
+        kind = unit.kind
+        if kind == UnitType.SEQUENCE_PARAMETERS:
+            if self.slices:
+                raise FormatError("a second sequence begins within the stream, which is not supported")
+            self.sequence = SequenceParameters.read(unit.payload)
+        elif kind == UnitType.GEOMETRY_PARAMETERS:
+            geometry = GeometryParameters.read(unit.payload)
+            self.geometry[geometry.geometry_id] = geometry
+        elif kind == UnitType.ATTRIBUTE_PARAMETERS:
+            attribute = AttributeParameters.read(unit.payload)
+            self.attribute[attribute.attribute_id] = attribute
+        elif kind == UnitType.GEOMETRY:
+            self._geometry_unit(unit)
+        elif kind == UnitType.ATTRIBUTE:
+            self._attribute_unit(unit)
+        elif kind == UnitType.USER_DATA:
+            self._user_data(unit)
+        elif kind in (UnitType.CONSTANT_ATTRIBUTE, UnitType.ATTRIBUTE_PARAMETER_INVENTORY):
+            raise FormatError(f"the stream has a {kind.title} unit, which is not supported")
+        # Tile inventories say which slices belong together, frame boundaries that a frame ends: neither is needed.
+
+    def _geometry_unit(self, unit: Unit) -> None:
+        if self.sequence is None:
+            raise FormatError("a slice comes before the sequence parameter set")
+        identity = GeometryHeader.parameter_set_of(unit.payload)
+        if identity not in self.geometry:
+            raise FormatError(f"a slice refers to geometry parameter set {identity}, which the stream lacks")
+        geometry = self.geometry[identity]
+        header, payload = GeometryHeader.read(unit.payload, self.sequence, geometry)
+        if self.slices and header.frame != self.slices[0].header.frame:
+            raise FormatError("the stream holds several frames, which is not supported")
+        if header.points > MAX_SLICE_POINTS:
+            raise FormatError(f"slice {header.slice_id}: {header.points} points")
+        self.slices.append(CodedSliceUnits(header, geometry, payload, size=unit.size))
+
+    def _attribute_unit(self, unit: Unit) -> None:
+        if not self.slices or self.sequence is None:
+            raise FormatError("an attribute comes before the geometry of its slice")
+        identity = AttributeHeader.parameter_set_of(unit.payload)
+        if identity not in self.attribute:
+            raise FormatError(f"an attribute refers to parameter set {identity}, which the stream lacks")
+        parameters = self.attribute[identity]
+        header, payload = AttributeHeader.read(unit.payload, parameters)
+        current = self.slices[-1]
+        if header.slice_id != current.header.slice_id:
+            raise FormatError(f"an attribute of slice {header.slice_id} follows slice {current.header.slice_id}")
+        if header.attribute >= len(self.sequence.attributes) or header.attribute in current.attributes:
+            raise FormatError(f"slice {header.slice_id} has an attribute {header.attribute} too many")
+        current.attributes[header.attribute] = AttributePayload(header, parameters, payload)
+        current.size += unit.size
+
+    def _user_data(self, unit: Unit) -> None:
+        content = read_user_data(unit.payload)
+        corrections = content.get("corrections")
+        if not isinstance(corrections, dict):
+            self.side.update(content)
+            return
+        if not self.slices or content.get("slice") != self.slices[-1].header.slice_id:
+            raise FormatError("corrections of ids follow another slice than their own")
+        self.slices[-1].corrections = corrections
+        self.slices[-1].size += unit.size
+
+
+def read_stream(data: bytes | memoryview) -> CodedStream:
+    """Takes a stream apart.
+
+    Raises:
+        FormatError: damaged, no first-edition G-PCC stream, or one with a tool that this decoder lacks (it is named).
+    """
+    parser = _Parser()
+    for unit in read_units(data):
+        parser.unit(unit)
+    if parser.sequence is None or not parser.slices:
+        raise FormatError("the stream holds no slice")
+    points = sum(units.header.points for units in parser.slices)
+    if points > _FREE_POINTS + _POINTS_PER_BYTE * len(data):
+        raise FormatError(f"a stream of {len(data)} bytes cannot hold {points} points")
+    for units in parser.slices:
+        missing = set(range(len(parser.sequence.attributes))) - set(units.attributes)
+        if missing:
+            raise FormatError(f"slice {units.header.slice_id} lacks attribute {min(missing)}")
+    attributes = _attributes(parser.sequence, parser.side)
+    return CodedStream(
+        parser.sequence, parser.slices, parser.side, attributes, _quantization(parser.sequence, parser.side)
+    )
+
+
+def _attributes(sequence: SequenceParameters, side: dict[str, Any]) -> list[CodedAttribute]:
+    names = side.get("names")
+    if not (isinstance(names, list) and len(set(map(str, names))) == len(names) == len(sequence.attributes)):
+        names = [d.label + (f"_{d.instance}" if d.instance else "") for d in sequence.attributes]
+    tables = side.get("tables")
+    result = []
+    for index, (name, description) in enumerate(zip(names, sequence.attributes, strict=True)):
+        if description.matrix not in (None, MATRIX_IDENTITY, MATRIX_BT709) and description.components == 3:
+            raise FormatError(f"attribute {name} has the colour matrix {description.matrix}, which is not supported")
+        if description.matrix == MATRIX_BT709 and (description.components != 3 or description.bit_depth != 8):
+            description = replace(description, matrix=None)
+        table = tables.get(name) if isinstance(tables, dict) else None
+        result.append(CodedAttribute(str(name), index, description, None if table is None else _table(name, table)))
+    return result
+
+
+def _table(name: str, content: Any) -> IdTable:
+    try:
+        ids, stride = np.asarray(content["ids"], np.uint16), int(content["stride"])
+    except (KeyError, ValueError, TypeError, OverflowError):
+        raise FormatError(f"the table of the ids of attribute {name} is damaged") from None
+    if ids.ndim != 1 or len(ids) == 0 or not 1 <= stride <= 65535:
+        raise FormatError(f"the table of the ids of attribute {name} is damaged")
+    return IdTable(ids, stride)
+
+
+def _quantization(sequence: SequenceParameters, side: dict[str, Any]) -> Quantization:
+    scale, centre = side.get("scale"), side.get("centre", 0.0)
+    if scale is None:
+        scale = float(sequence.resolution / sequence.global_scale)
+    if not isinstance(scale, float) or not isinstance(centre, float) or not 0 < scale < 1e300 or abs(centre) > 1:
+        raise FormatError("the scale of the positions is damaged")
+    x, y, z = (v << sequence.offset_log2_scale for v in sequence.offset)
+    return Quantization(scale, (x, y, z), sequence.size, centre, sequence.metres)

@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files and runs to G-PCC streams and back: what `ggslam encode`, `decode` and `inspect` do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.coding import (
+    AttributeSettings,
+    CodecSettings,
+    CodingReport,
+    PointCloud,
+    decode_box,
+    decode_cloud,
+    decode_slice,
+    encode_cloud,
+)
+from ggslam.coding.listing import StreamListing, list_units
+from ggslam.coding.splats import gaussians_of, is_splat_cloud, splat_attributes, splat_settings
+from ggslam.coding.stream import read_stream
+from ggslam.coding.study import GridCloud, on_grid
+from ggslam.errors import ConfigError, FormatError
+from ggslam.formats.atomic import make_folder, write_bytes
+from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_point_cloud
+from ggslam.run_folder import RunFolder
+
+PRESETS = ("pointcloud", "splat")
+Box = tuple[Sequence[float], Sequence[float]]
+"""Lowest and highest corner, metres."""
+_MOST_IDS = 1 << 16
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A written stream: what became of the cloud, and what the reader should know."""
+
+    path: Path
+    report: CodingReport
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """A written cloud or map."""
+
+    path: Path
+    count: int
+    what: str
+
+
+def encode_file(
+    source: Path, out: Path, settings: CodecSettings, preset: str = "pointcloud", rate: str = "r03"
+) -> Encoded:
+    """Codes a cloud or a Gaussian map.
+
+    Args:
+        source: a PLY or PCD file, or a run folder: its points.ply (pointcloud) or map.ply (splat).
+        out: the stream to write.
+        settings: every choice of the codec; the preset adds what is coded and how.
+        preset: "pointcloud": positions and colours, labels lossless; "splat": whole Gaussians of a 3DGS PLY.
+        rate: of the splat preset, r01 to r04.
+
+    Raises:
+        FormatError: the input is damaged or has nothing to code.
+        ConfigError: impossible settings.
+        RunFolderError: the output cannot be written, or the folder is not a run.
+    """
+    notes: list[str] = []
+    path = _input_file(source, preset)
+    if preset == "splat":
+        gaussians = read_gaussian_ply(path, with_moments=False)
+        if not len(gaussians):
+            raise FormatError(f"{path}: no Gaussians")
+        points: np.ndarray = gaussians.means.numpy().astype(np.float64)
+        attributes = splat_attributes(gaussians)
+        settings = splat_settings(settings, rate, attributes)
+    else:
+        cloud = read_point_cloud(path)
+        points, metadata = coded_points(cloud, settings)
+        attributes, labels = _coded_attributes(cloud, notes)
+        own = {name: AttributeSettings(lossless=True) for name in labels}
+        metadata |= {"preset": preset} | ({"label_offsets": labels} if any(labels.values()) else {})
+        settings = replace(settings, attributes={**settings.attributes, **own}, metadata=metadata)
+    encoded = encode_cloud(points, attributes, settings)
+    make_folder(out.parent)
+    write_bytes(out, encoded.data)
+    return Encoded(out, encoded.report, notes)
+
+
+def study_cloud(source: Path, settings: CodecSettings) -> GridCloud:
+    """The cloud of a file or run on its grid, for sweeps.
+
+    Raises:
+        FormatError: the input is damaged or has no colours.
+    """
+    path = _input_file(source, "pointcloud")
+    cloud = read_point_cloud(path)
+    if cloud.colors is None:
+        raise FormatError(f"{path}: no colours, which a sweep needs")
+    if cloud.voxel_size is not None and settings.voxel_size is None:
+        # The points of the grid stand at the corners of its voxels; the middle is safe from rounding.
+        settings = replace(settings, voxel_size=cloud.voxel_size)
+        return on_grid(cloud.points + cloud.voxel_size / 2, cloud.colors, settings)
+    return on_grid(coded_points(cloud, settings)[0], cloud.colors, settings)
+
+
+def decode_file(
+    source: Path, out: Path, slice_id: int | None = None, box: Box | None = None, workers: int | None = None
+) -> Decoded:
+    """Decodes a stream, or one slice or box of it, into a PLY (or PCD) file; a stream of Gaussians into a 3DGS PLY.
+
+    Raises:
+        FormatError: the stream is damaged, uses a tool that is not supported, has no such slice, or no point in the
+            box.
+        ConfigError: both a slice and a box are asked for.
+        RunFolderError: the output cannot be written.
+    """
+    if slice_id is not None and box is not None:
+        raise ConfigError("choose a slice or a box, not both")
+    data = read_bytes(source)
+    try:
+        cloud = _decoded(data, slice_id, box, workers)
+        if is_splat_cloud(cloud):
+            gaussians = gaussians_of(cloud)
+            make_folder(out.parent)
+            write_gaussian_ply(out, gaussians, ("object_id",) if "object_id" in cloud.attributes else ())
+            return Decoded(out, len(cloud), "Gaussians")
+        grid = _grid_of(cloud.metadata)
+        if not len(cloud):
+            raise FormatError("no points in the box")
+    except FormatError as error:
+        raise FormatError(f"{source}: {error}") from None
+    make_folder(out.parent)
+    points, comments = _placed(cloud, grid)
+    write_point_cloud(out, points, _labels_restored(cloud), comments if out.suffix.lower() != ".pcd" else ())
+    return Decoded(out, len(cloud), "points")
+
+
+def list_stream(path: Path) -> StreamListing:
+    """All units of a stream file.
+
+    Raises:
+        FormatError: the file cannot be read or is no G-PCC stream at all.
+    """
+    listing = list_units(read_bytes(path))
+    if not listing.units:
+        raise FormatError(f"{path}: not a G-PCC stream: {listing.problems[0] if listing.problems else 'it is empty'}")
+    return listing
+
+
+def read_bytes(path: Path) -> bytes:
+    """A whole file; FormatError if it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def _input_file(source: Path, preset: str) -> Path:
+    if preset not in PRESETS:
+        raise ConfigError(f"preset: expected one of {', '.join(PRESETS)}, found '{preset}'")
+    if not source.is_dir():
+        return source
+    return RunFolder.open(source).path / ("map.ply" if preset == "splat" else "points.ply")
+
+
+def coded_points(cloud: ColoredCloud, settings: CodecSettings) -> tuple[np.ndarray, dict[str, Any]]:
+    """Positions as the encoder shall see them, and what the decoder needs to know to place them.
+
+    Clouds on a grid are coded as whole voxels, so that lossless geometry gives back exactly their points: those that
+    ggslam voxelised (the grid's place goes into the metadata), and those whose coordinates are whole numbers, as of
+    the usual test clouds. Others are metres; the settings choose their voxels. So do they where they name a voxel size.
+    """
+    if settings.voxel_size is None and settings.box is None:
+        if cloud.grid is not None and cloud.voxel_size is not None and cloud.origin is not None:
+            return cloud.grid, {"grid": {"voxel_size": cloud.voxel_size, "origin": cloud.origin.tolist()}}
+        if np.abs(cloud.points).max() < 1 << 30 and (cloud.points == np.rint(cloud.points)).all():
+            return cloud.points.astype(np.int32), {}
+    return cloud.points, {}
+
+
+def _coded_attributes(cloud: ColoredCloud, notes: list[str]) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Attributes by name, and of each label the number to add to what is coded."""
+    attributes: dict[str, np.ndarray] = {}
+    offsets: dict[str, int] = {}
+    if cloud.colors is None:
+        notes.append("the cloud has no colours")
+    else:
+        attributes["color"] = cloud.colors
+    for name, values in cloud.labels.items():
+        low, high = int(values.min()), int(values.max())
+        offset = 0 if low >= 0 and high < _MOST_IDS else low
+        if high - offset >= _MOST_IDS:
+            notes.append(f"left out '{name}': it reaches from {low} to {high}, more than 16 bits")
+            continue
+        offsets[name] = offset
+        attributes[name] = (values.astype(np.int64) - offset).astype(np.uint16)
+    if cloud.left_out:
+        names = cloud.left_out if len(cloud.left_out) < 6 else (*cloud.left_out[:4], "...", cloud.left_out[-1])
+        notes.append(f"left out {', '.join(names)}: neither position nor colour nor whole numbers")
+    return attributes, offsets
+
+
+def _decoded(data: bytes, slice_id: int | None, box: Box | None, workers: int | None) -> PointCloud:
+    if slice_id is not None:
+        return decode_slice(data, slice_id)
+    if box is None:
+        return decode_cloud(data, workers)
+    low, high = (np.asarray(corner, np.float64) for corner in box)
+    metadata = read_stream(data).side.get("metadata")
+    grid = _grid_of(metadata if isinstance(metadata, dict) else {})
+    if grid is not None:
+        low, high = (low - grid[1]) / grid[0], (high - grid[1]) / grid[0]
+        tolerance = 1e-6  # of a voxel, for corners that lie on the grid
+        low, high = low - tolerance, high + tolerance
+    return decode_box(data, low.tolist(), high.tolist())
+
+
+def _grid_of(metadata: dict[str, Any]) -> tuple[float, np.ndarray] | None:
+    """Voxel size and origin of the grid that the coded integers are on, metres."""
+    grid = metadata.get("grid")
+    if grid is None:
+        return None
+    try:
+        voxel_size, origin = float(grid["voxel_size"]), np.array(grid["origin"], np.float64)
+    except (KeyError, TypeError, ValueError):
+        raise FormatError("the place of the grid in the stream's metadata is damaged") from None
+    if origin.shape != (3,) or not np.isfinite(origin).all() or not 0 < voxel_size < np.inf:
+        raise FormatError("the place of the grid in the stream's metadata is damaged")
+    return voxel_size, origin
+
+
+def _placed(cloud: PointCloud, grid: tuple[float, np.ndarray] | None) -> tuple[np.ndarray, list[str]]:
+    """Positions to write, and the header comments of a cloud that is on its grid still."""
+    quantization = cloud.quantization
+    if grid is None:
+        if not quantization.metres and quantization.scale == 1 and quantization.centre == 0:
+            return np.rint(cloud.points).astype(np.int32), []
+        return _narrowed(cloud.points, 1 / quantization.scale), []
+    voxel_size, origin = grid
+    points = origin + voxel_size * cloud.points
+    comments = []
+    if quantization.scale == 1:
+        place = " ".join(repr(float(value)) for value in origin)
+        comments = ["x y z are metres", f"voxel_size {voxel_size!r}", f"origin {place}"]
+    return _narrowed(points, voxel_size / quantization.scale), comments
+
+
+def _narrowed(points: np.ndarray, voxel_size: float) -> np.ndarray:
+    """float32 unless that moves a point by more than a hundredth of a voxel."""
+    narrow = points.astype(np.float32)
+    return narrow if np.abs(points - narrow).max(initial=0) < 0.01 * voxel_size else points
+
+
+def _labels_restored(cloud: PointCloud) -> dict[str, np.ndarray]:
+    """The attributes to write: labels as int32 with their offsets."""
+    offsets = cloud.metadata.get("label_offsets")
+    out: dict[str, np.ndarray] = {}
+    for name, values in cloud.attributes.items():
+        offset = offsets.get(name) if isinstance(offsets, dict) else None
+        if name == "color" and values.ndim == 2 and values.dtype == np.uint8:
+            out[name] = values
+        else:
+            out[name] = values.astype(np.int64) + (offset if isinstance(offset, int) else 0)
+    return out

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Point Cloud Data files (PCD 0.7, the Point Cloud Library's own): reads text, binary and compressed, writes binary.
+
+Specification: "The PCD (Point Cloud Data) file format", pointclouds.org.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import FormatError
+from ggslam.formats import lzf
+from ggslam.formats.atomic import write_bytes
+from ggslam.formats.text_numbers import fitted, parse_numbers
+
+_MAXIMUM_HEADER_BYTES = 1 << 16
+_KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+_SIZES = {"I": (1, 2, 4, 8), "U": (1, 2, 4, 8), "F": (4, 8)}
+
+
+@dataclass(frozen=True)
+class _Header:
+    """`stored` is the type of one point as it lies in the file; fields named '_' (padding) have running numbers."""
+
+    stored: np.dtype
+    points: int
+    encoding: str
+    size: int
+
+
+def read_pcd(path: str | Path) -> np.ndarray:
+    """The points of a PCD file as a structured array [N]; a field with COUNT k > 1 has shape [k]. Padding is left out.
+
+    Raises:
+        FormatError: the file is missing, no PCD file, cut off or damaged; names file and reason.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
+    header = _read_header(data, path)
+    body = data[header.size :]
+    if header.encoding == "ascii":
+        rows = _ascii_rows(body, header, path)
+    elif header.encoding == "binary":
+        rows = _binary_rows(body, header, path)
+    else:
+        rows = _compressed_rows(body, header, path)
+    wanted = [name for name in rows.dtype.names or () if not name.startswith("_ ")]
+    return rows[wanted]
+
+
+def write_pcd(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Writes a binary PCD file, atomically.
+
+    Args:
+        path: the file to write.
+        columns: one array [N] of integers or floating-point numbers per field, in order, all of one length.
+
+    Raises:
+        RunFolderError: the file cannot be written.
+    """
+    rows = np.empty(
+        len(next(iter(columns.values()))), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
+    )
+    for name, values in columns.items():
+        rows[name] = values
+    types = [values.dtype for values in columns.values()]
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", f"FIELDS {' '.join(columns)}",
+        f"SIZE {' '.join(str(t.itemsize) for t in types)}", f"TYPE {' '.join(t.kind.upper() for t in types)}",
+        f"COUNT {' '.join('1' for _ in types)}", f"WIDTH {len(rows)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(rows)}", "DATA binary", "",
+    ]  # fmt: skip
+    write_bytes(path, "\n".join(lines).encode("ascii") + rows.tobytes())
+
+
+def _read_header(data: bytes, path: Path) -> _Header:
+    lines, size = _header_lines(data, path)
+    try:
+        names = lines["FIELDS"]
+        sizes = [int(word) for word in lines["SIZE"]]
+        counts = [int(word) for word in lines.get("COUNT", ["1"] * len(names))]
+        width, height = int(lines["WIDTH"][0]), int(lines["HEIGHT"][0])
+        points = int(lines["POINTS"][0]) if "POINTS" in lines else width * height
+        stored = _stored_type(names, sizes, lines["TYPE"], counts)
+    except KeyError as error:
+        raise FormatError(f"{path}: the header has no line {error.args[0]}") from None
+    except (ValueError, IndexError) as error:
+        raise FormatError(f"{path}: the header is damaged: {error}") from None
+    if points < 0 or points != width * height:
+        raise FormatError(f"{path}: the header claims {points} points and an image of {width}x{height}")
+    encoding = (lines["DATA"] or [""])[0]
+    if encoding not in ("ascii", "binary", "binary_compressed"):
+        raise FormatError(f"{path}: DATA is {encoding!r}, expected ascii, binary or binary_compressed")
+    return _Header(stored, points, encoding, size)
+
+
+def _header_lines(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
+    """The words behind each keyword, and where the data begin."""
+    lines: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in lines:
+        end = data.find(b"\n", at, _MAXIMUM_HEADER_BYTES)
+        words = data[at : max(end, 0)].decode("latin-1").split()
+        if words and not words[0].startswith("#"):
+            if words[0] not in _KEYWORDS:
+                raise FormatError(f"{path}: not a PCD file, or damaged: a header line begins with {words[0][:32]!r}")
+            lines[words[0]] = words[1:]
+        if end < 0:
+            raise FormatError(f"{path}: not a PCD file, or cut off: no line DATA in its header")
+        at = end + 1
+    return lines, at
+
+
+def _stored_type(names: list[str], sizes: list[int], types: list[str], counts: list[int]) -> np.dtype:
+    if not names or not len(names) == len(sizes) == len(types) == len(counts):
+        raise ValueError("FIELDS, SIZE, TYPE and COUNT differ in length")
+    fields: list[tuple] = []
+    for number, (name, size, kind, count) in enumerate(zip(names, sizes, types, counts, strict=True)):
+        if kind not in _SIZES or size not in _SIZES[kind] or not 1 <= count <= 1 << 16:
+            raise ValueError(f"field '{name}' is of type {kind}, size {size} and count {count}")
+        unique = f"_ {number}" if name == "_" else name
+        if any(unique == other[0] for other in fields):
+            raise ValueError(f"field '{name}' is declared twice")
+        code = f"<{kind.lower()}{size}"
+        fields.append((unique, code) if count == 1 else (unique, code, (count,)))
+    return np.dtype(fields)
+
+
+def _binary_rows(body: bytes, header: _Header, path: Path) -> np.ndarray:
+    needed = header.points * header.stored.itemsize
+    if len(body) < needed:
+        raise FormatError(f"{path}: truncated: {header.points} points take {needed} bytes, found {len(body)}")
+    return np.frombuffer(body, header.stored, header.points)
+
+
+def _compressed_rows(body: bytes, header: _Header, path: Path) -> np.ndarray:
+    """Compressed files hold field after field, not point after point."""
+    if len(body) < 8:
+        raise FormatError(f"{path}: truncated: no sizes of the compressed data")
+    packed, unpacked = (int(v) for v in np.frombuffer(body, "<u4", 2))
+    needed = header.points * header.stored.itemsize
+    if unpacked != needed or len(body) - 8 < packed:
+        raise FormatError(
+            f"{path}: truncated or damaged: {header.points} points take {needed} bytes, the data say {unpacked}; "
+            f"{packed} compressed bytes, found {len(body) - 8}"
+        )
+    try:
+        data = lzf.decompress(body[8 : 8 + packed], unpacked)
+    except ValueError as error:
+        raise FormatError(f"{path}: damaged: {error}") from None
+    rows = np.empty(header.points, header.stored)
+    at = 0
+    for name in header.stored.names or ():
+        part = header.stored[name]
+        rows[name] = np.frombuffer(data, part, header.points, at)
+        at += header.points * part.itemsize
+    return rows
+
+
+def _ascii_rows(body: bytes, header: _Header, path: Path) -> np.ndarray:
+    names = header.stored.names or ()
+    widths = [int(np.prod(header.stored[name].shape, dtype=int)) for name in names]
+    words = body.split()
+    needed = header.points * sum(widths)
+    if len(words) < needed:
+        raise FormatError(f"{path}: truncated: {header.points} points take {needed} numbers, found {len(words)}")
+    table = parse_numbers(words[:needed], "data", path).reshape(header.points, sum(widths))
+    rows = np.empty(header.points, header.stored)
+    column = 0
+    for name, width in zip(names, widths, strict=True):
+        part = header.stored[name]
+        values = fitted(table[:, column : column + width], part.base.str[1:], name, path)
+        rows[name] = values if part.shape else values[:, 0]
+        column += width
+    return rows

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of coloured point clouds: each point a square as large as its voxel, the nearest one seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ggslam.scene.camera import Camera
+
+_BACKGROUND = 255
+_LARGEST = 24
+"""Pixels that a point is drawn wide at most."""
+_NEAREST = 0.05
+"""Points nearer to the camera than this share of the cloud's size are not drawn."""
+_FIELD_OF_VIEW = math.radians(50)
+_FILLED = 1.04
+"""The box of a cloud seen from outside is given a margin by this factor."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Where a cloud is looked at from; T_world_camera float64 [4, 4], OpenCV axes."""
+
+    camera: Camera
+    T_world_camera: np.ndarray
+
+
+def view_of(points: np.ndarray, width: int = 960, height: int = 720) -> View:
+    """A view that shows a cloud [N, 3].
+
+    A cloud around the origin is taken for the map of a run, whose world is the first camera: it is seen from there,
+    a step back. Any other one is seen whole from outside, obliquely, with its direction of least extent upwards.
+    """
+    focal = 0.5 * width / math.tan(_FIELD_OF_VIEW / 2)
+    camera = Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
+    low, high = np.percentile(points, [1, 99], axis=0)
+    size = float(np.linalg.norm(high - low)) or 1.0
+    pose = np.eye(4)
+    if (points.min(0) <= 0).all() and (points.max(0) >= 0).all() and high[2] > 0.5 * size:
+        pose[2, 3] = -0.1 * size
+        return View(camera, pose)
+    upwards = int(np.argmin(high - low))
+    direction = np.full(3, 1.0)
+    direction[upwards] = 1.2
+    direction[(upwards + 1) % 3] = 0.4
+    direction /= np.linalg.norm(direction)
+    forward, down = -direction, -np.eye(3)[upwards]
+    right = np.cross(down, forward)
+    right /= np.linalg.norm(right)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - (low + high) / 2
+    x, y, z = (corners @ pose[:3, :3]).T
+    # As near as all corners of the cloud's box stay within the picture.
+    wide, tall = np.abs(x) / width, np.abs(y) / height
+    distance = (2 * _FILLED * focal * np.maximum(wide, tall) - z).max()
+    pose[:3, 3] = (low + high) / 2 + direction * distance
+    return View(camera, pose)
+
+
+def draw_cloud(points: np.ndarray, colors: np.ndarray, view: View, point_size: float) -> np.ndarray:
+    """A picture, uint8 [H, W, 3], of points float [N, 3] with colours uint8 [N, 3]; white where there is none.
+
+    Args:
+        points, colors: the cloud.
+        view: where from.
+        point_size: edge of a point's square in units of the positions, usually the voxel size.
+    """
+    camera = view.camera
+    T_camera_world = np.linalg.inv(view.T_world_camera)
+    position = points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    nearest = _NEAREST * float(np.linalg.norm(np.ptp(points, axis=0))) + 1e-9
+    rows = np.flatnonzero(position[:, 2] > nearest)
+    rows = rows[np.argsort(-position[rows, 2], kind="stable")]  # the nearest are drawn last
+    x, y, z = position[rows].T
+    # A square that is seen from its side or corner shows up to sqrt(3) times its edge.
+    width = np.clip(np.ceil(1.3 * point_size * camera.fx / z), 1, _LARGEST).astype(np.int32)
+    left = np.rint(camera.fx * x / z + camera.cx).clip(-(1 << 20), 1 << 20).astype(np.int32) - (width - 1) // 2
+    top = np.rint(camera.fy * y / z + camera.cy).clip(-(1 << 20), 1 << 20).astype(np.int32) - (width - 1) // 2
+    picture = np.full((camera.height * camera.width, 3), _BACKGROUND, np.uint8)
+    depth, winner = np.full(len(picture), np.inf), np.empty(len(picture), np.int64)
+    for down, across in np.ndindex(int(width.max(initial=0)), int(width.max(initial=0))):
+        first = int(np.searchsorted(width, max(down, across) + 1))  # nearer points are drawn wider
+        u, v = left[first:] + across, top[first:] + down
+        seen = first + np.flatnonzero((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
+        pixel = v[seen - first] * camera.width + u[seen - first]
+        winner[pixel] = seen  # where several fall on one pixel the last, nearest one stays
+        visible = (winner[pixel] == seen) & (z[seen] < depth[pixel])
+        pixel, seen = pixel[visible], seen[visible]
+        depth[pixel] = z[seen]
+        picture[pixel] = colors[rows[seen]]
+    return picture.reshape(camera.height, camera.width, 3)
+
+
+def contact_sheet(pictures: Sequence[np.ndarray], captions: Sequence[str], columns: int = 3) -> np.ndarray:
+    """Pictures uint8 [H, W, 3] of one size in rows, each above its caption (ASCII); uint8 [H', W', 3]."""
+    height, width = pictures[0].shape[:2]
+    scale = max(0.45, width / 900)
+    strip = round(36 * scale)
+    rows = -(-len(pictures) // columns)
+    columns = min(columns, len(pictures))
+    sheet = np.full((rows * (height + strip), columns * width, 3), _BACKGROUND, np.uint8)
+    for number, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
+        top, left = number // columns * (height + strip), number % columns * width
+        sheet[top : top + height, left : left + width] = picture
+        place = (left + round(8 * scale), top + height + round(25 * scale))
+        cv2.putText(sheet, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8 * scale, (0, 0, 0), 1, cv2.LINE_AA)
+    return sheet

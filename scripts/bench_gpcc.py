@@ -1,0 +1,215 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""What the G-PCC codec costs, in one slice and in four: time, speed per core, size.
+
+    python scripts/bench_gpcc.py [--qp 10 22] [--repeats 3] [--every 1]
+
+Clouds of about a million points: each recording is back-projected with its true poses and voxelised at 10 bits, one
+point per voxel with the mean colour. Voxels with the fewest measurements, which are noise, are dropped until one slice
+can hold the cloud (1.1 million points). Times are the best of the repeats; ratios and overheads are to one slice coded
+by one worker in the same run. Nothing else should run on the machine.
+
+If GGSLAM_TMC3 names a tmc3 binary of release-v12.9, or one is on PATH, streams are checked against it both ways.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
+from ggslam.coding.metrics import color_quality, matching_rows
+from ggslam.coding.settings import LEVEL_LIMIT, Split
+from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
+from ggslam.native.loader import available_processors
+from ggslam.sequences import open_sequence
+from ggslam.sequences.sequence import Sequence
+
+BITS = 10
+SPLITS: tuple[Split, ...] = ("count", "interval")
+LAYOUTS = [(1, SPLITS[0], 1), *((4, split, workers) for split in SPLITS for workers in (1, 2, 4))]
+"""Slices, how they are cut, workers; the first is what the others are compared with."""
+COLUMNS = ("cloud, QP", "slices", "workers", "bytes", "overhead", "bits/point", "encode s", "M points/s/core", "ratio",
+           "decode s", "ratio", "Y dB")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A voxelised recording: grid int32 [N, 3], colours uint8 [N, 3]."""
+
+    name: str
+    grid: np.ndarray
+    colors: np.ndarray
+
+
+def world_points(sequence: Sequence, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points [N, 3] in world coordinates and colours [N, 3] of a frame; none if its pose is not known."""
+    frame = sequence.frame(index, masks=False)
+    if frame.T_world_camera is None:
+        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
+    seen = frame.depth > 0
+    points = frame.camera.back_project(frame.depth)[seen]
+    return points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3], frame.color[seen]
+
+
+def voxelised(path: Path, every: int) -> Cloud:
+    """Back-projects a recording and averages the colours in each voxel."""
+    sequence = open_sequence(path, stride=every)
+    extents = []
+    for index in range(len(sequence)):
+        points, _ = world_points(sequence, index)
+        if len(points):
+            extents.append((points.min(0), points.max(0)))
+    low, high = np.min([e[0] for e in extents], 0), np.max([e[1] for e in extents], 0)
+    scale = ((1 << BITS) - 1) / (high - low).max()
+    keys, sums = np.empty(0, np.int64), np.empty((0, 4), np.int64)
+    for index in range(len(sequence)):
+        points, colors = world_points(sequence, index)
+        grid = np.floor((points - low) * scale).astype(np.int64)
+        key = grid[:, 0] << 2 * BITS | grid[:, 1] << BITS | grid[:, 2]
+        keys, sums = merged(np.append(keys, key), np.concatenate([sums, np.insert(colors.astype(np.int64), 3, 1, 1)]))
+    counts = np.sort(sums[:, 3])
+    if len(counts) > LEVEL_LIMIT:
+        enough = sums[:, 3] > counts[-LEVEL_LIMIT - 1]
+        keys, sums = keys[enough], sums[enough]
+    limit = (1 << BITS) - 1
+    grid = np.stack([keys >> 2 * BITS, keys >> BITS & limit, keys & limit], 1).astype(np.int32)
+    return Cloud(path.name, grid, np.rint(sums[:, :3] / sums[:, 3:]).astype(np.uint8))
+
+
+def merged(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of equal key added up."""
+    order = np.argsort(keys, kind="stable")
+    keys, sums = keys[order], sums[order]
+    starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
+    return keys[starts], np.add.reduceat(sums, starts)
+
+
+def best_time(call: Callable[[], object], repeats: int) -> float:
+    """Shortest of the repeats, seconds."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def bench(cloud: Cloud, qp: int, repeats: int) -> None:
+    """Prints the lines of one cloud at one quantiser parameter."""
+    reference: tuple[int, float, float] | None = None
+    for slices, split, workers in LAYOUTS:
+        settings = CodecSettings(qp=qp, slices=slices, split=split, workers=workers)
+        encoded = encode_cloud(cloud.grid, {"color": cloud.colors}, settings)
+        decoded = decode_cloud(encoded.data, workers)
+        rows = matching_rows(cloud.grid, np.rint(decoded.points).astype(np.int32))
+        if rows is None:
+            raise SystemExit(f"{cloud.name}: the decoded points are not those that were coded")
+        quality = color_quality(cloud.colors, decoded.attributes["color"][rows]).y
+        encode_s = best_time(partial(encode_cloud, cloud.grid, {"color": cloud.colors}, settings), repeats)
+        decode_s = best_time(partial(decode_cloud, encoded.data, workers), repeats)
+        size, cores = len(encoded.data), min(workers, available_processors(), len(encoded.report.slices))
+        reference = reference or (size, encode_s, decode_s)
+        cells = [
+            f"{cloud.name}, {qp}", f"{len(encoded.report.slices)} {split if slices > 1 else ''}", f"{workers}",
+            f"{size}", f"{100 * (size / reference[0] - 1):+.2f} %", f"{8 * size / len(cloud.grid):.3f}",
+            f"{encode_s:.3f}", f"{len(cloud.grid) / encode_s / cores / 1e6:.2f}", f"{encode_s / reference[1]:.2f}",
+            f"{decode_s:.3f}", f"{decode_s / reference[2]:.2f}", f"{quality:.2f}",
+        ]  # fmt: skip
+        print("| " + " | ".join(cells) + " |", flush=True)
+
+
+def tmc3_binary() -> str | None:
+    """The reference software, if the machine has it."""
+    return os.environ.get("GGSLAM_TMC3") or shutil.which("tmc3")
+
+
+def cross_check(cloud: Cloud, qp: int, binary: str) -> None:
+    """Our stream through the reference decoder, the reference encoder's through ours; prints both outcomes."""
+    encoded = encode_cloud(cloud.grid, {"color": cloud.colors}, CodecSettings(qp=qp, slices=4), reconstruct=True)
+    assert encoded.reconstruction is not None
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        (folder / "ours.bin").write_bytes(encoded.data)
+        start = time.perf_counter()
+        run_tmc3(binary, mode=1, compressedStreamPath=folder / "ours.bin", reconstructedDataPath=folder / "ours.ply",
+                 outputBinaryPly=1, convertPlyColourspace=1)  # fmt: skip
+        theirs = read_point_cloud(folder / "ours.ply")
+        decoder_s = time.perf_counter() - start
+        mine = encoded.reconstruction
+        same = same_rows(mine.points, mine.attributes["color"], theirs.points, theirs.colors)
+        print(f"{cloud.name}, QP {qp}: tmc3 decodes our stream {'exactly' if same else 'WRONGLY'} ({decoder_s:.2f} s)")
+        write_point_cloud(folder / "in.ply", cloud.grid.astype(np.float32), {"color": cloud.colors})
+        start = time.perf_counter()
+        run_tmc3(
+            binary, mode=0, uncompressedDataPath=folder / "in.ply", compressedStreamPath=folder / "theirs.bin",
+            reconstructedDataPath=folder / "theirs.ply", outputBinaryPly=1, positionQuantizationScale=1,
+            trisoupNodeSizeLog2=0, mergeDuplicatedPoints=1, neighbourAvailBoundaryLog2=8,
+            adjacentChildContextualization=1, intra_pred_max_node_size_log2=6, inferredDirectCodingMode=0,
+            qtbtEnabled=0, planarEnabled=0, convertPlyColourspace=1, colourMatrix=1, transformType=0, qp=qp,
+            qpChromaOffset=0, bitdepth=8, attribute="color",
+        )  # fmt: skip
+        encoder_s = time.perf_counter() - start
+        data, wanted = (folder / "theirs.bin").read_bytes(), read_point_cloud(folder / "theirs.ply")
+        mine = decode_cloud(data)
+        same = same_rows(mine.points, mine.attributes["color"], wanted.points, wanted.colors)
+        print(
+            f"{cloud.name}, QP {qp}: we decode tmc3's stream {'exactly' if same else 'WRONGLY'} "
+            f"({len(data)} bytes, encoded in {encoder_s:.2f} s)"
+        )
+
+
+def same_rows(points: np.ndarray, colors: np.ndarray, others: np.ndarray, other_colors: np.ndarray | None) -> bool:
+    """Whether two clouds are the same set of points and colours."""
+    if other_colors is None:
+        return False
+    rows = [np.column_stack([np.rint(p).astype(np.int32), c]) for p, c in ((points, colors), (others, other_colors))]
+    return matching_rows(rows[0], rows[1]) is not None
+
+
+def run_tmc3(binary: str, **options: object) -> None:
+    """Runs the reference software; `attribute` has to be its last option."""
+    done = subprocess.run(
+        [binary, *(f"--{name}={value}" for name, value in options.items())], capture_output=True, text=True
+    )
+    if done.returncode:
+        raise SystemExit(f"{binary} failed:\n{done.stdout}\n{done.stderr}")
+
+
+def main() -> None:
+    """Prints the table."""
+    data = Path(os.environ.get("GGSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--recordings", nargs="*", type=Path, default=[data / "livingroom", data / "redkitchen"])
+    parser.add_argument("--qp", nargs="*", type=int, default=[10, 22])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--every", type=int, default=1, help="every n-th frame only")
+    arguments = parser.parse_args()
+    clouds = [voxelised(path, arguments.every) for path in arguments.recordings]
+    points = ", ".join(f"{cloud.name} {len(cloud.grid)} points" for cloud in clouds)
+    print(f"{points}; {available_processors()} processors; best of {arguments.repeats}\n")
+    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
+    for cloud in clouds:
+        for qp in arguments.qp:
+            bench(cloud, qp, arguments.repeats)
+    binary = tmc3_binary()
+    if binary is None:
+        print("\nnot checked against the reference software: set GGSLAM_TMC3 to a tmc3 binary of release-v12.9")
+        return
+    for cloud in clouds:
+        for qp in arguments.qp:
+            cross_check(cloud, qp, binary)
+
+
+if __name__ == "__main__":
+    main()

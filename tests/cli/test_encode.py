@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clouds, runs and maps go through `ggslam encode`, `inspect` and `decode`; mistakes get one clear line."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ggslam.cli.main import main
+from ggslam.coding.listing import list_units
+from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
+from ggslam.formats.point_ply import read_points, write_points
+from ggslam.formats.point_sampling import VoxelCloud
+from ggslam.scene.gaussian_map import GaussianMap
+
+Ggslam = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def ggslam(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Ggslam:
+    """Runs a command in this process: exit code, output, errors."""
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["ggslam", *(str(word) for word in words)])
+        try:
+            main()
+            code = 0
+        except SystemExit as end:
+            code = int(end.code or 0)
+        out, err = capsys.readouterr()
+        return code, " ".join(out.split()), " ".join(err.split())
+
+    return run
+
+
+def voxel_cloud(side: int = 40) -> VoxelCloud:
+    """A wavy sheet of four objects, sorted as voxel clouds are."""
+    x, y = (v.reshape(-1) for v in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
+    z = np.rint(6 + 5 * np.sin(x / 5) * np.cos(y / 6)).astype(int)
+    colors = np.stack([100 + 90 * np.sin(x / 6), 120 + 80 * np.cos(y / 9), 10 * z], 1).clip(0, 255).astype(np.uint8)
+    ids = (7 * (x > side // 2) + 300 * (y > side // 2)).astype(np.int32)
+    return VoxelCloud(np.stack([x, y, z], 1).astype(np.int32), colors, ids, 0.02, np.array([-0.4, 1.2, 0.06]))
+
+
+def by_grid(cloud: VoxelCloud) -> np.ndarray:
+    """Grid and id rows, sorted."""
+    assert cloud.object_id is not None
+    rows = np.column_stack([cloud.grid, cloud.object_id])
+    return rows[np.lexsort(rows.T[::-1])]
+
+
+@pytest.mark.parametrize("options", [[], ["--slices", 4], ["--slices", 4, "--split", "interval", "--workers", 1],
+                                     ["--slices", 6, "--split", "octree"]])  # fmt: skip
+def test_voxel_clouds_come_back_with_their_grid_and_ids(ggslam: Ggslam, tmp_path: Path, options: list[object]) -> None:
+    cloud = voxel_cloud()
+    write_points(tmp_path, cloud)
+    code, out, err = ggslam("encode", tmp_path / "points.ply", tmp_path / "a.bin", "--qp", 4, *options)
+    assert code == 0 and "object_id" in out and "1600 points" in out, err
+    code, out, err = ggslam("decode", tmp_path / "a.bin", tmp_path / "back.ply")
+    assert code == 0 and "1600 points" in out, err
+    back = read_points(tmp_path / "back.ply")
+    np.testing.assert_array_equal(by_grid(back), by_grid(cloud))
+    np.testing.assert_allclose(back.points.min(0), cloud.points.min(0), atol=1e-9)
+    order = np.lexsort(back.grid.T[::-1])
+    assert np.abs(back.colors[order].astype(int) - cloud.colors).max() < 8
+    listing = list_units((tmp_path / "a.bin").read_bytes())
+    assert listing.points == 1600 and (listing.slices >= 4 if options else listing.slices == 1)
+
+
+def test_parts_of_a_stream(ggslam: Ggslam, tmp_path: Path) -> None:
+    cloud = voxel_cloud()
+    write_points(tmp_path, cloud)
+    assert ggslam("encode", tmp_path / "points.ply", tmp_path / "a.bin", "--slices", 4)[0] == 0
+    parts = []
+    for number in range(4):
+        code, _, err = ggslam("decode", tmp_path / "a.bin", tmp_path / "part.ply", "--slice", number)
+        assert code == 0, err
+        parts.append(by_grid(read_points(tmp_path / "part.ply")))
+    rows = np.concatenate(parts)
+    np.testing.assert_array_equal(rows[np.lexsort(rows.T[::-1])], by_grid(cloud))
+    low, high = np.array([-0.2, 1.3, 0.06]), np.array([0.1, 1.5, 0.2])  # corners on the grid belong to the box
+    box = " ".join(f"{v:g}" for v in [*low, *high])
+    code, _, err = ggslam("decode", tmp_path / "a.bin", tmp_path / "box.ply", "--box", box)
+    assert code == 0, err
+    inside = ((cloud.points > low - 1e-9) & (cloud.points < high + 1e-9)).all(1)
+    found = by_grid(read_points(tmp_path / "box.ply"))
+    assert 20 < inside.sum() < 1500
+    np.testing.assert_array_equal(found, np.column_stack([cloud.grid, cloud.object_id])[inside])
+
+
+def test_coarser_geometry_and_clouds_in_metres(ggslam: Ggslam, tmp_path: Path) -> None:
+    cloud = voxel_cloud()
+    write_points(tmp_path, cloud)
+    assert ggslam("encode", tmp_path / "points.ply", tmp_path / "a.bin", "--geometry-scale", 0.5)[0] == 0
+    assert ggslam("decode", tmp_path / "a.bin", tmp_path / "half.ply")[0] == 0
+    half = read_point_cloud(tmp_path / "half.ply")
+    assert 300 < len(half) < 800 and half.grid is None
+    distance = np.abs(cloud.points[:, None] - half.points[None]).max(2).min(1)
+    assert distance.max() < 0.011  # half of a voxel of 2 cm
+    scattered = np.random.default_rng(0).random((500, 3)) * 3
+    attributes = {"color": np.full((500, 3), 90, np.uint8), "label": np.arange(500) - 200}
+    write_point_cloud(tmp_path / "scan.pcd", scattered, attributes)
+    code, out, err = ggslam("encode", tmp_path / "scan.pcd", tmp_path / "b.bin", "--voxel", 0.01)
+    assert code == 0, err
+    assert ggslam("decode", tmp_path / "b.bin", tmp_path / "back.pcd")[0] == 0
+    back = read_point_cloud(tmp_path / "back.pcd")
+    first = np.argsort(back.labels["label"])
+    assert back.labels["label"][first].tolist() == list(range(-200, 300))
+    assert np.abs(back.points[first] - scattered).max() < 0.00501
+
+
+def test_whole_gaussians_come_back_as_a_map(ggslam: Ggslam, tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(0)
+    gaussians = GaussianMap(1)
+    rows = gaussians.insert(
+        torch.rand(400, 3, generator=generator), torch.randn(400, 4, generator=generator),
+        torch.rand(400, 3, generator=generator) * 3 - 6, torch.randn(400, generator=generator) * 2,
+        torch.rand(400, 3, generator=generator), object_id=torch.randint(0, 5, (400,), generator=generator),
+    )  # fmt: skip
+    gaussians.sh[rows, 1:] = torch.randn(400, 3, 3, generator=generator) * 0.1
+    write_gaussian_ply(tmp_path / "map.ply", gaussians, ("object_id",))
+    errors = []
+    for rate in ("r01", "r04"):
+        code, out, err = ggslam("encode", tmp_path / "map.ply", tmp_path / "m.bin", "--preset", "splat", "--rate", rate)
+        assert code == 0 and "rotation_w" in out and "sh_3" in out, err
+        code, out, err = ggslam("decode", tmp_path / "m.bin", tmp_path / "back.ply")
+        assert code == 0 and "400 Gaussians" in out, err
+        back = read_gaussian_ply(tmp_path / "back.ply")
+        distance = (gaussians.means[:, None] - back.means[None]).norm(dim=2)
+        nearest = distance.argmin(1)
+        assert distance.min(1).values.max() < 2 / 2**18 and len(nearest.unique()) == 400
+        assert (back.object_id[nearest] == gaussians.object_id).all()
+        errors.append((back.sh[nearest] - gaussians.sh).abs().mean().item())
+        if rate == "r04":
+            assert (back.log_scales[nearest] - gaussians.log_scales).abs().max() < 0.1
+            q, p = (torch.nn.functional.normalize(m, dim=1) for m in (back.quaternions[nearest], gaussians.quaternions))
+            assert (q * p).sum(1).abs().min() > 0.99
+    assert errors[1] < 0.02 < errors[0] < 1
+
+
+def test_inspect_lists_every_unit(ggslam: Ggslam, tmp_path: Path) -> None:
+    write_points(tmp_path, voxel_cloud())
+    assert ggslam("encode", tmp_path / "points.ply", tmp_path / "a.bin", "--slices", 3, "--qp", 28)[0] == 0
+    code, out, _ = ggslam("inspect", tmp_path / "a.bin")
+    assert code == 0
+    for words in ("sequence parameters", "geometry parameters", "QP 28", "color: 3 x 8 bits", "slices: 3", "slice 2:"):
+        assert words in out, words
+    data = (tmp_path / "a.bin").read_bytes()
+    listing = list_units(data)
+    assert sum(unit.size for unit in listing.units) == sum(listing.parts.values()) == len(data)
+    assert set(listing.parts) == {"headers", "geometry", "color", "object_id"} and not listing.problems
+    (tmp_path / "cut.bin").write_bytes(data[:-5])
+    code, out, _ = ggslam("inspect", tmp_path / "cut.bin")
+    assert code == 0 and "damaged or not supported" in out
+
+
+def test_streams_of_others_are_listed(shared_data: Path) -> None:
+    folder = shared_data.parent / "gpcc" / "golden"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    listing = list_units((folder / "slices_qp22.bin").read_bytes())
+    assert listing.slices == 4 and listing.points == 65_819 and not listing.problems
+    assert sum(listing.parts.values()) == 12_218
+
+
+def test_a_sweep_writes_a_study(ggslam: Ggslam, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ggslam.coding.study.sweep_steps.__defaults__", ((10, 40), (0.5, 1.0)))
+    write_points(tmp_path, voxel_cloud())
+    code, out, err = ggslam("encode", tmp_path / "points.ply", tmp_path / "study", "--sweep", "both", "--no-plots")
+    assert code == 0 and "QP 40" in out and "scale 0.5" in out, err
+    record = json.loads((tmp_path / "study" / "study.json").read_text())
+    assert len(record["rows"]) == 4 and record["points"] == 1600 and record["voxels_per_unit"] == pytest.approx(50)
+    assert (tmp_path / "study" / "clouds_qp.png").is_file()
+
+
+def test_mistakes_are_named(ggslam: Ggslam, tmp_path: Path) -> None:
+    write_points(tmp_path, voxel_cloud())
+    points, stream = tmp_path / "points.ply", tmp_path / "a.bin"
+    assert ggslam("encode", points, stream)[0] == 0
+    (tmp_path / "noise.bin").write_bytes(b"\x07" * 50)
+    plain = tmp_path / "plain.ply"
+    write_point_cloud(plain, np.random.default_rng(0).random((9, 3)), {})
+    for words, expected in (
+        (("encode", tmp_path / "none.ply", stream), "none.ply"),
+        (("encode", stream, tmp_path / "b.bin"), "neither a PLY nor a PCD"),
+        (("encode", tmp_path, tmp_path / "b.bin"), "run.json"),
+        (("encode", points, tmp_path / "b.bin", "--preset", "splat"), "no Gaussians"),
+        (("encode", points, tmp_path / "b.bin", "--voxel", "1e-8"), "voxels"),
+        (("encode", points, tmp_path / "b.bin", "--sweep", "qp", "--preset", "splat"), "--sweep"),
+        (("encode", plain, tmp_path / "study", "--sweep", "qp", "--no-plots"), "no colours"),
+        (("decode", tmp_path / "none.bin", tmp_path / "b.ply"), "none.bin"),
+        (("decode", points, tmp_path / "b.ply"), "points.ply"),
+        (("decode", tmp_path / "noise.bin", tmp_path / "b.ply"), "noise.bin"),
+        (("decode", stream, tmp_path / "b.ply", "--slice", 9), "no slice 9"),
+        (("decode", stream, tmp_path / "b.ply", "--box", "0 0 0 1 1"), "x0 y0 z0"),
+        (("decode", stream, tmp_path / "b.ply", "--box", "50 50 50 60 60 60"), "no points in the box"),
+        (("decode", stream, tmp_path / "b.ply", "--box", "0 0 0 1 1 1", "--slice", 0), "not both"),
+        (("inspect", points), "not a G-PCC stream"),
+    ):
+        code, _, err = ggslam(*words)
+        assert code == 2 and expected in err, (words, err)
+    assert not (tmp_path / "b.bin").exists() and not (tmp_path / "b.ply").exists()
+
+
+@pytest.mark.parametrize("command", ["encode", "decode", "inspect"])
+def test_help_has_an_example(ggslam: Ggslam, command: str) -> None:
+    code, out, _ = ggslam(command, "--help")
+    assert code == 0 and "Examples" in out and f"ggslam {command}" in out

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Positions in metres come back in metres."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
+from ggslam.coding.quantization import Quantization, choose_quantization
+from ggslam.coding.stream import read_stream
+from ggslam.errors import ConfigError, FormatError
+
+
+@pytest.fixture
+def metres() -> np.ndarray:
+    return np.random.default_rng(0).uniform((-3, 1, -0.5), (2, 1.5, 4), (500, 3))
+
+
+def test_the_equation() -> None:
+    """p~ = clip(floor(s p) - o, 0, size - 1)."""
+    q = Quantization(10.0, (-5, 0, 2), (4, 100, 100))
+    points = np.array([[-0.41, 0.99, 0.35], [0.19, 0.0, 12.0], [-9.0, 1.0, 0.2]])
+    assert q.apply(points).tolist() == [[0, 9, 1], [3, 0, 99], [0, 10, 0]]
+
+
+@pytest.mark.parametrize("bits", [4, 10, 16, 21])
+def test_error_is_half_a_voxel_at_most(metres: np.ndarray, bits: int) -> None:
+    coded = encode_cloud(metres, settings=CodecSettings(geometry_bits=bits, duplicates="keep"), reconstruct=True)
+    cloud = decode_cloud(coded.data)
+    assert coded.reconstruction is not None and np.array_equal(cloud.points, coded.reconstruction.points)
+    edge = 1 / cloud.quantization.scale
+    assert np.ptp(metres, 0).max() / edge == pytest.approx(2**bits - 1)
+    for axis in range(3):
+        error = np.abs(np.sort(cloud.points[:, axis]) - np.sort(metres[:, axis]))
+        assert error.max() <= edge * (0.5 + 1e-6)
+    assert cloud.quantization.metres
+
+
+def test_the_exact_scale_travels(metres: np.ndarray) -> None:
+    """One that is no quotient of two 32-bit numbers."""
+    settings = CodecSettings(voxel_size=np.pi / 300)
+    cloud = decode_cloud(encode_cloud(metres, settings=settings).data)
+    assert cloud.quantization.scale == 1 / (np.pi / 300)
+
+
+def test_standard_fields_are_close_without_user_data(metres: np.ndarray) -> None:
+    """What another decoder makes of the sequence parameter set."""
+    data = encode_cloud(metres, settings=CodecSettings(voxel_size=np.pi / 300)).data
+    sequence = read_stream(data).sequence
+    assert float(sequence.resolution) == pytest.approx(300 / np.pi, rel=1e-9)
+    assert sequence.offset == tuple(np.floor(metres.min(0) / (np.pi / 300)).astype(int))
+    assert sequence.metres
+
+
+def test_integers_come_back_as_they_are() -> None:
+    points = np.array([[-7, 3, 2_000_000], [0, 4, 2_000_100]])
+    cloud = decode_cloud(encode_cloud(points).data)
+    assert sorted(cloud.points.tolist()) == sorted(points.tolist())
+    assert cloud.grid_points.dtype == np.int32 and cloud.grid_points.min() == 0
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int16, np.int64])
+def test_integers_of_any_kind(kind: type) -> None:
+    points = np.array([[250, 3, 9], [251, 0, 200], [250, 3, 10]]).astype(kind)
+    points = np.abs(points) if np.issubdtype(kind, np.signedinteger) else points
+    cloud = decode_cloud(encode_cloud(points).data)
+    assert sorted(cloud.points.tolist()) == sorted(points.astype(float).tolist())
+
+
+def test_half_resolution() -> None:
+    points = np.stack(np.meshgrid(*[np.arange(8)] * 3), -1).reshape(-1, 3)
+    cloud = decode_cloud(encode_cloud(points, settings=CodecSettings(geometry_scale=0.5)).data)
+    assert len(cloud) == 64
+    assert np.array_equal(np.unique(cloud.points), [0.5, 2.5, 4.5, 6.5])  # the means of the two integers in a voxel
+
+
+def test_a_box_clips(metres: np.ndarray) -> None:
+    settings = CodecSettings(box=((-1, 1, 0), (1, 1.25, 1)), voxel_size=0.125, duplicates="keep")
+    cloud = decode_cloud(encode_cloud(metres, settings=settings).data)
+    assert len(cloud) == len(metres)
+    assert np.array_equal(cloud.grid_points.max(0), [16, 2, 8])
+    assert cloud.quantization.size == (17, 3, 9)
+
+
+def test_grids_of_more_than_21_bits_are_refused(metres: np.ndarray) -> None:
+    with pytest.raises(ConfigError, match="choose larger voxels"):
+        encode_cloud(metres, settings=CodecSettings(voxel_size=1e-6))
+    with pytest.raises(ConfigError, match="too small"):
+        choose_quantization(metres * 1e9, 1e-9, 10, 1.0, None)
+
+
+def test_positions_must_be_numbers() -> None:
+    with pytest.raises(FormatError, match="not finite"):
+        encode_cloud(np.array([[0.0, np.nan, 1.0]]))
+    with pytest.raises(FormatError, match="without points"):
+        encode_cloud(np.empty((0, 3)))
+    with pytest.raises(ConfigError, match=r"expected \[N, 3\]"):
+        encode_cloud(np.zeros((4, 2)))

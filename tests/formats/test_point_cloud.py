@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coloured clouds: every common way to store them is read, what is written is read back, damaged files are refused."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ggslam.errors import FormatError
+from ggslam.formats import lzf
+from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.formats.ply import write_ply
+from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
+from ggslam.formats.point_ply import write_points
+from ggslam.formats.point_sampling import VoxelCloud
+from ggslam.scene.gaussian_map import GaussianMap
+
+POINTS = np.array([[0.5, -1.25, 2.0], [3.0, 4.5, -6.75], [7.125, 8.0, 9.0]])
+COLORS = np.array([[255, 0, 51], [0, 102, 255], [7, 8, 9]], np.uint8)
+LABELS = np.array([-1, 0, 70_000], np.int32)
+
+
+def ply_text(encoding: str, color: tuple[str, ...], color_type: str) -> str:
+    names = "".join(f"property {color_type} {name}\n" for name in color)
+    normals = "".join(f"property float n{axis}\n" for axis in "xyz")
+    return (
+        f"ply\nformat {encoding} 1.0\nelement vertex 3\nproperty double x\nproperty double y\nproperty double z\n"
+        f"{normals}{names}property int label\nend_header\n"
+    )
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize(
+    ("names", "color_type", "code", "scale"),
+    [
+        (("red", "green", "blue"), "uchar", "u1", 1),
+        (("r", "g", "b"), "float", "f4", 1 / 255),
+        (("diffuse_red", "diffuse_green", "diffuse_blue"), "double", "f8", 1 / 255),
+        (("Red", "Green", "Blue"), "float", "f4", 1),
+        (("red", "green", "blue"), "ushort", "u2", 257),
+    ],
+)
+def test_every_kind_of_ply(
+    tmp_path: Path, encoding: str, names: tuple[str, ...], color_type: str, code: str, scale: float
+) -> None:
+    order = ">" if "big" in encoding else "<"
+    fields = [(n, order + "f8") for n in "xyz"] + [(f"n{n}", order + "f4") for n in "xyz"]
+    rows = np.zeros(3, [*fields, *((n, order + code) for n in names), ("label", order + "i4")])
+    for axis, name in enumerate("xyz"):
+        rows[name] = POINTS[:, axis]
+    for channel, name in enumerate(names):
+        rows[name] = COLORS[:, channel] * float(scale)
+    rows["label"] = LABELS
+    path = tmp_path / "a.ply"
+    body = rows.tobytes()
+    if encoding == "ascii":
+        body = "\n".join(" ".join(repr(value.item()) for value in row) for row in rows).encode()
+    path.write_bytes(ply_text(encoding, names, color_type).encode() + body)
+    cloud = read_point_cloud(path)
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    np.testing.assert_array_equal(cloud.colors, COLORS)
+    assert list(cloud.labels) == ["label"] and cloud.labels["label"].tolist() == LABELS.tolist()
+    assert cloud.left_out == ("nx", "ny", "nz") and cloud.grid is None
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int32])
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_what_is_written_is_read_back(tmp_path: Path, dtype: type, suffix: str) -> None:
+    path, points = tmp_path / f"a{suffix}", POINTS.astype(dtype)
+    velocity = np.array([[1, -2], [3, 4], [5, 6]], np.int64)
+    attributes = {"color": COLORS, "object_id": LABELS, "velocity": velocity, "kind": np.array([1, 2, 3], np.uint16)}
+    write_point_cloud(path, points, attributes, ["made here"] if suffix == ".ply" else ())
+    cloud = read_point_cloud(path)
+    np.testing.assert_array_equal(cloud.points, points)
+    np.testing.assert_array_equal(cloud.colors, COLORS)
+    assert cloud.labels["object_id"].tolist() == LABELS.tolist() and cloud.labels["kind"].tolist() == [1, 2, 3]
+    assert cloud.labels["velocity_1"].tolist() == [-2, 4, 6] and cloud.left_out == ()
+    with pytest.raises(FormatError, match="32 bits"):
+        write_point_cloud(path, points, {"label": np.array([0, 0, 1 << 40])})
+
+
+def lzf_compressed(data: bytes) -> bytes:
+    """A plain compressor: the longest match that begins at the last place with the same three bytes."""
+    out, literals, places, at = bytearray(), bytearray(), {}, 0
+
+    def flush() -> None:
+        for start in range(0, len(literals), 32):
+            part = literals[start : start + 32]
+            out.extend(bytes([len(part) - 1]) + part)
+        literals.clear()
+
+    while at < len(data):
+        key, found = data[at : at + 3], places.get(data[at : at + 3])
+        places[key] = at
+        if found is None or len(key) < 3 or at - found > 1 << 13:
+            literals.append(data[at])
+            at += 1
+            continue
+        length = 3
+        while length < 264 and at + length < len(data) and data[found + length] == data[at + length]:
+            length += 1
+        flush()
+        distance = at - found - 1
+        if length - 2 < 7:
+            out.append((length - 2) << 5 | distance >> 8)
+        else:
+            out.extend([7 << 5 | distance >> 8, length - 9])
+        out.append(distance & 255)
+        at += length
+    flush()
+    return bytes(out)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+@pytest.mark.parametrize("packed", ["F", "U"])
+def test_every_kind_of_pcd(tmp_path: Path, encoding: str, packed: str) -> None:
+    bits = (COLORS.astype(np.uint32) << [16, 8, 0]).sum(1, dtype=np.uint32)
+    rows = np.zeros(4, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("pad", "u1", (4,)), ("rgb", "<u4"), ("id", "<i2")])
+    for axis, name in enumerate("xyz"):
+        rows[name] = [*POINTS[:, axis], np.nan]
+    rows["rgb"], rows["id"] = [*bits, 0], [-5, 6, 7, 8]
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z _ rgb id\nSIZE 4 4 4 1 4 2\n"
+        f"TYPE F F F U {packed} I\nCOUNT 1 1 1 4 1 1\nWIDTH 2\nHEIGHT 2\n"
+        f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 4\nDATA {encoding}\n"
+    )
+    body = rows.tobytes()
+    if encoding == "binary_compressed":
+        columns = b"".join(rows[name].tobytes() for name in rows.dtype.names or ())
+        squeezed = lzf_compressed(columns)
+        body = np.array([len(squeezed), len(columns)], "<u4").tobytes() + squeezed
+    elif encoding == "ascii":
+        rgb = [np.format_float_scientific(v) for v in rows["rgb"].view(np.float32)] if packed == "F" else rows["rgb"]
+        lines = [f"{r['x']} {r['y']} {r['z']} 0 0 0 0 {v} {r['id']}" for r, v in zip(rows, rgb, strict=True)]
+        body = "\n".join(lines).encode()
+    path = tmp_path / "a.pcd"
+    path.write_bytes(header.encode() + body)
+    cloud = read_point_cloud(path)
+    np.testing.assert_array_equal(cloud.points, POINTS)  # the pixel without a position is gone
+    np.testing.assert_array_equal(cloud.colors, COLORS)
+    assert cloud.labels["id"].tolist() == [-5, 6, 7]
+    for length in range(len(header) + len(body) - (3 if encoding == "ascii" else 0)):
+        path.write_bytes((header.encode() + body)[:length])
+        with pytest.raises(FormatError, match=r"a\.pcd"):
+            read_point_cloud(path)
+
+
+def test_lzf_inverts_a_compressor_and_refuses_damage() -> None:
+    generator = np.random.default_rng(0)
+    for data in (
+        b"", b"a", b"a" * 1000, b"abc" * 5000, bytes(generator.integers(0, 256, 3000, np.uint8)),
+        bytes(generator.integers(0, 3, 20_000, np.uint8)), bytes(9000) + b"x" + bytes(9000),
+    ):  # fmt: skip
+        packed = lzf_compressed(data)
+        assert lzf.decompress(packed, len(data)) == data
+        for size in (len(data) + 1, len(data) - 1, 1 << 40):
+            with pytest.raises(ValueError, match="compressed"):
+                lzf.decompress(packed, size)
+    assert lzf.decompress(b"\x02abc\xe0\x00\x02", 12) == b"abcabcabcabc"  # the source reaches into the copy
+    with pytest.raises(ValueError, match="before the data"):
+        lzf.decompress(b"\x00a\x20\x05", 4)
+    for _ in range(300):  # whatever the bytes, a plain error or exactly the wanted size
+        noise = bytes(generator.integers(0, 256, 40, np.uint8))
+        with contextlib.suppress(ValueError):
+            assert len(lzf.decompress(noise, 60)) == 60
+
+
+def test_gaussian_maps_give_their_colours_and_object_ids(tmp_path: Path) -> None:
+    gaussians = GaussianMap(1)
+    gaussians.insert(
+        torch.tensor(POINTS, dtype=torch.float32), torch.ones(3, 4), torch.zeros(3, 3), torch.zeros(3),
+        torch.tensor(COLORS / 255.0, dtype=torch.float32), object_id=torch.tensor([3, 0, 9]),
+    )  # fmt: skip
+    write_gaussian_ply(tmp_path / "map.ply", gaussians, extra=("object_id",))
+    cloud = read_point_cloud(tmp_path / "map.ply")
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    np.testing.assert_array_equal(cloud.colors, COLORS)
+    assert cloud.labels["object_id"].tolist() == [3, 0, 9] and "opacity" in cloud.left_out
+
+
+def test_voxel_clouds_know_their_grid(tmp_path: Path) -> None:
+    grid = np.array([[0, 3, 5], [1, 0, 70], [900, 2, 0]], np.int32)
+    written = VoxelCloud(grid, COLORS, np.array([1, 0, 2], np.int32), 0.01, np.array([-1.23, 0.5, 2.0]))
+    write_points(tmp_path, written)
+    for name in ("points.ply", "points_grid.ply"):
+        cloud = read_point_cloud(tmp_path / name)
+        np.testing.assert_array_equal(cloud.grid, grid)
+        np.testing.assert_array_equal(cloud.points, written.points)
+        assert cloud.voxel_size == 0.01 and cloud.labels["object_id"].tolist() == [1, 0, 2]
+
+
+def vertices(**columns: list[float]) -> np.ndarray:
+    count = len(next(iter(columns.values())))
+    rows = np.zeros(count, [(name, "f4") for name in columns])
+    for name, values in columns.items():
+        rows[name] = values
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("rows", "reason"),
+    [
+        (vertices(x=[1], y=[2]), "missing z"),
+        (vertices(x=[1, 2], y=[1, float("nan")], z=[1, 2]), "point 1 is"),
+        (vertices(x=[], y=[], z=[]), "no points"),
+        (vertices(x=[1], y=[1], z=[1], red=[0], green=[-3], blue=[0]), "expected 0 to 255"),
+        (vertices(x=[1], y=[1], z=[1], red=[0], green=[float("inf")], blue=[0]), "colour of point 0"),
+    ],
+)
+def test_impossible_clouds_are_refused(tmp_path: Path, rows: np.ndarray, reason: str) -> None:
+    write_ply(tmp_path / "bad.ply", {"vertex": rows})
+    with pytest.raises(FormatError, match=rf"bad\.ply.*{reason}"):
+        read_point_cloud(tmp_path / "bad.ply")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("POINTS 1", "POINTS 1000000000000", "claims"),
+        ("WIDTH 1", "WIDTH one", "damaged"),
+        ("SIZE 4 4 4", "SIZE 4 4", "differ in length"),
+        ("SIZE 4 4 4", "SIZE 4 4 2", "size 2"),
+        ("FIELDS x y z", "FIELDS x y y", "declared twice"),
+        ("FIELDS x y z", "FIELDS x y w", "missing z"),
+        ("TYPE F F F\n", "", "no line 'TYPE'|no line TYPE"),
+        ("DATA ascii", "DATA letters", "expected ascii"),
+        ("VERSION", "VARSION", "not a PCD file"),
+        ("1 2 3", "1 2 x", "could not convert"),
+    ],
+)
+def test_damaged_pcd_headers_are_refused(tmp_path: Path, old: str, new: str, reason: str) -> None:
+    head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+    text = f"{head}WIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n1 2 3\n"
+    (tmp_path / "bad.pcd").write_text(text)
+    assert read_point_cloud(tmp_path / "bad.pcd").points.tolist() == [[1, 2, 3]]
+    (tmp_path / "bad.pcd").write_text(text.replace(old, new))
+    with pytest.raises(FormatError, match=reason):
+        read_point_cloud(tmp_path / "bad.pcd")
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("1 2 3\n")
+    with pytest.raises(FormatError, match="neither a PLY nor a PCD"):
+        read_point_cloud(tmp_path / "a.txt")
+    with pytest.raises(FormatError, match="No such file"):
+        read_point_cloud(tmp_path / "none.ply")
+
+
+def test_real_clouds(shared_data: Path) -> None:
+    folder = shared_data / "clouds"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    aerial = read_point_cloud(folder / "b9_training.ply")
+    assert len(aerial) == 22_300 and aerial.colors is not None and aerial.colors.std() > 5 and "label" in aerial.labels
+    statue = read_point_cloud(folder / "angel.ply")
+    assert len(statue) == 71_359 and statue.colors is not None and statue.colors.std() > 5
+    scan = read_point_cloud(folder / "scan_pair" / "source.ply")
+    assert scan.colors is None and scan.left_out == ("scalar_intensity",)
