@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable
 
@@ -11,13 +10,10 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-# NumPy's linear algebra here is on small matrices; its idle threads would spin on cores that the core's threads need.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 from ggslam import __version__
 from ggslam.cli import (
-    edit_command,
     decode_command,
+    edit_command,
     encode_command,
     eval_command,
     export_command,
