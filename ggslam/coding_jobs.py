@@ -22,7 +22,6 @@ from ggslam.coding import (
 )
 from ggslam.coding.listing import StreamListing, list_units
 from ggslam.coding.splats import gaussians_of, is_splat_cloud, splat_attributes, splat_settings
-from ggslam.coding.stream import read_stream
 from ggslam.coding.study import GridCloud, on_grid
 from ggslam.errors import ConfigError, FormatError
 from ggslam.formats.atomic import make_folder, write_bytes
@@ -131,13 +130,12 @@ def decode_file(
             make_folder(out.parent)
             write_gaussian_ply(out, gaussians, ("object_id",) if "object_id" in cloud.attributes else ())
             return Decoded(out, len(cloud), "Gaussians")
-        grid = _grid_of(cloud.metadata)
         if not len(cloud):
             raise FormatError("no points in the box")
     except FormatError as error:
         raise FormatError(f"{source}: {error}") from None
     make_folder(out.parent)
-    points, comments = _placed(cloud, grid)
+    points, comments = _placed(cloud)
     write_point_cloud(out, points, _labels_restored(cloud), comments if out.suffix.lower() != ".pcd" else ())
     return Decoded(out, len(cloud), "points")
 
@@ -212,44 +210,21 @@ def _decoded(data: bytes, slice_id: int | None, box: Box | None, workers: int | 
         return decode_slice(data, slice_id)
     if box is None:
         return decode_cloud(data, workers)
-    low, high = (np.asarray(corner, np.float64) for corner in box)
-    metadata = read_stream(data).side.get("metadata")
-    grid = _grid_of(metadata if isinstance(metadata, dict) else {})
-    if grid is not None:
-        low, high = (low - grid[1]) / grid[0], (high - grid[1]) / grid[0]
-        tolerance = 1e-6  # of a voxel, for corners that lie on the grid
-        low, high = low - tolerance, high + tolerance
-    return decode_box(data, low.tolist(), high.tolist())
+    return decode_box(data, *box)
 
 
-def _grid_of(metadata: dict[str, Any]) -> tuple[float, np.ndarray] | None:
-    """Voxel size and origin of the grid that the coded integers are on, metres."""
-    grid = metadata.get("grid")
-    if grid is None:
-        return None
-    try:
-        voxel_size, origin = float(grid["voxel_size"]), np.array(grid["origin"], np.float64)
-    except (KeyError, TypeError, ValueError):
-        raise FormatError("the place of the grid in the stream's metadata is damaged") from None
-    if origin.shape != (3,) or not np.isfinite(origin).all() or not 0 < voxel_size < np.inf:
-        raise FormatError("the place of the grid in the stream's metadata is damaged")
-    return voxel_size, origin
-
-
-def _placed(cloud: PointCloud, grid: tuple[float, np.ndarray] | None) -> tuple[np.ndarray, list[str]]:
+def _placed(cloud: PointCloud) -> tuple[np.ndarray, list[str]]:
     """Positions to write, and the header comments of a cloud that is on its grid still."""
-    quantization = cloud.quantization
+    quantization, grid = cloud.quantization, cloud.world_grid
     if grid is None:
         if not quantization.metres and quantization.scale == 1 and quantization.centre == 0:
             return np.rint(cloud.points).astype(np.int32), []
         return _narrowed(cloud.points, 1 / quantization.scale), []
-    voxel_size, origin = grid
-    points = origin + voxel_size * cloud.points
-    comments = []
+    voxel_size, origin, comments = grid.voxel_size, grid.origin, []
     if quantization.scale == 1:
         place = " ".join(repr(float(value)) for value in origin)
         comments = ["x y z are metres", f"voxel_size {voxel_size!r}", f"origin {place}"]
-    return _narrowed(points, voxel_size / quantization.scale), comments
+    return _narrowed(cloud.points, voxel_size / quantization.scale), comments
 
 
 def _narrowed(points: np.ndarray, voxel_size: float) -> np.ndarray:

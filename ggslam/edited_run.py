@@ -88,5 +88,5 @@ def _stage(
     for name, picture in pictures.items():
         write_picture(staged.path / "renders" / name, picture)
     if not named_only:
-        write_points(staged.path, sample_points(scene.gaussians))
+        write_points(staged.path, sample_points(scene.gaussians, with_object_id=True))
     staged.save_objects(scene)

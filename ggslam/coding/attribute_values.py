@@ -20,10 +20,11 @@ from ggslam.coding.sequence_parameters import (
     KNOWN_LABELS,
     MATRIX_BT709,
     MATRIX_IDENTITY,
+    MAX_ATTRIBUTES,
     AttributeDescription,
 )
 from ggslam.coding.settings import AttributeSettings, CodecSettings
-from ggslam.coding.syntax import AttributeParameters
+from ggslam.coding.syntax import MAX_PARAMETER_SETS, AttributeParameters
 from ggslam.errors import ConfigError, FormatError
 
 _GBR = [1, 2, 0]  # where G, B, R are in R, G, B
@@ -146,6 +147,7 @@ def plan_attributes(
     if unknown:
         raise ConfigError(f"CodecSettings.attributes: there is no attribute {sorted(unknown)[0]!r}")
     plans: list[tuple[CodedAttribute, AttributeParameters]] = []
+    sets: dict[AttributeParameters, int] = {}
     for index, (name, values) in enumerate(attributes.items()):
         own = settings.attribute(name)
         values = np.asarray(values)
@@ -154,9 +156,15 @@ def plan_attributes(
         instance = sum(plan.description.label == description.label for plan, _ in plans)
         table = IdTable.of(values) if own.lossless else None
         plan = CodedAttribute(name, index, replace(description, instance=instance), table)
-        plans.append((plan, _parameters(index, own, settings, table)))
-    if len(plans) > 16:
-        raise ConfigError(f"{len(plans)} attributes; a stream has parameter sets for 16")
+        parameters = _parameters(own, settings, table)
+        # Attributes that are coded alike share a set: its id has 4 bits, and whole Gaussians have up to 21 attributes.
+        plans.append((plan, replace(parameters, attribute_id=sets.setdefault(parameters, len(sets)))))
+    if len(sets) > MAX_PARAMETER_SETS:
+        raise ConfigError(
+            f"{len(plans)} attributes with {len(sets)} different quantisers; a stream has room for {MAX_PARAMETER_SETS}"
+        )
+    if len(plans) > MAX_ATTRIBUTES:
+        raise ConfigError(f"{len(plans)} attributes; {MAX_ATTRIBUTES} are supported")
     return plans
 
 
@@ -190,11 +198,9 @@ def _describe(name: str, values: np.ndarray, own: AttributeSettings) -> Attribut
     return AttributeDescription(label, components, depth, 0, matrix)
 
 
-def _parameters(
-    index: int, own: AttributeSettings, settings: CodecSettings, table: IdTable | None
-) -> AttributeParameters:
+def _parameters(own: AttributeSettings, settings: CodecSettings, table: IdTable | None) -> AttributeParameters:
     qp = settings.qp if own.qp is None else own.qp
     offset = settings.chroma_offset if own.chroma_offset is None else own.chroma_offset
     if table is not None:
         qp, offset = table.qp(), 0
-    return AttributeParameters(qp, offset, settings.raht_prediction, attribute_id=index)
+    return AttributeParameters(qp, offset, settings.raht_prediction)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.coding.cloud import PointCloud
+from ggslam.coding.cloud import PointCloud, WorldGrid
 from ggslam.coding.native import SliceCoder, raht_settings
 from ggslam.coding.stream import CodedSliceUnits, CodedStream, read_stream
 from ggslam.errors import FormatError
@@ -65,12 +65,16 @@ def decode_slice(data: bytes | memoryview, slice_id: int) -> PointCloud:
 
 
 def decode_box(data: bytes | memoryview, low: Sequence[float], high: Sequence[float]) -> PointCloud:
-    """The points within a box, metres, both ends included; slices that lie outside are not decoded."""
+    """The points within a box, metres, both ends included (and a millionth of a voxel more, for corners that lie on
+    the grid); slices that lie outside are not decoded."""
     stream = read_stream(data)
-    first, last = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    grid = WorldGrid.of(stream.side.get("metadata"))
+    reach = 1e-6 / stream.quantization.scale * (1.0 if grid is None else grid.voxel_size)
+    first, last = np.asarray(low, np.float64) - reach, np.asarray(high, np.float64) + reach
     chosen = []
     for units in stream.slices:
         corners = stream.quantization.restore(np.stack(units.grid_box))
+        corners = corners if grid is None else grid.place(corners)
         if (corners[0] <= last).all() and (corners[1] >= first).all():
             chosen.append(units)
     cloud = _decode(stream, chosen, None)
@@ -99,7 +103,9 @@ def _decode(stream: CodedStream, slices: list[CodedSliceUnits], workers: int | N
         shape = (0,) if attribute.description.components == 1 else (0, 3)
         attributes[attribute.name] = _concatenate([part[1][attribute.name] for part in parts], shape, wide)
     metadata = stream.side.get("metadata")
-    return PointCloud(grid, attributes, stream.quantization, metadata if isinstance(metadata, dict) else {})
+    cloud = PointCloud(grid, attributes, stream.quantization, metadata if isinstance(metadata, dict) else {})
+    _ = cloud.world_grid  # FormatError if it is damaged
+    return cloud
 
 
 def _concatenate(parts: list[np.ndarray], empty: tuple[int, ...], dtype: type) -> np.ndarray:

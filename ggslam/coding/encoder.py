@@ -98,9 +98,10 @@ def _encode_slices(cloud: CloudToCode, count: int) -> list[CodedSlice]:
 def _parameter_units(cloud: CloudToCode, slices: list[CodedSlice]) -> bytes:
     """Parameter sets, once for all slices, and the unit of what they cannot hold."""
     geometry = {coded.geometry.geometry_id: coded.geometry for coded in slices}
+    attribute = {parameters.attribute_id: parameters for _, parameters in cloud.plans}
     units = [unit_bytes(UnitType.SEQUENCE_PARAMETERS, cloud.sequence.write())]
     units += [unit_bytes(UnitType.GEOMETRY_PARAMETERS, geometry[identity].write()) for identity in sorted(geometry)]
-    units += [unit_bytes(UnitType.ATTRIBUTE_PARAMETERS, parameters.write()) for _, parameters in cloud.plans]
+    units += [unit_bytes(UnitType.ATTRIBUTE_PARAMETERS, attribute[identity].write()) for identity in sorted(attribute)]
     content = _side_information(cloud)
     if content:
         units.append(unit_bytes(UnitType.USER_DATA, write_user_data(content)))

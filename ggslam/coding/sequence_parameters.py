@@ -10,6 +10,8 @@ from ggslam.coding.bits import BitReader, BitWriter
 from ggslam.errors import FormatError
 
 KNOWN_LABELS = ("color", "reflectance", "opacity", "frame_index", "frame_number", "material", "normal")
+MAX_ATTRIBUTES = 255
+"""Attributes of a stream that are supported."""
 CICP_PARAMETER = 2
 MATRIX_IDENTITY, MATRIX_BT709 = 0, 1
 _SECOND_EDITION = "a damaged stream, or one of a draft of the second edition, which is not supported"
@@ -113,7 +115,7 @@ class SequenceParameters:
         metres = r.flag()
         global_scale = _read_global_scale(r)
         count = r.ue()
-        if count > 255:
+        if count > MAX_ATTRIBUTES:
             raise FormatError(f"the sequence parameter set lists {count} attributes: {_SECOND_EDITION}")
         parameters = SequenceParameters(
             tuple(_read_attribute(r) for _ in range(count)), unique, offset, offset_scale, size,

@@ -14,6 +14,8 @@ from ggslam.errors import FormatError
 
 MAX_DEPTH = 21
 """Levels of an octree that are supported: positions of 21 bits."""
+MAX_PARAMETER_SETS = 16
+"""Attribute parameter sets of a stream: their ids have 4 bits."""
 FOOTER_BYTES = 3
 _HEADER_BYTES = 64  # no valid header is longer
 RAHT, PREDICTING, LIFTING, RAW = 0, 1, 2, 3

@@ -103,7 +103,7 @@ def test_realtime_keeps_pace(room: Path, tmp_path: Path) -> None:
     assert m["images"]["held_out"]["psnr"] > 20
 
 
-@pytest.mark.parametrize("command", ["run", "eval", "render", "export", "edit", "synth", "inspect"])
+@pytest.mark.parametrize("command", ["run", "eval", "render", "export", "edit", "encode", "decode", "synth", "inspect"])
 def test_help_has_an_example(command: str) -> None:
     done = ggslam(command, "--help")
     assert done.returncode == 0 and f"ggslam {command}" in done.stdout and "Example" in done.stdout
