@@ -72,6 +72,7 @@ def encode_file(
     """
     notes: list[str] = []
     path = _input_file(source, preset)
+    _refuse_itself(path, out)
     if preset == "splat":
         gaussians = read_gaussian_ply(path, with_moments=False)
         if not len(gaussians):
@@ -79,14 +80,20 @@ def encode_file(
         points: np.ndarray = gaussians.means.numpy().astype(np.float64)
         attributes = splat_attributes(gaussians)
         settings = splat_settings(settings, rate, attributes)
+        notes += _outliers(points)
     else:
         cloud = read_point_cloud(path)
         points, metadata = coded_points(cloud, settings)
         attributes, labels = _coded_attributes(cloud, notes)
         own = {name: AttributeSettings(lossless=True) for name in labels}
+        if "grid" in metadata:
+            settings = replace(settings, voxel_size=None)
         metadata |= {"preset": preset} | ({"label_offsets": labels} if any(labels.values()) else {})
         settings = replace(settings, attributes={**settings.attributes, **own}, metadata=metadata)
-    encoded = encode_cloud(points, attributes, settings)
+    try:
+        encoded = encode_cloud(points, attributes, settings)
+    except (ConfigError, FormatError) as error:
+        raise type(error)(f"{path}: {error}") from None
     make_folder(out.parent)
     write_bytes(out, encoded.data)
     return Encoded(out, encoded.report, notes)
@@ -122,21 +129,29 @@ def decode_file(
     """
     if slice_id is not None and box is not None:
         raise ConfigError("choose a slice or a box, not both")
+    if out.suffix.lower() not in (".ply", ".pcd"):
+        raise ConfigError(f"{out}: expected a name that ends in .ply or .pcd")
+    _refuse_itself(source, out)
     data = read_bytes(source)
     try:
         cloud = _decoded(data, slice_id, box, workers)
         if is_splat_cloud(cloud):
             gaussians = gaussians_of(cloud)
+            if out.suffix.lower() != ".ply":
+                raise ConfigError(f"{out}: Gaussians are written as .ply")
+            if not len(cloud):
+                raise FormatError("no Gaussians in the box")
             make_folder(out.parent)
             write_gaussian_ply(out, gaussians, ("object_id",) if "object_id" in cloud.attributes else ())
             return Decoded(out, len(cloud), "Gaussians")
         if not len(cloud):
             raise FormatError("no points in the box")
+        labels = _labels_restored(cloud)
     except FormatError as error:
         raise FormatError(f"{source}: {error}") from None
     make_folder(out.parent)
     points, comments = _placed(cloud)
-    write_point_cloud(out, points, _labels_restored(cloud), comments if out.suffix.lower() != ".pcd" else ())
+    write_point_cloud(out, points, labels, comments if out.suffix.lower() != ".pcd" else ())
     return Decoded(out, len(cloud), "points")
 
 
@@ -175,10 +190,11 @@ def coded_points(cloud: ColoredCloud, settings: CodecSettings) -> tuple[np.ndarr
     ggslam voxelised (the grid's place goes into the metadata), and those whose coordinates are whole numbers, as of
     the usual test clouds. Others are metres; the settings choose their voxels. So do they where they name a voxel size.
     """
-    if settings.voxel_size is None and settings.box is None:
+    if settings.box is None and settings.voxel_size in (None, cloud.voxel_size):
         if cloud.grid is not None and cloud.voxel_size is not None and cloud.origin is not None:
             return cloud.grid, {"grid": {"voxel_size": cloud.voxel_size, "origin": cloud.origin.tolist()}}
-        if np.abs(cloud.points).max() < 1 << 30 and (cloud.points == np.rint(cloud.points)).all():
+        small = settings.voxel_size is None and np.abs(cloud.points).max() < 1 << 30
+        if small and (cloud.points == np.rint(cloud.points)).all():
             return cloud.points.astype(np.int32), {}
     return cloud.points, {}
 
@@ -233,6 +249,21 @@ def _narrowed(points: np.ndarray, voxel_size: float) -> np.ndarray:
     return narrow if np.abs(points - narrow).max(initial=0) < 0.01 * voxel_size else points
 
 
+def _refuse_itself(source: Path, out: Path) -> None:
+    if source.exists() and out.exists() and out.samefile(source):
+        raise ConfigError(f"{out}: is the input itself")
+
+
+def _outliers(points: np.ndarray) -> list[str]:
+    """A note if a few Gaussians far outside cost the others their precision."""
+    low, high = np.quantile(points, [0.001, 0.999], axis=0)
+    bulk = float((high - low).max())
+    far = ((points < low - 10 * bulk) | (points > high + 10 * bulk)).any(1)
+    if not far.any() or bulk == 0:
+        return []
+    return [f"{int(far.sum())} Gaussians lie far outside the others; the grid spans them too and is coarser for it"]
+
+
 def _labels_restored(cloud: PointCloud) -> dict[str, np.ndarray]:
     """The attributes to write: labels as int32 with their offsets."""
     offsets = cloud.metadata.get("label_offsets")
@@ -242,5 +273,7 @@ def _labels_restored(cloud: PointCloud) -> dict[str, np.ndarray]:
         if name == "color" and values.ndim == 2 and values.dtype == np.uint8:
             out[name] = values
         else:
-            out[name] = values.astype(np.int64) + (offset if isinstance(offset, int) else 0)
+            if offset is not None and (not isinstance(offset, int) or abs(offset) >= 1 << 40):
+                raise FormatError(f"the metadata's offset of '{name}' is damaged")
+            out[name] = values.astype(np.int64) + (offset or 0)
     return out

@@ -33,7 +33,7 @@ class WorldGrid:
             voxel_size, origin = float(grid["voxel_size"]), np.array(grid["origin"], np.float64)
         except (KeyError, TypeError, ValueError, OverflowError):
             raise FormatError("the place of the grid in the stream's metadata is damaged") from None
-        if origin.shape != (3,) or not np.isfinite(origin).all() or not 0 < voxel_size < np.inf:
+        if origin.shape != (3,) or not (np.abs(origin) < 1e12).all() or not 1e-12 < voxel_size < 1e12:
             raise FormatError("the place of the grid in the stream's metadata is damaged")
         return WorldGrid(voxel_size, origin)
 

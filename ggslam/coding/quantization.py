@@ -16,6 +16,9 @@ import numpy as np
 from ggslam.errors import ConfigError
 
 GRID_BITS = 21
+ROUNDING = 1e-3
+"""Voxels that a coordinate may lie below a voxel's face and still count as in it: points that were on a grid once stay
+apart, whichever way their coordinates were rounded."""
 _MAX_FIELD = (1 << 32) - 2
 
 
@@ -51,6 +54,7 @@ class Quantization:
             grid = values if values.dtype == np.int32 and _is_int32(first, last) else values.astype(np.int64)
         else:
             grid = np.multiply(values, self.scale, dtype=np.float64)
+            grid += ROUNDING
             np.floor(grid, out=grid)
         if last is not None:
             grid = np.clip(grid, first, last)
@@ -100,10 +104,13 @@ def choose_quantization(
     high = np.asarray(box[1] if box else [c.max() for c in columns], np.float64)
     integers = np.issubdtype(points.dtype, np.integer)
     if voxel_size is None:
-        longest = float((high - low).max())
+        longest = float((high / 2 - low / 2).max()) * 2
         voxel_size = 1.0 if integers or longest == 0 else longest / ((1 << bits) - 1)
+        if not 1e-12 <= voxel_size <= 1e12:
+            raise ConfigError(f"positions that span {longest:g} fit on no grid: name a voxel size")
     scale = geometry_scale / voxel_size
-    first, last = np.floor(low * scale), np.floor(high * scale)
+    with np.errstate(over="ignore", invalid="ignore"):
+        first, last = np.floor(low * scale + ROUNDING), np.floor(high * scale + ROUNDING)
     if not np.isfinite(first).all() or not np.isfinite(last).all() or np.abs([first, last]).max() >= 1 << 52:
         raise ConfigError(f"voxels of {1 / scale:g} are too small for positions up to {np.abs([low, high]).max():g}")
     extent = (last - first).astype(np.int64) + 1

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+
 from ggslam.errors import ConfigError, check_ranges
 
 Split = Literal["count", "interval", "cube"]
@@ -97,6 +99,13 @@ class CodecSettings:
                 "rdoq": (0, 100),
             },
         )  # fmt: skip
+        for name in ("qp", "chroma_offset", "geometry_bits", "slices", "max_points", "intra_prediction_size"):
+            if not isinstance(getattr(self, name), (int, np.integer)):
+                raise ConfigError(f"CodecSettings.{name}: expected a whole number, found {getattr(self, name)!r}")
+        if self.box is not None:
+            corners = np.asarray(self.box, np.float64)
+            if corners.shape != (2, 3) or not np.isfinite(corners).all() or not (corners[0] <= corners[1]).all():
+                raise ConfigError(f"CodecSettings.box: expected a lowest and a highest corner, found {self.box!r}")
         if self.voxel_size is not None:
             check_ranges(self, {"voxel_size": (1e-12, 1e12)})
         if self.workers is not None:

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from ggslam.cli.main import main
+from ggslam.coding import decode_cloud
 from ggslam.coding.listing import list_units
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
@@ -178,6 +179,27 @@ def test_a_sweep_writes_a_study(ggslam: Ggslam, tmp_path: Path, monkeypatch: pyt
     record = json.loads((tmp_path / "study" / "study.json").read_text())
     assert len(record["rows"]) == 4 and record["points"] == 1600 and record["voxels_per_unit"] == pytest.approx(50)
     assert (tmp_path / "study" / "clouds_qp.png").is_file()
+
+
+def test_the_cloud_s_own_voxel_size_loses_nothing(ggslam: Ggslam, tmp_path: Path) -> None:
+    cloud = voxel_cloud()
+    write_points(tmp_path, cloud)
+    code, _, err = ggslam("encode", tmp_path / "points.ply", tmp_path / "a.bin", "--voxel", cloud.voxel_size)
+    assert code == 0, err
+    decoded = decode_cloud((tmp_path / "a.bin").read_bytes())
+    assert len(decoded) == len(cloud.grid)
+    np.testing.assert_allclose(decoded.points.min(0), cloud.points.min(0), atol=1e-9)  # metres, without the command
+
+
+def test_outputs_that_make_no_sense_are_refused(ggslam: Ggslam, tmp_path: Path) -> None:
+    write_points(tmp_path, voxel_cloud())
+    points, stream = tmp_path / "points.ply", tmp_path / "a.bin"
+    before = points.read_bytes()
+    for words in (("encode", points, points), ("decode", stream, stream), ("decode", stream, tmp_path / "o.txt")):
+        ggslam("encode", points, stream)
+        code, _, err = ggslam(*words)
+        assert code == 2 and words[-1].name in err  # type: ignore[union-attr]
+    assert points.read_bytes() == before
 
 
 def test_mistakes_are_named(ggslam: Ggslam, tmp_path: Path) -> None:

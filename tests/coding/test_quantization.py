@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
-from ggslam.coding.quantization import Quantization, choose_quantization
+from ggslam.coding.quantization import ROUNDING, Quantization, choose_quantization
 from ggslam.coding.stream import read_stream
 from ggslam.errors import ConfigError, FormatError
 
@@ -33,7 +33,7 @@ def test_error_is_half_a_voxel_at_most(metres: np.ndarray, bits: int) -> None:
     assert np.ptp(metres, 0).max() / edge == pytest.approx(2**bits - 1)
     for axis in range(3):
         error = np.abs(np.sort(cloud.points[:, axis]) - np.sort(metres[:, axis]))
-        assert error.max() <= edge * (0.5 + 1e-6)
+        assert error.max() <= edge * (0.5 + ROUNDING + 1e-6)
     assert cloud.quantization.metres
 
 
@@ -97,3 +97,25 @@ def test_positions_must_be_numbers() -> None:
         encode_cloud(np.empty((0, 3)))
     with pytest.raises(ConfigError, match=r"expected \[N, 3\]"):
         encode_cloud(np.zeros((4, 2)))
+
+
+def test_points_that_were_on_a_grid_stay_apart() -> None:
+    """However their coordinates were rounded: k * 0.01 may lie just below the face between two voxels."""
+    grid = np.unique(np.random.default_rng(0).integers(-300, 500, (4000, 3)), axis=0)
+    for kind in (np.float32, np.float64):
+        points = (grid * 0.01).astype(kind)
+        coded = encode_cloud(points, None, CodecSettings(voxel_size=0.01))
+        assert coded.report.points == len(grid)
+
+
+@pytest.mark.parametrize("far", [1.7e308, 1e200])
+def test_impossible_spans_are_refused(far: float) -> None:
+    with pytest.raises(ConfigError, match="voxel"):
+        encode_cloud(np.array([[-far, 0, 0], [far, 0, 0]]))
+    assert encode_cloud(np.array([[5e-324, 0, 0], [0, 0, 0]])).report.points == 1
+
+
+def test_settings_are_whole_numbers_and_boxes_have_insides() -> None:
+    for wrong in ({"qp": 22.5}, {"slices": 1.5}, {"box": ((0, 0, 0), (1, -1, 1))}, {"box": 1}):
+        with pytest.raises(ConfigError, match=next(iter(wrong))):
+            CodecSettings(**wrong)  # type: ignore[arg-type]
