@@ -83,11 +83,9 @@ def encode_file(
         notes += _outliers(points)
     else:
         cloud = read_point_cloud(path)
-        points, metadata = coded_points(cloud, settings)
+        points, settings, metadata = coded_points(cloud, settings)
         attributes, labels = _coded_attributes(cloud, notes)
         own = {name: AttributeSettings(lossless=True) for name in labels}
-        if "grid" in metadata:
-            settings = replace(settings, voxel_size=None)
         metadata |= {"preset": preset} | ({"label_offsets": labels} if any(labels.values()) else {})
         settings = replace(settings, attributes={**settings.attributes, **own}, metadata=metadata)
     try:
@@ -109,11 +107,10 @@ def study_cloud(source: Path, settings: CodecSettings) -> GridCloud:
     cloud = read_point_cloud(path)
     if cloud.colors is None:
         raise FormatError(f"{path}: no colours, which a sweep needs")
-    if cloud.voxel_size is not None and settings.voxel_size is None:
-        # The points of the grid stand at the corners of its voxels; the middle is safe from rounding.
-        settings = replace(settings, voxel_size=cloud.voxel_size)
-        return on_grid(cloud.points + cloud.voxel_size / 2, cloud.colors, settings)
-    return on_grid(coded_points(cloud, settings)[0], cloud.colors, settings)
+    if cloud.voxel_size is not None:  # in metres, as the pictures and tables are
+        return on_grid(cloud.points, cloud.colors, replace(settings, voxel_size=settings.voxel_size or cloud.voxel_size))
+    points, settings, _ = coded_points(cloud, settings)
+    return on_grid(points, cloud.colors, settings)
 
 
 def decode_file(
@@ -183,8 +180,9 @@ def _input_file(source: Path, preset: str) -> Path:
     return RunFolder.open(source).path / ("map.ply" if preset == "splat" else "points.ply")
 
 
-def coded_points(cloud: ColoredCloud, settings: CodecSettings) -> tuple[np.ndarray, dict[str, Any]]:
-    """Positions as the encoder shall see them, and what the decoder needs to know to place them.
+def coded_points(cloud: ColoredCloud, settings: CodecSettings) -> tuple[np.ndarray, CodecSettings, dict[str, Any]]:
+    """Positions as the encoder shall see them, the settings that fit them, and what the decoder needs to know to place
+    them.
 
     Clouds on a grid are coded as whole voxels, so that lossless geometry gives back exactly their points: those that
     ggslam voxelised (the grid's place goes into the metadata), and those whose coordinates are whole numbers, as of
@@ -192,11 +190,12 @@ def coded_points(cloud: ColoredCloud, settings: CodecSettings) -> tuple[np.ndarr
     """
     if settings.box is None and settings.voxel_size in (None, cloud.voxel_size):
         if cloud.grid is not None and cloud.voxel_size is not None and cloud.origin is not None:
-            return cloud.grid, {"grid": {"voxel_size": cloud.voxel_size, "origin": cloud.origin.tolist()}}
+            place = {"grid": {"voxel_size": cloud.voxel_size, "origin": cloud.origin.tolist()}}
+            return cloud.grid, replace(settings, voxel_size=None), place
         small = settings.voxel_size is None and np.abs(cloud.points).max() < 1 << 30
         if small and (cloud.points == np.rint(cloud.points)).all():
-            return cloud.points.astype(np.int32), {}
-    return cloud.points, {}
+            return cloud.points.astype(np.int32), settings, {}
+    return cloud.points, settings, {}
 
 
 def _coded_attributes(cloud: ColoredCloud, notes: list[str]) -> tuple[dict[str, np.ndarray], dict[str, int]]:

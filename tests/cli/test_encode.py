@@ -13,8 +13,9 @@ import pytest
 import torch
 
 from ggslam.cli.main import main
-from ggslam.coding import decode_cloud
+from ggslam.coding import CodecSettings, decode_cloud
 from ggslam.coding.listing import list_units
+from ggslam.coding_jobs import study_cloud
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
 from ggslam.formats.point_ply import read_points, write_points
@@ -189,6 +190,9 @@ def test_the_cloud_s_own_voxel_size_loses_nothing(ggslam: Ggslam, tmp_path: Path
     decoded = decode_cloud((tmp_path / "a.bin").read_bytes())
     assert len(decoded) == len(cloud.grid)
     np.testing.assert_allclose(decoded.points.min(0), cloud.points.min(0), atol=1e-9)  # metres, without the command
+    for named in (None, cloud.voxel_size):
+        study = study_cloud(tmp_path / "points.ply", CodecSettings(voxel_size=named))
+        np.testing.assert_array_equal(study.grid.max(0), np.ptp(cloud.grid, axis=0))
 
 
 def test_outputs_that_make_no_sense_are_refused(ggslam: Ggslam, tmp_path: Path) -> None:
