@@ -108,7 +108,8 @@ def study_cloud(source: Path, settings: CodecSettings) -> GridCloud:
     if cloud.colors is None:
         raise FormatError(f"{path}: no colours, which a sweep needs")
     if cloud.voxel_size is not None:  # in metres, as the pictures and tables are
-        return on_grid(cloud.points, cloud.colors, replace(settings, voxel_size=settings.voxel_size or cloud.voxel_size))
+        settings = replace(settings, voxel_size=settings.voxel_size or cloud.voxel_size)
+        return on_grid(cloud.points, cloud.colors, settings)
     points, settings, _ = coded_points(cloud, settings)
     return on_grid(points, cloud.colors, settings)
 

@@ -19,9 +19,10 @@ import numpy as np
 
 from ggslam.config import Config
 from ggslam.errors import SequenceError
-from ggslam.mapping.identity import IdentityLearner, vote_labels
+from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper, MapperTimes
+from ggslam.mapping.votes import vote_labels
 from ggslam.native.loader import NativeContext
 from ggslam.object_masks import ObjectMasks, observations
 from ggslam.objects.table import Observation, Supervision

@@ -20,12 +20,12 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from timing import seconds
 
 from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
 from ggslam.coding.metrics import color_quality, matching_rows
@@ -95,16 +95,6 @@ def merged(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return keys[starts], np.add.reduceat(sums, starts)
 
 
-def best_time(call: Callable[[], object], repeats: int) -> float:
-    """Shortest of the repeats, seconds."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
 def bench(cloud: Cloud, qp: int, repeats: int) -> None:
     """Prints the lines of one cloud at one quantiser parameter."""
     reference: tuple[int, float, float] | None = None
@@ -116,8 +106,8 @@ def bench(cloud: Cloud, qp: int, repeats: int) -> None:
         if rows is None:
             raise SystemExit(f"{cloud.name}: the decoded points are not those that were coded")
         quality = color_quality(cloud.colors, decoded.attributes["color"][rows]).y
-        encode_s = best_time(partial(encode_cloud, cloud.grid, {"color": cloud.colors}, settings), repeats)
-        decode_s = best_time(partial(decode_cloud, encoded.data, workers), repeats)
+        encode_s = min(seconds(partial(encode_cloud, cloud.grid, {"color": cloud.colors}, settings), repeats))
+        decode_s = min(seconds(partial(decode_cloud, encoded.data, workers), repeats))
         size, cores = len(encoded.data), min(workers, available_processors(), len(encoded.report.slices))
         reference = reference or (size, encode_s, decode_s)
         cells = [

@@ -13,12 +13,12 @@ from __future__ import annotations
 import argparse
 import ctypes
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from timing import seconds
 from torch.nn.functional import avg_pool2d
 
 from ggslam.mapping.losses import ImageLoss, KeyframeImages, LossSettings
@@ -49,12 +49,7 @@ def make_view(width: int, height: int) -> tuple[View, KeyframeImages]:
 
 def median_ms(call: Callable[[], object], repeats: int) -> float:
     call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return 1e3 * statistics.median(times)
+    return 1e3 * statistics.median(seconds(call, repeats))
 
 
 def torch_call(view: View, target: KeyframeImages, settings: LossSettings) -> Callable[[], object]:

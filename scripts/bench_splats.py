@@ -19,13 +19,12 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import tempfile
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from timing import seconds
 
 from ggslam.coding import CodecSettings, CodingReport, EncodedCloud, decode_cloud, encode_cloud
 from ggslam.coding.splats import RATES, gaussians_of, splat_attributes, splat_settings
@@ -98,16 +97,6 @@ def quality(views: list[View], gaussians: GaussianMap) -> list[str]:
     return [f"{same.psnr_unmasked:.2f}", f"{same.ssim_unmasked:.4f}", f"{real.psnr:.3f}", f"{real.ssim:.4f}"]
 
 
-def timed(call: Callable[[], object], repeats: int) -> float:
-    """Shortest of the repeats, seconds."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
 def through_gpcc(gaussians: GaussianMap, rate: str, repeats: int) -> Coded:
     """Codes a map at a rate; stops the script if an object id changed."""
     points = gaussians.means.numpy().astype(np.float64)
@@ -122,7 +111,8 @@ def through_gpcc(gaussians: GaussianMap, rate: str, repeats: int) -> Coded:
         sorted_rows(cloud.quantization.apply(points), gaussians), sorted_rows(cloud.grid_points, gaussians_of(cloud))
     ):
         raise SystemExit(f"{rate}: the decoded Gaussians do not have the positions and object ids that were coded")
-    encode_s, decode_s = timed(encode, repeats), timed(lambda: gaussians_of(decode_cloud(encoded.data)), repeats)
+    encode_s = min(seconds(encode, repeats))
+    decode_s = min(seconds(lambda: gaussians_of(decode_cloud(encoded.data)), repeats))
     return Coded(rate, len(encoded.data), parts_of(encoded.report), gaussians_of(cloud), encode_s, decode_s)
 
 
@@ -166,8 +156,8 @@ def through_spz(gaussians: GaussianMap, folder: Path, repeats: int) -> Coded:
     out.sh[rows, 0] = torch.tensor(read.sh0)
     if gaussians.sh_degree:
         out.sh[rows, 1:] = torch.tensor(read.shN).reshape(len(out), -1, 3)
-    encode_s = timed(lambda: gsply.write_spz(path, data), repeats)
-    decode_s = timed(lambda: gsply.read_spz(path), repeats)
+    encode_s = min(seconds(lambda: gsply.write_spz(path, data), repeats))
+    decode_s = min(seconds(lambda: gsply.read_spz(path), repeats))
     return Coded("SPZ", Path(path).stat().st_size, {}, out, encode_s, decode_s)
 
 

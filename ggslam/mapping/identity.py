@@ -24,6 +24,8 @@ from ggslam.mapping.class_table import ClassTable
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.neighbours import NeighbourIndex, kl_gradient
+from ggslam.mapping.pixel_pool import PixelPool, draw_pool
+from ggslam.mapping.votes import merge_votes, vote_labels, vote_shares
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.pixel_terms import FeatureAdamSettings, PixelTerms
 from ggslam.rendering.types import RenderBuffers
@@ -48,21 +50,6 @@ class IdentityTimes:
     steps: float = 0.0
     labelling: float = 0.0
     count: int = 0
-
-
-@dataclass
-class PixelPool:
-    """Pixels of one keyframe drawn for steps to come.
-
-    Attributes:
-        pixels: int32, flat indices.
-        vote_weights: float32, inverse of the density with which each was drawn, mean 1.
-        used: how many of them are used up.
-    """
-
-    pixels: np.ndarray
-    vote_weights: np.ndarray
-    used: int = 0
 
 
 @dataclass
@@ -331,80 +318,6 @@ def cross_entropy(
     z[rows, true] -= 1
     z /= len(z)
     return loss, z @ weight, np.concatenate([z.T @ features, z.sum(0)[:, None]], 1)
-
-
-def draw_pool(
-    ids: np.ndarray, wanted: int, settings: IdentitySettings, rng: np.random.Generator
-) -> PixelPool:
-    """Draws labelled pixels: a share `settings.boundary` of them at the boundaries of objects, where nearly all errors
-    are, the others anywhere; in both parts an object of n pixels comes with a share that goes with n^(1 - balance).
-
-    Args:
-        ids: object of each pixel, uint16 [H, W]; 0 is never drawn.
-        wanted: how many; a pixel may come twice.
-    """
-    flat = ids.reshape(-1)
-    edge = at_boundary(ids).reshape(-1)
-    parts, density = [], np.zeros(len(flat))
-    for share, strata in ((1 - settings.boundary, flat), (settings.boundary, np.where(edge, flat, 0))):
-        counts = np.bincount(strata)
-        counts[0] = 0
-        present = np.flatnonzero(counts)
-        number = round(share * wanted)
-        if not len(present) or not number:
-            continue
-        odds = counts[present].astype(np.float64) ** (1 - settings.balance)
-        odds /= odds.sum()
-        by_object = np.argsort(strata, kind="stable").astype(np.int32)  # a radix sort for 16 bits
-        starts = np.concatenate([[0], np.cumsum(np.bincount(strata))])[present]
-        drawn = rng.choice(len(present), number, p=odds)
-        parts.append(by_object[starts[drawn] + (rng.random(number) * counts[present][drawn]).astype(np.int64)])
-        per_pixel = np.zeros(len(counts))
-        per_pixel[present] = number * odds / counts[present]
-        density += per_pixel[strata]
-    if not parts:
-        return PixelPool(np.zeros(0, np.int32), np.zeros(0, np.float32))
-    pixels = rng.permutation(np.concatenate(parts))
-    weights = 1 / density[pixels]
-    return PixelPool(pixels, (weights / weights.mean()).astype(np.float32))
-
-
-def at_boundary(ids: np.ndarray) -> np.ndarray:
-    """Pixels with a pixel of another object beside, above or below them, bool [H, W]."""
-    edge = np.zeros(ids.shape, bool)
-    across, down = ids[:, 1:] != ids[:, :-1], ids[1:] != ids[:-1]
-    edge[:, 1:] |= across
-    edge[:, :-1] |= across
-    edge[1:] |= down
-    edge[:-1] |= down
-    return edge
-
-
-def vote_labels(gaussians: GaussianMap) -> np.ndarray:
-    """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none."""
-    return vote_shares(gaussians)[0]
-
-
-def vote_shares(gaussians: GaussianMap) -> tuple[np.ndarray, np.ndarray]:
-    """Object with the most votes of each Gaussian, uint16 [N], and its share of all votes there, [N]; 0 where there are
-    none."""
-    ids, weights = gaussians.vote_ids.numpy(), gaussians.vote_weights.numpy()
-    best = weights.argmax(1)[:, None]
-    most = np.take_along_axis(weights, best, 1)[:, 0]
-    label = np.where(most > 0, np.take_along_axis(ids, best, 1)[:, 0], 0)
-    return label.astype(np.uint16), most / np.maximum(weights.sum(1), 1e-12)
-
-
-def merge_votes(gaussians: GaussianMap, alias: np.ndarray) -> None:
-    """Replaces ids in the votes by `alias` [65536]; slots that then name one object become one."""
-    ids, weights = gaussians.vote_ids.numpy(), gaussians.vote_weights.numpy()
-    ids[:] = alias[ids]
-    weights[ids == 0] = 0
-    for a in range(ids.shape[1]):
-        for b in range(a + 1, ids.shape[1]):
-            same = (ids[:, a] == ids[:, b]) & (ids[:, a] != 0)
-            weights[same, a] += weights[same, b]
-            ids[same, b], weights[same, b] = 0, 0
 
 
 def by_parts(

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ggslam.mapping.exposure import ExposureAdam
-from ggslam.mapping.identity import IdentityLearner, vote_labels
+from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.insertion import fill_gaussians, new_gaussians, unexplained
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller, MapLabels
@@ -20,6 +20,7 @@ from ggslam.mapping.losses import ImageLoss, KeyframeImages
 from ggslam.mapping.pruning import prune
 from ggslam.mapping.sampling import KeyframeSampler
 from ggslam.mapping.settings import MapperSettings
+from ggslam.mapping.votes import vote_labels
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.cpu import CpuRasterizer

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 from ggslam.errors import ConfigError
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import IdentityClassifier
 
 CERTAIN = 0.9
 """Probability from which an identity vector is an example of its object."""
@@ -77,14 +77,12 @@ def _computed_code(classifier: IdentityClassifier, number: int) -> np.ndarray:
     """Maximises the log-probability of a class, which is concave in the vector, less a small share of its length."""
 
     def loss(vector: np.ndarray) -> tuple[float, np.ndarray]:
-        logits = weight @ vector + bias
-        highest = max(logits.max(), NOTHING_LOGIT)
-        probabilities = np.exp(logits - highest)
-        probabilities /= probabilities.sum() + np.exp(NOTHING_LOGIT - highest)
+        probabilities = exact.probabilities(vector)
         gradient = probabilities @ weight - weight[number] + 2e-4 * vector
         return float(-np.log(probabilities[number] + 1e-300) + 1e-4 * vector @ vector), gradient
 
-    weight, bias = classifier.weight.astype(np.float64), classifier.bias.astype(np.float64)
+    weight = classifier.weight.astype(np.float64)
+    exact = IdentityClassifier(classifier.class_ids, weight, classifier.bias.astype(np.float64))
     return minimize(loss, np.zeros(weight.shape[1]), jac=True, method="L-BFGS-B").x.astype(np.float32)
 
 

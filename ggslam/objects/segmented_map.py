@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.objects.table import ObjectTable
+from ggslam.scene.arrays import arrays_to_bytes, read_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 
@@ -42,9 +41,7 @@ class ObjectVotes:
 
     def to_bytes(self) -> bytes:
         """Content of a file that `from_file` reads (NumPy's .npz)."""
-        out = io.BytesIO()
-        np.savez(out, ids=self.ids, weights=self.weights)
-        return out.getvalue()
+        return arrays_to_bytes(ids=self.ids, weights=self.weights)
 
     @staticmethod
     def from_file(path: str | Path) -> ObjectVotes:
@@ -53,13 +50,7 @@ class ObjectVotes:
         Raises:
             FormatError: missing, damaged, or arrays that do not fit together.
         """
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                ids, weights = arrays["ids"], arrays["weights"]
-        except FileNotFoundError:
-            raise FormatError(f"{path}: file is missing") from None
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise FormatError(f"{path}: not votes written by ggslam: {error}") from None
+        ids, weights = read_arrays(path, "votes", "ids", "weights")
         if ids.ndim != 2 or ids.shape != weights.shape or not ids.shape[1] or not np.isfinite(weights).all():
             raise FormatError(f"{path}: shapes do not fit or weights are not finite: {ids.shape}, {weights.shape}")
         return ObjectVotes(ids.astype(np.uint16), weights.astype(np.float32))

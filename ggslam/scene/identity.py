@@ -8,14 +8,13 @@ be: nothing, with a constant logit. Without it whatever no mask has labelled wou
 
 from __future__ import annotations
 
-import io
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ggslam.errors import FormatError
+from ggslam.scene.arrays import arrays_to_bytes, read_arrays
 
 IDENTITY_CHANNELS = 16
 """Length of an identity vector."""
@@ -89,9 +88,7 @@ class IdentityClassifier:
 
     def to_bytes(self) -> bytes:
         """Content of a file that `from_file` reads (NumPy's .npz)."""
-        out = io.BytesIO()
-        np.savez(out, class_ids=self.class_ids, weight=self.weight, bias=self.bias)
-        return out.getvalue()
+        return arrays_to_bytes(class_ids=self.class_ids, weight=self.weight, bias=self.bias)
 
     @staticmethod
     def from_file(path: str | Path) -> IdentityClassifier:
@@ -100,13 +97,7 @@ class IdentityClassifier:
         Raises:
             FormatError: missing, damaged, or arrays that do not fit together.
         """
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                ids, weight, bias = arrays["class_ids"], arrays["weight"], arrays["bias"]
-        except FileNotFoundError:
-            raise FormatError(f"{path}: file is missing") from None
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise FormatError(f"{path}: not a classifier written by ggslam: {error}") from None
+        ids, weight, bias = read_arrays(path, "a classifier", "class_ids", "weight", "bias")
         if weight.ndim != 2 or ids.shape != (len(weight),) or bias.shape != ids.shape or not np.isfinite(weight).all():
             raise FormatError(
                 f"{path}: shapes do not fit or values are not finite: {ids.shape}, {weight.shape}, {bias.shape}"
