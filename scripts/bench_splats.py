@@ -24,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from held_out import held_out_poses
 from timing import seconds
 
 from ggslam.coding import CodecSettings, CodingReport, EncodedCloud, decode_cloud, encode_cloud
@@ -33,11 +34,9 @@ from ggslam.evaluation.images import score_image
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.pipeline import open_recording_of
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering_jobs import frame_poses
 from ggslam.run_folder import RunFolder
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import inverse
 
 PARTS = ("positions", "sh_0", "sh rest", "opacity", "scale", "rotation", "object ids", "side")
 COLUMNS = ("format", "bytes", "of PLY", "bytes/Gaussian", *PARTS, "PSNR vs original", "SSIM vs original",
@@ -67,16 +66,11 @@ class View:
 
 def held_out_views(folder: RunFolder, recording: Path | None, every: int, gaussians: GaussianMap) -> list[View]:
     """The frames that the run never trained on; of a run that held out none, those that are no keyframes."""
-    record = folder.read_json("keyframes.json")
-    poses, sequence = frame_poses(record), open_recording_of(folder, recording)
-    keyframes, evaluation = {k["frame"] for k in record["keyframes"]}, folder.config().evaluation
-    others = [index for index in sorted(poses) if index not in keyframes]
-    held_out = [index for index in others if evaluation.is_held_out(index)] or others
+    poses, sequence = held_out_poses(folder), open_recording_of(folder, recording)
     views = []
-    for index in held_out[::every]:
-        pose = inverse(poses[index])
+    for index in list(poses)[::every]:
         frame = sequence.frame(index, masks=False)
-        views.append(View(frame, pose, rendering(gaussians, frame, pose)))
+        views.append(View(frame, poses[index], rendering(gaussians, frame, poses[index])))
     return views
 
 

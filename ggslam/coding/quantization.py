@@ -13,6 +13,7 @@ from fractions import Fraction
 
 import numpy as np
 
+from ggslam.coding.grid_points import GridPoints
 from ggslam.errors import ConfigError
 
 GRID_BITS = 21
@@ -41,24 +42,13 @@ class Quantization:
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Grid positions int32 [N, 3] of points [N, 3]."""
-        grid = np.empty(points.shape, np.int32)
-        for axis in range(3):
-            grid[:, axis] = self.apply_along(axis, points[:, axis])
-        return grid
+        return self.of(points).positions()
 
-    def apply_along(self, axis: int, values: np.ndarray) -> np.ndarray:
-        """Grid coordinates int32 [N] of the coordinates [N] along one axis."""
-        first = self.origin[axis]
-        last = None if self.size is None else first + self.size[axis] - 1
-        if self.scale == 1 and np.issubdtype(values.dtype, np.integer):
-            grid = values if values.dtype == np.int32 and _is_int32(first, last) else values.astype(np.int64)
-        else:
-            grid = np.multiply(values, self.scale, dtype=np.float64)
-            grid += ROUNDING
-            np.floor(grid, out=grid)
-        if last is not None:
-            grid = np.clip(grid, first, last)
-        return (grid - first).astype(np.int32, copy=False)
+    def of(self, points: np.ndarray) -> GridPoints:
+        """Points [N, 3] seen on this grid."""
+        size = self.size or (1 << 31,) * 3
+        exact = self.scale == 1 and np.issubdtype(points.dtype, np.integer)
+        return GridPoints(points, self.scale, ROUNDING, self.origin, size, exact)
 
     def restore(self, grid: np.ndarray) -> np.ndarray:
         """Positions float64 [N, 3] of grid positions."""
@@ -77,9 +67,17 @@ class Quantization:
         return exact.limit_denominator(min(_MAX_FIELD, int(_MAX_FIELD / 2 / self.scale))), False
 
 
-def _is_int32(first: int, last: int | None) -> bool:
-    """Whether coordinates clipped to this range can be handled in 32 bits."""
-    return last is not None and first >= -(1 << 31) and last < 1 << 31
+def _extent(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates [3] of points [N, 3]. Rows of many points at once keep the reduction's inner loop
+    long: several times as fast as over axis 0 of [N, 3]."""
+    together = 1024
+    whole = len(points) // together * together
+    blocks = np.ascontiguousarray(points)[:whole].reshape(-1, 3 * together)
+    rest = points[whole:]
+    if not whole:
+        return rest.min(0), rest.max(0)
+    low, high = blocks.min(0).reshape(-1, 3), blocks.max(0).reshape(-1, 3)
+    return np.concatenate([low, rest]).min(0), np.concatenate([high, rest]).max(0)
 
 
 def choose_quantization(
@@ -99,9 +97,7 @@ def choose_quantization(
     Raises:
         ConfigError: a grid of more than 21 bits.
     """
-    columns = [points[:, axis] for axis in range(3)]  # much faster than a reduction over axis 0
-    low = np.asarray(box[0] if box else [c.min() for c in columns], np.float64)
-    high = np.asarray(box[1] if box else [c.max() for c in columns], np.float64)
+    low, high = (np.asarray(corner, np.float64) for corner in box or _extent(points))
     integers = np.issubdtype(points.dtype, np.integer)
     if voxel_size is None:
         longest = float((high / 2 - low / 2).max()) * 2

@@ -67,7 +67,7 @@ def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
     start = time.perf_counter()
     settings = cloud.settings
     rows = None if cloud.slice_numbers is None else np.flatnonzero(cloud.slice_numbers == number)
-    grid = cloud.quantization.apply(cloud.points if rows is None else np.take(cloud.points, rows, axis=0))
+    grid = cloud.quantization.of(cloud.points).positions(rows)
     origin = np.array([grid[:, axis].min() for axis in range(3)], np.int32)
     for axis in range(3):
         grid[:, axis] -= origin[axis]

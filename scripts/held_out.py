@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The frames that a run never trained on, for the benchmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.rendering_jobs import frame_poses
+from ggslam.run_folder import RunFolder
+from ggslam.scene.poses import inverse
+
+
+def held_out_poses(folder: RunFolder) -> dict[int, np.ndarray]:
+    """T_camera_world by frame number; of a run that held out none, those of the frames that are no keyframes."""
+    record = folder.read_json("keyframes.json")
+    poses, keyframes = frame_poses(record), {k["frame"] for k in record["keyframes"]}
+    evaluation = folder.config().evaluation
+    others = [index for index in sorted(poses) if index not in keyframes]
+    return {index: inverse(poses[index]) for index in [i for i in others if evaluation.is_held_out(i)] or others}
