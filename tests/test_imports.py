@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1] / "ggslam"
 BOTTOM = {"scene", "native", "errors"}
-LOWER = {"rendering", "sequences", "formats"}
+LOWER = {"rendering", "sequences", "formats", "features"}
 MIDDLE = {"tracking", "mapping", "evaluation", "reporting", "loops", "objects", "volumes", "submaps", "coding"}
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from ggslam.errors import check_ranges
+from ggslam.features.orb import FeatureSettings
 
 PhotometricMode = Literal["never", "degenerate", "auto", "always"]
 
@@ -164,12 +165,8 @@ class RecoverySettings:
     """A pose short of the convincing overlap is believed only if this share of the textured points was compared."""
     views: int = 2
     """Located frames whose features are matched, the latest first."""
-    features: int = 1000
-    max_hamming: int = 64
-    """ORB features and the largest distance of a match."""
-    reprojection: float = 2.0
-    """RANSAC's inlier distance in pixels of a 320-pixel-wide image."""
-    min_inliers: int = 12
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    """Of the frames, and when their matches make a start."""
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.features.orb import View, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -17,7 +18,6 @@ from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, P
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import FramePoints, extract_points
-from ggslam.tracking.recovery import View, feature_starts
 from ggslam.tracking.settings import DepthNoise, PhotometricMode, TrackerSettings
 
 __all__ = ["Tracker", "TrackerSettings", "TrackingResult", "TrackingStatus"]
@@ -239,8 +239,10 @@ class Tracker:
             best = self._align(points, target, self._pose @ self._velocity, photometric)
         # Feature matches are good to a centimetre or two; the coarse level would slide off along a bare wall.
         starts = [("last pose", self._pose, True)]
-        features = feature_starts(view, self.camera, self._views, self.settings.recovery)
-        starts += [(name, guess, False) for name, guess in features]
+        for number, earlier in enumerate(self._views):
+            pose = pose_from_matches(view, earlier, self.camera, self.settings.recovery.features)
+            if pose is not None:
+                starts.append((f"features of view {number}", pose.T_world_camera, False))
         for name, guess, coarse in starts:
             candidate = self._align(points, target, guess, photometric, coarse)
             if self._better(candidate, best):

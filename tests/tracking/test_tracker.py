@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
+from ggslam.features.orb import FeatureSettings, View, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.tracking.noise import estimate_noise
-from ggslam.tracking.recovery import View, feature_starts
 from ggslam.tracking.settings import DepthNoise, PhotometricSettings, RecoverySettings
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackerSettings, TrackingStatus
@@ -99,11 +99,11 @@ def test_a_jump_is_recovered_by_features() -> None:
 def test_feature_matches_give_the_pose() -> None:
     truth = se3_exp(np.array([0.2, -0.1, 0.1, 0.03, 0.1, -0.1]))
     one, two = wall_view(STILL, True), wall_view(truth, True)
-    starts = feature_starts(
-        View(two.color, two.depth, np.eye(4)), CAMERA, [View(one.color, one.depth, STILL)], RecoverySettings()
+    found = pose_from_matches(
+        View(two.color, two.depth, np.eye(4)), View(one.color, one.depth, STILL), CAMERA, FeatureSettings()
     )
-    assert len(starts) == 1
-    assert error_m(starts[0][1], truth) < 0.04
+    assert found is not None and found.matches >= found.inliers >= FeatureSettings().min_inliers
+    assert error_m(found.T_world_camera, truth) < 0.04
 
 
 def test_nothing_to_match_gives_no_start() -> None:
@@ -112,7 +112,7 @@ def test_nothing_to_match_gives_no_start() -> None:
     textured = View(view.color, view.depth, STILL)
     no_depth = View(view.color, np.zeros((240, 320), np.float32), STILL)
     for frame, earlier in ((blank, textured), (textured, blank), (textured, no_depth)):
-        assert feature_starts(frame, CAMERA, [earlier], RecoverySettings()) == []
+        assert pose_from_matches(frame, earlier, CAMERA, FeatureSettings()) is None
 
 
 def test_an_empty_depth_image_is_lost_and_tracking_goes_on_after_it() -> None:

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Views with ORB features (Rublee et al., ICCV 2011), and the pose of one from another by matches and depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ggslam.errors import check_ranges
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """How many features, and when matches make a pose."""
+
+    count: int = 1000
+    """Features of a view at most."""
+    max_hamming: int = 64
+    """The largest distance of two descriptors that match, of 256."""
+    reprojection: float = 2.0
+    """RANSAC's inlier distance in pixels of a 320-pixel-wide image."""
+    min_inliers: int = 12
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self, {"count": (1, 10**5), "max_hamming": (0, 256), "reprojection": (0.01, 1e3), "min_inliers": (6, 10**5)}
+        )
+
+
+@dataclass(frozen=True)
+class Features:
+    """ORB features: pixels float64 [n, 2], descriptors uint8 [n, 32]."""
+
+    pixels: np.ndarray
+    descriptors: np.ndarray
+
+
+@dataclass
+class View:
+    """A frame as the feature matcher needs it.
+
+    Attributes:
+        color: uint8 [H, W, 3].
+        depth: float32 [H, W], metres.
+        T_world_camera: float64 [4, 4].
+    """
+
+    color: np.ndarray
+    depth: np.ndarray
+    T_world_camera: np.ndarray
+    _features: Features | None = None
+
+    def features(self, settings: FeatureSettings) -> Features:
+        """ORB features, found when first asked for."""
+        if self._features is None:
+            detector = cv2.ORB.create(nfeatures=settings.count, fastThreshold=7)
+            keypoints, found = detector.detectAndCompute(cv2.cvtColor(self.color, cv2.COLOR_RGB2GRAY), None)
+            descriptors = np.zeros((0, 32), np.uint8) if found is None else found
+            self._features = Features(np.array([k.pt for k in keypoints], float).reshape(-1, 2), descriptors)
+        return self._features
+
+
+@dataclass(frozen=True)
+class FeaturePose:
+    """A pose from feature matches.
+
+    Attributes:
+        T_world_camera: float64 [4, 4].
+        matches: features of the two views that match and have depth.
+        inliers: those that agree with the pose.
+    """
+
+    T_world_camera: np.ndarray
+    matches: int
+    inliers: int
+
+
+def pose_from_matches(view: View, known: View, camera: Camera, settings: FeatureSettings) -> FeaturePose | None:
+    """Pose of a view (whose own pose and depth are not used) from its matches with a located one and that one's depth.
+
+    RANSAC with EPnP, then Levenberg-Marquardt. The same images give the same pose.
+
+    Returns:
+        None without enough inliers.
+    """
+    known_features, found = known.features(settings), view.features(settings)
+    if len(known_features.pixels) == 0 or len(found.pixels) == 0:
+        return None
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(known_features.descriptors, found.descriptors)
+    matches = [m for m in matches if m.distance <= settings.max_hamming]
+    pixels = known_features.pixels[[m.queryIdx for m in matches]].reshape(-1, 2)
+    targets = found.pixels[[m.trainIdx for m in matches]].reshape(-1, 2)
+    column, row = np.rint(pixels).astype(int).T
+    z = known.depth[np.clip(row, 0, camera.height - 1), np.clip(column, 0, camera.width - 1)].astype(float)
+    x = (pixels[:, 0] - camera.cx) / camera.fx * z
+    y = (pixels[:, 1] - camera.cy) / camera.fy * z
+    points, targets = np.stack([x, y, z], 1)[z > 0], targets[z > 0]
+    if len(points) < settings.min_inliers:
+        return None
+    cv2.setRNGSeed(0)
+    ok, rotation, translation, inliers = cv2.solvePnPRansac(
+        points, targets, camera.matrix(), None, iterationsCount=300,
+        reprojectionError=settings.reprojection * camera.width / 320, confidence=0.999, flags=cv2.SOLVEPNP_EPNP,
+    )  # fmt: skip
+    if not ok or inliers is None or len(inliers) < settings.min_inliers:
+        return None
+    chosen = inliers[:, 0]
+    rotation, translation = cv2.solvePnPRefineLM(
+        points[chosen], targets[chosen], camera.matrix(), None, rotation, translation
+    )
+    T_view_known = np.eye(4)
+    T_view_known[:3, :3] = cv2.Rodrigues(rotation)[0]
+    T_view_known[:3, 3] = translation[:, 0]
+    return FeaturePose(known.T_world_camera @ inverse(T_view_known), len(points), len(chosen))
