@@ -62,12 +62,12 @@ def write_study(
     """
     if plots:
         require_plotting()
-    make_folder(folder)
     meter = EnergyMeter()
     pictures = _Pictures(cloud, folder)
     rows = []
     for row, decoded in run_sweep(cloud, steps, settings, meter):
         rows.append(row)
+        make_folder(folder)  # now that there is something for it
         pictures.draw(row, decoded)
         if progress is not None:
             progress(row)

@@ -62,6 +62,7 @@ class Sweep(str, Enum):
 
 
 def encode(
+    context: typer.Context,
     source: Annotated[
         Path, typer.Argument(metavar="INPUT", help="PLY, 3DGS PLY or PCD file, or folder that `ggslam run` wrote.")
     ],
@@ -93,13 +94,12 @@ def encode(
     from ggslam.coding import CodecSettings
     from ggslam.coding_jobs import encode_file
 
+    _refuse_ignored(context, preset, sweep)
     settings = CodecSettings(
         qp=qp, chroma_offset=chroma_offset, geometry_scale=geometry_scale, voxel_size=voxel, geometry_bits=bits,
         slices=slices, split="cube" if split is Split.by_octree else split.value, workers=workers,
     )  # fmt: skip
     if sweep is not None:
-        if preset is Preset.splat:
-            raise ConfigError("--sweep goes with the preset pointcloud")
         _study(source, out, settings, ["qp", "geometry"] if sweep is Sweep.both else [sweep.value], plots)
         return
     done = encode_file(source, out, settings, preset.value, rate.value)
@@ -107,6 +107,23 @@ def encode(
     for note in done.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
     console.print(f"wrote {done.path}", highlight=False, markup=False)
+
+
+def _refuse_ignored(context: typer.Context, preset: Preset, sweep: Sweep | None) -> None:
+    """Raises ConfigError for an option that the others leave without effect."""
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    given = {name for name, source in sources.items() if source is not None and source.name != "DEFAULT"}
+    if preset is Preset.splat:
+        for name in ("qp", "chroma_offset", "bits", "sweep"):
+            if name in given:
+                option = name.replace("_", "-")
+                raise ConfigError(f"--{option} goes with --preset pointcloud; the quality of --preset splat is --rate")
+    elif "rate" in given:
+        raise ConfigError("--rate goes with --preset splat; the quality of --preset pointcloud is --qp")
+    if sweep is not None and given & {"qp", "geometry_scale"}:
+        raise ConfigError("--qp and --geometry-scale are what --sweep varies")
+    if sweep is None and "plots" in given:
+        raise ConfigError("--plots goes with --sweep")
 
 
 def _print_report(report: CodingReport) -> None:

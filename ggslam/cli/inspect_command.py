@@ -40,7 +40,7 @@ def inspect(
     samples: int = typer.Option(8, help="Frames to read and look at.", min=1),
 ) -> None:
     """Print what was recognised in a recording, and likely mistakes; of a G-PCC stream, print every unit."""
-    if sequence.is_file():
+    if sequence.is_file() or (sequence.suffix and not sequence.exists()):
         _print_stream(sequence)
         return
     from ggslam.sequences import open_sequence

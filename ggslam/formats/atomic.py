@@ -7,7 +7,7 @@ import errno
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ggslam.errors import RunFolderError
@@ -54,7 +54,8 @@ def atomic_write(path: str | Path, fsync: bool = False) -> Iterator[Path]:
             failure.exit_code = 1
         raise failure from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # a file system that cannot be written: the reason above is the one to tell
+            temporary.unlink(missing_ok=True)
 
 
 def write_bytes(path: str | Path, data: bytes, fsync: bool = False) -> None:

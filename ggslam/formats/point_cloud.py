@@ -9,7 +9,7 @@ numbers; in PCD files packed as rgb or rgba; in 3DGS files the degree-0 coeffici
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +40,7 @@ class ColoredCloud:
         voxel_size: edge of the grid's voxels in metres; points = origin + voxel_size * grid.
         origin: float64 [3], metres.
         left_out: names of the properties that are neither position nor colour nor whole numbers.
+        nowhere: number of points of the file that have no position and were left out.
     """
 
     points: np.ndarray
@@ -49,6 +50,7 @@ class ColoredCloud:
     voxel_size: float | None = None
     origin: np.ndarray | None = None
     left_out: tuple[str, ...] = ()
+    nowhere: int = 0
 
     def __len__(self) -> int:
         return len(self.points)
@@ -78,7 +80,8 @@ def read_point_cloud(path: str | Path) -> ColoredCloud:
         raise FormatError(f"{path}: neither a PLY nor a PCD file (it begins with {start!r})")
     rows = read_pcd(path)
     x, y, z = _named(path, rows, ("x", "y", "z"), "no positions")
-    return _cloud(path, rows[np.isfinite(x) & np.isfinite(y) & np.isfinite(z)], [])
+    somewhere = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    return replace(_cloud(path, rows[somewhere], []), nowhere=int((~somewhere).sum()))
 
 
 def write_point_cloud(

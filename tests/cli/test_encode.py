@@ -220,6 +220,10 @@ def test_mistakes_are_named(ggslam: Ggslam, tmp_path: Path) -> None:
         (("encode", points, tmp_path / "b.bin", "--preset", "splat"), "no Gaussians"),
         (("encode", points, tmp_path / "b.bin", "--voxel", "1e-8"), "voxels"),
         (("encode", points, tmp_path / "b.bin", "--sweep", "qp", "--preset", "splat"), "--sweep"),
+        (("encode", points, tmp_path / "b.bin", "--qp", "22", "--preset", "splat"), "--qp goes with"),
+        (("encode", points, tmp_path / "b.bin", "--rate", "r01"), "--rate goes with"),
+        (("encode", points, tmp_path / "b.bin", "--sweep", "both", "--geometry-scale", "0.5"), "--sweep varies"),
+        (("encode", points, tmp_path / "b.bin", "--no-plots"), "--plots goes with"),
         (("encode", plain, tmp_path / "study", "--sweep", "qp", "--no-plots"), "no colours"),
         (("decode", tmp_path / "none.bin", tmp_path / "b.ply"), "none.bin"),
         (("decode", points, tmp_path / "b.ply"), "points.ply"),
@@ -229,10 +233,30 @@ def test_mistakes_are_named(ggslam: Ggslam, tmp_path: Path) -> None:
         (("decode", stream, tmp_path / "b.ply", "--box", "50 50 50 60 60 60"), "no points in the box"),
         (("decode", stream, tmp_path / "b.ply", "--box", "0 0 0 1 1 1", "--slice", 0), "not both"),
         (("inspect", points), "not a G-PCC stream"),
+        (("inspect", tmp_path / "none.bin"), "cannot read"),
     ):
         code, _, err = ggslam(*words)
         assert code == 2 and expected in err, (words, err)
     assert not (tmp_path / "b.bin").exists() and not (tmp_path / "b.ply").exists()
+
+
+def test_what_is_left_out_is_said(ggslam: Ggslam, tmp_path: Path) -> None:
+    write_point_cloud(tmp_path / "a.pcd", np.array([[0.0, 1, 2], [np.nan, 0, 0], [3, 4, 5]]), {})
+    assert "left out 1 points" in ggslam("encode", tmp_path / "a.pcd", tmp_path / "a.bin")[1]
+    gaussians = GaussianMap()
+    means, quaternions = torch.rand(20, 3), torch.tensor([[1.0, 0, 0, 0]]).repeat(20, 1)
+    gaussians.insert(means, quaternions, torch.full((20, 3), -3.0), torch.zeros(20), torch.rand(20, 3))
+    write_gaussian_ply(tmp_path / "map.ply", gaussians)
+    assert "--preset splat" in ggslam("encode", tmp_path / "map.ply", tmp_path / "b.bin")[1]
+
+
+def test_ctrl_c_is_said(ggslam: Ggslam, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ggslam.coding_jobs.encode_file", interrupted)
+    code, _, err = ggslam("encode", tmp_path / "a.ply", tmp_path / "a.bin")
+    assert code == 130 and err == "interrupted"
 
 
 @pytest.mark.parametrize("command", ["encode", "decode", "inspect"])
