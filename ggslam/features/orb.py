@@ -39,6 +39,22 @@ class Features:
     descriptors: np.ndarray
 
 
+@dataclass(frozen=True)
+class Landmarks:
+    """Features with depth: all of a view that it takes to find a pose relative to it, without its images.
+
+    Attributes:
+        descriptors: uint8 [n, 32].
+        points: float32 [n, 3], in the view's camera frame, metres.
+    """
+
+    descriptors: np.ndarray
+    points: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
 @dataclass
 class View:
     """A frame as the feature matcher needs it.
@@ -62,6 +78,22 @@ class View:
             descriptors = np.zeros((0, 32), np.uint8) if found is None else found
             self._features = Features(np.array([k.pt for k in keypoints], float).reshape(-1, 2), descriptors)
         return self._features
+
+    def landmarks(self, camera: Camera, settings: FeatureSettings) -> Landmarks:
+        """The features that have depth at their nearest pixel."""
+        features = self.features(settings)
+        points = features_in_space(features.pixels, self.depth, camera)
+        seen = points[:, 2] > 0
+        return Landmarks(features.descriptors[seen], points[seen].astype(np.float32))
+
+
+def features_in_space(pixels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """Points in the camera frame, float64 [n, 3], at pixels [n, 2] with the depth [H, W] of the nearest; 0 without."""
+    column, row = np.rint(pixels).astype(int).T
+    z = depth[np.clip(row, 0, camera.height - 1), np.clip(column, 0, camera.width - 1)].astype(float)
+    x = (pixels[:, 0] - camera.cx) / camera.fx * z
+    y = (pixels[:, 1] - camera.cy) / camera.fy * z
+    return np.stack([x, y, z], 1)
 
 
 @dataclass(frozen=True)
@@ -94,11 +126,8 @@ def pose_from_matches(view: View, known: View, camera: Camera, settings: Feature
     matches = [m for m in matches if m.distance <= settings.max_hamming]
     pixels = known_features.pixels[[m.queryIdx for m in matches]].reshape(-1, 2)
     targets = found.pixels[[m.trainIdx for m in matches]].reshape(-1, 2)
-    column, row = np.rint(pixels).astype(int).T
-    z = known.depth[np.clip(row, 0, camera.height - 1), np.clip(column, 0, camera.width - 1)].astype(float)
-    x = (pixels[:, 0] - camera.cx) / camera.fx * z
-    y = (pixels[:, 1] - camera.cy) / camera.fy * z
-    points, targets = np.stack([x, y, z], 1)[z > 0], targets[z > 0]
+    points = features_in_space(pixels, known.depth, camera)
+    points, targets = points[points[:, 2] > 0], targets[points[:, 2] > 0]
     if len(points) < settings.min_inliers:
         return None
     cv2.setRNGSeed(0)

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pose of one view relative to another when both have depth.
+
+Three matches make a pose by aligning their points (Arun, Huang and Blostein, PAMI 1987); RANSAC (Fischler and Bolles,
+CACM 1981) counts the matches that agree with it in the image and in depth; the best is refined on the image. Against
+PnP on the pixels of one view alone, depth on both sides tells wrong matches apart and ties down what a small patch of
+features leaves open: on far-apart views of real rooms more poses are right, and fewer that seem right are wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ggslam.errors import check_ranges
+from ggslam.features.orb import Landmarks
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse
+
+FEWEST = 6
+"""Matches below which nothing is tried."""
+_ALIKE_CONSTANT, _ALIKE_SHARE = 0.03, 0.1
+"""Two matched points lie as far apart in both views, to so many metres plus this share."""
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """When matches agree with a pose."""
+
+    max_hamming: int = 64
+    """The largest distance of two descriptors that match, of 256."""
+    hypotheses: int = 400
+    """Triples of matches that are tried."""
+    reprojection: float = 2.5
+    """Inlier distance in pixels of a 320-pixel-wide image."""
+    depth_constant: float = 0.025
+    depth_square: float = 0.008
+    """Inlier distance in depth, metres: constant + square z^2 (three standard deviations of two structured-light
+    measurements, and a feature's reach)."""
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "max_hamming": (0, 256), "hypotheses": (1, 10**5), "reprojection": (0.01, 1e3),
+            "depth_constant": (1e-4, 10), "depth_square": (0, 10),
+        }  # fmt: skip
+        check_ranges(self, ranges)
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matched points in two camera frames.
+
+    Attributes:
+        old, new: float64 [m, 3], metres, each in its own camera's frame.
+    """
+
+    old: np.ndarray
+    new: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.old)
+
+    def agreeing(
+        self, T_old_new: np.ndarray, camera: Camera, settings: RegistrationSettings, slack: float = 1.0
+    ) -> np.ndarray:
+        """Which matches a pose [..., 4, 4] explains, bool [..., m]; `slack` widens both limits."""
+        T = inverse(T_old_new)
+        moved = np.einsum("...ij,mj->...mi", T[..., :3, :3], self.old) + T[..., None, :3, 3]
+        z = np.maximum(moved[..., 2], 1e-6)
+        seen = pixels_of(self.new, camera)
+        error = np.hypot(
+            camera.fx * moved[..., 0] / z + camera.cx - seen[:, 0],
+            camera.fy * moved[..., 1] / z + camera.cy - seen[:, 1],
+        )
+        depth_error = np.abs(moved[..., 2] - self.new[:, 2])
+        depth_limit = settings.depth_constant + settings.depth_square * self.new[:, 2] ** 2
+        pixel_limit = settings.reprojection * camera.width / 320
+        return (error < slack * pixel_limit) & (depth_error < slack * depth_limit)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A relative pose from matches.
+
+    Attributes:
+        T_old_new: float64 [4, 4].
+        matches: all matches, right or wrong.
+        inliers: bool [m], those that agree with the pose.
+    """
+
+    T_old_new: np.ndarray
+    matches: Matches
+    inliers: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """Number of inliers."""
+        return int(self.inliers.sum())
+
+
+def pixels_of(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Where points [n, 3] in front of the camera fall, float64 [n, 2]."""
+    return points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+
+
+def match(old: Landmarks, new: Landmarks, settings: RegistrationSettings) -> Matches:
+    """Mutually nearest descriptors that are near enough."""
+    pairs: list = []
+    if len(old) and len(new):
+        found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(old.descriptors, new.descriptors)
+        pairs = [(m.queryIdx, m.trainIdx) for m in found if m.distance <= settings.max_hamming]
+    chosen = np.array(pairs, int).reshape(-1, 2)
+    return Matches(old.points[chosen[:, 0]].astype(float), new.points[chosen[:, 1]].astype(float))
+
+
+def register(old: Landmarks, new: Landmarks, camera: Camera, settings: RegistrationSettings) -> Registration:
+    """Pose of a new view relative to an old one. The same landmarks give the same pose.
+
+    Returns:
+        The pose with the most inliers; the identity with none if no three matches make one.
+    """
+    matches = match(old, new, settings)
+    nothing = Registration(np.eye(4), matches, np.zeros(len(matches), bool))
+    hypotheses = _hypotheses(matches, settings) if len(matches) >= FEWEST else np.zeros((0, 4, 4))
+    if not len(hypotheses):
+        return nothing
+    agreeing = matches.agreeing(hypotheses, camera, settings, slack=2.0)
+    best = int(agreeing.sum(1).argmax())
+    T, inliers = hypotheses[best], agreeing[best]
+    for _ in range(3):
+        if inliers.sum() < FEWEST:
+            return nothing
+        T = _refined(T, matches, inliers, camera)
+        inliers = matches.agreeing(T, camera, settings)
+    return Registration(T, matches, inliers)
+
+
+def _hypotheses(matches: Matches, settings: RegistrationSettings) -> np.ndarray:
+    """T_old_new [h, 4, 4] of random triples whose sides are alike in both views."""
+    triples = np.random.default_rng(0).integers(0, len(matches), (settings.hypotheses, 3))
+    a, b = matches.old[triples], matches.new[triples]
+    sides, others = (np.linalg.norm(p - np.roll(p, 1, 1), axis=2) for p in (a, b))
+    alike = np.abs(sides - others) < _ALIKE_SHARE * np.maximum(sides, others) + _ALIKE_CONSTANT
+    chosen = alike.all(1) & (sides.min(1) > 0.1)  # a small triangle says little about rotation
+    a, b = a[chosen], b[chosen]
+    a_mean, b_mean = a.mean(1, keepdims=True), b.mean(1, keepdims=True)
+    U, _, Vt = np.linalg.svd(np.swapaxes(a - a_mean, 1, 2) @ (b - b_mean))
+    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]  # no reflections
+    T = np.tile(np.eye(4), (len(a), 1, 1))
+    T[:, :3, :3] = U @ Vt
+    T[:, :3, 3] = a_mean[:, 0] - np.einsum("nij,nj->ni", T[:, :3, :3], b_mean[:, 0])
+    return T
+
+
+def _refined(T_old_new: np.ndarray, matches: Matches, inliers: np.ndarray, camera: Camera) -> np.ndarray:
+    """The pose with the smallest reprojection error of the inliers near a first one."""
+    T = inverse(T_old_new)
+    rotation, translation = cv2.solvePnPRefineLM(
+        matches.old[inliers], pixels_of(matches.new[inliers], camera), camera.matrix(), None,
+        cv2.Rodrigues(T[:3, :3])[0], T[:3, 3:].copy(),
+    )  # fmt: skip
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+    return inverse(T)
