@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which keyframes the tracker may rely on.
+
+A frame that is aligned to all that was ever mapped hides the drift at the end of a loop: the alignment slides from the
+surface mapped a moment ago onto the one mapped at the beginning, and the step between them is taken for motion.
+Keyframes that were not seen for a while are therefore put aside (inactive) until a closure says how they lie to the
+present ones; ElasticFusion (Whelan et al., RSS 2015) parts its model in active and inactive in the same way, by time.
+Here the measure is the path travelled, in units of the scene's depth, so that a camera that stays in one room keeps
+all of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.errors import check_ranges
+
+
+@dataclass(frozen=True)
+class ActivitySettings:
+    """When keyframes are put aside and taken back."""
+
+    forget_after: float = 5.0
+    """A keyframe is put aside when the camera has travelled this many times the median depth since it looked at the
+    keyframe's surface last."""
+    near: float = 1.0
+    """The camera looks at a keyframe's surface if the middles of what both see are nearer than this many times the
+    mean of their median depths."""
+    batch: int = 8
+    """Keyframes are put aside so many at a time: each time the surface is gathered anew."""
+    spread: int = 3
+    """A keyframe near the camera is taken back if one of so many before or after it is active: neighbours in time lie
+    right to each other."""
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self, {"forget_after": (0, 1e6), "near": (0, 1e3), "batch": (1, 10**6), "spread": (0, 10**6)}
+        )
+
+
+class ActiveKeyframes:
+    """Keeps the set of active keyframes as the camera moves.
+
+    Args:
+        settings: limits.
+    """
+
+    def __init__(self, settings: ActivitySettings | None = None) -> None:
+        self.settings = settings or ActivitySettings()
+        self.active: set[int] = set()
+        self._depths = np.empty(0)
+        self._cameras = np.empty((0, 3))
+        self._middles = np.empty((0, 3))
+        self._seen = np.empty(0)
+        self._path = 0.0
+
+    def __len__(self) -> int:
+        return len(self._depths)
+
+    def add(self, T_world_camera: np.ndarray, median_depth_m: float) -> None:
+        """A keyframe is made at `T_world_camera` [4, 4]. It is active, and the camera is there now."""
+        if len(self):
+            self._path += float(np.linalg.norm(T_world_camera[:3, 3] - self._cameras[-1]))
+        self.active.add(len(self))
+        self._depths = np.append(self._depths, median_depth_m)
+        self._cameras = np.vstack([self._cameras, T_world_camera[:3, 3]])
+        self._middles = np.vstack([self._middles, T_world_camera[:3, 3] + median_depth_m * T_world_camera[:3, 2]])
+        self._seen = np.append(self._seen, self._path)
+        active = np.array(sorted(self.active))
+        self._seen[active[self._near(-1)[active]]] = self._path
+
+    def move(self, T_world_camera: np.ndarray) -> None:
+        """Keyframes were given new poses [K, 4, 4]."""
+        self._cameras = T_world_camera[:, :3, 3].copy()
+        self._middles = self._cameras + self._depths[:, None] * T_world_camera[:, :3, 2]
+
+    def changed(self) -> bool:
+        """Puts aside and takes back what is due; whether the set changed."""
+        s, before = self.settings, set(self.active)
+        limit = s.forget_after * float(np.median(self._depths[-20:]))
+        stale = {k for k in self.active if self._path - self._seen[k] > limit}
+        if len(stale) >= s.batch:
+            self.active -= stale
+        near = set(np.flatnonzero(self._near(-1)).tolist()) - self.active
+        while found := near & {k + d for k in self.active for d in range(-s.spread, s.spread + 1)}:
+            self._take_back(found)
+            near -= found
+        return self.active != before
+
+    def restart(self, number: int) -> None:
+        """After a jump to where keyframe `number` looks: what lies there is active, everything else put aside."""
+        self.active = set()
+        self.activate_around(number)
+
+    def activate_around(self, number: int) -> None:
+        """Takes back keyframe `number` and its neighbours in time that look at the same surface: how they lie to the
+        camera is known now."""
+        near = self._near(number)
+        for step in (-1, 1):
+            k = number
+            while 0 <= k < len(self) and (near[k] or abs(k - number) <= self.settings.spread):
+                self._take_back({k})
+                k += step
+
+    @property
+    def median_depths(self) -> np.ndarray:
+        """Median depth of every keyframe, float64 [K], metres."""
+        return self._depths.copy()
+
+    def inactive(self) -> set[int]:
+        """Numbers of the keyframes put aside."""
+        return set(range(len(self))) - self.active
+
+    def _take_back(self, numbers: set[int]) -> None:
+        self.active |= numbers
+        self._seen[sorted(numbers)] = self._path
+
+    def _near(self, number: int) -> np.ndarray:
+        """Which keyframes look where keyframe `number` looks, bool [K]."""
+        reach = self.settings.near * 0.5 * (self._depths + self._depths[number])
+        return np.linalg.norm(self._middles - self._middles[number], axis=1) < reach

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry as dead reckoning, with the covariance that gathers along it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ggslam.loops.uncertainty import covariance_in_frame
+from ggslam.scene.poses import inverse, orthonormalized
+
+
+@dataclass
+class OdometryTree:
+    """Odometry as dead reckoning: every node hangs on an earlier one.
+
+    `poses` are relative to the first node; `covariances` of their left twists in its frame; `steps` the covariance of
+    the last motion alone, in the frame of the node it starts from.
+    """
+
+    parents: list[int] = field(default_factory=list)
+    poses: list[np.ndarray] = field(default_factory=list)
+    covariances: list[np.ndarray] = field(default_factory=list)
+    steps: list[np.ndarray] = field(default_factory=list)
+
+    @classmethod
+    def rooted(cls) -> OdometryTree:
+        """The first node alone."""
+        return cls([-1], [np.eye(4)], [np.zeros((6, 6))], [np.zeros((6, 6))])
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def add(self, parent: int, T_parent_node: np.ndarray, covariance: np.ndarray) -> None:
+        """The next node, with the covariance [6, 6] of the left twist of its motion in its parent's frame."""
+        self.parents.append(parent)
+        T = orthonormalized(self.poses[parent] @ T_parent_node)
+        moved = covariance_in_frame(covariance, self.poses[parent])
+        self.poses.append(T)
+        self.covariances.append(self.covariances[parent] + moved)
+        self.steps.append(covariance)
+
+    def meeting(self, i: int, j: int) -> int:
+        """The last node that the ways from the first to i and to j share."""
+        while i != j:  # a node comes after its parent
+            if i > j:
+                i = self.parents[i]
+            else:
+                j = self.parents[j]
+        return i
+
+    def covariance_between(self, i: int, j: int) -> np.ndarray:
+        """Covariance [6, 6] of the motion T_i_j by odometry alone, left twist in frame i."""
+        summed = self.covariances[i] + self.covariances[j] - 2 * self.covariances[self.meeting(i, j)]
+        return covariance_in_frame(summed, inverse(self.poses[i]))

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which old keyframes see the same place: an index without vocabulary file and without training.
+
+Words are bits sampled from ORB descriptors (locality-sensitive hashing: P. Indyk, R. Motwani, STOC 1998): descriptors
+alike share most of their bits and so some of their words. An inverted list per word (J. Sivic, A. Zisserman, ICCV
+2003) names the keyframes it was seen in; rare words count more. The keyframes with the best scores are then compared
+by randomised ferns on a thumbnail of colour and depth (B. Glocker et al., TVCG 2015), which prefers like viewpoints:
+they are the ones that can be verified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import chain
+
+import cv2
+import numpy as np
+
+from ggslam.errors import FormatError
+from ggslam.features.orb import Landmarks, View
+from ggslam.loops.settings import PlaceSettings
+from ggslam.scene.camera import Camera
+
+_SEED = 0
+_THUMBNAIL = (40, 30)
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a view is known by.
+
+    Attributes:
+        landmarks: its features with depth.
+        words: int64 [w], sorted.
+        codes: uint8 [ferns].
+    """
+
+    landmarks: Landmarks
+    words: np.ndarray
+    codes: np.ndarray
+
+
+@dataclass(frozen=True)
+class PlaceMatch:
+    """A keyframe that may see the same place; scores above 0, comparable within one query."""
+
+    number: int
+    score: float
+
+
+class PlaceIndex:
+    """Keyframes by what they look like.
+
+    Args:
+        camera: of all views.
+        settings: see `PlaceSettings`.
+    """
+
+    def __init__(self, camera: Camera, settings: PlaceSettings | None = None) -> None:
+        self.camera = camera
+        self.settings = s = settings or PlaceSettings()
+        # RandomState's numbers are the same in every version of numpy: saved codes stay comparable.
+        random = np.random.RandomState(_SEED)
+        self._bits = np.stack([random.permutation(256)[: s.bits] for _ in range(s.tables)])
+        self._fern_pixels = random.randint(0, _THUMBNAIL[0] * _THUMBNAIL[1], s.ferns)
+        self._fern_colors = random.randint(30, 226, (s.ferns, 3))
+        self._fern_depths = random.uniform(s.near, s.far, s.ferns)
+        self._numbers: list[int] = []
+        self._positions: dict[int, int] = {}
+        self._places: list[Place] = []
+        self._codes, self._sizes = np.zeros((16, s.ferns), np.uint8), np.zeros(16)
+        self._lists: dict[int, list[int]] = {}
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._positions
+
+    def __getitem__(self, number: int) -> Place:
+        return self._places[self._positions[number]]
+
+    def describe(self, view: View) -> Place:
+        """What a view is known by; for `add`, `query`, or both."""
+        landmarks = view.landmarks(self.camera, self.settings.features)
+        return Place(landmarks, self._words(landmarks.descriptors), self._fern_codes(view))
+
+    def add(self, number: int, place: Place) -> None:
+        """Keyframe `number` sees `place`. Numbers next to each other are next in time.
+
+        Raises:
+            ValueError: the number is there already.
+        """
+        if number in self._positions:
+            raise ValueError(f"keyframe {number} is in the index already")
+        position = self._positions[number] = len(self._numbers)
+        self._numbers.append(number)
+        self._places.append(place)
+        if position == len(self._codes):
+            self._codes = np.concatenate([self._codes, np.zeros_like(self._codes)])
+            self._sizes = np.concatenate([self._sizes, np.zeros_like(self._sizes)])
+        self._codes[position], self._sizes[position] = place.codes, len(place.words)
+        for word in place.words.tolist():
+            self._lists.setdefault(word, []).append(position)
+
+    def query(
+        self, place: Place, count: int, excluded: Callable[[int], bool] = lambda number: False
+    ) -> list[PlaceMatch]:
+        """The keyframes that look most like a place, best first.
+
+        Args:
+            count: of keyframes at most; those without a common word are never among them.
+            excluded: says of a keyframe's number that it is not wanted: it does not support others either.
+        """
+        scores = self._word_scores(place)
+        best = np.argsort(-scores, kind="stable")
+        chosen: list[int] = []
+        for position in best.tolist():
+            if scores[position] <= 0 or len(chosen) == self.settings.shortlist:
+                break
+            if not excluded(self._numbers[position]):
+                chosen.append(position)
+        alike = (self._codes[chosen] == place.codes).mean(1) if chosen else np.zeros(0)
+        found = {self._numbers[k]: float(scores[k] * a) for k, a in zip(chosen, alike, strict=True)}
+        supported = [PlaceMatch(n, s + self.settings.support * self._neighbour(n, s, found)) for n, s in found.items()]
+        return sorted(supported, key=lambda m: (-m.score, m.number))[:count]
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """All that it takes to find a view again in another run: see `from_arrays`."""
+        landmarks = [place.landmarks for place in self._places]
+        return {
+            "numbers": np.array(self._numbers, np.int32),
+            "counts": np.array([len(marks) for marks in landmarks], np.int32),
+            "descriptors": np.concatenate([marks.descriptors for marks in landmarks] or [np.zeros((0, 32), np.uint8)]),
+            "points": np.concatenate([marks.points for marks in landmarks] or [np.zeros((0, 3), np.float32)]),
+            "codes": self._codes[: len(self)].copy(),
+        }
+
+    @classmethod
+    def from_arrays(
+        cls, camera: Camera, arrays: Mapping[str, np.ndarray], settings: PlaceSettings | None = None
+    ) -> PlaceIndex:
+        """The index that `to_arrays` came from, with the same settings.
+
+        Args:
+            arrays: numbers int32 [n], counts int32 [n], codes uint8 [n, ferns]; of all landmarks, keyframe after
+                keyframe, descriptors uint8 [sum of counts, 32] and points float32 [sum of counts, 3].
+
+        Raises:
+            FormatError: an array is missing or they do not fit each other or the settings.
+        """
+        index = cls(camera, settings)
+        _check_arrays(arrays, index.settings.ferns)
+        starts = np.cumsum(arrays["counts"])[:-1]
+        descriptors, points = (np.split(arrays[name], starts) for name in ("descriptors", "points"))
+        rows = zip(arrays["numbers"].tolist(), descriptors, points, arrays["codes"], strict=False)
+        for number, of_descriptors, of_points, codes in rows:
+            landmarks = Landmarks(of_descriptors.copy(), of_points.copy())
+            index.add(number, Place(landmarks, index._words(of_descriptors), codes.copy()))
+        return index
+
+    # --- parts -------------------------------------------------------------------------------------------------------
+
+    def _words(self, descriptors: np.ndarray) -> np.ndarray:
+        bits = np.unpackbits(descriptors, axis=1)[:, self._bits].astype(np.int64)  # [n, tables, bits]
+        tables = np.arange(self.settings.tables) << self.settings.bits
+        return np.unique(bits @ (1 << np.arange(self.settings.bits)) + tables)
+
+    def _fern_codes(self, view: View) -> np.ndarray:
+        soft = cv2.resize(view.color, _THUMBNAIL, interpolation=cv2.INTER_AREA)
+        color = cv2.GaussianBlur(soft, (0, 0), 0.5).reshape(-1, 3)[self._fern_pixels]
+        depth = cv2.resize(view.depth, _THUMBNAIL, interpolation=cv2.INTER_NEAREST).reshape(-1)[self._fern_pixels]
+        code = (color > self._fern_colors) @ np.array([1, 2, 4]) + 8 * (depth > self._fern_depths)
+        return code.astype(np.uint8)
+
+    def _word_scores(self, place: Place) -> np.ndarray:
+        """Sum of squared inverse document frequencies of the common words over the root of both numbers of words.
+
+        The rarest words are looked up first, until so many entries were read: a query takes no longer in a large index.
+        """
+        lists = [found for word in place.words.tolist() if (found := self._lists.get(word))]
+        lists.sort(key=len)
+        lengths = np.array([len(found) for found in lists], int)
+        read = int(np.searchsorted(np.cumsum(lengths), self.settings.entries, "right"))
+        lists, lengths = lists[:read], lengths[:read]
+        hits = np.fromiter(chain.from_iterable(lists), int, int(lengths.sum()))
+        weights = np.repeat(np.log((1 + len(self)) / lengths) ** 2, lengths)
+        scores = np.bincount(hits, weights, minlength=len(self))
+        return scores / np.sqrt(np.maximum(self._sizes[: len(self)], 1) * max(len(place.words), 1))
+
+    @staticmethod
+    def _neighbour(number: int, score: float, found: Mapping[int, float]) -> float:
+        """The better score of the two keyframes next in time, at most `score`."""
+        return min(score, max(found.get(number - 1, 0.0), found.get(number + 1, 0.0)))
+
+
+def _check_arrays(arrays: Mapping[str, np.ndarray], ferns: int) -> None:
+    expected = {"numbers": (1,), "counts": (1,), "descriptors": (2, 32), "points": (2, 3), "codes": (2, ferns)}
+    for name, (dimensions, *columns) in expected.items():
+        if name not in arrays:
+            raise FormatError(f"places: no array '{name}'")
+        shape = arrays[name].shape
+        if len(shape) != dimensions or list(shape[1:]) != columns:
+            raise FormatError(f"places: '{name}' is {list(shape)}, expected [n{''.join(f', {c}' for c in columns)}]")
+    rows, landmarks = len(arrays["numbers"]), int(arrays["counts"].sum())
+    for name, length in (("counts", rows), ("codes", rows), ("descriptors", landmarks), ("points", landmarks)):
+        if len(arrays[name]) != length:
+            raise FormatError(f"places: '{name}' has {len(arrays[name])} rows, expected {length}")

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The graph of keyframe poses: odometry, closures, and which of the closures to believe.
+
+Two tests decide. Each closure alone must be reachable by drift: the correction it asks for is compared with the summed
+covariance of the odometry between its ends (a chi-square test; closures that err in unison do not pass either). Taken
+from where the closures believed so far have put them, ends are nearer than by dead reckoning; either way will do.
+Those left must agree with each other: graduated non-convexity with truncated least squares, odometry being known
+inliers (H. Yang et al., "Graduated Non-Convexity for Robust Spatial Perception", RA-L 2020, as in GTSAM).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+from scipy.stats import chi2
+
+from ggslam.errors import MissingDependency
+from ggslam.loops.condensed import CondensedGraph, Link
+from ggslam.loops.odometry import OdometryTree
+from ggslam.loops.settings import GraphSettings
+from ggslam.loops.uncertainty import covariance_in_frame, covariance_of
+from ggslam.scene.poses import inverse, se3_log, so3_log
+
+_SHORTEST = 0.01
+"""Metres: standing still counts as a path of this length, so that no motion is held to be exact."""
+
+
+@dataclass(frozen=True)
+class GraphResult:
+    """Poses that satisfy odometry and the believed closures.
+
+    Attributes:
+        poses: float64 [n, 4, 4], T_world_camera of all nodes; the first stays where it was.
+        accepted: numbers of the closures believed.
+        rejected: reason by number of the closures that were not; they are judged anew next time.
+        error_before, error_after: half the squared Mahalanobis length of all residuals of odometry and the believed
+            closures, before and after.
+        seconds: time taken.
+    """
+
+    poses: np.ndarray
+    accepted: tuple[int, ...]
+    rejected: dict[int, str]
+    error_before: float
+    error_after: float
+    seconds: float
+
+
+class PoseGraph:
+    """Keyframe poses, linked by odometry and closures.
+
+    All information matrices are inverse covariances [6, 6] of the left twist (v, w) of a motion T_i_j, translation
+    first: T_true = exp((v, w)) T_i_j, in the axes of frame i about its origin (see `uncertainty`). They are made less
+    sure by what `GraphSettings` says of drift.
+
+    Args:
+        settings: see `GraphSettings`.
+    """
+
+    def __init__(self, settings: GraphSettings | None = None) -> None:
+        self.settings = settings or GraphSettings()
+        self.poses: list[np.ndarray] = []
+        """T_world_camera of every node as last known; `optimise` starts from them and replaces them."""
+        self.loops: list[Link] = []
+        self._tree = OdometryTree()
+
+    def add_node(self, T_world_camera: np.ndarray) -> int:
+        """A keyframe; returns its number. Every node but the first then needs an `add_odometry` of its own."""
+        if len(self._tree) != len(self.poses):
+            raise ValueError(f"node {len(self.poses) - 1} has no odometry yet")
+        self.poses.append(np.array(T_world_camera, float))
+        if len(self.poses) == 1:
+            self._tree = OdometryTree.rooted()
+        return len(self.poses) - 1
+
+    def add_odometry(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> None:
+        """The motion from an earlier node i to the newest node j. It is never doubted.
+
+        Raises:
+            ValueError: j is not the newest node, has odometry already, or i is not before it.
+        """
+        if j != len(self.poses) - 1 or len(self._tree) != j or not 0 <= i < j:
+            raise ValueError(f"odometry {i} to {j}: expected from an older node to the newest, which has none yet")
+        s = self.settings
+        turn = float(np.linalg.norm(so3_log(T_i_j[:3, :3])))
+        path = max(float(np.linalg.norm(T_i_j[:3, 3])) + s.turn_length * turn, _SHORTEST)
+        drift = _isotropic(s.translation_drift * path**0.5, s.rotation_drift_deg * path**0.5)
+        self._tree.add(i, np.array(T_i_j, float), covariance_of(information, covariance_in_frame(drift, T_i_j)))
+
+    def add_loop(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> int:
+        """A closure between two nodes; returns its number. Whether it is believed, `optimise` decides.
+
+        Raises:
+            ValueError: no two different nodes.
+        """
+        if i == j or not (0 <= i < len(self.poses) and 0 <= j < len(self.poses)):
+            raise ValueError(f"closure from {i} to {j}: expected two different ones of {len(self.poses)} nodes")
+        s = self.settings
+        added = covariance_in_frame(_isotropic(s.loop_translation, s.loop_rotation_deg), T_i_j)
+        self.loops.append(Link(i, j, np.array(T_i_j, float), covariance_of(information, added)))
+        return len(self.loops) - 1
+
+    def optimise(self) -> GraphResult:
+        """Judges all closures, also those rejected before, and moves the nodes to agree with the believed ones.
+
+        Raises:
+            MissingDependency: gtsam is not installed.
+            ValueError: the newest node has no odometry.
+        """
+        start = time.perf_counter()
+        if len(self._tree) != len(self.poses):
+            raise ValueError(f"node {len(self.poses) - 1} has no odometry yet")
+        gtsam = _gtsam()
+        far = self._beyond_drift(self.poses, self._beyond_drift(self._tree.poses, range(len(self.loops))))
+        while True:
+            condensed, disagreeing, errors = self._settled(gtsam, far)
+            poses = condensed.all_poses()
+            nearer = self._beyond_drift(poses, far)
+            if len(nearer) == len(far):
+                break
+            far = nearer  # what is out of odometry's reach may be near once the closures before it are closed
+        self.poses = list(poses)
+        rejected = far | disagreeing
+        accepted = tuple(k for k in range(len(self.loops)) if k not in rejected)
+        return GraphResult(poses, accepted, rejected, *errors, time.perf_counter() - start)
+
+    def _beyond_drift(self, poses: Sequence[np.ndarray] | np.ndarray, numbers: Iterable[int]) -> dict[int, str]:
+        """Reason by number of those closures that drift does not explain, given poses [n, 4, 4] to start from."""
+        limit = float(chi2.ppf(self.settings.drift_probability, 6))
+        rejected = {}
+        for number in numbers:
+            loop = self.loops[number]
+            T = inverse(poses[loop.i]) @ poses[loop.j]
+            covariance = self._tree.covariance_between(loop.i, loop.j) + loop.covariance
+            twist = se3_log(loop.T_i_j @ inverse(T))
+            squared = float(twist @ np.linalg.solve(covariance, twist))
+            if squared > limit:
+                shift = float(np.linalg.norm(loop.T_i_j[:3, 3] - T[:3, 3]))
+                turn = float(np.degrees(np.linalg.norm(twist[3:])))
+                rejected[number] = (
+                    f"{shift:.2f} m and {turn:.1f} degrees off, beyond drift: {squared**0.5:.1f} standard deviations, "
+                    f"limit {limit**0.5:.1f}"
+                )
+        return rejected
+
+    def _settled(
+        self, gtsam: ModuleType, far: Mapping[int, str]
+    ) -> tuple[CondensedGraph, dict[int, str], tuple[float, float]]:
+        """The graph settled on those closures not too far that agree; the others' reasons; errors before and after."""
+        candidates = [k for k in range(len(self.loops)) if k not in far]
+        condensed = CondensedGraph(self._tree, self.poses, [self.loops[k] for k in candidates])
+        believed, limit, lengths = condensed.believed(gtsam, self.settings.inlier_probability)
+        disagreeing = {
+            number: f"disagrees with other closures: {length:.1f} standard deviations, limit {limit:.1f}"
+            for number, ok, length in zip(candidates, believed, lengths, strict=True)
+            if not ok
+        }
+        return condensed, disagreeing, condensed.settle(gtsam, believed)
+
+
+def _isotropic(metres: float, degrees: float) -> np.ndarray:
+    """Covariance [6, 6] of standard deviations per axis."""
+    return np.diag([metres**2] * 3 + [np.radians(degrees) ** 2] * 3)
+
+
+def _gtsam() -> ModuleType:
+    try:
+        import gtsam
+    except ImportError:
+        raise MissingDependency("closing loops needs gtsam: pip install gtsam, or run without loops") from None
+    return gtsam
