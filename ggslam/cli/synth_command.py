@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -10,24 +11,49 @@ import typer
 
 from ggslam.cli.console import console, progress_bar
 
-EPILOG = "[bold]Example[/]  ggslam synth demo/room --frames 60"
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam synth demo/room --frames 60
+
+  ggslam synth demo/loop --scene loop
+"""
+
+
+class SceneName(str, Enum):
+    """What to record."""
+
+    room = "room"
+    loop = "loop"
 
 
 def synth(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to write the recording.")],
-    frames: Annotated[int, typer.Option(help="Number of frames.", min=2)] = 60,
+    scene: Annotated[
+        SceneName,
+        typer.Option(
+            help="room: one furnished room; loop: a walk through four rooms and four corridors, back into the first."
+        ),
+    ] = SceneName.room,
+    frames: Annotated[int | None, typer.Option(help="Number of frames; default 60, of the loop 480.", min=2)] = None,
     width: Annotated[int, typer.Option(help="Image width.", min=16)] = 320,
     height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
-    seed: Annotated[int, typer.Option(help="Of room and camera path.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Of textures, camera path and noise.", min=0)] = 0,
+    depth_distortion: Annotated[
+        float | None,
+        typer.Option(help="Fixed error of the depth camera, steps of disparity; default 0, of the loop 0.3."),
+    ] = None,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Depth noise of a Kinect-like sensor.")] = True,
 ) -> None:
-    """Generate a recording: a textured, furnished room with exact poses and instance masks."""
-    from ggslam.sequences.synthetic import write_synthetic_sequence
+    """Generate a recording: textured, furnished rooms with exact poses and instance masks."""
+    from ggslam.sequences.synthetic import SCENES, write_synthetic_sequence
 
+    frames = SCENES[scene.value].frames if frames is None else frames
     with progress_bar() as bar:
         task = bar.add_task("render", total=frames, info="")
         write_synthetic_sequence(
-            folder, frames=frames, width=width, height=height, seed=seed, noise=noise,
+            folder, frames=frames, width=width, height=height, seed=seed, noise=noise, scene=scene.value,
+            depth_distortion=depth_distortion,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
     console.print(f"wrote {folder}: {frames} frames of {width}x{height}", highlight=False, markup=False)

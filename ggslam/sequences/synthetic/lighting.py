@@ -8,6 +8,7 @@ shadows are smooth rather than noisy.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -63,7 +64,14 @@ def bake(scene: Scene) -> LightMaps:
     light = np.zeros((len(position), 3), np.float32)
     light[seen] = _ambient(scene, patches)
     for source in scene.lights:
-        light[seen] += _direct(scene, source, patches)
+        if source.bounds is None:
+            light[seen] += _direct(scene.shapes, source, patches)
+            continue
+        low, high = np.array(source.bounds)
+        inside = np.nonzero(((patches.position >= low) & (patches.position <= high)).all(1))[0]
+        lit = _Patches(patches.position[inside], patches.normal[inside], patches.owner[inside])
+        shapes = [shape if _reaches_into(shape, low, high) else None for shape in scene.shapes]
+        light[seen[inside]] += _direct(shapes, source, lit)
     return _pack(light, sizes)
 
 
@@ -156,8 +164,14 @@ def _ambient(scene: Scene, patches: _Patches) -> np.ndarray:
     return below[:, None] * np.array(scene.ambient_down) + above[:, None] * np.array(scene.ambient_up)
 
 
-def _direct(scene: Scene, light: Light, patches: _Patches) -> np.ndarray:
-    """Light [n, 3] that patches get from an area light."""
+def _reaches_into(shape: Shape, low: np.ndarray, high: np.ndarray) -> bool:
+    """Whether the bounding sphere of a shape meets a box."""
+    centre = shape.T_world_shape[:3, 3]
+    return bool(np.linalg.norm(centre - np.clip(centre, low, high)) < shape.radius())
+
+
+def _direct(shapes: Sequence[Shape | None], light: Light, patches: _Patches) -> np.ndarray:
+    """Light [n, 3] that patches get from an area light; None stands for shapes that hide nothing of it."""
     to_light = (light.points.T[:, None] - patches.position.T[:, :, None]).astype(np.float32)  # [3, n, points]
     squared = (to_light**2).sum(0)
     length = np.sqrt(squared)
@@ -169,8 +183,8 @@ def _direct(scene: Scene, light: Light, patches: _Patches) -> np.ndarray:
     visible = np.ones(strength.shape, bool)
     centre = light.points.mean(0)
     spread = float(np.linalg.norm(light.points - centre, axis=1).max())
-    for number, shape in enumerate(scene.shapes):
-        if shape.casts_shadow:
+    for number, shape in enumerate(shapes):
+        if shape is not None and shape.casts_shadow:
             chosen = patches.shaded(number, shape, centre, spread)
             chosen = chosen[lit[chosen]]
             visible[chosen] &= _first_hits(shape, patches.position[chosen], to_light[:, chosen]) > 1

@@ -137,6 +137,21 @@ class MaterialMaker:
         strength = np.broadcast_to(_step(np.sin(2 * np.pi * count * x) * 12), (256, 256))
         return self.finish(_mix(first, second, strength) * (1 + 0.03 * self.noise(256, 256, 0.6))[..., None], tile)
 
+    def clouded(self, color: Color, contrast: float, tile: float = 2.4) -> Material:
+        """Limewash, carpet, stone: irregular patches of all sizes, no two alike within a tile."""
+        shade = contrast * (0.7 * self.noise(slope=1.1) + 0.5 * self.noise(slope=0.6))
+        hue = 0.25 * contrast * np.stack([self.noise(slope=1.3) for _ in range(3)], -1)
+        return self.finish(np.array(color) * (1 + shade[..., None] + hue), tile)
+
+    def tiles(self, first: Color, second: Color, joint: Color, across: int, tile: float) -> Material:
+        """Square tiles of two colours by turns, each with its own tone; `across` (even) of them a copy."""
+        y, x = np.mgrid[:SIZE, :SIZE] * across / SIZE
+        row, column = y.astype(int), x.astype(int)
+        tone = 1 + 0.10 * self.rng.standard_normal((across, across))[row, column] + 0.05 * self.noise(slope=0.7)
+        image = _mix(first, second, ((row + column) % 2).astype(float)) * tone[..., None]
+        inside = (np.abs(y % 1 - 0.5) < 0.475) & (np.abs(x % 1 - 0.5) < 0.475)
+        return self.finish(np.where(inside[..., None], image, np.array(joint)), tile)
+
     # --- cloth and things --------------------------------------------------------------------------------------------
 
     def fabric(self, color: Color, tile: float = 0.35) -> Material:

@@ -78,6 +78,22 @@ def screen(make: MaterialMaker, ground: Color, lines: int = 14) -> Material:
     return make.finish(image, None, emission=0.75)
 
 
+def diagram(make: MaterialMaker) -> Material:
+    """A whiteboard with boxes, arrows and handwriting."""
+    height, width = 240, 360
+    image = _canvas(height, width, (0.93, 0.94, 0.95)) * (1 + 0.02 * make.noise(height, width, 1.2))[..., None]
+    inks = [(0.15, 0.25, 0.65), (0.70, 0.15, 0.15), (0.12, 0.45, 0.22), (0.1, 0.1, 0.12)]
+    for i in range(9):
+        x, y = 20 + 118 * (i % 3) + int(make.rng.integers(0, 24)), 16 + 76 * (i // 3) + int(make.rng.integers(0, 18))
+        ink = inks[int(make.rng.integers(len(inks)))]
+        cv2.rectangle(image, (x, y), (x + 72, y + 42), ink, 2, cv2.LINE_AA)
+        for line in range(3):
+            ends = (x + 8, y + 10 + 11 * line), (x + int(make.rng.integers(24, 66)), y + 10 + 11 * line)
+            cv2.line(image, *ends, inks[3], 2, cv2.LINE_AA)
+        cv2.arrowedLine(image, (x + 74, y + 20), (x + 100, y + int(make.rng.integers(0, 40))), ink, 2, cv2.LINE_AA)
+    return make.finish(image, None)
+
+
 def door(make: MaterialMaker, color: Color) -> Material:
     """A panelled door."""
     height, width = 400, 180

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
-from ggslam.sequences.synthetic.lighting import bake
+from ggslam.sequences.synthetic.lighting import LightMaps, bake
 from ggslam.sequences.synthetic.materials import Material
 from ggslam.sequences.synthetic.scene import FACES, Kind, Scene
 from ggslam.sequences.synthetic.surfaces import face_sizes, intersect, locate
@@ -33,11 +34,11 @@ class RayImages:
 
 
 class RayCaster:
-    """Renders views of one scene. Light maps and texture pyramids are prepared once."""
+    """Renders views of one scene. Texture pyramids are prepared once, light maps when the first colour is asked for."""
 
     def __init__(self, scene: Scene, seed: int = 0) -> None:
+        self._scene = scene
         self._shapes = scene.shapes
-        self._lights = bake(scene)
         self._kinds = np.array([int(shape.kind) for shape in scene.shapes])
         self._half = np.array([shape.half for shape in scene.shapes], np.float32)
         self._top = np.array([shape.top for shape in scene.shapes], np.float32)
@@ -47,6 +48,10 @@ class RayCaster:
         self._materials: list[Material] = []
         self._pyramids: list[list[np.ndarray]] = []
         self._prepare_faces(np.random.default_rng(seed))
+
+    @cached_property
+    def _lights(self) -> LightMaps:
+        return bake(self._scene)
 
     def _prepare_faces(self, rng: np.random.Generator) -> None:
         """Per face: material, texture coordinates as an affine map of (u, v), and metres per texel."""
@@ -79,19 +84,22 @@ class RayCaster:
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> RayImages:
         """One view. `T_world_camera` [4, 4]."""
-        u = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
-        v = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
         T_shape_camera = self._T_shape_world @ T_world_camera
-        depth, hit = self._trace(u, v, T_shape_camera)
+        depth, mask = self.measure(camera, T_world_camera)
         fine = camera.resized(2 * camera.width, 2 * camera.height)
         u = ((np.arange(fine.width) - fine.cx) / fine.fx).astype(np.float32)
         v = ((np.arange(fine.height) - fine.cy) / fine.fy).astype(np.float32)
         light = self._shade(u, v, *self._trace(u, v, T_shape_camera), T_shape_camera, 1 / fine.fx)
         light = cv2.resize(light, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         color = (1 - np.exp(-_EXPOSURE * light)) ** (1 / 2.2)
-        return RayImages(
-            np.rint(255 * color).astype(np.uint8), np.where(hit >= 0, depth, np.float32(0)), self._instances[hit + 1]
-        )
+        return RayImages(np.rint(255 * color).astype(np.uint8), depth, mask)
+
+    def measure(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Depth and mask of one view, as in `RayImages`, without the cost of light and colour."""
+        u = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
+        v = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
+        depth, hit = self._trace(u, v, self._T_shape_world @ T_world_camera)
+        return np.where(hit >= 0, depth, np.float32(0)), self._instances[hit + 1]
 
     def _trace(self, u: np.ndarray, v: np.ndarray, T_shape_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Depth float32 [H, W] and number of the nearest shape int16 [H, W] (-1: none) on the rays (u, v, 1)."""
@@ -100,8 +108,11 @@ class RayCaster:
         boxes = _outlines(self._bounds, T_shape_camera)
         columns = np.searchsorted(u, boxes[:, (0, 2)])
         rows = np.searchsorted(v, boxes[:, (1, 3)])
+        nearest_depth = self._nearest_depths(T_shape_camera)
         for number in np.nonzero((columns[:, 0] < columns[:, 1]) & (rows[:, 0] < rows[:, 1]))[0]:
             window = (slice(*rows[number]), slice(*columns[number]))
+            if depth[window].max() <= nearest_depth[number]:
+                continue  # hidden behind earlier shapes
             R, o = (part.astype(np.float32) for part in np.split(T_shape_camera[number, :3], [3], 1))
             across, down = u[window[1]][None, :], v[window[0]][:, None]
             direction = [R[k, 0] * across + (R[k, 1] * down + R[k, 2]) for k in range(3)]
@@ -111,6 +122,12 @@ class RayCaster:
             np.copyto(nearest, t, where=closer)
             np.copyto(hit[window], np.int16(number), where=closer)
         return depth, hit
+
+    def _nearest_depths(self, T_shape_camera: np.ndarray) -> np.ndarray:
+        """A lower bound [n] of the depth of each shape: of its bounding box, less a margin for rounding."""
+        R, o = T_shape_camera[:, :3, :3], T_shape_camera[:, :3, 3]
+        middle = -np.einsum("nk,nk->n", R[:, :, 2], o)
+        return middle - np.einsum("nk,nk->n", np.abs(R[:, :, 2]), self._bounds) - 1e-3
 
     def _shade(
         self, u: np.ndarray, v: np.ndarray, depth: np.ndarray, hit: np.ndarray, T_shape_camera: np.ndarray, angle: float

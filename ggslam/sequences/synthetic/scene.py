@@ -72,12 +72,13 @@ class Shape:
 
 @dataclass(frozen=True)
 class Light:
-    """A small area that shines: `points` [n, 3] on it, colour times intensity [3] at 1 m, and the direction it faces
-    (None: all directions)."""
+    """A small area that shines: `points` [n, 3] on it, colour times intensity [3] at 1 m, the direction it faces (None:
+    all directions), and the lowest and highest corner of the space that it lights (None: all there is)."""
 
     points: np.ndarray
     power: Vector
     normal: Vector | None = None
+    bounds: tuple[Vector, Vector] | None = None
 
 
 @dataclass
@@ -92,6 +93,8 @@ class Scene:
         bounds: lowest and highest corner of the inhabited space; what lies outside is never seen and gets no light.
         walk: centre (x, y, z) and radii (x, y) of an ellipse with free space around it, for the camera.
         interest: points [n, 3] worth looking at; the first is where a recording begins.
+        route: [n, 5] x, y, z in metres, heading (from the x axis towards y) and pitch (up) in degrees: a closed way for
+            the camera; headings run on past 360. Empty where the scene is one room.
     """
 
     shapes: list[Shape] = field(default_factory=list)
@@ -102,6 +105,7 @@ class Scene:
     bounds: tuple[Vector, Vector] = ((-1e6, -1e6, -1e6), (1e6, 1e6, 1e6))
     walk: tuple[Vector, tuple[float, float]] = ((0.0, 0.0, 1.4), (0.5, 0.5))
     interest: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    route: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
 
 
 class SceneBuilder:

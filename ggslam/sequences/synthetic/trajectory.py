@@ -3,16 +3,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.synthetic.scene import Scene
 
-TRAJECTORIES = ("loop", "round", "pan")
+TRAJECTORIES = ("loop", "round", "pan", "route")
 LARGEST_STEP, LARGEST_TURN = 0.045, 1.9
 """Metres and degrees between frames that a path keeps to (short recordings see less of the scene)."""
 CLEARANCE = 0.18
 """Metres that the camera stays away from every shape."""
+ROUTE_CLEARANCE = 0.3
+"""The same on a route through several rooms."""
+ROUTE_STEP, ROUTE_TURN = 0.075, 2.5
+"""Metres and degrees between frames that the pace along a route weighs alike: where it turns, the camera is slower."""
+SEEN_AGAIN = 0.14
+"""Share of a route's circuit that is gone a second time: its beginning."""
 
 
 def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int = 0) -> np.ndarray:
@@ -23,7 +33,7 @@ def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int =
         frames: how many.
         trajectory: "loop": once around the ellipse, the view swinging over the points nearest to the first and back, so
             that the end meets the beginning; "round": around the ellipse while the view passes over all the points;
-            "pan": turning on the spot.
+            "pan": turning on the spot; "route": along the scene's route, past its beginning for `SEEN_AGAIN` of it.
         seed: of the unrest.
 
     Raises:
@@ -33,9 +43,11 @@ def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int =
         raise SequenceError(f"trajectory: expected one of {', '.join(TRAJECTORIES)}, found '{trajectory}'")
     if frames < 2:
         raise SequenceError(f"frames: expected at least 2, found {frames}")
+    if trajectory == "route":
+        return _route(scene, frames, seed)
     for size in (1.0, 0.7, 0.45, 0.25, 0.1):
         poses = _path(scene, frames, trajectory, seed, size)
-        if _is_clear(scene, poses[:, :3, 3]):
+        if _is_clear(scene, poses[:, :3, 3], CLEARANCE):
             return poses
     raise SequenceError("the scene leaves the camera no free way: every path comes too near to something")
 
@@ -96,5 +108,48 @@ def _unrest(frames: int, seed: int) -> np.ndarray:
     return values
 
 
-def _is_clear(scene: Scene, positions: np.ndarray) -> bool:
-    return all(shape.distance(positions).min() >= CLEARANCE for shape in scene.shapes)
+def _is_clear(scene: Scene, positions: np.ndarray, clearance: float) -> bool:
+    return all(shape.distance(positions).min() >= clearance for shape in scene.shapes)
+
+
+def _route(scene: Scene, frames: int, seed: int) -> np.ndarray:
+    """Poses [frames, 4, 4] along the closed route of the scene, at an even pace."""
+    if len(scene.route) < 3:
+        raise SequenceError("the scene has no route to follow")
+    where, period = _closed_spline(scene.route)
+    fine = np.linspace(0, period, 4096)
+    step = np.diff(where(fine), axis=0)
+    metres, degrees = np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
+    effort = np.hypot(metres / ROUTE_STEP, degrees / ROUTE_TURN)
+    effort = gaussian_filter1d(effort, 40, mode="wrap")  # the pace changes gently
+    spent = np.concatenate([[0.0], np.cumsum(effort)])
+    wanted = spent[-1] * (1 + SEEN_AGAIN) * np.arange(frames) / frames
+    laps, rest = np.divmod(wanted, spent[-1])
+    values = where(np.asarray(np.interp(rest, spent, fine)))
+    values[:, 3] += 360 * laps
+    unrest = _unrest(frames, seed)
+    position = values[:, :3] + 0.015 * unrest[:, :3]
+    heading = np.radians(values[:, 3]) + 0.014 * unrest[:, 3]
+    tilt = np.radians(values[:, 4]) + 0.012 * unrest[:, 4]
+    forward = np.stack([np.cos(heading) * np.cos(tilt), np.sin(heading) * np.cos(tilt), np.sin(tilt)], 1)
+    if not _is_clear(scene, position, ROUTE_CLEARANCE):
+        raise SequenceError(f"the route leads nearer than {ROUTE_CLEARANCE} m to something")
+    return np.stack([_looking(p, f, 0.012 * u) for p, f, u in zip(position, forward, unrest[:, 5], strict=True)])
+
+
+def _closed_spline(route: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
+    """A smooth function of a parameter from 0 to its period that gives rows of the route and whole turns of heading in
+    between."""
+    closed = np.concatenate([route, route[:1]])
+    turns = 360 * np.rint((closed[-2, 3] - closed[-1, 3]) / 360)
+    closed[-1, 3] += turns
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed[:, :3], axis=0), axis=1) ** 0.5)])
+    drift = turns * at / at[-1]
+    spline = CubicSpline(at, np.column_stack([closed[:, :3], closed[:, 3] - drift, closed[:, 4]]), bc_type="periodic")
+
+    def value(u: np.ndarray) -> np.ndarray:
+        rows = spline(u)
+        rows[:, 3] += turns * u / at[-1]
+        return rows
+
+    return value, float(at[-1])

@@ -17,12 +17,13 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
 from ggslam.sequences.synthetic.raycast import RayCaster
-from ggslam.sequences.synthetic.room import furnished_room
 from ggslam.sequences.synthetic.scene import Scene
-from ggslam.sequences.synthetic.sensor import noisy_color, noisy_depth
+from ggslam.sequences.synthetic.scenes import SCENES, SceneKind
+from ggslam.sequences.synthetic.sensor import disparity_distortion, noisy_color, noisy_depth
 from ggslam.sequences.synthetic.trajectory import camera_path
 
 DEPTH_SCALE = 5000.0
+LARGEST_DISTORTION = 10.0
 FOCAL_LENGTH = 0.75
 """As a share of the image width: 67 degrees of view."""
 
@@ -30,29 +31,34 @@ FOCAL_LENGTH = 0.75
 def write_synthetic_sequence(
     folder: str | Path,
     *,
-    frames: int = 60,
+    frames: int | None = None,
     width: int = 320,
     height: int = 240,
     seed: int = 0,
     noise: bool = True,
-    trajectory: str = "loop",
-    frame_rate: float = 30.0,
-    scene: Scene | None = None,
+    trajectory: str | None = None,
+    frame_rate: float | None = None,
+    scene: Scene | str = "room",
+    depth_distortion: float | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Ray-casts a recording of a furnished room and writes it as rgb/, depth/, masks/, camera.yaml and poses.txt.
+    """Ray-casts a recording of a furnished room or a house: rgb/, depth/, masks/, camera.yaml and poses.txt.
 
     The same arguments give the same recording. The folder appears only when it is complete.
 
     Args:
         folder: to be made; must not exist or be empty, unless `overwrite`.
-        frames, width, height: size of the recording.
+        frames: how many; None: 60 of the room, 480 of the house.
+        width, height: size of the images.
         seed: of textures, the unrest of the hand, and noise.
         noise: depth and colour noise of a sensor; otherwise depth is exact to 0.1 mm.
-        trajectory: see `camera_path`.
-        frame_rate: frames per second, for the timestamps.
-        scene: another scene than the furnished room.
+        trajectory: see `camera_path`; None: "route" through the house, "loop" elsewhere.
+        frame_rate: frames per second, for the timestamps; None: 10 in the house, else 30.
+        scene: "room": a furnished room; "loop": a house with a ring of rooms and corridors; or a scene of one's own,
+            for which None means as for the room.
+        depth_distortion: what the depth camera always measures wrongly, in steps of disparity, see
+            `disparity_distortion`; nothing without noise. None: 0.3 in the house, else 0.
         overwrite: replaces a recording of this generator that is already there.
         progress: called with (frames done, frames).
 
@@ -63,12 +69,19 @@ def write_synthetic_sequence(
         SequenceError: impossible arguments, or the folder cannot be written.
     """
     target = Path(folder)
+    kind = _kind_of(scene)
+    frames = kind.frames if frames is None else frames
+    frame_rate = kind.frame_rate if frame_rate is None else frame_rate
+    trajectory = kind.trajectory if trajectory is None else trajectory
+    distortion = kind.depth_distortion if depth_distortion is None else depth_distortion
+    if not 0 <= distortion <= LARGEST_DISTORTION:
+        raise SequenceError(f"depth_distortion: expected 0 to {LARGEST_DISTORTION:g} steps, found {distortion}")
     if width < 16 or height < 16 or not frame_rate > 0:
         raise SequenceError(
             f"expected at least 16x16 pixels and a positive frame rate, found {width}x{height} and {frame_rate}"
         )
     _check_target(target, overwrite)
-    scene = furnished_room(seed) if scene is None else scene
+    scene = scene if isinstance(scene, Scene) else kind.build(seed)
     poses = camera_path(scene, frames, trajectory, seed)
     focal = FOCAL_LENGTH * width
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
@@ -78,8 +91,8 @@ def write_synthetic_sequence(
     except OSError as error:
         raise SequenceError(f"{target}: cannot be written: {error.strerror}") from None
     try:
-        _write_images(work, scene, camera, poses, seed, noise, progress)
-        _write_description(work, scene, camera, poses, seed, noise, trajectory, frame_rate)
+        _write_images(work, scene, camera, poses, seed, noise, distortion, progress)
+        _write_description(work, scene, camera, poses, seed, noise, trajectory, frame_rate, distortion)
         work.chmod(0o755)  # mkdtemp makes it private
         _put_in_place(work, target)
     except OSError as error:
@@ -87,6 +100,13 @@ def write_synthetic_sequence(
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return target
+
+
+def _kind_of(scene: Scene | str) -> SceneKind:
+    name = "room" if isinstance(scene, Scene) else scene
+    if name not in SCENES:
+        raise SequenceError(f"scene: expected one of {', '.join(SCENES)}, found '{name}'")
+    return SCENES[name]
 
 
 def _put_in_place(work: Path, target: Path) -> None:
@@ -120,17 +140,18 @@ def _check_target(target: Path, overwrite: bool) -> None:
 
 def _write_images(
     folder: Path, scene: Scene, camera: Camera, poses: np.ndarray, seed: int, noise: bool,
-    progress: Callable[[int, int], None] | None,
+    distortion: float, progress: Callable[[int, int], None] | None,
 ) -> None:  # fmt: skip
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir()
     caster = RayCaster(scene, seed)
+    offset = disparity_distortion(camera, distortion, seed) if distortion else 0.0
     for i, pose in enumerate(poses):
         images = caster.render(camera, pose)
         color, depth = images.color, images.depth
         if noise:
             rng = np.random.default_rng([seed, 4, i])
-            color, depth = noisy_color(color, rng), noisy_depth(depth, camera, rng)
+            color, depth = noisy_color(color, rng), noisy_depth(depth, camera, rng, offset)
         raw = np.rint(np.minimum(depth * DEPTH_SCALE, 65535)).astype(np.uint16)
         _write_png(folder / "rgb" / f"{i:06d}.png", cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
         _write_png(folder / "depth" / f"{i:06d}.png", raw)
@@ -147,8 +168,9 @@ def _write_png(path: Path, image: np.ndarray) -> None:
 
 
 def _write_description(
-    folder: Path, scene: Scene, camera: Camera, poses: np.ndarray, seed: int, noise: bool, trajectory: str, rate: float
-) -> None:
+    folder: Path, scene: Scene, camera: Camera, poses: np.ndarray, seed: int, noise: bool, trajectory: str, rate: float,
+    distortion: float,
+) -> None:  # fmt: skip
     description = {
         "generator": f"ggslam synth {__version__}",
         "seed": seed,
@@ -162,6 +184,7 @@ def _write_description(
         "cy": camera.cy,
         "depth_scale": DEPTH_SCALE,
         "frame_rate": rate,
+        **({"depth_distortion": distortion} if distortion and noise else {}),
         "instances": dict(scene.instance_names),
     }
     (folder / "camera.yaml").write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
