@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from ggslam import __version__
 from ggslam.cli import (
+    compare_command,
     decode_command,
     edit_command,
     encode_command,
@@ -50,6 +51,7 @@ def _options(
 _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "run": (run_command.run, run_command.EPILOG), "eval": (eval_command.evaluate, eval_command.EPILOG),
     "render": (render_command.render, render_command.EPILOG), "export": (export_command.export, export_command.EPILOG),
+    "compare": (compare_command.compare, compare_command.EPILOG),
     "edit": (edit_command.edit, edit_command.EPILOG),
     "encode": (encode_command.encode, encode_command.EPILOG), "decode": (decode_command.decode, decode_command.EPILOG),
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),

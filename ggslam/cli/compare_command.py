@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam compare`: two runs side by side, or a run against a cloud or mesh."""
+
+from __future__ import annotations
+
+import json
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ggslam.cli.console import console, table
+from ggslam.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ggslam.comparison import Comparison
+    from ggslam.evaluation.geometry import Overlap
+
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam compare runs/with_loops runs/without_loops
+
+  ggslam compare runs/kitchen scan_of_kitchen.ply --align icp
+
+  ggslam compare runs/a runs/b --align trajectory --thresholds 0.01,0.03 --json difference.json
+"""
+
+
+class AlignmentName(str, Enum):
+    """How A is brought into the frame of B."""
+
+    none = "none"
+    icp = "icp"
+    trajectory = "trajectory"
+
+
+SidePath = Annotated[Path, typer.Argument(metavar="A", help="Folder of a run, or PLY or PCD file: a cloud or a mesh.")]
+ReferencePath = Annotated[Path, typer.Argument(metavar="B", help="The same; the reference.")]
+
+
+def compare(
+    a: SidePath,
+    b: ReferencePath,
+    align: Annotated[
+        AlignmentName,
+        typer.Option(help="none: both are in one frame, as runs of one recording are; icp: A is registered upon B; "
+                     "trajectory: by camera positions at common times."),
+    ] = AlignmentName.none,
+    max_distance: Annotated[
+        float, typer.Option(help="Metres up to which points are partners, for fitness, RMSE and ICP.")
+    ] = 0.05,
+    thresholds: Annotated[str, typer.Option(help="Metres, for precision, recall and F1.")] = "0.01,0.02,0.05",
+    seed: Annotated[int, typer.Option(help="Of random samples.", min=0)] = 0,
+    json_path: Annotated[Path | None, typer.Option("--json", help="File to write all numbers to.")] = None,
+) -> None:  # fmt: skip
+    """Compare two maps: how far apart trajectories and surfaces are, and scores side by side. B is the reference."""
+    from ggslam.comparison import compare as compare_sides
+    from ggslam.formats.atomic import write_text
+
+    found = compare_sides(a, b, align.value, max_distance, _numbers(thresholds), seed)
+    _print(found, max_distance)
+    if json_path is not None:
+        write_text(json_path, json.dumps(found.to_dict(), indent=1) + "\n")
+        console.print(f"wrote {json_path}", highlight=False, markup=False)
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        values = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        values = []
+    if not values:
+        raise ConfigError(f'--thresholds: expected numbers like "0.01,0.02,0.05", found {text!r}')
+    return values
+
+
+def _print(c: Comparison, max_distance: float) -> None:
+    for name, side in (("A", c.a), ("B", c.b)):
+        console.print(f"{name}: {side.path}, {len(side.points)} points", highlight=False, markup=False)
+    console.print(table(f"overlap within {100 * max_distance:g} cm", ["", "fitness", "inlier RMSE"], _overlaps(c)))
+    if c.icp is not None:
+        console.print(
+            f"ICP moves A by {100 * c.icp.moved_m:.2f} cm, {c.icp.turned_deg:.3f} deg", highlight=False, markup=False
+        )
+    else:
+        console.print("ICP: too few points of A lie near B", highlight=False)
+    rows = [[f"{100 * t.threshold_m:g} cm", *(f"{100 * v:.1f} %" for v in (t.precision, t.recall, t.f1))]
+            for t in c.scores.thresholds]  # fmt: skip
+    console.print(table("surfaces of A against B", ["within", "precision", "recall", "F1"], rows))
+    s = c.scores
+    console.print(
+        f"accuracy {100 * s.accuracy_m:.2f} cm (median {100 * s.accuracy_median_m:.2f}), completeness "
+        f"{100 * s.completeness_m:.2f} cm (median {100 * s.completeness_median_m:.2f})", highlight=False
+    )  # fmt: skip
+    console.print(_trajectory_line(c), highlight=False)
+    rows = _metric_rows(c.a.metrics, c.b.metrics)
+    if rows:
+        console.print(table("scores", ["", "A", "B"], rows))
+
+
+def _overlaps(c: Comparison) -> list[list[str]]:
+    def row(name: str, o: Overlap) -> list[str]:
+        return [name, f"{o.fitness:.4f}", f"{100 * o.inlier_rmse_m:.2f} cm"]
+
+    rows = [row("A on B", c.a_on_b), row("B on A", c.b_on_a)]
+    if c.icp is not None and c.b_on_a_after_icp is not None and c.align != "icp":
+        rows += [row("A on B after ICP", c.icp.overlap), row("B on A after ICP", c.b_on_a_after_icp)]
+    return rows
+
+
+def _trajectory_line(c: Comparison) -> str:
+    t = c.trajectory
+    if t is None:
+        both = c.a.trajectory is not None and c.b.trajectory is not None
+        return f"trajectories: {c.common_poses} poses at common times, too few" if both else "trajectories: not of both"
+    return (
+        f"trajectories over {t.frames_compared} common frames: RMSE {100 * t.ate_rmse_m:.2f} cm, max "
+        f"{100 * t.ate_max_m:.2f} cm (aligned), raw {100 * t.ate_raw_rmse_m:.2f} cm; RPE {100 * t.rpe_trans_m:.2f} cm, "
+        f"{t.rpe_rot_deg:.3f} deg"
+    )
+
+
+_METRICS = [
+    ("PSNR held out, dB", ("images", "held_out", "psnr"), 1.0, ".2f"),
+    ("SSIM held out", ("images", "held_out", "ssim"), 1.0, ".3f"),
+    ("LPIPS held out", ("images", "held_out", "lpips"), 1.0, ".3f"),
+    ("depth L1 held out, cm", ("images", "held_out", "depth_l1_m"), 100.0, ".2f"),
+    ("ATE RMSE, cm", ("trajectory", "ate_rmse_m"), 100.0, ".2f"),
+    ("mIoU held out, %", ("segmentation", "held_out", "miou"), 100.0, ".1f"),
+    ("Gaussians", ("map", "gaussians"), 1.0, ".0f"),
+    ("frames/s", ("speed", "frames_per_s"), 1.0, ".1f"),
+    ("peak memory, MB", ("memory", "peak_rss_mb"), 1.0, ".0f"),
+]  # fmt: skip
+
+
+def _metric_rows(a: dict[str, Any] | None, b: dict[str, Any] | None) -> list[list[str]]:
+    """Scores that at least one side has."""
+    rows = []
+    for name, keys, factor, form in _METRICS:
+        values = [_at(side, keys) for side in (a, b)]
+        if any(value is not None for value in values):
+            rows.append([name, *("-" if v is None else format(factor * v, form) for v in values)])
+    return rows
+
+
+def _at(metrics: dict[str, Any] | None, keys: tuple[str, ...]) -> float | None:
+    value: Any = metrics
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value if isinstance(value, (int, float)) else None
