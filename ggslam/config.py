@@ -13,16 +13,18 @@ import typing
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pydantic
 import yaml
 
 from ggslam.errors import ConfigError, check_ranges
 from ggslam.formats.atomic import write_text
+from ggslam.loop_closing import LoopSettings
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.settings import MapperSettings
 from ggslam.object_masks import MaskSettings
+from ggslam.tracking.feature_settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
 from ggslam.tracking.tracker import TrackerSettings
 
@@ -55,12 +57,17 @@ class Config:
     """Threads of the compiled core; 0: the processors this process may use."""
     sh_degree: int = 0
     """Spherical-harmonic degree of the colours, 0 to 3."""
+    tracker: Literal["gicp", "features"] = "gicp"
+    """gicp: G-ICP against the keyframes' points; features: edges and planes in a budget of time, and G-ICP where they
+    do not convince."""
     realtime_fps: float = 0.0
     """0: synchronous. Otherwise frames arrive at this rate like from a camera; tracker and mapper run side by side."""
     refine_iterations: int = 0
     """Optimisation steps after the last frame."""
     tracking: TrackerSettings = field(default_factory=TrackerSettings)
+    features: FeatureTrackerSettings = field(default_factory=FeatureTrackerSettings)
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
+    loops: LoopSettings = field(default_factory=LoopSettings)
     mapping: MapperSettings = field(default_factory=MapperSettings)
     identity: IdentitySettings = field(default_factory=IdentitySettings)
     masks: MaskSettings = field(default_factory=MaskSettings)

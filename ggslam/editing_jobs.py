@@ -35,7 +35,8 @@ from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import joined
 from ggslam.objects.table import ObjectTable
 from ggslam.objects.traces import drop_traces, places
-from ggslam.pipeline import open_recording_of, uninterrupted
+from ggslam.pipeline import uninterrupted
+from ggslam.recordings import open_recording_of
 from ggslam.rendering_jobs import frame_poses, run_camera
 from ggslam.run_folder import MARKER, RunFolder
 from ggslam.scene.camera import Camera

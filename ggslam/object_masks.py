@@ -6,8 +6,8 @@ cleaned and, unless their ids prove consistent over time, matched with the objec
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -169,16 +169,25 @@ def _checked(mask: np.ndarray, frame: Frame) -> np.ndarray:
     return mask
 
 
-def observations(keyframes: list[Keyframe], current: Callable[[np.ndarray], np.ndarray]) -> dict[int, Observation]:
+def observations(
+    keyframes: list[Keyframe],
+    current: Callable[[np.ndarray], np.ndarray],
+    earlier: Mapping[int, Observation] | None = None,
+) -> dict[int, Observation]:
     """First and last frame and number of keyframes in which each object was seen.
 
     Args:
-        keyframes: with masks or without.
+        keyframes: with masks or without; those of another recording (frame -1) are passed over.
         current: object ids -> ids after merges.
+        earlier: what was seen in the recordings that the map began with: views are added, frames stand for objects
+            that are not seen again.
     """
     seen: dict[int, list[int]] = {}
     for keyframe in keyframes:
-        if keyframe.mask is not None:
+        if keyframe.mask is not None and keyframe.frame_index >= 0:
             for i in np.flatnonzero(np.bincount(current(keyframe.mask).reshape(-1))).tolist():
                 seen.setdefault(i, []).append(keyframe.frame_index)
-    return {i: Observation(min(frames), max(frames), len(frames)) for i, frames in seen.items() if i}
+    found = {i: Observation(min(frames), max(frames), len(frames)) for i, frames in seen.items() if i}
+    for i, old in (earlier or {}).items():
+        found[i] = replace(found[i], views=found[i].views + old.views) if i in found else old
+    return found

@@ -8,49 +8,26 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ggslam.config import Config, load_config
-from ggslam.errors import GgslamError, RunFolderError, SequenceError
+from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.progress import Observer, SilentObserver
 from ggslam.realtime import RealtimeSlam
-from ggslam.run_folder import RunFolder, json_ready
+from ggslam.recordings import SequenceRequest, describe
+from ggslam.run_folder import RunFolder
 from ggslam.scoring import score_run
-from ggslam.sequences import Sequence, open_sequence
-from ggslam.slam import Slam, SlamResult
-
-
-@dataclass(frozen=True)
-class SequenceRequest:
-    """Which part of which recording, and how to read it; see `open_sequence`."""
-
-    path: Path
-    format: str | None = None
-    start: int = 0
-    stop: int | None = None
-    stride: int = 1
-    scale: float = 1.0
-    masks: Path | None = None
-    depth_scale: float | None = None
-    on_bad_frame: str = "error"
-
-    def open(self) -> Sequence:
-        """Opens the recording.
-
-        Raises:
-            SequenceError: it cannot be read.
-        """
-        return open_sequence(
-            self.path, format=self.format, start=self.start, stop=self.stop, stride=self.stride, scale=self.scale,
-            masks=self.masks, depth_scale=self.depth_scale, on_bad_frame=self.on_bad_frame,  # type: ignore[arg-type]
-        )  # fmt: skip
+from ggslam.sequences import Sequence
+from ggslam.slam import Slam
+from ggslam.slam_result import SlamResult
+from ggslam.starting import start_in_map
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """A whole run."""
+    """A whole run; with `map` in the map of an earlier one, which grows unless `localize_only`."""
 
     sequence: SequenceRequest
     out: Path | None = None
@@ -58,6 +35,8 @@ class RunRequest:
     overrides: list[str] = field(default_factory=list)
     evaluate: bool = True
     overwrite: bool = False
+    map: Path | None = None
+    localize_only: bool = False
 
 
 @dataclass
@@ -77,6 +56,8 @@ class RunOutcome:
         counts = Counter(frame.status for frame in r.frames)
         parts += [f"{counts[status]} frames {status}" for status in ("recovered", "lost") if counts[status]]
         parts += [f"{len(r.dropped_frames)} frames dropped"] if r.dropped_frames else []
+        closed = sum(event.kind == "closed" for event in r.loop_events)
+        parts += [f"{closed} loop{'s' if closed > 1 else ''} closed"] if closed else []
         return ", ".join(parts)
 
 
@@ -88,16 +69,23 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
         GgslamError: nothing could be done at all: settings, recording or output folder at fault.
     """
     observer = observer or SilentObserver()
-    config = load_config(request.config, request.overrides)
+    config, earlier = load_config(request.config, request.overrides), None
+    if request.localize_only and request.map is None:
+        raise ConfigError("--localize-only needs --map: the run in whose map to localize")
+    if request.map is not None:
+        earlier = RunFolder.open(request.map)
+        config = replace(config, sh_degree=earlier.config().sh_degree)
     sequence = request.sequence.open()
     if request.sequence.masks is not None and not sequence.has_masks:
         raise SequenceError(f"{request.sequence.masks}: none of the masks there belongs to a frame of this run")
     out = request.out if request.out is not None else Path("runs") / sequence.name
+    if earlier is not None and out.resolve() == earlier.path.resolve():
+        raise ConfigError(f"--out {out}: is the map to start in; choose another folder")
     folder = RunFolder.create(out, overwrite=request.overwrite)
     for warning in sequence.warnings:
         observer.note(warning)
     try:
-        result, error = run_slam(sequence, config, observer)
+        result, error = run_slam(sequence, config, observer, earlier, not request.localize_only)
     except GgslamError:  # before the first frame: settings that do not fit the recording, a model that is none
         folder.discard()
         raise
@@ -105,6 +93,8 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
         folder.discard()
         reason = result.frames[0].reason if result.frames else "no frame could be read"
         raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
+    for text in tracking_notes(result):
+        observer.note(text)
     for skipped in sequence.skipped:
         observer.note(f"skipped: {skipped.reason}")
     for problem in sequence.mask_problems.values():
@@ -112,12 +102,28 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
     if sequence.has_masks and config.identity.enabled and config.masks.source != "none" and result.objects is None:
         observer.note("no objects were learned: the masks of the keyframes label nothing")
     with uninterrupted():
-        names = sequence.instance_names
-        folder.save(config, describe(request.sequence, sequence), result, None if error is None else repr(error), names)
+        names = {**_names(earlier), **sequence.instance_names}
+        described = describe(request.sequence, sequence, request.map)
+        folder.save(config, described, result, None if error is None else repr(error), names)
     outcome = RunOutcome(folder, result, error=error)
     if request.evaluate and error is None:
         outcome.metrics = score_run(folder, sequence, observer)
     return outcome
+
+
+def tracking_notes(result: SlamResult) -> list[str]:
+    """What a user should know of loops and lost stretches, a line each."""
+    notes = [
+        f"loop closed at frame {event.frame}: keyframe {event.keyframe} moved {100 * event.moved_m:.1f} cm to keyframe "
+        f"{event.old_keyframe}"
+        for event in result.loop_events if event.kind == "closed"
+    ]  # fmt: skip
+    found = {event.frame: event.reason for event in result.loop_events if event.kind == "found again"}
+    for stretch in result.lost_stretches():
+        after = f"; found again: {found[stretch.after]}" if stretch.after in found else ""
+        ending = after if stretch.after is not None else " and not found again"
+        notes.append(f"lost for {stretch.frames} frames ({stretch.seconds:.2f} s) from frame {stretch.first}{ending}")
+    return notes
 
 
 @contextmanager
@@ -136,11 +142,27 @@ def uninterrupted() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def run_slam(sequence: Sequence, config: Config, observer: Observer) -> tuple[SlamResult, BaseException | None]:
-    """The loop over a recording, synchronous or in real time as the settings say."""
-    observer.begin("track + map", len(sequence))
+def _names(earlier: RunFolder | None) -> dict[int, str]:
+    """Names of the objects of the run that this one began with."""
+    if earlier is None or not earlier.has_objects():
+        return {}
+    return {o.id: o.name for o in earlier.object_table().objects if o.name is not None}
+
+
+def run_slam(
+    sequence: Sequence, config: Config, observer: Observer, earlier: RunFolder | None = None, growing: bool = True
+) -> tuple[SlamResult, BaseException | None]:
+    """The loop over a recording, synchronous or in real time as the settings say; with `earlier` in that run's map,
+    which grows or stays as it is.
+
+    Raises:
+        GgslamError: settings or map do not fit the recording.
+    """
     error: BaseException | None = None
     slam = Slam(sequence.camera, config, sequence.has_masks)
+    if earlier is not None:
+        start_in_map(slam, earlier, growing)
+    observer.begin("track + map" if growing else "localize", len(sequence))
     try:
         if config.realtime_fps > 0:
             RealtimeSlam(slam, config.realtime_fps).run(sequence.stream(masks="lazy"), observer.frame)
@@ -157,43 +179,3 @@ def run_slam(sequence: Sequence, config: Config, observer: Observer) -> tuple[Sl
 def _run_synchronous(slam: Slam, sequence: Sequence, observer: Observer) -> None:
     for frame in sequence.stream(masks="lazy"):  # only those of keyframes are read
         observer.frame(slam.step(frame))
-
-
-def describe(request: SequenceRequest, sequence: Sequence) -> dict[str, Any]:
-    """What `sequence.json` holds: how to open the recording again, and its camera."""
-    masks = None if request.masks is None else request.masks.absolute()
-    values = {**asdict(request), "path": request.path.absolute(), "masks": masks}
-    return {
-        "open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence),
-        "warnings": sequence.warnings, "skipped": [asdict(skipped) for skipped in sequence.skipped],
-        "mask_problems": sequence.mask_problems,
-    }  # fmt: skip
-
-
-def open_recording_of(folder: RunFolder, path: Path | None = None, masks: Path | None = None) -> Sequence:
-    """Opens the recording of a run again, as the run did.
-
-    Args:
-        folder: of the run.
-        path: where the recording is now, if it was moved.
-        masks: folder of masks to use instead of those that the run had.
-
-    Raises:
-        SequenceError: it is not there any more.
-        RunFolderError: the run does not say which it was.
-    """
-    try:
-        record = folder.read_json("sequence.json")
-        values = dict(record["open"])
-        values["path"] = Path(path if path is not None else values["path"])
-        used = masks if masks is not None else values["masks"]
-        values["masks"] = None if used is None else Path(used)
-        request = SequenceRequest(**values)
-    except (KeyError, TypeError) as error:
-        raise RunFolderError(f"{folder.path / 'sequence.json'}: not as ggslam writes it: {error!r}") from None
-    sequence = request.open()
-    found = {"frames": len(sequence), "camera": asdict(sequence.camera)}
-    expected = {name: record.get(name) for name in found}
-    if json_ready(found) != expected:
-        raise RunFolderError(f"{sequence.path}: not the recording of {folder.path}: expected {expected}, found {found}")
-    return sequence

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from ggslam.slam import StepReport
+from ggslam.slam_result import StepReport
 
 
 class Observer(Protocol):

@@ -15,7 +15,8 @@ from collections.abc import Callable, Iterable
 
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
-from ggslam.slam import Slam, StepReport
+from ggslam.slam import Slam
+from ggslam.slam_result import StepReport
 from ggslam.tracking.tracker import TrackingResult
 
 MAX_LAG_FRAMES = 3
@@ -35,7 +36,7 @@ class RealtimeSlam:
     def __init__(self, slam: Slam, frames_per_second: float) -> None:
         self.slam = slam
         self.period = 1.0 / frames_per_second
-        self._jobs: queue.Queue[tuple[Frame, TrackingResult] | None] = queue.Queue()
+        self._jobs: queue.Queue[tuple[Frame, TrackingResult, int] | None] = queue.Queue()
         self._mapper_error: BaseException | None = None
         # The kernels of one context take turns; the tracker must not wait for the mapper's.
         slam.tracker.context = NativeContext(slam.context.threads, slam.context.instruction_set)
@@ -84,7 +85,7 @@ class RealtimeSlam:
         is_keyframe = self._jobs.qsize() < MAX_WAITING and slam.wants_keyframe(frame, tracking)
         if is_keyframe:
             slam.anchor_to(tracking.T_world_camera)
-            self._jobs.put((frame, tracking))
+            self._jobs.put((frame, tracking, slam.moves_followed))
         slam.remember(frame, tracking)
         slam.times.stop()
         return StepReport(slam.frames[-1], is_keyframe, slam.map.count, slam.mapper.last_psnr)
@@ -94,7 +95,7 @@ class RealtimeSlam:
     def _map(self) -> None:
         try:
             while self._insert_next():
-                if self.slam.mapper.keyframes:
+                if self.slam.mapper.keyframes and self.slam.growing:
                     self.slam.mapper.run(1)
         except BaseException as error:  # handed to the caller's thread
             self._mapper_error = error

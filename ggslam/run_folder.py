@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a run leaves on disk. Every file is written to a temporary name and renamed: none is ever half there.
 
+    loops.json       closures and what became of other candidates, stretches in which the camera was lost
     trajectory.txt   TUM: timestamp tx ty tz qx qy qz qw, camera to world, the world being the first camera
     keyframes.json   poses, exposures and frame numbers of the keyframes; how each frame was tracked
     map.ply          Gaussians in the fields of 3DGS
     points.ply       coloured cloud sampled from the map, metres; points_grid.ply: the same in integer grid cells
+    places.npz       what another recording needs to start in this map
     config.yaml      all settings; sequence.json: where the recording was and how it was read
     timing.json      seconds by part; metrics.json: scores; renders/: pictures
 of a run with objects, whose map.ply also holds each Gaussian's object id and identity vector:
@@ -40,7 +42,7 @@ from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
-from ggslam.slam import SlamResult
+from ggslam.slam_result import SlamResult
 
 MARKER = "run.json"
 """Is there if and only if a folder is a run of ggslam."""
@@ -131,18 +133,21 @@ class RunFolder:
         """
         mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish"}
         self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
-        for stale in ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", *OBJECT_FILES):
+        for stale in ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", "places.npz", *OBJECT_FILES):
             (self.path / stale).unlink(missing_ok=True)
         shutil.rmtree(self.path / "renders", ignore_errors=True)
         save_config(config, self.path / "config.yaml")
         self.write_json("sequence.json", sequence)
         self.write_json("timing.json", timing(result))
         self.write_json("keyframes.json", _keyframes(result))
+        self.write_json("loops.json", _loops(result))
         write_tum(self.path / "trajectory.txt", result.timestamps(), result.trajectory())
         if result.objects is None:
             write_gaussian_ply(self.path / "map.ply", result.gaussians)
         else:
             self.save_objects(segmented(result, names))
+        if result.places is not None:
+            write_bytes(self.path / "places.npz", result.places)
         self.write_json(MARKER, {**mark, "complete": error is None, "stopped_by": error})
         # Last and largest; `ggslam export --format points` makes them again from the map.
         write_points(self.path, sample_points(result.gaussians, with_object_id=result.objects is not None))
@@ -187,9 +192,9 @@ class RunFolder:
         except (OSError, yaml.YAMLError) as error:
             raise RunFolderError(f"{path}: cannot be read: {error}") from None
 
-    def gaussians(self) -> GaussianMap:
-        """The map, without optimizer state."""
-        return read_gaussian_ply(self.path / "map.ply", with_moments=False)
+    def gaussians(self, with_moments: bool = False) -> GaussianMap:
+        """The map; optimizer state, if there is room for it, begins anew."""
+        return read_gaussian_ply(self.path / "map.ply", with_moments=with_moments)
 
     def trajectory(self) -> Trajectory:
         """Camera poses of all frames."""
@@ -276,8 +281,9 @@ def timing(result: SlamResult) -> dict[str, Any]:
     return {
         "frames": len(result.frames), "dropped_frames": result.dropped_frames,
         "frames_per_s": result.frames_per_second(),
-        "wall_s": t.wall, "tracking_s": t.tracking, "refinement_s": t.refinement,
-        "tracking_ms_per_frame": 1e3 * t.tracking / frames, "mapping_ms_per_iteration": m.iteration_ms,
+        "wall_s": t.wall, "tracking_s": t.tracking, "loops_s": t.loops, "refinement_s": t.refinement,
+        "tracking_ms_per_frame": 1e3 * t.tracking / frames, "tracking_ms_per_100_frames": t.tracking_ms_by_window(),
+        "mapping_ms_per_iteration": m.iteration_ms,
         "refine_iterations": result.refine_iterations, "mapping": asdict(m), "gaussians": len(result.gaussians),
         "peak_rss_mb": peak_memory_mb(),
     }  # fmt: skip
@@ -287,6 +293,13 @@ def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, in MB (10^6 bytes)."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def _loops(result: SlamResult) -> dict[str, Any]:
+    return {
+        "seconds": result.times.loops, "events": [asdict(event) for event in result.loop_events],
+        "lost": [asdict(stretch) for stretch in result.lost_stretches()],
+    }  # fmt: skip
 
 
 def _keyframes(result: SlamResult) -> dict[str, Any]:

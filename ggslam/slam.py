@@ -10,149 +10,34 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from ggslam.config import Config
 from ggslam.errors import SequenceError
+from ggslam.loop_closing import Correction, LoopCloser
 from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.keyframe import Keyframe
-from ggslam.mapping.mapper import Mapper, MapperTimes
+from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.votes import vote_labels
 from ggslam.native.loader import NativeContext
 from ggslam.object_masks import ObjectMasks, observations
-from ggslam.objects.table import Observation, Supervision
+from ggslam.saved_places import places_to_bytes
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
+from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.scene.poses import inverse
+from ggslam.slam_result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
+from ggslam.tracking.feature_tracker import FeatureTracker
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """What is remembered of every frame.
-
-    Attributes:
-        frame_index, source_index, timestamp: of the `Frame`.
-        keyframe: number of the keyframe its pose hangs on.
-        T_keyframe_camera: float64 [4, 4], pose relative to that keyframe, so that it moves when the keyframe moves.
-        overlap: share of its points that matched the map.
-        rmse_m: root mean square point-to-plane distance of the matched points, metres.
-        status: outcome of tracking.
-        reason: why it was lost or how it was recovered, else empty.
-    """
-
-    frame_index: int
-    source_index: int
-    timestamp: float
-    keyframe: int
-    T_keyframe_camera: np.ndarray
-    overlap: float
-    rmse_m: float
-    status: str
-    reason: str = ""
-
-
-@dataclass
-class StepReport:
-    """What one step did, for the progress line."""
-
-    frame: TrackedFrame
-    is_keyframe: bool
-    gaussians: int
-    psnr: float
-
-
-@dataclass
-class SlamTimes:
-    """Seconds of wall time.
-
-    Attributes:
-        wall: from the first step's begin to the last step's end: reading, tracking, mapping.
-        tracking: spent tracking.
-        refinement: spent on the final refinement, not part of `wall`.
-    """
-
-    wall: float = 0.0
-    tracking: float = 0.0
-    refinement: float = 0.0
-    _started: float | None = None
-
-    def start(self) -> None:
-        """A step begins."""
-        if self._started is None:
-            self._started = time.perf_counter()
-
-    def stop(self) -> None:
-        """A step ends."""
-        if self._started is not None:
-            self.wall = time.perf_counter() - self._started
-
-
-@dataclass(frozen=True)
-class LearnedObjects:
-    """Objects of a run; the Gaussians' `object_id`, `features` and votes belong to them.
-
-    Attributes:
-        classifier: of identity vectors.
-        supervision: what taught them.
-        observations: where each object was seen.
-    """
-
-    classifier: IdentityClassifier
-    supervision: Supervision
-    observations: dict[int, Observation]
-
-
-@dataclass
-class SlamResult:
-    """A run.
-
-    Attributes:
-        gaussians: the map.
-        keyframes: with refined poses.
-        frames: one entry per frame, in order.
-        times: seconds spent tracking and in all.
-        mapper_times: seconds spent mapping, by part.
-        dropped_frames: indices of frames that were not tracked (real-time runs that fell behind).
-        refine_iterations: optimisation steps of the final refinement.
-        objects: what was learned about objects; None if nothing was.
-    """
-
-    gaussians: GaussianMap
-    keyframes: list[Keyframe]
-    frames: list[TrackedFrame]
-    times: SlamTimes
-    mapper_times: MapperTimes
-    dropped_frames: list[int] = field(default_factory=list)
-    refine_iterations: int = 0
-    objects: LearnedObjects | None = None
-
-    def trajectory(self) -> np.ndarray:
-        """T_world_camera of every frame, float64 [n, 4, 4], NaN for lost ones; the world is the first keyframe's
-        camera."""
-        poses = np.full((len(self.frames), 4, 4), np.nan)
-        for pose, f in zip(poses, self.frames, strict=True):
-            # A keyframe may be missing if a real-time run stopped before its mapper had taken it in.
-            if f.status != TrackingStatus.LOST.value and f.keyframe < len(self.keyframes):
-                pose[:] = self.keyframes[f.keyframe].T_world_camera @ f.T_keyframe_camera
-        return poses
-
-    def timestamps(self) -> np.ndarray:
-        """Seconds, float64 [n]."""
-        return np.array([f.timestamp for f in self.frames])
-
-    def frames_per_second(self) -> float:
-        """Frames by wall time, reading the recording included, final refinement and scoring not."""
-        return len(self.frames) / self.times.wall if self.times.wall > 0 else float("nan")
 
 
 @dataclass(frozen=True)
@@ -181,8 +66,11 @@ class Slam:
         wanted = self.config.identity.enabled and self.masks.active
         learner = IdentityLearner(self.config.identity, self.config.seed) if wanted else None
         self.map = GaussianMap(self.config.sh_degree, IDENTITY_CHANNELS if learner else 0)
-        self.tracker = Tracker(camera, self.config.tracking, self.context)
+        self.tracker = make_tracker(camera, self.config, self.context)
         self.surface = MeasuredSurface(self.config.tracking.target, self.context)
+        self.loops: LoopCloser | None = None
+        if self.config.loops.enabled:
+            self.loops = LoopCloser(camera, self.config.loops, self.surface, self.tracker, self.context)
         self.policy = KeyframePolicy(self.config.keyframes)
         self.mapper = Mapper(self.map, self.config.mapping, self.context, self.config.seed, learner)
         self.frames: list[TrackedFrame] = []
@@ -190,8 +78,32 @@ class Slam:
         self.refine_iterations = 0
         self.times = SlamTimes()
         self._anchor = Anchor(-1, np.eye(4))
+        self._keyframes_made = 0
+        self.growing = True
+        """Whether keyframes are made and the map is trained; off: frames are located in the map as it is."""
+        self._moves: list[np.ndarray] = []
+        self._moves_followed = 0
+        self._publishing = threading.Lock()
         self._settled = False
         self._objects: LearnedObjects | None = None
+
+    def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
+        """Starts in a map made before; `surface` and `loops` hold its keyframes already. The camera counts as lost
+        until `loops` finds it.
+
+        Args:
+            gaussians: the map.
+            keyframes: its keyframes.
+            objects: its objects.
+        """
+        self.map, self._objects, self._keyframes_made = gaussians, objects, len(keyframes)
+        self.mapper.adopt(gaussians, keyframes)
+        if objects is None or gaussians.feature_channels != IDENTITY_CHANNELS:
+            self.mapper.identity = None
+        elif self.mapper.identity is not None:
+            self.mapper.identity.resume(objects.classifier)
+        assert self.surface.target is not None
+        self.tracker.start_lost(self.surface.target)
 
     # --- the loop ----------------------------------------------------------------------------------------------------
 
@@ -205,10 +117,10 @@ class Slam:
         tracking = self.track(frame)
         is_keyframe = self.wants_keyframe(frame, tracking)
         if is_keyframe:
-            self.insert(frame, tracking)
+            self.insert(frame, tracking, self.moves_followed)
             self.anchor_to(tracking.T_world_camera)
         self.remember(frame, tracking)
-        if self.mapper.keyframes:
+        if self.mapper.keyframes and self.growing:
             first = is_keyframe and len(self.mapper.keyframes) == 1
             settings = self.config.mapping
             self.mapper.run(settings.first_frame_iterations if first else settings.iterations_per_frame)
@@ -219,7 +131,7 @@ class Slam:
         """Final refinement (`refine_iterations`), then the result. `progress(done, total)` is called now and then."""
         start, before = time.perf_counter(), self.mapper.times.iterations
         try:
-            if self.config.refine_iterations and self.mapper.keyframes:
+            if self.config.refine_iterations and self.mapper.keyframes and self.growing:
                 self.mapper.refine(self.config.refine_iterations, progress)
         finally:  # an interrupted refinement counts for what it did
             self.refine_iterations = self.mapper.times.iterations - before
@@ -230,16 +142,18 @@ class Slam:
         """What there is so far. The first call settles the objects: it is for the end."""
         return SlamResult(
             self.map, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
-            self.refine_iterations, self._learned_objects(),
+            self.refine_iterations, self._learned_objects(), self.loops.events if self.loops else [],
+            places_to_bytes(self),
         )  # fmt: skip
 
     def _learned_objects(self) -> LearnedObjects | None:
         """The last identity steps, and every Gaussian's object; once."""
         identity = self.mapper.identity
-        if self._settled or identity is None or not identity.table.count:
+        if self._settled or identity is None or not identity.table.count or not self.growing:
             return self._objects
         self._settled = True  # if it fails below, the map can still be had by another call
-        seen = observations(self.mapper.keyframes, identity.current)
+        earlier = None if self._objects is None else self._objects.observations
+        seen = observations(self.mapper.keyframes, identity.current, earlier)
         sizes = np.bincount(vote_labels(self.map), minlength=65536)
         noise = self.masks.noise(identity.classifier.class_ids, seen, len(self.mapper.keyframes), sizes)
         identity.forget(self.map, noise)
@@ -251,35 +165,86 @@ class Slam:
     # --- its parts, also used by the real-time loop ------------------------------------------------------------------
 
     def track(self, frame: Frame) -> TrackingResult:
-        """Locates one frame against the current target.
+        """Locates one frame against the current target; a lost one is looked up among all keyframes.
 
         Raises:
             SequenceError: images of another size than the camera's, or of another type than `Frame` says.
         """
         check_frame(frame, self.camera)
         start = time.perf_counter()
+        self._follow_moves()
         result = self.tracker.track(frame)
+        if result.status is TrackingStatus.LOST and self.loops is not None and self.tracker.target is not None:
+            found = self.loops.find(frame, result)
+            if found is not None:
+                result, keyframe = found
+                self._anchor = Anchor(keyframe, self.loops.poses[keyframe].copy())
         if not self.mapper.keyframes and self.tracker.noise is not None:
             self.mapper.depth_sigma = self.tracker.noise.sigma(result.median_depth_m)
-        self.times.tracking += time.perf_counter() - start
+        self.times.tracking_by_frame.append(time.perf_counter() - start)
+        self.times.tracking += self.times.tracking_by_frame[-1]
         return result
+
+    def _follow_moves(self) -> None:
+        """The tracker goes along with corrections of the map made since the last frame."""
+        with self._publishing:
+            target, moves = self.surface.target, self._moves[self._moves_followed :]
+            self._moves_followed = len(self._moves)
+        for T_new_old in moves:
+            self.tracker.move(T_new_old)
+            self.policy.move(T_new_old)
+            self._anchor = Anchor(self._anchor.keyframe, T_new_old @ self._anchor.T_world_camera)
+        if target is not None:
+            self.tracker.set_target(target)
+
+    @property
+    def moves_followed(self) -> int:
+        """How many corrections of the map the newest tracked pose knows of."""
+        return self._moves_followed
 
     def wants_keyframe(self, frame: Frame, tracking: TrackingResult) -> bool:
         """Whether the frame becomes a keyframe: never when lost, and never when held out for scoring (but something
         has to be the first)."""
         held_out = self.policy.kind is not None and self.config.evaluation.is_held_out(frame.index)
-        if held_out or tracking.status is TrackingStatus.LOST:
+        if held_out or tracking.status is TrackingStatus.LOST or not self.growing:
             return False
         return self.policy.decide(frame.index, tracking)
 
-    def insert(self, frame: Frame, tracking: TrackingResult) -> None:
-        """A keyframe goes into the map and into what the tracker aligns to."""
+    def insert(self, frame: Frame, tracking: TrackingResult, moves_followed: int) -> None:
+        """A keyframe goes into the map and into what the tracker aligns to; if it closes a loop, the map is corrected.
+
+        Args:
+            frame: of the keyframe.
+            tracking: where it is.
+            moves_followed: the corrections that this knows of.
+        """
+        for T_new_old in self._moves[moves_followed:]:
+            tracking = replace(tracking, T_world_camera=T_new_old @ tracking.T_world_camera)
         self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
-        self.tracker.set_target(self.surface.add(tracking.points, tracking.T_world_camera))
+        with self._publishing:
+            self.surface.add(tracking.points, tracking.T_world_camera)
+        if self.loops is None:
+            return
+        before = self.loops.seconds
+        correction = self.loops.add(frame, tracking)
+        if correction is not None:
+            self._correct(self.loops, correction)
+        self.times.loops += self.loops.seconds - before
+
+    def _correct(self, loops: LoopCloser, correction: Correction) -> None:
+        """Moves the map after its keyframes, takes out what is double now, and trains both ends of the loop."""
+        self.mapper.move_keyframes(correction.T_new_old)
+        with self._publishing:
+            loops.settle(correction)
+            self._moves.append(correction.T_new_old[-1])
+        self.mapper.mend(
+            sorted(correction.kept & correction.active), sorted(correction.doubted), self.config.loops.repair_iterations
+        )
 
     def anchor_to(self, T_world_camera: np.ndarray) -> None:
-        """From now on poses are remembered relative to this keyframe."""
-        self._anchor = Anchor(self._anchor.keyframe + 1, T_world_camera.copy())
+        """From now on poses are remembered relative to this keyframe, the newest."""
+        self._anchor = Anchor(self._keyframes_made, T_world_camera.copy())
+        self._keyframes_made += 1
 
     def remember(self, frame: Frame, tracking: TrackingResult) -> None:
         """Notes the pose of a frame relative to the newest keyframe."""
@@ -290,6 +255,13 @@ class Slam:
                 tracking.overlap, tracking.rmse_m, tracking.status.value, tracking.reason,
             )
         )  # fmt: skip
+
+
+def make_tracker(camera: Camera, config: Config, context: NativeContext) -> Tracker:
+    """The front-end that the settings name."""
+    if config.tracker == "features":
+        return FeatureTracker(camera, config.tracking, config.features, context)
+    return Tracker(camera, config.tracking, context)
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:

@@ -22,7 +22,7 @@ from held_out import held_out_poses
 
 from ggslam.editing_jobs import Edit, edit_run
 from ggslam.objects.segmented_map import SegmentedMap
-from ggslam.pipeline import open_recording_of
+from ggslam.recordings import open_recording_of
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import vote_label_image
 from ggslam.run_folder import RunFolder

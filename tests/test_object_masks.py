@@ -15,11 +15,13 @@ import pytest
 
 from ggslam.config import load_config
 from ggslam.errors import ConfigError, GgslamError, SequenceError
-from ggslam.pipeline import RunOutcome, RunRequest, SequenceRequest, execute
+from ggslam.pipeline import RunOutcome, RunRequest, execute
 from ggslam.progress import SilentObserver
+from ggslam.recordings import SequenceRequest
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
-from ggslam.slam import Slam, SlamResult
+from ggslam.slam import Slam
+from ggslam.slam_result import SlamResult
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from scramble_masks import scramble_recording  # noqa: E402
@@ -64,8 +66,8 @@ def test_shuffled_ids_become_objects(room: Path, tmp_path: Path) -> None:
     scramble_recording(room, tmp_path / "masks", 0, 0.2, 0.05, 0.01)
     outcome = run(room, tmp_path / "run", masks=tmp_path / "masks", evaluate=False)
     assert table(tmp_path / "run")["supervision"] == "associated masks"
-    from ggslam.pipeline import open_recording_of
     from ggslam.progress import SilentObserver
+    from ggslam.recordings import open_recording_of
     from ggslam.scoring import score_run
 
     truth = open_recording_of(outcome.folder, masks=room / "masks")

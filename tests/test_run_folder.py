@@ -12,7 +12,8 @@ from ggslam.config import load_config
 from ggslam.errors import RunFolderError
 from ggslam.run_folder import RunFolder
 from ggslam.sequences import open_sequence
-from ggslam.slam import Slam, SlamResult
+from ggslam.slam import Slam
+from ggslam.slam_result import SlamResult
 
 
 @pytest.fixture(scope="module")

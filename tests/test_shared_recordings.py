@@ -12,8 +12,9 @@ from typing import Any
 
 import pytest
 
-from ggslam.pipeline import RunRequest, SequenceRequest, execute, open_recording_of
+from ggslam.pipeline import RunRequest, execute
 from ggslam.progress import SilentObserver
+from ggslam.recordings import SequenceRequest, open_recording_of
 from ggslam.run_folder import RunFolder
 from ggslam.scoring import score_run
 

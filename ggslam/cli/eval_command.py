@@ -34,7 +34,7 @@ def evaluate(
     ] = None,
 ) -> None:
     """Score a run against its recording: trajectory, images and objects of keyframes, held-out and all frames."""
-    from ggslam.pipeline import open_recording_of
+    from ggslam.recordings import open_recording_of
     from ggslam.run_folder import RunFolder
     from ggslam.scoring import score_run
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -23,7 +24,16 @@ EPILOG = """
   ggslam run data/redkitchen --scale 0.5 --realtime 10
 
   ggslam run data/redkitchen --set mapping.insertion.opacity=0.7 --set seed=1
+
+  ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
 """
+
+
+class TrackerName(str, Enum):
+    """How frames are located."""
+
+    gicp = "gicp"
+    features = "features"
 
 
 def run(
@@ -45,6 +55,18 @@ def run(
     realtime: Annotated[
         float | None, typer.Option(metavar="FPS", help="Frames arrive at this rate; tracker and mapper side by side.")
     ] = None,
+    tracker: Annotated[
+        TrackerName | None, typer.Option(help="How frames are located: G-ICP (default), or edge and plane features.")
+    ] = None,
+    earlier: Annotated[
+        Path | None, typer.Option("--map", metavar="RUN", help="Start in the map of this run instead of an empty one.")
+    ] = None,
+    localize_only: Annotated[
+        bool, typer.Option("--localize-only", help="With --map: locate the frames, leave the map as it is.")
+    ] = False,
+    loops: Annotated[
+        bool | None, typer.Option("--loops/--no-loops", help="Close loops and look lost frames up (default: yes).")
+    ] = None,
     threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of all random draws.", min=0)] = None,
     skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
@@ -52,12 +74,14 @@ def run(
     overwrite: Annotated[bool, typer.Option(help="Replace a finished run in the output folder.")] = False,
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
-    from ggslam.pipeline import RunRequest, SequenceRequest, execute  # imports torch: only when needed
+    from ggslam.pipeline import RunRequest, execute  # imports torch: only when needed
+    from ggslam.recordings import SequenceRequest
 
     overrides = [*(settings or [])]
     shortcuts = {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
-        "threads": threads, "seed": seed,
+        "threads": threads, "seed": seed, "loops.enabled": loops,
+        "tracker": None if tracker is None else tracker.value,
     }  # fmt: skip
     overrides += [f"{name}={value}" for name, value in shortcuts.items() if value is not None]
     request = RunRequest(
@@ -65,7 +89,8 @@ def run(
             sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, masks=masks,
             depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error",
         ),
-        out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite,
+        out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite, map=earlier,
+        localize_only=localize_only,
     )  # fmt: skip
     with progress_bar() as bar:
         outcome = execute(request, ProgressObserver(bar))

@@ -57,6 +57,12 @@ class ClassTable:
         self._class_of[new] = np.arange(self.count, needed)
         self.count = needed
 
+    def resume(self, classifier: IdentityClassifier) -> None:
+        """Takes over the classes of a classifier, with fresh moments."""
+        self.add(classifier.class_ids)
+        number = self._class_of[classifier.class_ids]
+        self._rows[number, :-1], self._rows[number, -1] = classifier.weight, classifier.bias
+
     def remove(self, object_id: int) -> None:
         """Forgets a class; the last one takes its place."""
         number, last = int(self._class_of[object_id]), self.count - 1

@@ -82,6 +82,10 @@ class IdentityLearner:
         """As trained so far."""
         return self.table.classifier
 
+    def resume(self, classifier: IdentityClassifier) -> None:
+        """Goes on with the classes of a map made before, whose Gaussians bring their vectors and votes."""
+        self.table.resume(classifier)
+
     # --- objects ------------------------------------------------------------------------------------------------------
 
     def current(self, ids: np.ndarray) -> np.ndarray:

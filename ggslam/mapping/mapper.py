@@ -11,6 +11,8 @@ from functools import partial
 import numpy as np
 import torch
 
+from ggslam.mapping.deformation import move_with_keyframes
+from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.exposure import ExposureAdam
 from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.insertion import fill_gaussians, new_gaussians, unexplained
@@ -26,6 +28,7 @@ from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import inverse
 
 FINAL_DECAY = 0.2
 """The last identity steps fall to this share of their length."""
@@ -108,6 +111,36 @@ class Mapper:
         self.times.insertion += time.perf_counter() - start
         self.times.keyframes += 1
         return keyframe
+
+    def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
+        """Goes on with a map made before. Keyframes without images keep their Gaussians but are never trained on."""
+        self.map, self.keyframes = gaussians, keyframes
+        self._pose_optimizers = [PoseAdam() for _ in keyframes]
+        self._exposure_optimizers = [ExposureAdam(self.settings.exposure) for _ in keyframes]
+
+    def move_keyframes(self, T_new_old: np.ndarray) -> None:
+        """Moves keyframes, and with each the Gaussians that it inserted.
+
+        Args:
+            T_new_old: [K, 4, 4], for each keyframe what moves the world about it.
+        """
+        for keyframe, T in zip(self.keyframes, T_new_old, strict=True):
+            keyframe.T_camera_world = inverse(T @ keyframe.T_world_camera)
+        move_with_keyframes(self.map, T_new_old)
+
+    def mend(self, kept: list[int], doubted: list[int], iterations: int) -> None:
+        """After the keyframes were moved so that two ends of a loop meet: drops what the newer end had mapped again,
+        and trains both ends.
+
+        Args:
+            kept: numbers of the keyframes at the older end.
+            doubted: of those that may have mapped the same again.
+            iterations: optimisation steps, on keyframes of either end by turns.
+        """
+        remove_duplicates(self.map, np.array(kept, int), np.array(doubted, int), 2 * self.depth_sigma)
+        ends = [self.keyframes[n] for pair in zip(reversed(doubted), reversed(kept), strict=False) for n in pair]
+        for i in range(iterations if ends else 0):
+            self.iterate(ends[i % len(ends)])
 
     def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None) -> None:
         depth, s = keyframe.depth_m(), self.settings.insertion

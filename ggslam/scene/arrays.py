@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +21,11 @@ def arrays_to_bytes(**arrays: np.ndarray) -> bytes:
     return out.getvalue()
 
 
+def read_all_arrays(path: str | Path, content: str) -> dict[str, np.ndarray]:
+    """All arrays of a file by name; see `read_arrays`."""
+    return _read(path, content, lambda arrays: {name: arrays[name] for name in arrays.files})
+
+
 def read_arrays(path: str | Path, content: str, *names: str) -> list[np.ndarray]:
     """The arrays of these names.
 
@@ -29,9 +36,13 @@ def read_arrays(path: str | Path, content: str, *names: str) -> list[np.ndarray]
     Raises:
         FormatError: missing, damaged, or without one of them.
     """
+    return _read(path, content, lambda arrays: [arrays[name] for name in names])
+
+
+def _read(path: str | Path, content: str, chosen: Callable[[Any], Any]) -> Any:
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return [arrays[name] for name in names]
+            return chosen(arrays)
     except FileNotFoundError:
         raise FormatError(f"{path}: file is missing") from None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:

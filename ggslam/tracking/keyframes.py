@@ -88,6 +88,10 @@ class KeyframePolicy:
         self.kind, self._frame_index, self._T_world_camera = kind, frame_index, tracked.T_world_camera.copy()
         return True
 
+    def move(self, T_new_old: np.ndarray) -> None:
+        """The world about the last keyframe was moved by a correction [4, 4]."""
+        self._T_world_camera = T_new_old @ self._T_world_camera
+
     def _kind(self, frame_index: int, tracked: Tracked) -> KeyframeKind | None:
         s = self.settings
         if self.kind is None:

@@ -10,6 +10,9 @@ G-ICP Gaussian SLAM escapes this by hardly training positions at all, at the pri
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
 import numpy as np
 
 from ggslam.native.loader import NativeContext
@@ -23,8 +26,18 @@ FLATNESS = 0.1
 _OPACITY_LOGIT = 3.0
 
 
+@dataclass
+class _Part:
+    """One keyframe's points and normals in its camera's frame, float32 [n, 3]."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    T_world_camera: np.ndarray
+
+
 class MeasuredSurface:
-    """Keyframes' points gathered into one target, keyframe by keyframe.
+    """Keyframes' points gathered into one target, keyframe by keyframe. Which of the keyframes take part can be
+    chosen, and keyframes can be moved: after a loop was closed the surface is where they are.
 
     Args:
         settings: voxel sizes and bounds.
@@ -33,24 +46,98 @@ class MeasuredSurface:
 
     def __init__(self, settings: TargetSettings, context: NativeContext) -> None:
         self._settings, self._context = settings, context
+        self._parts: list[_Part] = []
+        self.active: set[int] = set()
+        """Numbers of the keyframes that take part."""
         self.target: GicpTarget | None = None
-        """What has been gathered so far; None before the first keyframe. Each `add` makes a new one."""
+        """What has been gathered so far; None before the first keyframe. Each change makes a new one."""
+
+    def __len__(self) -> int:
+        return len(self._parts)
 
     def add(self, points: FramePoints, T_world_camera: np.ndarray) -> GicpTarget:
         """Adds the points of a keyframe seen from `T_world_camera` [4, 4]; returns the new target."""
-        R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
-        sigma = SPACING * points.points[:, 2]
+        part = _Part(points.points.copy(), points.normals.copy(), np.array(T_world_camera, float))
+        self.active.add(len(self._parts))
+        self._parts.append(part)
+        self.target = self._gathered([part], self.target)
+        return self.target
+
+    @property
+    def poses(self) -> np.ndarray:
+        """T_world_camera of the keyframes, float64 [K, 4, 4]."""
+        return np.array([part.T_world_camera for part in self._parts]).reshape(-1, 4, 4)
+
+    def of(self, numbers: Iterable[int]) -> GicpTarget:
+        """A target of these keyframes alone."""
+        return self._gathered([self._parts[number] for number in numbers], None)
+
+    def points(self, numbers: Iterable[int]) -> np.ndarray:
+        """World points float32 [n, 3] of these keyframes."""
+        parts = [self._parts[number] for number in numbers]
+        return np.concatenate([np.empty((0, 3), np.float32), *(_moved(p.points, p.T_world_camera) for p in parts)])
+
+    def arrange(self, active: set[int], T_world_camera: np.ndarray | None = None) -> GicpTarget:
+        """Chooses the keyframes that take part, and with `T_world_camera` [K, 4, 4] where keyframes are; returns the
+        new target."""
+        if T_world_camera is not None:
+            for part, T in zip(self._parts, T_world_camera, strict=True):
+                part.T_world_camera = np.array(T, float)
+        self.active = set(active)
+        self.target = self.of(sorted(self.active))
+        return self.target
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Everything, for a file: points to 1/32767 of the farthest of a keyframe, normals to half a degree."""
+        points = [np.float32(np.abs(p.points).max(initial=1e-6)) for p in self._parts]
+        return {
+            "counts": np.array([len(p.points) for p in self._parts], np.int64),
+            "reach": np.array(points, np.float32),
+            "points": np.concatenate(
+                [np.empty((0, 3), np.int16)]
+                + [np.rint(p.points * (32767 / r)).astype(np.int16) for p, r in zip(self._parts, points, strict=True)]
+            ),
+            "normals": np.concatenate(
+                [np.empty((0, 3), np.int8)] + [np.rint(p.normals * 127).astype(np.int8) for p in self._parts]
+            ),
+            "poses": self.poses,
+        }
+
+    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes over what `to_arrays` gave, all of it active.
+
+        Raises:
+            ValueError: arrays that do not fit together.
+        """
+        counts, poses = arrays["counts"], arrays["poses"]
+        if counts.sum() != len(arrays["points"]) or len(arrays["points"]) != len(arrays["normals"]):
+            raise ValueError("points and normals do not fit their numbers")
+        ends = np.cumsum(counts)[:-1]
+        for q, n, r, T in zip(
+            np.split(arrays["points"], ends), np.split(arrays["normals"], ends), arrays["reach"], poses, strict=True
+        ):
+            normals = n.astype(np.float32)
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+            self._parts.append(_Part(q.astype(np.float32) * (r / np.float32(32767)), normals, T.astype(float)))
+        self.arrange(set(range(len(self._parts))))
+
+    def _gathered(self, parts: list[_Part], base: GicpTarget | None) -> GicpTarget:
+        points = np.concatenate([_moved(p.points, p.T_world_camera) for p in parts])
+        normals = np.concatenate([p.normals @ p.T_world_camera[:3, :3].T for p in parts])
+        sigma = SPACING * np.concatenate([p.points[:, 2] for p in parts])
         log_scales = np.log(sigma)[:, None] + np.log([1.0, 1.0, FLATNESS])
 
         def contiguous(array: np.ndarray) -> np.ndarray:
             return np.ascontiguousarray(array, np.float32)
 
-        self.target = GicpTarget.from_arrays(
-            contiguous(points.points @ R.T + t), contiguous(quaternions_from_normals(points.normals @ R.T)),
-            contiguous(log_scales), np.full(len(points), _OPACITY_LOGIT, np.float32),
-            self._settings, self._context, base=self.target,
+        return GicpTarget.from_arrays(
+            contiguous(points), contiguous(quaternions_from_normals(normals)), contiguous(log_scales),
+            np.full(len(points), _OPACITY_LOGIT, np.float32), self._settings, self._context, base=base,
         )  # fmt: skip
-        return self.target
+
+
+def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def quaternions_from_normals(normals: np.ndarray) -> np.ndarray:

@@ -108,6 +108,10 @@ class Tracker:
         """Frames are aligned to `target` from the next one on."""
         self.target = target
 
+    def start_lost(self, target: GicpTarget) -> None:
+        """Nothing is known of the camera's pose but that it is somewhere at `target`; see `relocate`."""
+        self.target, self._was_lost = target, True
+
     def set_reference(self, reference: PhotometricReference | None) -> None:
         """Grey values are compared with `reference` until the tracker has moved on and takes a frame of its own."""
         self._reference = reference
@@ -150,9 +154,25 @@ class Tracker:
     def move(self, T_new_old: np.ndarray) -> None:
         """Moves the tracker's own pose, after the world about it was moved by a correction [4, 4]."""
         self._pose = orthonormalized(T_new_old @ self._pose)
-        for view in self._views:
+        for view in {id(v): v for v in (*self._views, self._reference_view) if v is not None}.values():
             view.T_world_camera = T_new_old @ view.T_world_camera
         self._reference = None
+
+    def relocate(self, view: View, points: FramePoints, found: AlignmentResult, source: str) -> TrackingResult:
+        """A frame that was lost was located by other means; tracking goes on from there.
+
+        Args:
+            view: the frame.
+            points: of the frame.
+            found: where it is.
+            source: how that is known, for `TrackingResult.reason`.
+        """
+        T = orthonormalized(found.T_world_camera)
+        self._velocity, self._was_lost = np.eye(4), False
+        self._pose = view.T_world_camera = T
+        self._views, self._reference_view, self._reference = [], None, None
+        self._remember(view, points)
+        return TrackingResult(T.copy(), TrackingStatus.RECOVERED, found.overlap, found.rmse, source, points, found)
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
@@ -220,13 +240,19 @@ class Tracker:
     def _acceptable(self, found: AlignmentResult) -> bool:
         """Whether to believe a pose at all. Some overlap can be had anywhere (a floor is a floor), so that a pose short
         of the convincing overlap, or after being lost, must be witnessed by grey values."""
+        if found.status is AlignmentStatus.LOST or found.overlap < self.settings.recovery.min_overlap:
+            return False
+        if self._was_lost:
+            return self._witnessed(found)
+        return self._convincing(found) or self._witnessed(found, tolerance=2)
+
+    def _witnessed(self, found: AlignmentResult, tolerance: float = 1) -> bool:
+        """Whether there is some overlap and the images agree over enough of the frame."""
         recovery = self.settings.recovery
         if found.status is AlignmentStatus.LOST or found.overlap < recovery.min_overlap:
             return False
         seen = found.photometric_share >= recovery.min_share
-        tolerance = 1 if self._was_lost else 2
-        agrees = seen and found.photometric_residual <= tolerance * recovery.convincing_residual
-        return agrees or (self._convincing(found) and not self._was_lost)
+        return seen and found.photometric_residual <= tolerance * recovery.convincing_residual
 
     def _retry(
         self, view: View, points: FramePoints, target: GicpTarget, found: AlignmentResult,

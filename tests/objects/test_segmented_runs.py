@@ -23,12 +23,12 @@ from ggslam.mapping.keyframe import make_keyframe
 from ggslam.mapping.mapper import MapperTimes
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
-from ggslam.pipeline import SequenceRequest, describe
+from ggslam.recordings import SequenceRequest, describe
 from ggslam.run_folder import RunFolder
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
-from ggslam.slam import SlamResult, SlamTimes, TrackedFrame
+from ggslam.slam_result import SlamResult, SlamTimes, TrackedFrame
 
 
 def votes_for(labels: np.ndarray) -> ObjectVotes:

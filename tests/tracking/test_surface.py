@@ -63,3 +63,41 @@ def test_a_new_view_of_a_measured_corner_is_located(threads: int) -> None:
     found = align(points, surface.target, guess, settings.align, DepthNoise(), context)
     assert np.linalg.norm(found.T_world_camera[:3, 3] - truth[:3, 3]) < 1e-3
     assert found.overlap > 0.8
+
+
+def test_keyframes_can_be_moved_and_put_aside() -> None:
+    settings, context = TrackerSettings(), NativeContext(2)
+    poses = [se3_exp(np.array(t, float)) for t in ([0] * 6, [0.1, 0, 0, 0, 0.1, 0], [0, 0.1, 0, 0.1, 0, 0])]
+    points = [extract_points(corner_depth(T), CAMERA, settings.points, DepthNoise(), context) for T in poses]
+    surface, moved = (MeasuredSurface(settings.target, context) for _ in range(2))
+    shift = se3_exp(np.array([0.5, -0.2, 0.1, 0.3, 0.0, 0.2]))
+    for T, p in zip(poses, points, strict=True):
+        surface.add(p, T)
+        moved.add(p, shift @ T)
+    two = surface.arrange({0, 2})
+    only = MeasuredSurface(settings.target, context)
+    only.add(points[0], poses[0])
+    assert len(two) == len(only.add(points[2], poses[2])) and surface.active == {0, 2}
+    assert len(two) == len(moved.of([0, 2])) or abs(len(two) - len(moved.of([0, 2]))) < 0.1 * len(two)
+    np.testing.assert_array_equal(surface.points([0, 1]).shape, (len(points[0]) + len(points[1]), 3))
+    again = surface.arrange({0, 1, 2}, np.stack([shift @ T for T in poses]))
+    assert moved.target is not None
+    a, b = (np.sort(target.voxels()["means"], axis=0) for target in (again, moved.target))
+    np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+def test_a_surface_comes_back_from_its_arrays() -> None:
+    settings, context = TrackerSettings(), NativeContext(2)
+    surface, again = (MeasuredSurface(settings.target, context) for _ in range(2))
+    for twist in ([0.0] * 6, [0.1, 0.05, 0, 0.02, 0.1, 0]):
+        T = se3_exp(np.array(twist))
+        surface.add(extract_points(corner_depth(T), CAMERA, settings.points, DepthNoise(), context), T)
+    again.load(surface.to_arrays())
+    assert again.target is not None and surface.target is not None and again.active == {0, 1}
+    np.testing.assert_allclose(again.points([0, 1]), surface.points([0, 1]), atol=2e-4)
+    truth = se3_exp(np.array([0.08, -0.05, 0.1, 0.05, 0.05, -0.03]))
+    points = extract_points(corner_depth(truth), CAMERA, settings.points, DepthNoise(), context)
+    found = align(points, again.target, truth, settings.align, DepthNoise(), context)
+    assert np.linalg.norm(found.T_world_camera[:3, 3] - truth[:3, 3]) < 1e-3 and found.overlap > 0.8
+    with pytest.raises(ValueError, match="do not fit"):
+        again.load({**surface.to_arrays(), "normals": np.zeros((3, 3), np.int8)})

@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Places, verification and pose graph at work in the loop: what `Slam` asks after each keyframe and when it is lost."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ggslam.errors import check_ranges
+from ggslam.features.orb import View
+from ggslam.loops.activity import ActiveKeyframes, ActivitySettings
+from ggslam.loops.places import Place, PlaceIndex
+from ggslam.loops.pose_graph import PoseGraph
+from ggslam.loops.settings import GraphSettings, PlaceSettings, VerificationSettings
+from ggslam.loops.uncertainty import information_in_frame
+from ggslam.loops.verification import LocalMap, Verification, verify
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse, so3_log
+from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
+from ggslam.tracking.points import FramePoints
+from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.surface import MeasuredSurface
+from ggslam.tracking.tracker import Tracker, TrackingResult
+
+_FIRM = 1e6 * np.eye(6)
+"""Information of a motion that is sure to a millimetre and a milliradian."""
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """When loops are looked for, and when they are believed."""
+
+    enabled: bool = True
+    """Whether loops are closed and lost frames are looked up among all keyframes."""
+    candidates: int = 3
+    """Old keyframes that are tried for a new one, and for a frame that is lost, the likeliest first."""
+    confirmations: int = 2
+    """A loop is closed when so many keyframes in a row have found the same correction."""
+    confirmation_gap: int = 5
+    """In a row: no more than so many keyframes apart."""
+    agreement_m: float = 0.05
+    agreement_deg: float = 2.0
+    """Two corrections are the same if they differ by less where the camera is, metres and degrees."""
+    neighbourhood: int = 3
+    """Keyframes before and after an old one whose points make its local map."""
+    repair_iterations: int = 40
+    """Optimisation steps after a closure, on the keyframes at both of its ends."""
+    activity: ActivitySettings = field(default_factory=ActivitySettings)
+    places: PlaceSettings = field(default_factory=PlaceSettings)
+    verification: VerificationSettings = field(default_factory=VerificationSettings)
+    graph: GraphSettings = field(default_factory=GraphSettings)
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            {
+                "candidates": (1, 1000), "confirmations": (1, 100), "confirmation_gap": (1, 10**6),
+                "agreement_m": (0, 1e3), "agreement_deg": (0, 180), "neighbourhood": (0, 1000),
+                "repair_iterations": (0, 10**6),
+            },
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LoopEvent:
+    """What came of a candidate, or of a frame that was lost.
+
+    Attributes:
+        kind: "closed", "verified" (believed later or never), "refused", "found again".
+        frame: index of the frame.
+        keyframe: number of the newer keyframe (of the one it would become, for a frame found again).
+        old_keyframe: the one it was compared with.
+        reason: in words, with numbers.
+        moved_m: how far the newer end was moved, metres (closed only).
+    """
+
+    kind: str
+    frame: int
+    keyframe: int
+    old_keyframe: int
+    reason: str
+    moved_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Correction:
+    """New keyframe poses after a loop was closed.
+
+    Attributes:
+        T_world_camera: float64 [K, 4, 4].
+        T_new_old: float64 [K, 4, 4], what moves the world about each keyframe.
+        kept: numbers of the keyframes at the older end, whose map stays.
+        doubted: numbers of those that may have mapped the same surface again.
+        active: numbers of the keyframes that the tracker relies on now.
+    """
+
+    T_world_camera: np.ndarray
+    T_new_old: np.ndarray
+    kept: set[int]
+    doubted: set[int]
+    active: set[int]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A verified loop: the newer keyframe, what moves it to where the older end has it, and where it was."""
+
+    keyframe: int
+    T_correction: np.ndarray
+    T_world_camera: np.ndarray
+
+
+class LoopCloser:
+    """Remembers every keyframe's place and odometry; finds loops, and lost frames.
+
+    All methods may be called from tracker and mapper thread.
+
+    Args:
+        camera: of all frames.
+        settings: see `LoopSettings`.
+        surface: the keyframes' points; read, and arranged anew when keyframes are put aside.
+        tracker: whose settings and noise G-ICP works with.
+        context: threads.
+    """
+
+    def __init__(
+        self, camera: Camera, settings: LoopSettings, surface: MeasuredSurface, tracker: Tracker, context: NativeContext
+    ) -> None:
+        self.settings = settings
+        self.events: list[LoopEvent] = []
+        self.seconds = 0.0
+        """Spent here, verification and graph included."""
+        self.graph = PoseGraph(settings.graph)
+        self.places = PlaceIndex(camera, settings.places)
+        self.activity = ActiveKeyframes(settings.activity)
+        self.poses: list[np.ndarray] = []
+        """T_world_camera of the keyframes as tracked and corrected (the mapper refines its own on top)."""
+        self._camera, self._surface, self._tracker, self._context = camera, surface, tracker, context
+        self._verified: list[_Found] = []
+        self._found_at: int | None = None
+        self._lock = threading.RLock()
+
+    # --- keyframes ---------------------------------------------------------------------------------------------------
+
+    def add(self, frame: Frame, tracking: TrackingResult) -> Correction | None:
+        """A keyframe was made of a frame, and its points are in the surface. Puts aside and takes back keyframes.
+
+        Returns:
+            The correction if this closes a loop; `settle` it.
+        """
+        start = time.perf_counter()
+        with self._lock:
+            T = tracking.T_world_camera
+            view = View(frame.color, frame.depth, T)
+            place = self.places.describe(view)
+            self._connect(tracking)
+            self.activity.add(T, tracking.median_depth_m)
+            self.poses.append(T.copy())
+            self.places.add(len(self.poses) - 1, place)
+            correction = self._look_back(frame, place, tracking)
+            if correction is None and self.activity.changed():
+                self._surface.arrange(self.activity.active)
+        self.seconds += time.perf_counter() - start
+        return correction
+
+    def settle(self, correction: Correction) -> None:
+        """Takes over the poses of a correction; the surface is arranged accordingly."""
+        with self._lock:
+            self.poses = list(correction.T_world_camera)
+            self.activity.move(correction.T_world_camera)
+            self._surface.arrange(correction.active, correction.T_world_camera)
+            self._verified.clear()
+
+    def _connect(self, tracking: TrackingResult) -> None:
+        """The new keyframe's node, tied to the one before it, or to where a lost camera was found again."""
+        T, number = tracking.T_world_camera, len(self.poses)
+        self.graph.add_node(T)
+        before = number - 1 if self._found_at is None else self._found_at
+        self._found_at = None
+        if before >= 0:
+            T_before_world = inverse(self.poses[before])
+            information = _FIRM  # without an alignment, what drift allows for is all that is unsure
+            if tracking.alignment is not None:
+                information = information_in_frame(tracking.alignment.information, T_before_world)
+            self.graph.add_odometry(before, number, T_before_world @ T, information)
+
+    def _look_back(self, frame: Frame, place: Place, tracking: TrackingResult) -> Correction | None:
+        number, s = len(self.poses) - 1, self.settings
+        if len(self.activity.active) == len(self.poses):
+            return None  # everything is in view of the tracker: there is nothing to come back to
+        for match in self.places.query(place, s.candidates, self.activity.active.__contains__):
+            found, _ = self._verify(tracking.points, place, match.number)
+            if not found.accepted:
+                if found.inliers >= s.verification.min_inliers:  # others were never likely
+                    self.events.append(LoopEvent("refused", frame.index, number, match.number, found.reason))
+                continue
+            reason = f"{found.inliers} features, {found.overlap:.0%} of the voxels, RMSE {1e3 * found.rmse:.1f} mm"
+            self.events.append(LoopEvent("verified", frame.index, number, match.number, reason))
+            loop = self.graph.add_loop(match.number, number, found.T_old_new, found.information)
+            correction = self.poses[match.number] @ found.T_old_new @ inverse(self.poses[number])
+            self._verified.append(_Found(number, correction, self.poses[number]))
+            return self._close(frame, match.number, loop) if self._confirmed() else None
+        return None
+
+    def _verify(
+        self, points: FramePoints, place: Place, old: int
+    ) -> tuple[Verification, AlignmentResult | None]:
+        """Whether a frame sees what keyframe `old` saw, and the last alignment to the surface there."""
+        around = self._around(old)
+        target, T_world_old = self._surface.of(around), self.poses[old]
+        T_old_world, last = inverse(T_world_old), None
+
+        def aligned(T_old_new: np.ndarray) -> AlignmentResult:
+            nonlocal last
+            last = self._align(points, target, T_world_old @ T_old_new)
+            information = information_in_frame(last.information, T_old_world)
+            return replace(last, T_world_camera=T_old_world @ last.T_world_camera, information=information)
+
+        surface = self._surface.points(around) @ T_old_world[:3, :3].T + T_old_world[:3, 3]
+        found = verify(
+            LocalMap(self.places[old].landmarks, surface), LocalMap(place.landmarks, points.points),
+            self._camera, self._noise().sigma, aligned, self.settings.verification,
+        )  # fmt: skip
+        return found, last
+
+    def _confirmed(self) -> bool:
+        """Whether the last loops found agree on the correction."""
+        s, newest = self.settings, self._verified[-1]
+        count = 0
+        for found in reversed(self._verified):
+            if newest.keyframe - found.keyframe > count * s.confirmation_gap:
+                break
+            difference = inverse(newest.T_correction @ newest.T_world_camera) @ (
+                found.T_correction @ newest.T_world_camera
+            )
+            angle = float(np.degrees(np.linalg.norm(so3_log(difference[:3, :3]))))
+            if float(np.linalg.norm(difference[:3, 3])) < s.agreement_m and angle < s.agreement_deg:
+                count += 1
+        return count >= s.confirmations
+
+    def _close(self, frame: Frame, old: int, loop: int) -> Correction | None:
+        before = np.array(self.graph.poses)
+        result, number = self.graph.optimise(), len(self.poses) - 1
+        if loop in result.rejected:
+            reason = f"the pose graph does not believe it: {result.rejected[loop]}"
+            self.events.append(LoopEvent("refused", frame.index, number, old, reason))
+            self.graph.poses = list(before)
+            return None
+        poses = result.poses
+        T_new_old = np.stack([new @ inverse(before) for new, before in zip(poses, self.poses, strict=True)])
+        kept, doubted = self.activity.inactive(), set(self.activity.active)
+        moved = float(np.linalg.norm(poses[-1][:3, 3] - self.poses[-1][:3, 3]))
+        reason = f"{len(result.accepted)} of {len(self.graph.loops)} closures believed, {result.seconds:.2f} s"
+        self.events.append(LoopEvent("closed", frame.index, number, old, reason, moved))
+        self.activity.activate_around(old)
+        return Correction(poses, T_new_old, kept, doubted, set(self.activity.active))
+
+    # --- lost frames -------------------------------------------------------------------------------------------------
+
+    def find(self, frame: Frame, lost: TrackingResult) -> tuple[TrackingResult, int] | None:
+        """Looks a lost frame up among all keyframes; the tracker goes on from there.
+
+        Returns:
+            What tracking says now, and the number of the keyframe it was found at; None if none leads to a pose.
+        """
+        if len(lost.points) < self._tracker.settings.align.min_matches:
+            return None
+        start = time.perf_counter()
+        with self._lock:
+            result = self._found_among(frame, lost)
+        self.seconds += time.perf_counter() - start
+        return result
+
+    def _found_among(self, frame: Frame, lost: TrackingResult) -> tuple[TrackingResult, int] | None:
+        view = View(frame.color, frame.depth, lost.T_world_camera)
+        place = self.places.describe(view)
+        for match in self.places.query(place, self.settings.candidates):
+            found, alignment = self._verify(lost.points, place, match.number)
+            if not found.accepted or alignment is None:
+                continue
+            old = self._found_at = match.number
+            self.activity.restart(old)
+            self._surface.arrange(self.activity.active)
+            reason = f"keyframe {old}: {found.inliers} features, {found.overlap:.0%} of the voxels"
+            self.events.append(LoopEvent("found again", frame.index, len(self.poses), old, reason))
+            return self._tracker.relocate(view, lost.points, alignment, reason), old
+        return None
+
+    # --- files -------------------------------------------------------------------------------------------------------
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Places, poses and depths, for a file."""
+        return {
+            "poses": np.array(self.poses).reshape(-1, 4, 4), "median_depths": self.activity.median_depths,
+            **{f"places_{name}": values for name, values in self.places.to_arrays().items()},
+        }  # fmt: skip
+
+    def load(self, arrays: Mapping[str, np.ndarray], camera: Camera) -> None:
+        """Takes over what `to_arrays` gave, of keyframes that `camera` saw, before any keyframe was added. All of it is
+        put aside until found.
+
+        Raises:
+            FormatError, ValueError: arrays that do not fit together.
+        """
+        if (camera.width, camera.height) != (self._camera.width, self._camera.height):
+            raise ValueError(
+                f"it was made with images of {camera.width}x{camera.height}, these are "
+                f"{self._camera.width}x{self._camera.height}"
+            )
+        places = {name.removeprefix("places_"): a for name, a in arrays.items() if name.startswith("places_")}
+        self.places = PlaceIndex.from_arrays(self._camera, places, self.settings.places)
+        for number, (T, depth) in enumerate(zip(arrays["poses"], arrays["median_depths"], strict=True)):
+            self.graph.add_node(T)
+            if number:
+                self.graph.add_odometry(number - 1, number, inverse(self.poses[-1]) @ T, _FIRM)
+            self.poses.append(T.astype(float))
+            self.activity.add(T, float(depth))
+        if not len(self.poses) == len(self.places) == len(self._surface):
+            raise ValueError("places, poses and surfaces are not of the same keyframes")
+        self.activity.active = set()
+
+    # --- parts -------------------------------------------------------------------------------------------------------
+
+    def _around(self, number: int) -> list[int]:
+        reach = self.settings.neighbourhood
+        return list(range(max(0, number - reach), min(len(self.poses), number + reach + 1)))
+
+    def _noise(self) -> DepthNoise:
+        return self._tracker.noise or DepthNoise()
+
+    def _align(self, points: FramePoints, target: GicpTarget, guess: np.ndarray) -> AlignmentResult:
+        return align(points, target, guess, self._tracker.settings.align, self._noise(), self._context)

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map follows its keyframes: each Gaussian moves rigidly with the keyframe that inserted it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import matrix_to_quaternion
+
+_BLOCK = 1 << 16
+"""Gaussians moved at a time, so that the temporaries of a large map stay small."""
+
+
+def move_with_keyframes(gaussians: GaussianMap, T_new_old: np.ndarray) -> None:
+    """Moves Gaussians after their keyframes were corrected.
+
+    Means and rotations move rigidly. Adam's first moments, which are averages of gradients, turn along; of the second
+    moments, averages of squared gradients, the diagonal is turned as if the components were uncorrelated. Colours keep
+    their coefficients: exact for degree 0, for higher degrees only as long as the rotation is small.
+
+    Args:
+        gaussians: the map. Gaussians of unknown birth (-1) stay where they are.
+        T_new_old: [K, 4, 4], for each keyframe what moves the world about it from the old to the new place.
+    """
+    birth = gaussians.birth_keyframe.long()
+    R = torch.as_tensor(T_new_old[:, :3, :3], dtype=torch.float32)
+    t = torch.as_tensor(T_new_old[:, :3, 3], dtype=torch.float32)
+    turn = left_multiplication(torch.as_tensor(np.stack([matrix_to_quaternion(r) for r in T_new_old[:, :3, :3]])))
+    moved = torch.as_tensor(np.abs(T_new_old - np.eye(4)).max((1, 2)) > 0)
+    rows = torch.nonzero((birth >= 0) & moved[birth.clamp(min=0)], as_tuple=True)[0]
+    for block in rows.split(_BLOCK):
+        own = birth[block]
+        gaussians.means[block] = _times(R[own], gaussians.means[block]) + t[own]
+        gaussians.quaternions[block] = _times(turn[own], gaussians.quaternions[block])
+        if gaussians.with_moments:
+            for name, matrices in (("means", R[own]), ("quaternions", turn[own])):
+                first, second = gaussians.moments[name]
+                first[block] = _times(matrices, first[block])
+                second[block] = _times(matrices**2, second[block])
+    gaussians.version += 1
+
+
+def left_multiplication(q: torch.Tensor) -> torch.Tensor:
+    """Matrices float32 [K, 4, 4] whose product with a quaternion wxyz is the Hamilton product of q [K, 4] with it."""
+    w, x, y, z = q.to(torch.float32).unbind(-1)
+    rows = [(w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w)]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def _times(matrices: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    return torch.einsum("nij,nj->ni", matrices, vectors)

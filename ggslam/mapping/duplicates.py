@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a loop leaves double: the same surface mapped when the camera left and again when it came back."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from ggslam.scene.gaussian_map import GaussianMap
+
+
+def remove_duplicates(
+    gaussians: GaussianMap, kept_births: np.ndarray, doubted_births: np.ndarray, least_distance_m: float
+) -> int:
+    """Drops Gaussians that lie on a surface which other keyframes had mapped before; returns how many.
+
+    A doubted Gaussian goes if a kept one that is not transparent lies nearer than its own extent along the surface
+    (and in any case if nearer than `least_distance_m`), so that what fills a hole between the kept ones stays.
+
+    Args:
+        gaussians: the map, after the loop was closed.
+        kept_births: numbers of the keyframes whose Gaussians stay.
+        doubted_births: numbers of the keyframes whose Gaussians are judged.
+        least_distance_m: what counts as the same place anyway: the depth camera's noise, metres.
+    """
+    birth = gaussians.birth_keyframe.numpy()
+    kept = np.isin(birth, kept_births) & (gaussians.opacities.numpy() > 0.3)
+    doubted = np.flatnonzero(np.isin(birth, doubted_births))
+    if not kept.any() or not len(doubted):
+        return 0
+    tree = cKDTree(gaussians.means.numpy()[kept])
+    # The middle of the three scales is the lesser extent along a disc's surface.
+    extent = np.sort(gaussians.scales.numpy()[doubted], axis=1)[:, 1]
+    reach = np.maximum(extent, least_distance_m)
+    distance, _ = tree.query(gaussians.means.numpy()[doubted], distance_upper_bound=float(reach.max()))
+    stays = np.ones(len(gaussians), bool)
+    stays[doubted[distance < reach]] = False
+    return gaussians.keep(torch.from_numpy(stays))

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which recording a run reads, and how to open it again later."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ggslam.errors import RunFolderError
+from ggslam.run_folder import RunFolder, json_ready
+from ggslam.sequences import Sequence, open_sequence
+
+
+@dataclass(frozen=True)
+class SequenceRequest:
+    """Which part of which recording, and how to read it; see `open_sequence`."""
+
+    path: Path
+    format: str | None = None
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+    scale: float = 1.0
+    masks: Path | None = None
+    depth_scale: float | None = None
+    on_bad_frame: str = "error"
+
+    def open(self) -> Sequence:
+        """Opens the recording.
+
+        Raises:
+            SequenceError: it cannot be read.
+        """
+        return open_sequence(
+            self.path, format=self.format, start=self.start, stop=self.stop, stride=self.stride, scale=self.scale,
+            masks=self.masks, depth_scale=self.depth_scale, on_bad_frame=self.on_bad_frame,  # type: ignore[arg-type]
+        )  # fmt: skip
+
+
+def describe(request: SequenceRequest, sequence: Sequence, earlier: Path | None = None) -> dict[str, Any]:
+    """What `sequence.json` holds: how to open the recording again, its camera, and the run whose map this one began
+    with, if any."""
+    masks = None if request.masks is None else request.masks.absolute()
+    values = {**asdict(request), "path": request.path.absolute(), "masks": masks}
+    return {
+        "open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence),
+        "warnings": sequence.warnings, "skipped": [asdict(skipped) for skipped in sequence.skipped],
+        "mask_problems": sequence.mask_problems, "map": None if earlier is None else earlier.absolute(),
+    }  # fmt: skip
+
+
+def open_recording_of(folder: RunFolder, path: Path | None = None, masks: Path | None = None) -> Sequence:
+    """Opens the recording of a run again, as the run did.
+
+    Args:
+        folder: of the run.
+        path: where the recording is now, if it was moved.
+        masks: folder of masks to use instead of those that the run had.
+
+    Raises:
+        SequenceError: it is not there any more.
+        RunFolderError: the run does not say which it was.
+    """
+    try:
+        record = folder.read_json("sequence.json")
+        values = dict(record["open"])
+        values["path"] = Path(path if path is not None else values["path"])
+        used = masks if masks is not None else values["masks"]
+        values["masks"] = None if used is None else Path(used)
+        request = SequenceRequest(**values)
+    except (KeyError, TypeError) as error:
+        raise RunFolderError(f"{folder.path / 'sequence.json'}: not as ggslam writes it: {error!r}") from None
+    sequence = request.open()
+    found = {"frames": len(sequence), "camera": asdict(sequence.camera)}
+    expected = {name: record.get(name) for name in found}
+    if json_ready(found) != expected:
+        raise RunFolderError(f"{sequence.path}: not the recording of {folder.path}: expected {expected}, found {found}")
+    return sequence

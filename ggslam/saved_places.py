@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`places.npz` in a run folder: what another recording needs to start in the run's map.
+
+The surface that frames are aligned to, the features by which places are found, and for going on with the map which
+keyframe each Gaussian came from. `starting.py` reads it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ggslam.scene.arrays import arrays_to_bytes
+from ggslam.scene.camera import Camera
+from ggslam.tracking.settings import DepthNoise
+
+if TYPE_CHECKING:
+    from ggslam.slam import Slam
+
+FILE = "places.npz"
+
+
+def places_to_bytes(slam: Slam) -> bytes | None:
+    """Content of `places.npz`; None if the run looked for no loops and so remembers no places."""
+    if slam.loops is None or not len(slam.surface):
+        return None
+    noise = slam.tracker.noise or DepthNoise()
+    arrays = {f"surface_{name}": values for name, values in slam.surface.to_arrays().items()}
+    arrays |= {f"loops_{name}": values for name, values in slam.loops.to_arrays().items()}
+    arrays |= {
+        "camera": _camera_row(slam.camera),
+        "noise": np.array([noise.constant, noise.square]),
+        "keyframe_poses": np.stack([k.T_world_camera for k in slam.mapper.keyframes]),
+        "birth": slam.map.birth_keyframe.numpy().astype(np.int32),
+    }  # fmt: skip
+    return arrays_to_bytes(**arrays)
+
+
+def _camera_row(camera: Camera) -> np.ndarray:
+    return np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy], float)
