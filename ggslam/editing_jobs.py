@@ -188,8 +188,9 @@ class _Source:
             folder.read_json("sequence.json")["open"]["path"]
         with _as_written(folder.path / "keyframes.json"):
             record = folder.read_json("keyframes.json")
-            poses = {k["frame"]: np.array(k["T_world_camera"], float) for k in record["keyframes"]}
-            views = [View(camera, inverse(pose), frame) for frame, pose in sorted(poses.items())]
+            poses = [(k["frame"], np.array(k["T_world_camera"], float)) for k in record["keyframes"]]
+            # Keyframes of another recording, which the map began with (frame -1), have no images here.
+            views = [View(camera, inverse(pose), None if frame < 0 else frame) for frame, pose in poses]
             if not views or not frame_poses(record):
                 raise ValueError("it lists no keyframes or no tracked frames")
         return _Source(camera, record, views, displacement)

@@ -301,18 +301,12 @@ class LoopCloser:
             **{f"places_{name}": values for name, values in self.places.to_arrays().items()},
         }  # fmt: skip
 
-    def load(self, arrays: Mapping[str, np.ndarray], camera: Camera) -> None:
-        """Takes over what `to_arrays` gave, of keyframes that `camera` saw, before any keyframe was added. All of it is
-        put aside until found.
+    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes over what `to_arrays` gave, before any keyframe was added. All of it is put aside until found.
 
         Raises:
             FormatError, ValueError: arrays that do not fit together.
         """
-        if (camera.width, camera.height) != (self._camera.width, self._camera.height):
-            raise ValueError(
-                f"it was made with images of {camera.width}x{camera.height}, these are "
-                f"{self._camera.width}x{self._camera.height}"
-            )
         places = {name.removeprefix("places_"): a for name, a in arrays.items() if name.startswith("places_")}
         self.places = PlaceIndex.from_arrays(self._camera, places, self.settings.places)
         for number, (T, depth) in enumerate(zip(arrays["poses"], arrays["median_depths"], strict=True)):

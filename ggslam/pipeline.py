@@ -22,7 +22,7 @@ from ggslam.scoring import score_run
 from ggslam.sequences import Sequence
 from ggslam.slam import Slam
 from ggslam.slam_result import SlamResult
-from ggslam.starting import start_in_map
+from ggslam.starting import ancestors, start_in_map
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
     if request.sequence.masks is not None and not sequence.has_masks:
         raise SequenceError(f"{request.sequence.masks}: none of the masks there belongs to a frame of this run")
     out = request.out if request.out is not None else Path("runs") / sequence.name
-    if earlier is not None and out.resolve() == earlier.path.resolve():
-        raise ConfigError(f"--out {out}: is the map to start in; choose another folder")
+    if earlier is not None and out.resolve() in ancestors(earlier):
+        raise ConfigError(f"--out {out}: is the map to start in, or one that this comes from; choose another folder")
     folder = RunFolder.create(out, overwrite=request.overwrite)
     for warning in sequence.warnings:
         observer.note(warning)
@@ -100,10 +100,13 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
     for problem in sequence.mask_problems.values():
         observer.note(f"mask not used: {problem}")
     if sequence.has_masks and config.identity.enabled and config.masks.source != "none" and result.objects is None:
-        observer.note("no objects were learned: the masks of the keyframes label nothing")
+        reason = "the masks of the keyframes label nothing"
+        if earlier is not None and not earlier.has_objects():
+            reason = f"the map of {earlier.path} has none"
+        observer.note(f"no objects were learned: {reason}")
     with uninterrupted():
         names = {**_names(earlier), **sequence.instance_names}
-        described = describe(request.sequence, sequence, request.map)
+        described = describe(request.sequence, sequence, earlier)
         folder.save(config, described, result, None if error is None else repr(error), names)
     outcome = RunOutcome(folder, result, error=error)
     if request.evaluate and error is None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ class SequenceRequest:
         )  # fmt: skip
 
 
-def describe(request: SequenceRequest, sequence: Sequence, earlier: Path | None = None) -> dict[str, Any]:
+def describe(request: SequenceRequest, sequence: Sequence, earlier: RunFolder | None = None) -> dict[str, Any]:
     """What `sequence.json` holds: how to open the recording again, its camera, and the run whose map this one began
     with, if any."""
     masks = None if request.masks is None else request.masks.absolute()
@@ -46,8 +47,17 @@ def describe(request: SequenceRequest, sequence: Sequence, earlier: Path | None 
     return {
         "open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence),
         "warnings": sequence.warnings, "skipped": [asdict(skipped) for skipped in sequence.skipped],
-        "mask_problems": sequence.mask_problems, "map": None if earlier is None else earlier.absolute(),
+        "mask_problems": sequence.mask_problems, "map": None if earlier is None else earlier.path.absolute(),
+        "map_fingerprint": None if earlier is None else fingerprint(earlier),
     }  # fmt: skip
+
+
+def fingerprint(folder: RunFolder) -> str:
+    """Tells a run from another one in the same folder."""
+    try:
+        return hashlib.sha256((folder.path / "keyframes.json").read_bytes()).hexdigest()
+    except OSError as error:
+        raise RunFolderError(f"{folder.path / 'keyframes.json'}: cannot be read: {error.strerror}") from None
 
 
 def open_recording_of(folder: RunFolder, path: Path | None = None, masks: Path | None = None) -> Sequence:

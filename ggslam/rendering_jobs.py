@@ -58,6 +58,8 @@ def select_frames(folder: RunFolder, numbers: str | None, every: int | None, cou
         ConfigError: not a number, or no such frame in the run.
     """
     known = sorted(frame_poses(folder.read_json("keyframes.json")))
+    if not known:
+        raise ConfigError(f"{folder.path}: no frame of this run was located, so there is nowhere to look from")
     if numbers is not None:
         try:
             wanted = [int(number) for number in numbers.split(",")]

@@ -140,6 +140,7 @@ class Slam:
 
     def result(self) -> SlamResult:
         """What there is so far. The first call settles the objects: it is for the end."""
+        self.times.loops = self.loops.seconds if self.loops is not None else 0.0
         return SlamResult(
             self.map, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
             self.refine_iterations, self._learned_objects(), self.loops.events if self.loops else [],
@@ -225,11 +226,9 @@ class Slam:
             self.surface.add(tracking.points, tracking.T_world_camera)
         if self.loops is None:
             return
-        before = self.loops.seconds
         correction = self.loops.add(frame, tracking)
         if correction is not None:
             self._correct(self.loops, correction)
-        self.times.loops += self.loops.seconds - before
 
     def _correct(self, loops: LoopCloser, correction: Correction) -> None:
         """Moves the map after its keyframes, takes out what is double now, and trains both ends of the loop."""

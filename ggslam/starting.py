@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from ggslam.errors import FormatError, RunFolderError, SequenceError
+from ggslam.errors import ConfigError, FormatError, RunFolderError, SequenceError
+from ggslam.loop_closing import LoopCloser
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.objects.table import Observation
-from ggslam.recordings import open_recording_of
+from ggslam.recordings import fingerprint, open_recording_of
 from ggslam.run_folder import RunFolder
 from ggslam.saved_places import FILE
 from ggslam.scene.arrays import read_all_arrays
@@ -24,8 +25,14 @@ from ggslam.slam import Slam
 from ggslam.slam_result import LearnedObjects
 from ggslam.tracking.settings import DepthNoise
 
+_NEEDED = "to grow its map, the images of its keyframes are needed"
+_INSTEAD = "--localize-only does without its images"
 ELSEWHERE = -1
 """Frame number of keyframes that are of another recording than the run's."""
+
+
+class OtherImagesError(Exception):
+    """The map was made with images of another size."""
 
 
 def _camera(row: np.ndarray) -> Camera:
@@ -45,29 +52,48 @@ def start_in_map(slam: Slam, folder: RunFolder, growing: bool) -> None:
     """
     path = folder.path / FILE
     if not path.is_file():
-        raise RunFolderError(f"{path}: missing; only runs with loops.enabled can be started in")
-    arrays: dict[str, Any] = read_all_arrays(path, "the places of a run")
+        raise RunFolderError(f"{path}: missing: the run was made without loops, or its map was edited since")
     if slam.loops is None:
-        raise RunFolderError(f"{folder.path}: to start in a map, loops.enabled must not be off")
+        raise ConfigError("--map: to start in a map, loops.enabled must not be off")
+    arrays: dict[str, Any] = read_all_arrays(path, "the places of a run")
     try:
-        gaussians = folder.gaussians(with_moments=True)
-        if len(gaussians) != len(arrays["birth"]):
-            raise RunFolderError(
-                f"{path}: expected {len(gaussians)} Gaussians as in map.ply, found {len(arrays['birth'])}"
-            )
-        gaussians.birth_keyframe[:] = torch.from_numpy(arrays["birth"])
-        slam.surface.load(_part(arrays, "surface_"))
-        slam.loops.load(_part(arrays, "loops_"), _camera(arrays["camera"]))
-        poses = arrays["keyframe_poses"]
-    except (KeyError, ValueError, IndexError, FormatError) as error:
-        raise RunFolderError(f"{path}: not the places of a run: {error}") from None
-    slam.tracker.noise = DepthNoise(*(float(value) for value in arrays["noise"]))
-    keyframes = [_bare_keyframe(k, T, slam.camera) for k, T in enumerate(poses)]
+        gaussians, keyframes = _load(slam, slam.loops, folder, arrays)
+    except OtherImagesError as error:
+        raise ConfigError(f"{folder.path}: {error}; see --scale") from None
+    except (KeyError, ValueError, IndexError, TypeError, RuntimeError, ConfigError, FormatError) as error:
+        reason = f"lacks {error}" if isinstance(error, KeyError) else error
+        raise RunFolderError(f"{path}: not the places of this run: {reason}") from None
     objects = _objects(folder, gaussians)
     if growing:
         keyframes = _with_images(folder, keyframes, objects is not None and objects.supervision == "masks")
     slam.growing = growing
     slam.adopt(gaussians, keyframes, objects)
+
+
+def _load(
+    slam: Slam, loops: LoopCloser, folder: RunFolder, arrays: dict[str, Any]
+) -> tuple[GaussianMap, list[Keyframe]]:
+    """Fills surface and loops; gives the map and its keyframes without images."""
+    gaussians, birth, poses = folder.gaussians(with_moments=True), arrays["birth"], arrays["keyframe_poses"]
+    if birth.shape != (len(gaussians),):
+        raise ValueError(f"expected {len(gaussians)} Gaussians as in map.ply, found {len(birth)}")
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+        raise ValueError(f"keyframe_poses: expected numbers [K, 4, 4], found {list(poses.shape)}")
+    if birth.max(initial=-1) >= len(poses) or birth.min(initial=0) < -1:
+        raise ValueError(f"birth: expected keyframes up to {len(poses) - 1}, found {birth.min()} to {birth.max()}")
+    camera, (constant, square) = _camera(arrays["camera"]), arrays["noise"].tolist()
+    if (camera.width, camera.height) != (slam.camera.width, slam.camera.height):
+        raise OtherImagesError(
+            f"it was made with images of {camera.width}x{camera.height}, these are "
+            f"{slam.camera.width}x{slam.camera.height}"
+        )
+    gaussians.birth_keyframe[:] = torch.from_numpy(birth.astype(np.int32))
+    slam.surface.load(_part(arrays, "surface_"))
+    loops.load(_part(arrays, "loops_"))
+    if len(loops.poses) != len(poses) or not np.isfinite(np.array(loops.poses)).all():
+        raise ValueError(f"expected numbers for the poses of {len(poses)} keyframes")
+    slam.tracker.noise = DepthNoise(constant, square)
+    return gaussians, [_bare_keyframe(k, T, slam.camera) for k, T in enumerate(poses)]
 
 
 def _objects(folder: RunFolder, gaussians: GaussianMap) -> LearnedObjects | None:
@@ -99,25 +125,56 @@ def _with_images(folder: RunFolder, keyframes: list[Keyframe], with_masks: bool)
     Raises:
         RunFolderError: a recording is not there any more.
     """
-    first = 0
-    if (earlier := folder.read_json("sequence.json").get("map")) is not None:
-        parent = RunFolder.open(Path(earlier))
-        first = len(parent.read_json("keyframes.json")["keyframes"])
-        keyframes = _with_images(parent, keyframes[:first], with_masks) + keyframes[first:]
+    record = folder.read_json("sequence.json")
+    if record.get("map") is not None:
+        earlier = parent(folder, record)
+        first = len(earlier.read_json("keyframes.json")["keyframes"])
+        keyframes = _with_images(earlier, keyframes[:first], with_masks) + keyframes[first:]
+    else:
+        first = 0
     records = folder.read_json("keyframes.json")["keyframes"][first:]
     try:
         sequence = open_recording_of(folder)
     except SequenceError as error:
-        raise RunFolderError(
-            f"{folder.path}: to grow its map, the images of its keyframes are needed ({error}); --localize-only does "
-            "without"
-        ) from None
+        raise RunFolderError(f"{folder.path}: {_NEEDED} ({error}); {_INSTEAD}") from None
     out = keyframes[:first]
     for keyframe, record in zip(keyframes[first:], records, strict=True):
         frame = sequence.frame(record["frame"], masks=with_masks)
         made = make_keyframe(keyframe.index, frame, keyframe.T_world_camera)
         out.append(replace(made, frame_index=ELSEWHERE, iterations=record["iterations"]))
     return out
+
+
+def parent(folder: RunFolder, record: dict[str, Any]) -> RunFolder:
+    """The run whose map a run began with.
+
+    Args:
+        folder: of the run.
+        record: content of its sequence.json.
+
+    Raises:
+        RunFolderError: it is not there any more, or is another one now.
+    """
+    path = Path(record["map"])
+    try:
+        earlier = RunFolder.open(path)
+    except RunFolderError as error:
+        raise RunFolderError(f"{folder.path} began with the map of another run: {error}; {_INSTEAD}") from None
+    if fingerprint(earlier) != record.get("map_fingerprint"):
+        raise RunFolderError(
+            f"{path}: not the run any more whose map {folder.path} began with (it was made anew); {_INSTEAD}"
+        )
+    return earlier
+
+
+def ancestors(folder: RunFolder) -> list[Path]:
+    """Folders of the runs that a run's map comes from, its own first."""
+    paths = [folder.path.resolve()]
+    while (earlier := RunFolder(paths[-1]).read_json("sequence.json").get("map")) is not None:
+        if Path(earlier).resolve() in paths or not Path(earlier).is_dir():
+            break
+        paths.append(Path(earlier).resolve())
+    return paths
 
 
 def _part(arrays: dict[str, Any], prefix: str) -> dict[str, np.ndarray]:

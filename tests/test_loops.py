@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 from ggslam.config import Config, load_config
+from ggslam.editing_jobs import Edit, edit_run
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.loop_closing import LoopSettings
@@ -187,9 +189,55 @@ def test_mistakes_with_maps_are_named(room: Path, first_half: Path, tmp_path: Pa
         played(room, tmp_path / "a", map=tmp_path / "none")
     with pytest.raises(ConfigError, match="is the map to start in"):
         played(room, first_half, map=first_half, overwrite=True)
-    with pytest.raises(RunFolderError, match="images of 160x120, these are 80x60"):
+    with pytest.raises(ConfigError, match="images of 160x120, these are 80x60; see --scale"):
         execute(RunRequest(SequenceRequest(room, scale=0.5), tmp_path / "a", map=first_half, evaluate=False))
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("noise", None), ("noise", np.ones(5)), ("keyframe_poses", np.zeros((1, 2, 4))), ("camera", np.ones(3)),
+        ("keyframe_poses", np.eye(4)[None]), ("birth", np.zeros((3, 3), np.int32)),
+        ("loops_poses", np.full((9, 4, 4), np.nan)),
+        ("birth", "far"), ("surface_counts", np.array([5])),
+    ],
+)  # fmt: skip
+def test_damaged_places_are_named(
+    room: Path, first_half: Path, tmp_path: Path, name: str, value: np.ndarray | str | None
+) -> None:
+    shutil.copytree(first_half, tmp_path / "map")
+    arrays = dict(np.load(tmp_path / "map" / "places.npz"))
+    if value is None:
+        del arrays[name]
+    else:
+        arrays[name] = arrays[name] + 1000 if isinstance(value, str) else value
+    np.savez(tmp_path / "map" / "places.npz", **arrays)
+    with pytest.raises(RunFolderError, match="places.npz: not the places of this run"):
+        played(room, tmp_path / "a", stop=2, map=tmp_path / "map", localize_only=True)
+
+
+def test_the_first_run_must_be_there_still(room: Path, first_half: Path, tmp_path: Path) -> None:
+    shutil.copytree(first_half, tmp_path / "a")
+    assert played(room, tmp_path / "b", start=12, stop=16, map=tmp_path / "a").error is None
+    with pytest.raises(ConfigError, match="or one that this comes from"):
+        played(room, tmp_path / "a", map=tmp_path / "b", overwrite=True)
+    assert played(room, tmp_path / "a", stop=14, overwrite=True).error is None
+    with pytest.raises(RunFolderError, match="not the run any more"):
+        played(room, tmp_path / "c", map=tmp_path / "b")
+    shutil.rmtree(tmp_path / "a")
+    with pytest.raises(RunFolderError, match="began with the map of another run"):
+        played(room, tmp_path / "c", map=tmp_path / "b")
+    assert played(room, tmp_path / "c", start=12, stop=14, map=tmp_path / "b", localize_only=True).error is None
+
+
+def test_a_grown_run_is_edited_and_then_no_map_to_start_in(room: Path, first_half: Path, tmp_path: Path) -> None:
+    assert played(room, tmp_path / "b", start=12, stop=16, map=first_half).error is None
+    grown = RunFolder.open(tmp_path / "b")
+    largest = max(grown.object_table().objects, key=lambda o: o.gaussians).id
+    edit_run(grown, [Edit("remove", str(largest))], tmp_path / "edited", inpainting=True)
+    with pytest.raises(RunFolderError, match="its map was edited"):
+        played(room, tmp_path / "c", map=tmp_path / "edited")
 
 
 def test_loops_can_be_turned_off(frames: list[Frame]) -> None:

@@ -66,7 +66,7 @@ def test_several_edits_at_once_leave_a_whole_run(finished: Path, tmp_path: Path)
     names = {record.name for record in RunFolder.open(out).object_table().objects}
     assert {"carpet", "sideboard copy"} <= names and not {"vase", "rug", "west wall"} & names
     expected = {"trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "timing.json", "run.json",
-                "map.ply", "objects.json", "classifier.npz", "votes.npz", "points.ply", "points_grid.ply",
+                "map.ply", "objects.json", "classifier.npz", "votes.npz", "points.ply", "points_grid.ply", "loops.json",
                 "renders"}  # fmt: skip
     assert {path.name for path in out.iterdir()} == expected
     marker = json.loads((out / "run.json").read_text())

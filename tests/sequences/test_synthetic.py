@@ -214,10 +214,10 @@ def test_refusals(tmp_path: Path, recording: Path) -> None:
         write(tmp_path / "a", frames=1)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "letter.txt").write_text("dear")
-    with pytest.raises(SequenceError, match="folder is not empty"):
+    with pytest.raises(SequenceError, match="full: is not empty; choose another folder"):
         write(tmp_path / "full", overwrite=True)
     assert (tmp_path / "full" / "letter.txt").exists()
-    with pytest.raises(SequenceError, match="ask for overwriting"):
+    with pytest.raises(SequenceError, match="holds a generated recording already"):
         write(recording)
     small = tmp_path / "small"
     write(small, frames=3)

@@ -134,8 +134,8 @@ def _check_target(target: Path, overwrite: bool) -> None:
     description = target / "camera.yaml"
     generated = description.is_file() and "generator:" in description.read_text(encoding="utf-8", errors="replace")
     if not (overwrite and generated):
-        hint = "ask for overwriting" if generated else "and holds no generated recording"
-        raise SequenceError(f"{target}: folder is not empty: {hint}")
+        what = "holds a generated recording already" if generated else "is not empty"
+        raise SequenceError(f"{target}: {what}; choose another folder")
 
 
 def _write_images(
