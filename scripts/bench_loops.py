@@ -17,6 +17,7 @@ Parts:
     graph         circuits of 20 m with drift, true closures and three false ones
     closing       whole runs with loops and without: ATE, and what closing does to the first room's views
     localization  the first 120 frames are mapped; starts in that map from later frames, without a pose
+    cut           a run without frames 100 to 159
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
-from loop_runs import closing, localization
+from loop_runs import closing, cut, localization
 
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.features.orb import View
@@ -353,7 +354,7 @@ def _noise(random: np.random.Generator, metres: float, degrees: float) -> np.nda
 # --- command line ----------------------------------------------------------------------------------------------------
 
 OF_RECORDINGS = {"retrieval": retrieval, "growth": growth, "verification": verification}
-OF_RUNS = {"closing": closing, "localization": localization}
+OF_RUNS = {"closing": closing, "localization": localization, "cut": cut}
 OTHERS = {"graph": graph}
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.config import load_config
+from ggslam.config import Config, load_config
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.loop_closing import Correction, LoopCloser
 from ggslam.mapping.keyframe import Keyframe
@@ -27,6 +27,8 @@ FIRST_FRAMES = 40
 """Keyframes of so many frames are the first room's views."""
 MAPPED_FRAMES, START_EVERY, TRIES = 120, 5, 3
 """Localisation: frames that make the map, distance of the starts in the rest, frames that a start may take."""
+CUT_FRAMES = (100, 160)
+"""First frame that is cut out, and the first after it."""
 
 
 class WatchedSlam(Slam):
@@ -53,11 +55,15 @@ def psnr(slam: Slam, keyframe: Keyframe) -> float:
     return float(-10 * np.log10((error**2).mean()))
 
 
+def run_settings(enabled: bool, iterations: int) -> Config:
+    """Settings of runs without objects."""
+    loops = f"loops.enabled={str(enabled).lower()}"
+    return load_config(None, ["identity.enabled=false", loops, f"mapping.iterations_per_frame={iterations}"])
+
+
 def run(sequence: Sequence, enabled: bool, iterations: int) -> tuple[WatchedSlam, float]:
     """A run with loops or without, and its wall time in seconds."""
-    loops = f"loops.enabled={str(enabled).lower()}"
-    config = load_config(None, ["identity.enabled=false", loops, f"mapping.iterations_per_frame={iterations}"])
-    slam = WatchedSlam(sequence.camera, config, has_masks=False)
+    slam = WatchedSlam(sequence.camera, run_settings(enabled, iterations), has_masks=False)
     start = time.perf_counter()
     for frame in sequence.stream():
         slam.step(frame)
@@ -149,10 +155,38 @@ def localization(path: Path, scale: float, iterations: int, pictures: Path | Non
                     errors.append(np.linalg.norm(visitor.result().trajectory()[-1][:3, 3] - difference[:3, 3]))
                     tries.append(tried)
                     break
+        visitor = Slam(whole.camera, slam.config, has_masks=False)
+        start_in_map(visitor, folder, growing=False)
+        played = range(MAPPED_FRAMES, len(whole))
+        located = sum(visitor.step(whole.frame(k)).frame.status != "lost" for k in played)
     first, any_of = (100 * count / len(starts) for count in (tries.count(0), len(tries)))
     middle, most, largest = 100 * np.quantile(errors, [0.5, 0.9, 1.0])
     print(
         f"{whole.name}: {len(starts)} starts in a map of {MAPPED_FRAMES} frames; localised by the first frame "
         f"{first:.0f} %, by one of {TRIES} {any_of:.0f} %; error median {middle:.1f} cm, 90 % {most:.1f} cm, largest "
-        f"{largest:.1f} cm; {1e3 * np.median(seconds):.0f} ms a frame"
+        f"{largest:.1f} cm; {1e3 * np.median(seconds):.0f} ms a frame; of all {len(played)} frames "
+        f"played in a row {located} are located"
     )
+
+
+def cut(path: Path, scale: float, iterations: int, pictures: Path | None) -> None:
+    """Prints the trajectory's error with and without a gap in the recording, and when the camera was found again."""
+    sequence = open_sequence(path, scale=scale)
+    truth = sequence.ground_truth
+    assert truth is not None
+    for gap in (range(0), range(*CUT_FRAMES)):
+        chosen = [k for k in range(len(sequence)) if k not in gap]
+        slam = Slam(sequence.camera, run_settings(True, iterations), has_masks=False)
+        for k in chosen:
+            slam.step(sequence.frame(k, masks=False))
+        result = slam.result()
+        known = [T if np.isfinite(T).all() else None for T in result.trajectory()]
+        scores = score_trajectory(known, truth[chosen])
+        assert scores is not None and slam.loops is not None
+        lost = sum(stretch.frames for stretch in result.lost_stretches())
+        found = [f"frame {e.frame} at {e.reason}" for e in slam.loops.events if e.kind == "found again"]
+        print(
+            f"{sequence.name}: {len(chosen)} frames, {lost} lost, found again: {', '.join(found) or '-'}; ATE RMSE "
+            f"{100 * scores.ate_rmse_m:.2f} cm",
+            flush=True,
+        )
