@@ -143,7 +143,8 @@ class LoopCloser:
         """T_world_camera of the keyframes as tracked and corrected (the mapper refines its own on top)."""
         self._camera, self._surface, self._tracker, self._context = camera, surface, tracker, context
         self._verified: list[_Found] = []
-        self._found_at: int | None = None
+        self._found_at: tuple[int, int] | None = None
+        """Frame at which a lost camera was found, and the keyframe it was found at; until its first keyframe is in."""
         self._lock = threading.RLock()
 
     # --- keyframes ---------------------------------------------------------------------------------------------------
@@ -159,11 +160,18 @@ class LoopCloser:
             T = tracking.T_world_camera
             view = View(frame.color, frame.depth, T)
             place = self.places.describe(view)
-            self._connect(tracking)
+            # In real time, keyframes from before the camera was lost may still come after it was found.
+            belated = self._found_at is not None and frame.index < self._found_at[0]
+            self._connect(tracking, belated)
             self.activity.add(T, tracking.median_depth_m)
             self.poses.append(T.copy())
             self.places.add(len(self.poses) - 1, place)
-            correction = self._look_back(frame, place, tracking)
+            if belated:
+                self.activity.active.discard(len(self.poses) - 1)
+                self._surface.arrange(self.activity.active)
+                correction = None
+            else:
+                correction = self._look_back(frame, place, tracking)
             if correction is None and self.activity.changed():
                 self._surface.arrange(self.activity.active)
         self.seconds += time.perf_counter() - start
@@ -177,12 +185,13 @@ class LoopCloser:
             self._surface.arrange(correction.active, correction.T_world_camera)
             self._verified.clear()
 
-    def _connect(self, tracking: TrackingResult) -> None:
+    def _connect(self, tracking: TrackingResult, belated: bool) -> None:
         """The new keyframe's node, tied to the one before it, or to where a lost camera was found again."""
         T, number = tracking.T_world_camera, len(self.poses)
         self.graph.add_node(T)
-        before = number - 1 if self._found_at is None else self._found_at
-        self._found_at = None
+        before = number - 1
+        if self._found_at is not None and not belated:
+            before, self._found_at = self._found_at[1], None
         if before >= 0:
             T_before_world = inverse(self.poses[before])
             information = _FIRM  # without an alignment, what drift allows for is all that is unsure
@@ -284,7 +293,8 @@ class LoopCloser:
             found, alignment = self._verify(lost.points, place, match.number)
             if not found.accepted or alignment is None:
                 continue
-            old = self._found_at = match.number
+            old = match.number
+            self._found_at = frame.index, old
             self.activity.restart(old)
             self._surface.arrange(self.activity.active)
             reason = f"keyframe {old}: {found.inliers} features, {found.overlap:.0%} of the voxels"

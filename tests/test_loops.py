@@ -126,6 +126,21 @@ def test_a_lost_camera_is_found_far_from_where_it_was_lost(frames: list[Frame]) 
     assert any("lost for 3 frames (0.40 s) from frame 24" in note for note in tracking_notes(result))
 
 
+def test_a_keyframe_from_before_the_loss_that_comes_late_hangs_on_the_one_before_it(frames: list[Frame]) -> None:
+    slam, _ = drifting(frames)
+    loops = slam.loops
+    assert loops is not None
+    points = extract_points(frames[4].depth, slam.camera, slam.config.tracking.points, DepthNoise(), slam.context)
+    last, count = loops.poses[-1].copy(), len(loops.poses)
+    loops._found_at = (1000, 0)  # the tracker was lost and found at keyframe 0 by frame 1000
+    late = TrackingResult(last, TrackingStatus.OK, 1.0, 0.0, "", points)
+    slam.insert(dataclasses.replace(frames[4], index=990), late, slam.moves_followed)
+    assert loops.graph._tree.parents[count] == count - 1 and count not in loops.activity.active
+    slam.insert(dataclasses.replace(frames[4], index=1001), late, slam.moves_followed)
+    assert loops.graph._tree.parents[count + 1] == 0 and count + 1 in loops.activity.active
+    assert loops._found_at is None
+
+
 def played(room: Path, out: Path, **values: object) -> RunOutcome:
     sequence = SequenceRequest(room, start=int(values.pop("start", 0)), stop=int(values.pop("stop", 24)))  # type: ignore[call-overload]
     return execute(RunRequest(sequence, out, overrides=CHEAP[:2], evaluate=False, **values))  # type: ignore[arg-type]
