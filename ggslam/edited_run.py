@@ -18,14 +18,13 @@ from ggslam.formats.staging import new_staging, publish
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
 from ggslam.run_folder import MARKER, OBJECT_FILES, RunFolder
+from ggslam.saved_places import PLACES_FILE
 
 COPIED = ("trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "loops.json")
 """Files that stay true of an edited run."""
 SCORES = ("metrics.json", "frames.csv")
 """Files that do not, unless objects were only renamed. `ggslam eval` makes them anew."""
 POINTS = ("points.ply", "points_grid.ply")
-PLACES = "places.npz"
-"""Goes with the Gaussians as they were, like scores; nothing makes it anew."""
 
 
 def save_edited(
@@ -66,7 +65,7 @@ def save_edited(
             raise RunFolderError(f"{target.path}: the edited run cannot be written: {error}") from None
         raise
     try:
-        publish(staged.path, target.path, MARKER, (*SCORES, *POINTS, *OBJECT_FILES, PLACES, "renders"), meanwhile)
+        publish(staged.path, target.path, MARKER, (*SCORES, *POINTS, *OBJECT_FILES, PLACES_FILE, "renders"), meanwhile)
     except RunFolderError:
         shutil.rmtree(staged.path, ignore_errors=True)
         raise
@@ -80,7 +79,7 @@ def _stage(
     source: RunFolder, staged: RunFolder, scene: SegmentedMap, pictures: Mapping[str, np.ndarray], named_only: bool
 ) -> None:
     make_folder(staged.path / "renders")
-    kept = (*COPIED, *SCORES, *POINTS, PLACES) if named_only else COPIED
+    kept = (*COPIED, *SCORES, *POINTS, PLACES_FILE) if named_only else COPIED
     for name in kept:
         if (source.path / name).is_file():
             shutil.copyfile(source.path / name, staged.path / name)

@@ -15,6 +15,7 @@ import numpy as np
 from ggslam.edited_run import save_edited
 from ggslam.editing_pictures import before_and_after
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.editing import (
     Change,
@@ -189,8 +190,8 @@ class _Source:
         with _as_written(folder.path / "keyframes.json"):
             record = folder.read_json("keyframes.json")
             poses = [(k["frame"], np.array(k["T_world_camera"], float)) for k in record["keyframes"]]
-            # Keyframes of another recording, which the map began with (frame -1), have no images here.
-            views = [View(camera, inverse(pose), None if frame < 0 else frame) for frame, pose in poses]
+            # Keyframes of the map that the run began with have no images here.
+            views = [View(camera, inverse(pose), None if frame == ELSEWHERE else frame) for frame, pose in poses]
             if not views or not frame_poses(record):
                 raise ValueError("it lists no keyframes or no tracked frames")
         return _Source(camera, record, views, displacement)

@@ -21,7 +21,7 @@ from ggslam.loops.verification import LocalMap, Verification, verify
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, so3_log
+from ggslam.scene.poses import inverse, separation, transformed
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
@@ -168,11 +168,8 @@ class LoopCloser:
             self.places.add(len(self.poses) - 1, place)
             if belated:
                 self.activity.active.discard(len(self.poses) - 1)
-                self._surface.arrange(self.activity.active)
-                correction = None
-            else:
-                correction = self._look_back(frame, place, tracking)
-            if correction is None and self.activity.changed():
+            correction = None if belated else self._look_back(frame, place, tracking)
+            if correction is None and (self.activity.changed() or belated):
                 self._surface.arrange(self.activity.active)
         self.seconds += time.perf_counter() - start
         return correction
@@ -222,16 +219,16 @@ class LoopCloser:
     ) -> tuple[Verification, AlignmentResult | None]:
         """Whether a frame sees what keyframe `old` saw, and the last alignment to the surface there."""
         around = self._around(old)
-        target, T_world_old = self._surface.of(around), self.poses[old]
-        T_old_world, last = inverse(T_world_old), None
+        T_world_old, last = self.poses[old], None
+        T_old_world = inverse(T_world_old)
 
         def aligned(T_old_new: np.ndarray) -> AlignmentResult:
-            nonlocal last
-            last = self._align(points, target, T_world_old @ T_old_new)
+            nonlocal last  # most candidates are refused before it comes to this: the target is gathered here
+            last = self._align(points, self._surface.of(around), T_world_old @ T_old_new)
             information = information_in_frame(last.information, T_old_world)
             return replace(last, T_world_camera=T_old_world @ last.T_world_camera, information=information)
 
-        surface = self._surface.points(around) @ T_old_world[:3, :3].T + T_old_world[:3, 3]
+        surface = transformed(self._surface.points(around), T_old_world)
         found = verify(
             LocalMap(self.places[old].landmarks, surface), LocalMap(place.landmarks, points.points),
             self._camera, self._noise().sigma, aligned, self.settings.verification,
@@ -240,17 +237,13 @@ class LoopCloser:
 
     def _confirmed(self) -> bool:
         """Whether the last loops found agree on the correction."""
-        s, newest = self.settings, self._verified[-1]
-        count = 0
+        s, newest, count = self.settings, self._verified[-1], 0
+        here = newest.T_world_camera
         for found in reversed(self._verified):
             if newest.keyframe - found.keyframe > count * s.confirmation_gap:
                 break
-            difference = inverse(newest.T_correction @ newest.T_world_camera) @ (
-                found.T_correction @ newest.T_world_camera
-            )
-            angle = float(np.degrees(np.linalg.norm(so3_log(difference[:3, :3]))))
-            if float(np.linalg.norm(difference[:3, 3])) < s.agreement_m and angle < s.agreement_deg:
-                count += 1
+            apart, turned = separation(newest.T_correction @ here, found.T_correction @ here)
+            count += apart < s.agreement_m and turned < s.agreement_deg
         return count >= s.confirmations
 
     def _close(self, frame: Frame, old: int, loop: int) -> Correction | None:
@@ -262,7 +255,7 @@ class LoopCloser:
             self.graph.poses = list(before)
             return None
         poses = result.poses
-        T_new_old = np.stack([new @ inverse(before) for new, before in zip(poses, self.poses, strict=True)])
+        T_new_old = poses @ inverse(np.array(self.poses))
         kept, doubted = self.activity.inactive(), set(self.activity.active)
         moved = float(np.linalg.norm(poses[-1][:3, 3] - self.poses[-1][:3, 3]))
         reason = f"{len(result.accepted)} of {len(self.graph.loops)} closures believed, {result.seconds:.2f} s"

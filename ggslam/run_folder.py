@@ -40,6 +40,7 @@ from ggslam.formats.staging import finish_saving, leftovers
 from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
+from ggslam.saved_places import PLACES_FILE
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam_result import SlamResult
@@ -133,7 +134,7 @@ class RunFolder:
         """
         mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish"}
         self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
-        for stale in ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", "places.npz", *OBJECT_FILES):
+        for stale in ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", PLACES_FILE, *OBJECT_FILES):
             (self.path / stale).unlink(missing_ok=True)
         shutil.rmtree(self.path / "renders", ignore_errors=True)
         save_config(config, self.path / "config.yaml")
@@ -147,7 +148,7 @@ class RunFolder:
         else:
             self.save_objects(segmented(result, names))
         if result.places is not None:
-            write_bytes(self.path / "places.npz", result.places)
+            write_bytes(self.path / PLACES_FILE, result.places)
         self.write_json(MARKER, {**mark, "complete": error is None, "stopped_by": error})
         # Last and largest; `ggslam export --format points` makes them again from the map.
         write_points(self.path, sample_points(result.gaussians, with_object_id=result.objects is not None))

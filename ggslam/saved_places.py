@@ -18,7 +18,7 @@ from ggslam.tracking.settings import DepthNoise
 if TYPE_CHECKING:
     from ggslam.slam import Slam
 
-FILE = "places.npz"
+PLACES_FILE = "places.npz"
 
 
 def places_to_bytes(slam: Slam) -> bytes | None:

@@ -12,11 +12,11 @@ import torch
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError, SequenceError
 from ggslam.loop_closing import LoopCloser
-from ggslam.mapping.keyframe import Keyframe, make_keyframe
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
 from ggslam.objects.table import Observation
 from ggslam.recordings import fingerprint, open_recording_of
 from ggslam.run_folder import RunFolder
-from ggslam.saved_places import FILE
+from ggslam.saved_places import PLACES_FILE
 from ggslam.scene.arrays import read_all_arrays
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -27,8 +27,6 @@ from ggslam.tracking.settings import DepthNoise
 
 _NEEDED = "to grow its map, the images of its keyframes are needed"
 _INSTEAD = "--localize-only does without its images"
-ELSEWHERE = -1
-"""Frame number of keyframes that are of another recording than the run's."""
 
 
 class OtherImagesError(Exception):
@@ -50,7 +48,7 @@ def start_in_map(slam: Slam, folder: RunFolder, growing: bool) -> None:
     Raises:
         RunFolderError: the run has no places, or its files do not belong together.
     """
-    path = folder.path / FILE
+    path = folder.path / PLACES_FILE
     if not path.is_file():
         raise RunFolderError(f"{path}: missing: the run was made without loops, or its map was edited since")
     if slam.loops is None:

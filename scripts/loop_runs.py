@@ -45,13 +45,16 @@ class WatchedSlam(Slam):
         print(f"  closed: first views {before:.2f} dB before, {self.first_views():.2f} dB after", flush=True)
 
 
+def rendered(slam: Slam, keyframe: Keyframe) -> np.ndarray:
+    """The map from a keyframe's pose, float32 [3, H, W]."""
+    rasterizer = CpuRasterizer(context=slam.context)
+    return rasterizer.forward(slam.map, keyframe.camera, keyframe.T_camera_world, features=False).image.numpy()
+
+
 def psnr(slam: Slam, keyframe: Keyframe) -> float:
     """Of a keyframe over pixels with depth, dB."""
-    view = CpuRasterizer(context=slam.context).forward(
-        slam.map, keyframe.camera, keyframe.T_camera_world, features=False
-    )
     seen = keyframe.depth > 0
-    error = view.image.numpy().clip(0, 1).transpose(1, 2, 0)[seen] - keyframe.color[seen] / 255.0
+    error = rendered(slam, keyframe).clip(0, 1).transpose(1, 2, 0)[seen] - keyframe.color[seen] / 255.0
     return float(-10 * np.log10((error**2).mean()))
 
 
@@ -120,16 +123,8 @@ def closing(path: Path, scale: float, iterations: int, pictures: Path | None) ->
         pictures.mkdir(parents=True, exist_ok=True)
         for number in (0, 3, 6):
             row = [slams["without"].mapper.keyframes[number].color]
-            row += [shown(slam, slam.mapper.keyframes[number]) for slam in slams.values()]
+            row += [color_to_uint8(rendered(slam, slam.mapper.keyframes[number])) for slam in slams.values()]
             write_picture(pictures / f"{sequence.name}_{number}.png", np.concatenate(row, axis=1))
-
-
-def shown(slam: Slam, keyframe: Keyframe) -> np.ndarray:
-    """The map from a keyframe's pose, uint8 [H, W, 3]."""
-    view = CpuRasterizer(context=slam.context).forward(
-        slam.map, keyframe.camera, keyframe.T_camera_world, features=False
-    )
-    return color_to_uint8(view.image.numpy())
 
 
 def localization(path: Path, scale: float, iterations: int, pictures: Path | None) -> None:

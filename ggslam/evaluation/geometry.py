@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ggslam.scene.poses import inverse, orthonormalized, se3_exp, so3_log
+from ggslam.scene.poses import inverse, orthonormalized, se3_exp, transformed, turning_angle
 
 THRESHOLDS_M = (0.01, 0.02, 0.05)
 FEWEST_MATCHES = 10
@@ -199,7 +199,7 @@ def register(
     for distance in distances:
         converged = False
         for _ in range(iterations):
-            step = _step(_moved(chosen, T), target, normals, distance)
+            step = _step(transformed(chosen, T), target, normals, distance)
             T = orthonormalized(se3_exp(step) @ T)
             made += 1
             if np.abs(step).max() < SMALL_STEP:
@@ -209,8 +209,8 @@ def register(
     return Registration(
         T_target_source=T,
         overlap=overlap(source, target, distances[-1], T, seed),
-        moved_m=float(np.linalg.norm(_moved(middle, T) - _moved(middle, start))),
-        turned_deg=float(np.degrees(np.linalg.norm(so3_log((inverse(start) @ T)[:3, :3])))),
+        moved_m=float(np.linalg.norm(transformed(middle, T) - transformed(middle, start))),
+        turned_deg=float(np.degrees(turning_angle(start, T))),
         iterations=made,
         converged=converged,
     )
@@ -289,12 +289,8 @@ def _nearest(
     `distance`."""
     points = source.points[source.sample(MOST_QUERIES, seed)]
     if T_target_source is not None:
-        points = _moved(points, T_target_source)
+        points = transformed(points, T_target_source)
     return target.tree.query(points, distance_upper_bound=distance, workers=-1)
-
-
-def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def _at(threshold: float, to_reference: np.ndarray, to_estimate: np.ndarray) -> ThresholdScore:

@@ -16,6 +16,7 @@ from ggslam.features.orb import Landmarks
 from ggslam.features.registration import Registration, pixels_of, register
 from ggslam.loops.settings import VerificationSettings
 from ggslam.scene.camera import Camera
+from ggslam.scene.poses import transformed
 
 _CELLS = 4
 
@@ -121,7 +122,9 @@ def verify(
     depth = float(np.median(new.points[:, 2])) if len(new.points) else 0.0
     noise = sigma(depth)
     overlap = voxel_overlap(
-        old.points, _moved(new.points, refined.T_world_camera), settings.voxel_constant + settings.voxel_sigmas * noise
+        old.points,
+        transformed(new.points, refined.T_world_camera),
+        settings.voxel_constant + settings.voxel_sigmas * noise,
     )
     reason = _doubt_about_geometry(refined, registration, agreeing, noise, settings)
     if not reason and overlap < settings.min_overlap:
@@ -144,10 +147,6 @@ def _voxel_keys(points: np.ndarray, voxel: float) -> np.ndarray:
     """int64 [n]; equal for points of one voxel (coordinates up to a million voxels)."""
     cells = np.floor(points / voxel).astype(np.int64) + (1 << 20)
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
-
-
-def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def _doubt_about_features(found: Registration, camera: Camera, settings: VerificationSettings) -> str:

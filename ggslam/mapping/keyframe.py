@@ -11,6 +11,8 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
 
+ELSEWHERE = -1
+"""Frame index of keyframes that are of another recording than the run's: of the map that it began with."""
 DEPTH_UNITS_PER_METRE = 5000.0
 """Depth of keyframes is kept as uint16 in units of 0.2 mm (range 13.1 m), the resolution of the TUM recordings."""
 
@@ -21,7 +23,7 @@ class Keyframe:
 
     Attributes:
         index: number of the keyframe (0, 1, 2, ...).
-        frame_index: index of the frame it was made from.
+        frame_index: index of the frame it was made from, or `ELSEWHERE`.
         color: uint8 [H, W, 3].
         depth: uint16 [H, W], units of 1 / DEPTH_UNITS_PER_METRE metres, 0 = none.
         T_camera_world: float64 [4, 4], the pose as refined so far.

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 
@@ -48,6 +50,21 @@ def se3_log(T: np.ndarray) -> np.ndarray:
         factor = (1 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2  # the half angle stays exact near half a turn
     V_inverse = np.eye(3) - 0.5 * W + factor * W @ W
     return np.concatenate([V_inverse @ T[:3, 3], w])
+
+
+def transformed(points: np.ndarray, T_to_from: np.ndarray) -> np.ndarray:
+    """Points [n, 3] in the frame that T_to_from [4, 4] leads to."""
+    return points @ T_to_from[:3, :3].T + T_to_from[:3, 3]
+
+
+def turning_angle(T_one: np.ndarray, T_other: np.ndarray) -> float:
+    """Angle in radians between the rotations of two poses [4, 4]."""
+    return 2.0 * math.asin(min(1.0, float(np.linalg.norm(T_one[:3, :3] - T_other[:3, :3])) / math.sqrt(8.0)))
+
+
+def separation(T_one: np.ndarray, T_other: np.ndarray) -> tuple[float, float]:
+    """How far two poses [4, 4] are apart: metres and degrees."""
+    return float(np.linalg.norm(T_one[:3, 3] - T_other[:3, 3])), math.degrees(turning_angle(T_one, T_other))
 
 
 def inverse(T: np.ndarray) -> np.ndarray:

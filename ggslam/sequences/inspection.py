@@ -11,7 +11,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse
+from ggslam.scene.poses import inverse, transformed
 from ggslam.sequences.sequence import Sequence
 
 SMALLEST_MEDIAN_DEPTH, LARGEST_MEDIAN_DEPTH = 0.1, 20.0
@@ -195,7 +195,7 @@ def _relative_depth_error(frame: Frame, other: Frame, convert: Callable[[np.ndar
     points = frame.camera.back_project(frame.depth)[::8, ::8].reshape(-1, 3)
     points = points[points[:, 2] > 0]
     T = inverse(convert(other.T_world_camera)) @ convert(frame.T_world_camera)
-    points = points @ T[:3, :3].T + T[:3, 3]
+    points = transformed(points, T)
     points = points[points[:, 2] > 0.05]
     c = other.camera
     u = np.rint(c.fx * points[:, 0] / points[:, 2] + c.cx).astype(int)

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import torch
 
+from ggslam.scene.poses import turning_angle
 from ggslam.tracking.feature_map import FeatureMap
 from ggslam.tracking.feature_settings import FeatureAlignSettings
 from ggslam.tracking.features import ScanFeatures
@@ -316,11 +317,6 @@ def _observability(fit: _Fit, residuals: _Residuals, limit: float) -> tuple[np.n
     scale = np.array([1.0, 1.0, 1.0] + [1.0 / max(radius, 1e-3)] * 3)
     values, vectors = np.linalg.eigh(about * np.outer(scale, scale) / total)
     return values, vectors[:, values < limit].T
-
-
-def turning_angle(T_one: np.ndarray, T_other: np.ndarray) -> float:
-    """Angle in radians between the rotations of two poses [4, 4]."""
-    return 2.0 * math.asin(min(1.0, float(np.linalg.norm(T_one[:3, :3] - T_other[:3, :3])) / math.sqrt(8.0)))
 
 
 def _moved(T: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +14,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
-from ggslam.tracking.feature_alignment import FeatureAlignment, turning_angle
+from ggslam.tracking.feature_alignment import FeatureAlignment
 from ggslam.tracking.feature_scans import DepthImageFeatures
 from ggslam.tracking.feature_settings import FeatureTrackerSettings
 from ggslam.tracking.features import ScanFeatures
@@ -150,13 +149,6 @@ class FeatureTracker(Tracker):
 
     def _points(self, frame: Frame) -> FramePoints:
         return extract_points(frame.depth, self.camera, self.settings.points, self.noise or DepthNoise(), self.context)
-
-    def _is_far(self, T_world_reference: np.ndarray, T_world_camera: np.ndarray, depth: float) -> bool:
-        """As `Tracker._is_far`, in a fraction of its time."""
-        settings = self.settings.photometric
-        moved = float(np.linalg.norm(T_world_camera[:3, 3] - T_world_reference[:3, 3]))
-        turned = math.degrees(turning_angle(T_world_reference, T_world_camera))
-        return moved > settings.renew_translation * depth or turned > settings.renew_rotation_deg
 
     def _start_in_target(self, frame: Frame, scan: ScanFeatures) -> TrackingResult:
         """Nothing of its own to hold on to, but a map that someone else made: see `start_lost`."""

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from ggslam.errors import check_ranges
-from ggslam.scene.poses import inverse, so3_log
+from ggslam.scene.poses import separation
 
 
 class Tracked(Protocol):
@@ -99,8 +99,6 @@ class KeyframePolicy:
         gap = frame_index - self._frame_index
         if tracked.overlap < (s.min_overlap if gap >= s.min_gap else 0.75 * s.min_overlap):
             return KeyframeKind.TRACKING
-        motion = inverse(self._T_world_camera) @ tracked.T_world_camera
-        translation = float(np.linalg.norm(motion[:3, 3]))
-        rotation = float(np.degrees(np.linalg.norm(so3_log(motion[:3, :3]))))
+        translation, rotation = separation(self._T_world_camera, tracked.T_world_camera)
         moved = translation > s.max_translation * max(tracked.median_depth_m, 1e-3) or rotation > s.max_rotation_deg
         return KeyframeKind.MAPPING if gap >= s.max_gap or moved else None

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 import torch
 
-from ggslam.scene.poses import inverse, orthonormalized
-from ggslam.tracking.feature_alignment import LAST_STEP, FeatureAligner, FeatureAlignment, FrameClock, turning_angle
+from ggslam.scene.poses import inverse, orthonormalized, separation
+from ggslam.tracking.feature_alignment import LAST_STEP, FeatureAligner, FeatureAlignment, FrameClock
 from ggslam.tracking.feature_map import FeatureMap
 from ggslam.tracking.feature_settings import FeatureTrackerSettings
 from ggslam.tracking.features import ScanFeatures
@@ -83,8 +82,7 @@ class LocalFeatureMap:
         if self._T_map_added is None or overlap < s.overlap:
             return True
         T = inverse(self._T_world_map) @ T_world_sensor
-        moved = float(np.linalg.norm(T[:3, 3] - self._T_map_added[:3, 3]))
-        turned = math.degrees(turning_angle(self._T_map_added, T))
+        moved, turned = separation(self._T_map_added, T)
         return moved > s.translation * scan.median_distance or turned > s.rotation_deg
 
     @torch.inference_mode()

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.native.loader import NativeContext
+from ggslam.scene.poses import transformed
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import TargetSettings
@@ -75,7 +76,8 @@ class MeasuredSurface:
     def points(self, numbers: Iterable[int]) -> np.ndarray:
         """World points float32 [n, 3] of these keyframes."""
         parts = [self._parts[number] for number in numbers]
-        return np.concatenate([np.empty((0, 3), np.float32), *(_moved(p.points, p.T_world_camera) for p in parts)])
+        placed = (transformed(p.points, p.T_world_camera) for p in parts)
+        return np.concatenate([np.empty((0, 3), np.float32), *placed])
 
     def arrange(self, active: set[int], T_world_camera: np.ndarray | None = None) -> GicpTarget:
         """Chooses the keyframes that take part, and with `T_world_camera` [K, 4, 4] where keyframes are; returns the
@@ -122,7 +124,7 @@ class MeasuredSurface:
         self.arrange(set(range(len(self._parts))))
 
     def _gathered(self, parts: list[_Part], base: GicpTarget | None) -> GicpTarget:
-        points = np.concatenate([_moved(p.points, p.T_world_camera) for p in parts])
+        points = np.concatenate([transformed(p.points, p.T_world_camera) for p in parts])
         normals = np.concatenate([p.normals @ p.T_world_camera[:3, :3].T for p in parts])
         sigma = SPACING * np.concatenate([p.points[:, 2] for p in parts])
         log_scales = np.log(sigma)[:, None] + np.log([1.0, 1.0, FLATNESS])
@@ -134,10 +136,6 @@ class MeasuredSurface:
             contiguous(points), contiguous(quaternions_from_normals(normals)), contiguous(log_scales),
             np.full(len(points), _OPACITY_LOGIT, np.float32), self._settings, self._context, base=base,
         )  # fmt: skip
-
-
-def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def quaternions_from_normals(normals: np.ndarray) -> np.ndarray:

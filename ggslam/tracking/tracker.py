@@ -13,7 +13,7 @@ from ggslam.features.orb import View, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, orthonormalized, so3_log
+from ggslam.scene.poses import inverse, orthonormalized, separation
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart, align
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
@@ -312,9 +312,5 @@ class Tracker:
 
     def _is_far(self, T_world_reference: np.ndarray, T_world_camera: np.ndarray, depth: float) -> bool:
         settings = self.settings.photometric
-        motion = inverse(T_world_reference) @ T_world_camera
-        rotation = float(np.degrees(np.linalg.norm(so3_log(motion[:3, :3]))))
-        return (
-            float(np.linalg.norm(motion[:3, 3])) > settings.renew_translation * depth
-            or rotation > settings.renew_rotation_deg
-        )
+        moved, turned = separation(T_world_reference, T_world_camera)
+        return moved > settings.renew_translation * depth or turned > settings.renew_rotation_deg

@@ -14,7 +14,9 @@ from ggslam.scene.poses import (
     quaternion_to_matrix,
     se3_exp,
     se3_log,
+    separation,
     so3_log,
+    transformed,
 )
 
 ANGLES = (0.0, 1e-12, 1e-8, 9e-7, 1.1e-6, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-7)
@@ -93,3 +95,19 @@ def test_valid_poses() -> None:
         bad[row, column] = value
         assert not is_valid_pose(bad)
     assert not is_valid_pose(good @ np.diag([1.0, 1, -1, 1]))  # a reflection
+
+
+def test_separation_is_that_of_the_motion_between() -> None:
+    for twist in ([0.3, -0.1, 0.2, 0.4, 0.2, -0.3], [0, 0, 0, 0, 0, 0], [1, 2, 3, 0, 3.0, 0]):
+        T_one = se3_exp(np.array([0.5, 1.0, -2.0, 0.3, -0.2, 0.9]))
+        T_other = T_one @ se3_exp(np.array(twist, float))
+        motion = np.linalg.inv(T_one) @ T_other
+        metres, degrees = separation(T_one, T_other)
+        assert metres == pytest.approx(np.linalg.norm(motion[:3, 3]), abs=1e-12)
+        assert degrees == pytest.approx(np.degrees(np.linalg.norm(twist[3:])), abs=1e-6)
+
+
+def test_transformed_points() -> None:
+    T, points = se3_exp(np.array([0.5, 1.0, -2.0, 0.3, -0.2, 0.9])), np.random.default_rng(0).normal(size=(7, 3))
+    expected = (T @ np.column_stack([points, np.ones(7)]).T).T[:, :3]
+    np.testing.assert_allclose(transformed(points, T), expected, atol=1e-12)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from feature_scenes import CAMERA, lidar_scan, room_view
 
-from ggslam.scene.poses import inverse, se3_exp, se3_log
+from ggslam.scene.poses import inverse, se3_exp, se3_log, turning_angle
 from ggslam.tracking import feature_alignment
-from ggslam.tracking.feature_alignment import FrameClock, _pose_matrix, turning_angle
+from ggslam.tracking.feature_alignment import FrameClock, _pose_matrix
 from ggslam.tracking.feature_scans import DepthImageFeatures, LidarFeatures, split_features
 from ggslam.tracking.feature_settings import LIDAR, FeatureAlignSettings, FeatureTrackerSettings
 from ggslam.tracking.features import ScanFeatures

@@ -74,22 +74,13 @@ def write_synthetic_sequence(
     frame_rate = kind.frame_rate if frame_rate is None else frame_rate
     trajectory = kind.trajectory if trajectory is None else trajectory
     distortion = kind.depth_distortion if depth_distortion is None else depth_distortion
-    if not 0 <= distortion <= LARGEST_DISTORTION:
-        raise SequenceError(f"depth_distortion: expected 0 to {LARGEST_DISTORTION:g} steps, found {distortion}")
-    if width < 16 or height < 16 or not frame_rate > 0:
-        raise SequenceError(
-            f"expected at least 16x16 pixels and a positive frame rate, found {width}x{height} and {frame_rate}"
-        )
+    _check_numbers(width, height, frame_rate, distortion)
     _check_target(target, overwrite)
     scene = scene if isinstance(scene, Scene) else kind.build(seed)
     poses = camera_path(scene, frames, trajectory, seed)
     focal = FOCAL_LENGTH * width
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    except OSError as error:
-        raise SequenceError(f"{target}: cannot be written: {error.strerror}") from None
+    work = _folder_beside(target)
     try:
         _write_images(work, scene, camera, poses, seed, noise, distortion, progress)
         _write_description(work, scene, camera, poses, seed, noise, trajectory, frame_rate, distortion)
@@ -100,6 +91,24 @@ def write_synthetic_sequence(
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return target
+
+
+def _check_numbers(width: int, height: int, frame_rate: float, distortion: float) -> None:
+    if not 0 <= distortion <= LARGEST_DISTORTION:
+        raise SequenceError(f"depth_distortion: expected 0 to {LARGEST_DISTORTION:g} steps, found {distortion}")
+    if width < 16 or height < 16 or not frame_rate > 0:
+        raise SequenceError(
+            f"expected at least 16x16 pixels and a positive frame rate, found {width}x{height} and {frame_rate}"
+        )
+
+
+def _folder_beside(target: Path) -> Path:
+    """A new hidden folder on the same file system."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as error:
+        raise SequenceError(f"{target}: cannot be written: {error.strerror}") from None
 
 
 def _kind_of(scene: Scene | str) -> SceneKind:
