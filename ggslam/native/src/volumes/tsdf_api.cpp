@@ -1,0 +1,133 @@
+// SPDX-License-Identifier: Apache-2.0
+// The block store as seen from outside: making, listing, reading and writing blocks.
+#include <algorithm>
+#include <cstring>
+
+#include "context.hpp"
+#include "volumes/tsdf.hpp"
+
+using ggslam::volumes::Block;
+using ggslam::volumes::BlockCoordinates;
+using ggslam::volumes::kVoxels;
+using ggslam::volumes::Tsdf;
+using ggslam::volumes::VoxelBlock;
+
+namespace {
+
+// Voxels of blocks as arrays of [blocks, 512] (colour: [blocks, 512, 3]); any may be null.
+struct VoxelArrays {
+  int16_t* value;
+  uint16_t* weight;
+  uint16_t* label;
+  uint8_t* color;
+  uint8_t* votes;
+};
+
+template <class T>
+void copy_out(T* to, std::size_t row, const T* from) {
+  if (to != nullptr) std::memcpy(to + row * kVoxels, from, kVoxels * sizeof(T));
+}
+
+template <class T>
+void copy_in(T* to, std::size_t row, const T* from) {
+  if (from != nullptr) std::memcpy(to, from + row * kVoxels, kVoxels * sizeof(T));
+}
+
+Tsdf& tsdf(void* handle) { return *static_cast<Tsdf*>(handle); }
+
+}  // namespace
+
+GGSLAM_EXPORT void* ggslam_tsdf_create(float voxel, float truncation, float max_weight) {
+  return new Tsdf(voxel, truncation, max_weight);
+}
+
+GGSLAM_EXPORT void ggslam_tsdf_destroy(void* handle) { delete static_cast<Tsdf*>(handle); }
+
+GGSLAM_EXPORT void ggslam_tsdf_clear(void* handle) { tsdf(handle).clear(); }
+
+GGSLAM_EXPORT int64_t ggslam_tsdf_size(void* handle) { return tsdf(handle).size(); }
+GGSLAM_EXPORT int64_t ggslam_tsdf_dense(void* handle) { return tsdf(handle).dense(); }
+GGSLAM_EXPORT int64_t ggslam_tsdf_bytes(void* handle) { return tsdf(handle).bytes(); }
+GGSLAM_EXPORT uint32_t ggslam_tsdf_revision(void* handle) { return tsdf(handle).revision; }
+
+// All blocks by row: coordinates [n, 3], whether they have voxels [n], weights of those that are free [n], whether
+// they are frozen [n], revisions [n].
+GGSLAM_EXPORT void ggslam_tsdf_list(void* handle, int32_t* at, uint8_t* dense, uint16_t* free_weight, uint8_t* frozen,
+                                    uint32_t* revision) {
+  const Tsdf& map = tsdf(handle);
+  for (std::size_t row = 0; row < map.size(); ++row) {
+    const Block& b = map.block(row);
+    at[3 * row] = b.at.x, at[3 * row + 1] = b.at.y, at[3 * row + 2] = b.at.z;
+    dense[row] = b.slot >= 0, free_weight[row] = b.free_weight, frozen[row] = b.frozen, revision[row] = b.revision;
+  }
+}
+
+// Voxels of the blocks at coordinates [n, 3]; those that are free throughout are written out, too. Blocks that are not
+// there come out as never seen.
+GGSLAM_EXPORT void ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at, const VoxelArrays* out) {
+  const Tsdf& map = tsdf(handle);
+  VoxelBlock plain{};
+  std::fill_n(plain.value, kVoxels, ggslam::volumes::kFreeValue);
+  for (int64_t i = 0; i < n; ++i) {
+    const int64_t row = map.find({at[3 * i], at[3 * i + 1], at[3 * i + 2]});
+    const VoxelBlock* v = row < 0 ? nullptr : map.voxels(map.block(row));
+    if (v == nullptr) {
+      std::fill_n(plain.weight, kVoxels, row < 0 ? uint16_t{0} : map.block(row).free_weight);
+      v = &plain;
+    }
+    copy_out(out->value, i, v->value);
+    copy_out(out->weight, i, v->weight);
+    copy_out(out->label, i, v->label);
+    copy_out(out->votes, i, v->votes);
+    if (out->color == nullptr) continue;
+    uint8_t* color = out->color + 3 * i * kVoxels;
+    for (int k = 0; k < kVoxels; ++k)
+      color[3 * k] = v->red[k], color[3 * k + 1] = v->green[k], color[3 * k + 2] = v->blue[k];
+  }
+}
+
+// Writes voxels of the blocks at coordinates [n, 3], made where there are none. What `in` lacks stays as it is.
+GGSLAM_EXPORT void ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at, const VoxelArrays* in) {
+  Tsdf& map = tsdf(handle);
+  ++map.revision;
+  for (int64_t i = 0; i < n; ++i) {
+    Block& block = map.block(map.insert({at[3 * i], at[3 * i + 1], at[3 * i + 2]}));
+    block.revision = map.revision;
+    VoxelBlock* v = map.densify(block);
+    copy_in(v->value, i, in->value);
+    copy_in(v->weight, i, in->weight);
+    copy_in(v->label, i, in->label);
+    copy_in(v->votes, i, in->votes);
+    if (in->color == nullptr) continue;
+    const uint8_t* color = in->color + 3 * i * kVoxels;
+    for (int k = 0; k < kVoxels; ++k)
+      v->red[k] = color[3 * k], v->green[k] = color[3 * k + 1], v->blue[k] = color[3 * k + 2];
+  }
+}
+
+// Makes the blocks at coordinates [n, 3] free throughout, with weights [n].
+GGSLAM_EXPORT void ggslam_tsdf_write_free(void* handle, int64_t n, const int32_t* at, const uint16_t* weight) {
+  Tsdf& map = tsdf(handle);
+  ++map.revision;
+  for (int64_t i = 0; i < n; ++i) {
+    Block& block = map.block(map.insert({at[3 * i], at[3 * i + 1], at[3 * i + 2]}));
+    block.revision = map.revision;
+    map.collapse(block, weight[i]);
+  }
+}
+
+// Removes the blocks at coordinates [n, 3], where there are any.
+GGSLAM_EXPORT void ggslam_tsdf_erase(void* handle, int64_t n, const int32_t* at) {
+  Tsdf& map = tsdf(handle);
+  ++map.revision;
+  for (int64_t i = 0; i < n; ++i) {
+    const int64_t row = map.find({at[3 * i], at[3 * i + 1], at[3 * i + 2]});
+    if (row >= 0) map.erase(row);
+  }
+}
+
+// From now on decay leaves all blocks that are there alone (frozen = 1), or no longer (0).
+GGSLAM_EXPORT void ggslam_tsdf_freeze(void* handle, int frozen) {
+  Tsdf& map = tsdf(handle);
+  for (std::size_t row = 0; row < map.size(); ++row) map.block(row).frozen = frozen != 0;
+}

@@ -1,0 +1,250 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "volumes/tsdf_fusion.hpp"
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <limits>
+
+#include "context.hpp"
+#include "volumes/tsdf_scratch.hpp"
+
+GGSLAM_DECLARE_KERNEL(void tsdf_prepare_depth(const float* depth, int width, int height, int row, float min_depth,
+                                              float max_depth, float* out, volumes::DepthTile* tiles, int32_t* valid))
+GGSLAM_DECLARE_KERNEL(void tsdf_erode_row(const float* depth, int width, int v, float* out))
+GGSLAM_DECLARE_KERNEL(void tsdf_erode_column(const float* rows, int width, int height, int v, float* out))
+GGSLAM_DECLARE_KERNEL(void tsdf_pack_color(const uint8_t* color, std::size_t begin, std::size_t end, int32_t* out))
+GGSLAM_DECLARE_KERNEL(unsigned tsdf_fuse_block(const volumes::VoxelUpdate& update, volumes::VoxelBlock& block))
+GGSLAM_DECLARE_KERNEL(unsigned tsdf_decay_block(volumes::VoxelBlock& block, float factor, int least))
+
+namespace ggslam::volumes {
+namespace {
+
+using Clock = std::chrono::steady_clock;
+
+double milliseconds(Clock::time_point from, Clock::time_point to) {
+  return std::chrono::duration<double, std::milli>(to - from).count();
+}
+
+// --- images ----------------------------------------------------------------------------------------------------------
+
+void add_levels(DepthPyramid& pyramid) {
+  for (std::size_t level = 0; pyramid.levels[level].width > 1 || pyramid.levels[level].height > 1; ++level) {
+    if (pyramid.levels.size() < level + 2) pyramid.levels.emplace_back();
+    const DepthPyramid::Level& fine = pyramid.levels[level];
+    DepthPyramid::Level& coarse = pyramid.levels[level + 1];
+    coarse.width = (fine.width + 1) / 2, coarse.height = (fine.height + 1) / 2;
+    coarse.tiles.assign(static_cast<std::size_t>(coarse.width) * coarse.height,
+                        {std::numeric_limits<float>::infinity(), 0.0f});
+    for (int v = 0; v < fine.height; ++v)
+      for (int u = 0; u < fine.width; ++u) {
+        const DepthTile from = fine.tiles[static_cast<std::size_t>(v) * fine.width + u];
+        DepthTile& to = coarse.tiles[static_cast<std::size_t>(v / 2) * coarse.width + u / 2];
+        to.low = std::min(to.low, from.low), to.high = std::max(to.high, from.high);
+      }
+    if (coarse.width == 1 && coarse.height == 1) pyramid.levels.resize(level + 2);
+  }
+}
+
+void erode(const FusionInput& in, Context& context, FusionImages& images) {
+  const auto kernel = GGSLAM_DISPATCH(context.isa, tsdf_erode_column);
+  images.eroded.resize(images.eroded_rows.size());
+  context.pool.parallel_for(in.height, 16, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t v = begin; v < end; ++v)
+      kernel(images.eroded_rows.data(), in.width, in.height, static_cast<int>(v), images.eroded.data());
+  });
+}
+
+void prepare(const FusionInput& in, const FusionSettings& settings, Context& context, FusionImages& images) {
+  const std::size_t pixels = static_cast<std::size_t>(in.width) * in.height;
+  const int columns = (in.width + kTile - 1) / kTile, rows = (in.height + kTile - 1) / kTile;
+  DepthPyramid& pyramid = images.pyramid;
+  if (pyramid.levels.empty()) pyramid.levels.emplace_back();
+  DepthPyramid::Level& base = pyramid.levels[0];
+  base.width = columns, base.height = rows;
+  base.tiles.resize(static_cast<std::size_t>(columns) * rows);
+  images.depth.resize(pixels + in.width + 1), images.eroded_rows.resize(pixels);
+  if (in.color != nullptr) images.color.resize(pixels);
+  const std::size_t stride = columns + 1;
+  pyramid.valid.assign(stride * (rows + 1), 0);
+  const auto depth_kernel = GGSLAM_DISPATCH(context.isa, tsdf_prepare_depth);
+  const auto erosion_kernel = GGSLAM_DISPATCH(context.isa, tsdf_erode_row);
+  const auto color_kernel = GGSLAM_DISPATCH(context.isa, tsdf_pack_color);
+  context.pool.parallel_for(rows, 8, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t row = begin; row < end; ++row) {
+      const int first = static_cast<int>(row) * kTile, last = std::min(first + kTile, in.height);
+      depth_kernel(in.depth, in.width, in.height, static_cast<int>(row), settings.min_depth, settings.max_depth,
+                   images.depth.data(), base.tiles.data() + row * columns, &pyramid.valid[(row + 1) * stride + 1]);
+      for (int v = first; v < last; ++v) erosion_kernel(images.depth.data(), in.width, v, images.eroded_rows.data());
+    }
+    if (in.color == nullptr) return;
+    const std::size_t per_row = static_cast<std::size_t>(kTile) * in.width;
+    color_kernel(in.color, begin * per_row, std::min(end * per_row, pixels), images.color.data());
+  });
+  erode(in, context, images);
+  for (int v = 1; v <= rows; ++v)
+    for (int u = 1; u <= columns; ++u)
+      pyramid.valid[v * stride + u] += pyramid.valid[v * stride + u - 1] + pyramid.valid[(v - 1) * stride + u] -
+                                       pyramid.valid[(v - 1) * stride + u - 1];
+  add_levels(pyramid);
+  const DepthTile all = pyramid.levels.back().tiles[0];
+  images.nearest = all.low, images.farthest = all.high;
+}
+
+// --- blocks ----------------------------------------------------------------------------------------------------------
+
+// Candidates of all cells, in an order that does not depend on the threads.
+void select(const Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context,
+            FusionScratch& scratch) {
+  scratch.candidates.clear();
+  if (scratch.images.farthest <= 0) return;
+  const CandidateSearch search(map, in, settings, scratch.images);
+  const std::size_t threads = context.pool.size();
+  scratch.parts.resize(threads);
+  for (auto& part : scratch.parts) part.clear();
+  scratch.cells.assign(search.cells(), {});
+  context.pool.parallel_for(search.cells(), 4, [&](std::size_t begin, std::size_t end, int thread) {
+    std::vector<Candidate>& part = scratch.parts[thread];
+    for (std::size_t cell = begin; cell < end; ++cell) {
+      const std::size_t first = part.size();
+      search.search(cell, part);
+      scratch.cells[cell] = {thread, first, part.size()};
+    }
+  });
+  for (const auto& cell : scratch.cells) {
+    const auto from = scratch.parts[cell.thread].begin();
+    scratch.candidates.insert(scratch.candidates.end(), from + cell.begin, from + cell.end);
+  }
+}
+
+uint16_t grown(uint16_t weight, float measured, float most) {
+  const float total = std::min(weight + std::floor(measured + 0.5f), std::max(most, static_cast<float>(weight)));
+  return static_cast<uint16_t>(total);
+}
+
+// Notes free blocks, makes the blocks of surfaces, and lists the blocks whose voxels are to be updated.
+void make_blocks(Tsdf& map, const FusionSettings& settings, FusionScratch& scratch, FusionStats& stats) {
+  const float scale = kFullWeight / map.max_weight, most = settings.max_free_weight * scale;
+  scratch.updates.clear();
+  for (Candidate& c : scratch.candidates) {
+    const bool is_new = c.row < 0;
+    if (is_new) c.row = static_cast<int32_t>(map.insert(c.at));
+    Block& block = map.block(c.row);
+    block.seen = map.views;
+    // A block that is known to be free needs no voxels for a view that shows a part of it as free.
+    if (c.sight == Sight::partial && !is_new && block.slot < 0) continue;
+    if (c.sight == Sight::free && block.slot < 0) {
+      if (is_new) block.revision = map.revision, ++stats.made;
+      block.free_weight = grown(block.free_weight, scale / (c.z * c.z), most);
+      continue;
+    }
+    const bool was_dense = block.slot >= 0;
+    VoxelBlock* voxels = map.densify(block);
+    scratch.updates.push_back({c.at, voxels, c.row, is_new, !was_dense, 0u});
+  }
+}
+
+void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context,
+                   FusionScratch& scratch) {
+  VoxelUpdate view{};
+  view.depth = scratch.images.depth.data();
+  view.eroded = settings.clearing > 0 ? scratch.images.eroded.data() : nullptr;
+  view.color = in.color == nullptr ? nullptr : scratch.images.color.data();
+  view.labels = in.labels;
+  view.width = in.width, view.height = in.height;
+  view.fx = in.fx, view.fy = in.fy, view.cx = in.cx, view.cy = in.cy;
+  view.truncation = map.truncation, view.voxel = map.voxel, view.edge = settings.edge;
+  view.clearing = settings.clearing;
+  view.weight_scale = kFullWeight / map.max_weight;
+  view.max_free_weight = settings.max_free_weight * view.weight_scale;
+  for (int axis = 0; axis < 3; ++axis)
+    for (int a = 0; a < 3; ++a) view.step[axis][a] = static_cast<float>(in.rotation[3 * a + axis] * map.voxel);
+  const auto kernel = GGSLAM_DISPATCH(context.isa, tsdf_fuse_block);
+  context.pool.parallel_for(scratch.updates.size(), 8, [&](std::size_t begin, std::size_t end, int) {
+    VoxelUpdate own = view;
+    for (std::size_t n = begin; n < end; ++n) {
+      FusionScratch::Update& update = scratch.updates[n];
+      const double p[3] = {(kSide * static_cast<double>(update.at.x) + 0.5) * map.voxel,
+                           (kSide * static_cast<double>(update.at.y) + 0.5) * map.voxel,
+                           (kSide * static_cast<double>(update.at.z) + 0.5) * map.voxel};
+      for (int a = 0; a < 3; ++a) {
+        const double* r = in.rotation + 3 * a;
+        own.origin[a] = static_cast<float>(r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + in.translation[a]);
+      }
+      update.flags = kernel(own, *update.voxels);
+    }
+  });
+}
+
+uint16_t least_weight(const VoxelBlock& voxels) { return *std::min_element(voxels.weight, voxels.weight + kVoxels); }
+
+// Blocks that are free throughout give their voxels back; those that got voxels for nothing are as they were before.
+void finish_blocks(Tsdf& map, FusionScratch& scratch, FusionStats& stats) {
+  scratch.gone.clear();
+  for (const FusionScratch::Update& update : scratch.updates) {
+    Block& block = map.block(update.row);
+    const bool in_vain = update.is_new ? update.flags & kNoneSeen : update.was_free && !(update.flags & kInBand);
+    if (update.flags & kAllFree) {
+      if (!update.was_free || update.is_new) block.revision = map.revision;
+      stats.freed += !update.was_free;
+      stats.made += update.is_new;
+      map.collapse(block, least_weight(*update.voxels));
+    } else if (in_vain && update.is_new) {
+      scratch.gone.push_back(update.at);
+    } else if (in_vain) {
+      map.collapse(block, block.free_weight);
+    } else if (update.flags & kChanged) {
+      block.revision = map.revision;
+      stats.made += update.is_new;
+    }
+  }
+  for (const BlockCoordinates at : scratch.gone) map.erase(map.find(at));
+}
+
+}  // namespace
+
+FusionStats integrate(Tsdf& map, FusionScratch& scratch, Context& context, const FusionInput& in,
+                      const FusionSettings& settings) {
+  FusionStats stats{};
+  ++map.revision, ++map.views;
+  const auto start = Clock::now();
+  prepare(in, settings, context, scratch.images);
+  const auto prepared = Clock::now();
+  select(map, in, settings, context, scratch);
+  make_blocks(map, settings, scratch, stats);
+  const auto selected = Clock::now();
+  update_blocks(map, in, settings, context, scratch);
+  finish_blocks(map, scratch, stats);
+  stats.blocks = scratch.candidates.size(), stats.updated = scratch.updates.size();
+  stats.prepare_ms = milliseconds(start, prepared), stats.select_ms = milliseconds(prepared, selected);
+  stats.update_ms = milliseconds(selected, Clock::now());
+  return stats;
+}
+
+int64_t decay(Tsdf& map, FusionScratch& scratch, Context& context, float factor, int least, bool spare_in_view) {
+  ++map.revision;
+  const auto kernel = GGSLAM_DISPATCH(context.isa, tsdf_decay_block);
+  scratch.emptied.assign(map.size(), 0);
+  context.pool.parallel_for(map.size(), 64, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t row = begin; row < end; ++row) {
+      Block& block = map.block(row);
+      if (block.frozen || (spare_in_view && map.views > 0 && block.seen == map.views)) continue;
+      if (block.slot < 0) {
+        const int weight = static_cast<int>(block.free_weight * factor + 0.5f);
+        block.free_weight = static_cast<uint16_t>(weight < least ? 0 : weight);
+        scratch.emptied[row] = block.free_weight == 0;
+        continue;
+      }
+      const unsigned flags = kernel(*map.voxels(block), factor, least);
+      if (flags & kChanged) block.revision = map.revision;
+      scratch.emptied[row] = (flags & kNoneSeen) != 0;
+    }
+  });
+  int64_t erased = 0;
+  // From the last row down: an erased row is filled by the last one, which has been dealt with.
+  for (std::size_t row = scratch.emptied.size(); row-- > 0;)
+    if (scratch.emptied[row]) map.erase(row), ++erased;
+  return erased;
+}
+
+}  // namespace ggslam::volumes

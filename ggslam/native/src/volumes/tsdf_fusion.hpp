@@ -1,0 +1,146 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the parts of the fusion of a depth image share.
+#pragma once
+#include <cstdint>
+#include <vector>
+
+#include "volumes/tsdf.hpp"
+
+namespace ggslam {
+struct Context;
+}
+
+namespace ggslam::volumes {
+
+constexpr int kTile = 4;        // pixels along an edge of the depth pyramid's smallest tiles
+constexpr int kErosion = 2;     // pixels: what is looked through must be so in this neighbourhood
+constexpr float kNear = 0.02f;  // metres; what is nearer is not projected
+
+// Numbers of the fusion, field by field as in ggslam/volumes/tsdf_native.py. Distances in metres.
+struct FusionSettings {
+  float min_depth, max_depth, free_share, edge, clearing, max_free_weight;
+};
+
+// A view to be fused. `color` [H, W, 3] and `labels` [H, W] may be null.
+struct FusionInput {
+  const float* depth;
+  const uint8_t* color;
+  const uint16_t* labels;
+  int32_t width, height;
+  float fx, fy, cx, cy;
+  double rotation[9], translation[3];  // of T_camera_world, row by row
+};
+
+struct FusionStats {
+  int64_t blocks, updated, made, freed;
+  double prepare_ms, select_ms, update_ms;
+};
+
+// Smallest and largest depth in tiles of kTile x 2^level pixels; (inf, 0) where there is none.
+struct DepthTile {
+  float low, high;
+};
+
+struct DepthPyramid {
+  struct Level {
+    int width, height;
+    std::vector<DepthTile> tiles;
+  };
+  std::vector<Level> levels;
+  // [tile rows + 1, tile columns + 1], number of pixels with depth above and left of a tile
+  std::vector<int32_t> valid;
+};
+
+// The prepared images: depth with 0 for none, with room to read a row and a pixel past the end; the smallest depth
+// within kErosion pixels, infinite for none; colour as red + 256 green + 65536 blue.
+struct FusionImages {
+  std::vector<float> depth, eroded_rows, eroded;
+  std::vector<int32_t> color;
+  DepthPyramid pyramid;
+  float nearest, farthest;  // of all depth; (inf, 0) if there is none
+};
+
+enum class Sight : uint8_t {
+  surface,  // depth lies within the truncation of the block
+  free,     // the block is wholly in view and all depth lies behind it
+  partial   // a part of it is in view and free
+};
+
+struct Candidate {
+  BlockCoordinates at;
+  Sight sight;
+  float z;      // depth of the block's centre
+  int32_t row;  // in the map; -1: none yet
+};
+
+// Blocks that the view tells about: those with a surface, those that are free, and those of which parts are, unless
+// they are known to be free.
+class CandidateSearch {
+ public:
+  CandidateSearch(const Tsdf& map, const FusionInput& input, const FusionSettings& settings,
+                  const FusionImages& images);
+
+  // Cubes of many blocks that enclose what is in view.
+  std::size_t cells() const { return static_cast<std::size_t>(count_[0]) * count_[1] * count_[2]; }
+  // Appends the candidates of a cell.
+  void search(std::size_t cell, std::vector<Candidate>& out) const;
+
+ private:
+  static constexpr int kMostCells = 4096;
+  struct Footprint {
+    int u0, v0, u1, v1;  // tiles, inclusive
+    bool whole;          // nothing is cut off at the image's border or near the camera
+  };
+  struct Cube {
+    float centre[3], near, far;  // in the camera's frame, with the depth of its nearest and farthest corner
+    float offset[3], half;       // centre from the camera along the map's axes, half of the edge
+  };
+  const Tsdf& map_;
+  const FusionInput& in_;
+  const FusionSettings& settings_;
+  const FusionImages& images_;
+  double block_;         // edge, metres
+  int cell_ = 4;         // edge of a cell in blocks
+  float extent_[3];      // half extents of a block along the camera's axes
+  double position_[3];   // of the camera
+  float axes_[3][3];     // of the camera in the map
+  float spread_[3];      // along the map's axes at z = 1, of one pixel
+  int32_t first_[3], count_[3];
+
+  void descend(BlockCoordinates at, int side, std::vector<Candidate>& out) const;
+  void emit(BlockCoordinates at, Sight sight, std::vector<Candidate>& out) const;
+  void emit_free(BlockCoordinates at, int side, std::vector<Candidate>& out) const;
+  Cube cube(BlockCoordinates at, int side) const;
+  bool footprint(const Cube& cube, int side, Footprint& out) const;
+  bool meets(int level, int u, int v, const Cube& cube, float& z0, float& z1) const;
+  unsigned look(int level, int u, int v, const Footprint& area, const Cube& cube) const;
+  unsigned look_at_pixels(int u, int v, float low, float high) const;
+  float valid_share(const Footprint& area) const;
+};
+
+// What happened to a block's voxels; bits.
+enum : unsigned { kChanged = 1, kInBand = 2, kAllFree = 4, kNoneSeen = 8 };
+
+// A block to be updated, for the kernel.
+struct VoxelUpdate {
+  const float* depth;
+  const float* eroded;     // null: no clearing
+  const int32_t* color;    // null: none
+  const uint16_t* labels;  // null: none
+  int32_t width, height;
+  float fx, fy, cx, cy;
+  float origin[3];         // of the block's first voxel centre, camera frame
+  float step[3][3];        // from voxel to voxel along the block's axes, camera frame
+  float truncation, voxel, edge, clearing;
+  float weight_scale;      // 65535 / largest weight
+  float max_free_weight;   // in 65535ths of the largest
+};
+
+FusionStats integrate(Tsdf& map, FusionScratch& scratch, Context& context, const FusionInput& input,
+                      const FusionSettings& settings);
+
+// Multiplies the weights of blocks that are not frozen (nor, if those are to be spared, in the last view); voxels whose
+// weight falls below `least` are forgotten, and blocks without others erased. Returns how many.
+int64_t decay(Tsdf& map, FusionScratch& scratch, Context& context, float factor, int least, bool spare_in_view);
+
+}  // namespace ggslam::volumes

@@ -1,0 +1,31 @@
+// SPDX-License-Identifier: Apache-2.0
+// Memory that the fusion keeps from view to view.
+#pragma once
+#include <vector>
+
+#include "volumes/tsdf_fusion.hpp"
+
+namespace ggslam::volumes {
+
+struct FusionScratch {
+  struct Cell {
+    int thread = 0;
+    std::size_t begin = 0, end = 0;  // candidates of the cell among those of the thread
+  };
+  struct Update {
+    BlockCoordinates at;
+    VoxelBlock* voxels;
+    int32_t row;
+    bool is_new, was_free;
+    unsigned flags;
+  };
+  FusionImages images;
+  std::vector<std::vector<Candidate>> parts;
+  std::vector<Cell> cells;
+  std::vector<Candidate> candidates;
+  std::vector<Update> updates;
+  std::vector<BlockCoordinates> gone;
+  std::vector<uint8_t> emptied;
+};
+
+}  // namespace ggslam::volumes

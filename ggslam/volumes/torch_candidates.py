@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which blocks a view tells about, in plain torch: the rules of the compiled core (native/src/volumes/
+tsdf_candidates.cpp), for all blocks of the frustum at once instead of from large cubes to small ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from ggslam.scene.camera import Camera
+
+TILE = 4
+NEAR = 0.02
+_CHUNK = 1 << 22
+"""Pairs of block and tile looked at together."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A view on the device: depth float32 [H, W] with 0 for none, camera, rotation [3, 3] and translation [3] of
+    T_camera_world (float64)."""
+
+    depth: Tensor
+    camera: Camera
+    rotation: Tensor
+    translation: Tensor
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Blocks in view: coordinates int64 [n, 3], z [n] of their centres, and what is seen of each: a surface within the
+    truncation, or free space throughout."""
+
+    coordinates: Tensor
+    z: Tensor
+    surface: Tensor
+    free: Tensor
+
+
+@dataclass(frozen=True)
+class _Tiles:
+    """Smallest and largest depth by tile, level after level in one row; pixels with depth, summed from the top left."""
+
+    low: Tensor
+    high: Tensor
+    widths: Tensor
+    starts: Tensor
+    sums: Tensor
+
+
+def find_candidates(view: View, block: float, truncation: float, free_share: float) -> Candidates:
+    """Blocks of edge `block` metres that show a surface, are free throughout, or are in view otherwise."""
+    device = view.depth.device
+    if not bool((view.depth > 0).any()):
+        none = torch.zeros(0, device=device)
+        return Candidates(none.long().reshape(0, 3), none, none.bool(), none.bool())
+    tiles = _tiles(view.depth)
+    at = _frustum_blocks(view, block, float(view.depth.max()) + truncation)
+    centre = ((at.double() + 0.5) * block) @ view.rotation.T + view.translation
+    extent = 0.5 * block * view.rotation.abs().sum(1)
+    area, whole, visible = _footprints(view.camera, centre.float(), extent.float())
+    at, centre, area, whole = at[visible], centre[visible].float(), area[visible], whole[visible]
+    near, far = centre[:, 2] - extent[2].float(), centre[:, 2] + extent[2].float()
+
+    low, high = _range_over(tiles, area)
+    some = (high > 0) & (high >= near - truncation)
+    at, centre, area, whole, low, near, far = (a[some] for a in (at, centre, area, whole, low, near, far))
+    behind = low > far + truncation
+    surface, hidden = torch.zeros_like(behind), torch.zeros_like(behind)
+    unsure = torch.nonzero(~behind)[:, 0]
+    position = -view.rotation.T @ view.translation
+    offset = ((at[unsure].double() + 0.5) * block - position).float()
+    seen = _look(view, tiles, area[unsure], offset, near[unsure], far[unsure], 0.5 * block, truncation)
+    behind[unsure], hidden[unsure], surface[unsure] = seen
+    keep = behind | surface
+    free = behind & ~hidden & ~surface & whole & (_valid_share(tiles, area, view.camera) >= free_share)
+    return Candidates(at[keep], centre[keep, 2], surface[keep], free[keep])
+
+
+def _tiles(depth: Tensor) -> _Tiles:
+    height, width = depth.shape
+    padded = pad(depth, (0, -width % TILE, 0, -height % TILE))
+    blocks = padded.unfold(0, TILE, TILE).unfold(1, TILE, TILE).flatten(2)
+    low, high = torch.where(blocks > 0, blocks, torch.inf).amin(2), blocks.amax(2)
+    counts = (blocks > 0).sum(2)
+    sums = pad(counts.cumsum(0).cumsum(1), (1, 0, 1, 0))
+    lows, highs, widths = [low], [high], [low.shape[1]]
+    while max(low.shape) > 1:
+        odd = (0, low.shape[1] % 2, 0, low.shape[0] % 2)
+        low = pad(low, odd, value=torch.inf).unfold(0, 2, 2).unfold(1, 2, 2).flatten(2).amin(2)
+        high = pad(high, odd).unfold(0, 2, 2).unfold(1, 2, 2).flatten(2).amax(2)
+        lows.append(low)
+        highs.append(high)
+        widths.append(low.shape[1])
+    sizes = torch.tensor([0, *(level.numel() for level in lows)], device=depth.device)
+    return _Tiles(
+        torch.cat([level.flatten() for level in lows]), torch.cat([level.flatten() for level in highs]),
+        torch.tensor(widths, device=depth.device), sizes.cumsum(0), sums,
+    )  # fmt: skip
+
+
+def _frustum_blocks(view: View, block: float, far: float) -> Tensor:
+    c, rotation, translation = view.camera, view.rotation, view.translation
+    x = torch.tensor([-0.5 - c.cx, c.width - 0.5 - c.cx], dtype=torch.float64) / c.fx
+    y = torch.tensor([-0.5 - c.cy, c.height - 0.5 - c.cy], dtype=torch.float64) / c.fy
+    corners = torch.cartesian_prod(x, y, torch.ones(1, dtype=torch.float64)) * far
+    corners = torch.cat([torch.zeros(1, 3, dtype=torch.float64), corners]).to(rotation.device)
+    world = (corners - translation) @ rotation
+    first, last = (world.amin(0) / block).floor().long(), (world.amax(0) / block).floor().long()
+    axes = [torch.arange(int(a), int(b) + 1, device=rotation.device) for a, b in zip(first, last, strict=True)]
+    return torch.cartesian_prod(*axes)
+
+
+def _footprints(camera: Camera, centre: Tensor, extent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Tiles u0, v0, u1, v1 (inclusive) of blocks, whether nothing is cut off, and whether there are any."""
+    near, far = centre[:, 2] - extent[2], centre[:, 2] + extent[2]
+    start = near.clamp(min=NEAR)
+    whole, visible = near >= NEAR, far > NEAR
+    low, high = [], []
+    c = camera
+    for a, (focal, middle, size) in enumerate(((c.fx, c.cx, c.width), (c.fy, c.cy, c.height))):
+        left, right = centre[:, a] - extent[a], centre[:, a] + extent[a]
+        p0 = focal * left / torch.where(left < 0, start, far) + middle + 0.5
+        p1 = focal * right / torch.where(right > 0, start, far) + middle + 0.5
+        visible = visible & (p1 >= 0) & (p0 < size)
+        whole = whole & (p0 >= 0) & (p1 < size)
+        low.append(p0.clamp(0, size - 1).long() // TILE)
+        high.append(p1.clamp(0, size - 1).long() // TILE)
+    return torch.stack([*low, *high], 1), whole, visible
+
+
+def _range_over(tiles: _Tiles, area: Tensor) -> tuple[Tensor, Tensor]:
+    """Bounds of the depth in footprints, from the four tiles of a level that cover each."""
+    span = torch.maximum(area[:, 2] - area[:, 0], area[:, 3] - area[:, 1])
+    level = torch.ceil(torch.log2(span.clamp(min=1).double())).long()
+    level = level.clamp(max=len(tiles.widths) - 1)
+    low, high = torch.full_like(span, torch.inf, dtype=torch.float32), torch.zeros_like(span, dtype=torch.float32)
+    for u in (area[:, 0], area[:, 2]):
+        for v in (area[:, 1], area[:, 3]):
+            at = tiles.starts[level] + (v >> level) * tiles.widths[level] + (u >> level)
+            low, high = torch.minimum(low, tiles.low[at]), torch.maximum(high, tiles.high[at])
+    return low, high
+
+
+def _look(
+    view: View, tiles: _Tiles, area: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float, truncation: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Whether depth lies behind, in front of, and at blocks, tile by tile of their footprints; bool [n] each."""
+    n, device = len(area), area.device
+    found = torch.zeros(3, n, dtype=torch.bool, device=device)
+    columns = area[:, 2] - area[:, 0] + 1
+    counts = columns * (area[:, 3] - area[:, 1] + 1)
+    ends = counts.cumsum(0)
+    total = int(ends[-1]) if n else 0
+    for begin in range(0, total, _CHUNK):
+        pair = torch.arange(begin, min(begin + _CHUNK, total), device=device)
+        b = torch.searchsorted(ends, pair, right=True)
+        within = pair - (ends[b] - counts[b])
+        u, v = area[b, 0] + within % columns[b], area[b, 1] + within // columns[b]
+        tile = v * tiles.widths[0] + u
+        met, z0, z1 = _meeting(view, u, v, offset[b], near[b], far[b], half)
+        low, high = z0 - truncation, z1 + truncation
+        least, most = tiles.low[tile], tiles.high[tile]
+        met &= most > 0
+        behind, front = met & (least > high), met & (most < low)
+        at = met & ~behind & ~front
+        # Depth in front and behind: nothing may lie between.
+        split = torch.nonzero(at & (least < low) & (most > high))[:, 0]
+        between = _pixels_between(view.depth, u[split], v[split], low[split], high[split])
+        at[split], behind[split], front[split] = between, ~between, ~between
+        for kind, flags in zip(found, (behind, front, at), strict=True):
+            kind[b[flags]] = True
+    return found[0], found[1], found[2]
+
+
+def _meeting(
+    view: View, u: Tensor, v: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Whether rays through tiles (u, v) meet cubes, and the stretch of depth in which they do."""
+    c = view.camera
+    x = ((2 * u + 1) * (0.5 * TILE) - 0.5 - c.cx) / c.fx
+    y = ((2 * v + 1) * (0.5 * TILE) - 0.5 - c.cy) / c.fy
+    axes = view.rotation.T.float()
+    z0, z1, met = near.clamp(min=NEAR), far, torch.ones_like(near, dtype=torch.bool)
+    for a in range(3):
+        direction = axes[a, 0] * x + axes[a, 1] * y + axes[a, 2]
+        spread = 0.5 * TILE * (axes[a, 0].abs() / c.fx + axes[a, 1].abs() / c.fy)
+        low, high = offset[:, a] - half, offset[:, a] + half
+        most, least = direction + spread, direction - spread
+        z0 = torch.where(most > 0, torch.maximum(z0, low / most), z0)
+        z1 = torch.where(most < 0, torch.minimum(z1, low / most), z1)
+        z1 = torch.where(least > 0, torch.minimum(z1, high / least), z1)
+        z0 = torch.where(least < 0, torch.maximum(z0, high / least), z0)
+        met &= ~((most == 0) & (low > 0)) & ~((least == 0) & (high < 0))
+    return met & (z0 <= z1), z0, z1
+
+
+def _pixels_between(depth: Tensor, u: Tensor, v: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Whether tiles have a pixel of depth in [low, high]."""
+    step = torch.arange(TILE, device=depth.device)
+    rows = (v[:, None] * TILE + step).clamp(max=depth.shape[0] - 1)
+    columns = (u[:, None] * TILE + step).clamp(max=depth.shape[1] - 1)
+    z = depth[rows[:, :, None], columns[:, None, :]].flatten(1)
+    return ((z >= low[:, None]) & (z <= high[:, None])).any(1)
+
+
+def _valid_share(tiles: _Tiles, area: Tensor, camera: Camera) -> Tensor:
+    u0, v0, u1, v1 = area.T
+    s = tiles.sums
+    n = s[v1 + 1, u1 + 1] - s[v1 + 1, u0] - s[v0, u1 + 1] + s[v0, u0]
+    columns = ((u1 + 1) * TILE).clamp(max=camera.width) - u0 * TILE
+    rows = ((v1 + 1) * TILE).clamp(max=camera.height) - v0 * TILE
+    return n / (columns * rows)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A TSDF as one file: NumPy's .npz with the settings, the dense blocks' voxels, and the free blocks."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import ConfigError, FormatError
+from ggslam.formats.atomic import write_bytes
+from ggslam.native.loader import NativeContext
+from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
+from ggslam.volumes.settings import TsdfSettings
+from ggslam.volumes.tsdf import VOXELS, TsdfMap
+
+_VERSION = 1
+_CONTENT = "a TSDF"
+_VOXEL_ARRAYS = {
+    "value": (np.int16, ()), "weight": (np.uint16, ()), "color": (np.uint8, (3,)), "label": (np.uint16, ()),
+    "votes": (np.uint8, ()),
+}  # fmt: skip
+
+
+def save_tsdf(path: str | Path, tsdf: TsdfMap) -> None:
+    """Writes a map.
+
+    Raises:
+        RunFolderError: the file cannot be written.
+    """
+    blocks = tsdf.blocks()
+    # Order in the map depends on its history; in the file it does not.
+    order = np.lexsort(blocks.coordinates.T)
+    coordinates, dense = blocks.coordinates[order], blocks.dense[order]
+    voxels = tsdf.read(coordinates[dense])
+    names = [field.name for field in dataclasses.fields(TsdfSettings)]
+    data = arrays_to_bytes(
+        version=np.array(_VERSION),
+        setting_names=np.array(names),
+        setting_values=np.array([getattr(tsdf.settings, name) for name in names], float),
+        dense=coordinates[dense],
+        free=coordinates[~dense],
+        free_weight=blocks.free_weight[order][~dense],
+        **{name: getattr(voxels, name) for name in _VOXEL_ARRAYS},
+    )
+    write_bytes(path, data)
+
+
+def load_tsdf(path: str | Path, frozen: bool = True, context: NativeContext | None = None) -> TsdfMap:
+    """Reads a map.
+
+    Args:
+        path: of a file by `save_tsdf`.
+        frozen: decay leaves its blocks alone.
+        context: threads to work on.
+
+    Raises:
+        FormatError: the file is missing or damaged.
+    """
+    arrays = read_all_arrays(path, _CONTENT)
+    settings = _settings(path, arrays)
+    dense = _checked(path, arrays, "dense", np.int32, (-1, 3))
+    free = _checked(path, arrays, "free", np.int32, (-1, 3))
+    voxels = {
+        name: _checked(path, arrays, name, dtype, (len(dense), VOXELS, *tail))
+        for name, (dtype, tail) in _VOXEL_ARRAYS.items()
+    }
+    free_weight = _checked(path, arrays, "free_weight", np.uint16, (len(free),))
+    everything = np.concatenate([dense, free])
+    if len(np.unique(everything, axis=0)) != len(everything):
+        raise FormatError(f"{path}: not {_CONTENT} written by ggslam: a block is there twice")
+    tsdf = TsdfMap(settings, context)
+    tsdf.write(dense, **voxels)
+    tsdf.write_free(free, free_weight)
+    tsdf.freeze(frozen)
+    return tsdf
+
+
+def _settings(path: str | Path, arrays: dict[str, np.ndarray]) -> TsdfSettings:
+    try:
+        if int(arrays["version"]) != _VERSION:
+            raise FormatError(f"{path}: TSDF of version {int(arrays['version'])}, expected {_VERSION}")
+        names, values = arrays["setting_names"], arrays["setting_values"]
+        return TsdfSettings(**{str(n): float(v) for n, v in zip(names, values, strict=True)})
+    except (KeyError, TypeError, ValueError, ConfigError) as error:
+        raise FormatError(f"{path}: not {_CONTENT} written by ggslam: {error}") from None
+
+
+def _checked(
+    path: str | Path, arrays: dict[str, np.ndarray], name: str, dtype: type, shape: tuple[int, ...]
+) -> np.ndarray:
+    array = arrays.get(name)
+    if array is None:
+        raise FormatError(f"{path}: not {_CONTENT} written by ggslam: it has no '{name}'")
+    fits = array.ndim == len(shape) and all(e in (-1, n) for e, n in zip(shape, array.shape, strict=True))
+    if array.dtype != dtype or not fits:
+        expected = f"{np.dtype(dtype).name} {['n' if e < 0 else e for e in shape]}"
+        raise FormatError(f"{path}: {name}: expected {expected}, found {array.dtype} {list(array.shape)}")
+    return array

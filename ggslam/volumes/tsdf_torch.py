@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The TSDF in plain torch: the same fusion as the compiled core's (`TsdfMap`), batched over blocks, for any device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.volumes.fusion_view import FusionView
+from ggslam.volumes.settings import TsdfSettings
+from ggslam.volumes.torch_candidates import NEAR, Candidates, View, find_candidates
+from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, MOST_VOXELS, SIDE, VOXELS, TsdfMap
+
+_SURPRISE = 0.5
+_FREE_FROM = 0.98 * FREE_VALUE
+_EROSION = 2
+_LABEL_VOXELS = 2.0
+_COLOR_SHARE = 0.125
+_OFFSET = 1 << 20
+"""Block coordinates are below this in size, so that three of them make one number."""
+
+
+@dataclass
+class Voxels:
+    """Voxels of blocks as in `tsdf.BlockVoxels`, [n, 512] (color [n, 512, 3]), as int32 (value, weight, label), uint8
+    (color) and int32 (votes)."""
+
+    value: Tensor
+    weight: Tensor
+    color: Tensor
+    label: Tensor
+    votes: Tensor
+
+    @staticmethod
+    def free(weight: Tensor) -> Voxels:
+        """Blocks that are free throughout, with weights [n]."""
+        value = torch.full((len(weight), VOXELS), FREE_VALUE, dtype=torch.int32, device=weight.device)
+        nothing = torch.zeros_like(value)
+        color = torch.zeros((*value.shape, 3), dtype=torch.uint8, device=weight.device)
+        return Voxels(value, weight[:, None].expand_as(value).int().clone(), color, nothing, nothing.clone())
+
+    def __getitem__(self, rows: Tensor) -> Voxels:
+        return Voxels(*(a[rows] for a in vars(self).values()))
+
+    def put(self, rows: Tensor, other: Voxels) -> None:
+        """Overwrites blocks."""
+        for name, array in vars(self).items():
+            array[rows] = getattr(other, name)
+
+    def joined(self, other: Voxels) -> Voxels:
+        """Both, one after the other."""
+        return Voxels(*(torch.cat([a, getattr(other, name)]) for name, a in vars(self).items()))
+
+
+class TorchTsdf:
+    """The map on a device.
+
+    Its blocks are those of a `TsdfMap` that fused the same views: dense where a surface was seen within the truncation,
+    free throughout between it and the camera. Values agree up to rounding.
+
+    Args:
+        settings: of the fusion.
+        device: to work on.
+    """
+
+    def __init__(self, settings: TsdfSettings | None = None, device: str | torch.device = "cpu") -> None:
+        self.settings = settings or TsdfSettings()
+        self.device = torch.device(device)
+        none = torch.zeros(0, dtype=torch.int64, device=self.device)
+        self._dense, self._voxels = none, Voxels.free(none)
+        self._free, self._free_weight = none, none
+
+    @property
+    def dense_blocks(self) -> int:
+        """Blocks with voxels."""
+        return len(self._dense)
+
+    def __len__(self) -> int:
+        """Number of blocks."""
+        return len(self._dense) + len(self._free)
+
+    def integrate(
+        self,
+        depth: np.ndarray,
+        camera: Camera,
+        T_world_camera: np.ndarray,
+        color: np.ndarray | None = None,
+        labels: np.ndarray | None = None,
+    ) -> None:
+        """Fuses a view; arguments and errors of `TsdfMap.integrate`."""
+        s = self.settings
+        limit = min(MOST_VOXELS, 0.5 * _OFFSET * SIDE) * s.voxel
+        checked = FusionView(depth, camera, T_world_camera, color, labels, limit)
+        T = torch.from_numpy(checked.T_camera_world).to(self.device)
+        depth_image = torch.from_numpy(checked.depth).to(self.device)
+        in_range = (depth_image >= s.min_depth) & (depth_image <= s.max_depth)
+        view = View(torch.where(in_range, depth_image, 0), camera, T[:3, :3], T[:3, 3])
+        found = find_candidates(view, SIDE * s.voxel, s.truncation, s.free_share)
+        keys = _keys(found.coordinates)
+        dense_row, free_row = _rows(self._dense, keys), _rows(self._free, keys)
+        self._note_free(found, keys, dense_row, free_row)
+
+        old = dense_row >= 0
+        # A block that is not known yet gets voxels also if parts of it alone are seen as free.
+        new = ~old & (found.surface | (~found.free & (free_row < 0)))
+        weight = torch.zeros_like(keys)
+        known = free_row >= 0
+        weight[known] = self._free_weight[free_row[known]]
+        voxels = self._voxels[dense_row[old]].joined(Voxels.free(weight[new]))
+        color_image = None if checked.color is None else torch.from_numpy(checked.color).to(self.device)
+        label_image = None if checked.labels is None else torch.from_numpy(checked.labels.astype(np.int32))
+        at = torch.cat([found.coordinates[old], found.coordinates[new]])
+        in_band = _fuse(voxels, at, view, s, color_image, None if label_image is None else label_image.to(self.device))
+        told = torch.where(free_row[new] < 0, (voxels.weight > 0).any(1)[int(old.sum()) :], in_band[int(old.sum()) :])
+        self._keep(voxels, dense_row[old], keys[new], told)
+
+    def _note_free(self, found: Candidates, keys: Tensor, dense_row: Tensor, free_row: Tensor) -> None:
+        free = found.free & (dense_row < 0)
+        scale = FULL_WEIGHT / self.settings.max_weight
+        measured = (scale / found.z[free] ** 2 + 0.5).floor().long()
+        known = free_row[free] >= 0
+        rows = free_row[free][known]
+        before = torch.zeros_like(measured)
+        before[known] = self._free_weight[rows]
+        most = before.clamp(min=int(self.settings.max_free_weight * scale))
+        weight = torch.minimum(before + measured, most)
+        self._free_weight[rows] = weight[known]
+        self._free = torch.cat([self._free, keys[free][~known]])
+        self._free_weight = torch.cat([self._free_weight, weight[~known]])
+
+    def _keep(self, voxels: Voxels, rows: Tensor, new_keys: Tensor, told: Tensor) -> None:
+        """Takes over updated blocks: those at `rows`, then of the new ones those that the view told something about.
+        Blocks free throughout give their voxels back."""
+        n = len(rows)
+        all_free = ((voxels.value == FREE_VALUE) & (voxels.weight > 0)).all(1)
+        self._voxels.put(rows, voxels[torch.arange(n, device=self.device)])
+        freed, freed_new = rows[all_free[:n]], new_keys[all_free[n:]]
+        least = voxels.weight.amin(1).long()[all_free]
+        made = torch.nonzero(told & ~all_free[n:])[:, 0]
+        gone = torch.isin(self._free, torch.cat([new_keys[made], freed_new]))
+        self._free = torch.cat([self._free[~gone], self._dense[freed], freed_new])
+        self._free_weight = torch.cat([self._free_weight[~gone], least])
+        if len(freed):
+            stays = torch.ones_like(self._dense, dtype=torch.bool)
+            stays[freed] = False
+            self._dense, self._voxels = self._dense[stays], self._voxels[stays]
+        if len(made):
+            self._dense = torch.cat([self._dense, new_keys[made]])
+            self._voxels = self._voxels.joined(voxels[made + n])
+
+    def to_native(self, context: NativeContext | None = None) -> TsdfMap:
+        """The same map for mesh, distance field and files."""
+        tsdf = TsdfMap(self.settings, context)
+        arrays = {name: array.cpu().numpy() for name, array in vars(self._voxels).items()}
+        tsdf.write(_coordinates(self._dense), **arrays)
+        tsdf.write_free(_coordinates(self._free), self._free_weight.cpu().numpy())
+        return tsdf
+
+
+def _keys(coordinates: Tensor) -> Tensor:
+    x, y, z = (coordinates + _OFFSET).unbind(1)
+    return (x << 42) + (y << 21) + z
+
+
+def _coordinates(keys: Tensor) -> np.ndarray:
+    mask = 2 * _OFFSET - 1
+    return (torch.stack([keys >> 42, keys >> 21 & mask, keys & mask], 1) - _OFFSET).cpu().numpy()
+
+
+def _rows(table: Tensor, keys: Tensor) -> Tensor:
+    """Where `keys` stand in `table`; -1: nowhere."""
+    if len(table) == 0:
+        return torch.full_like(keys, -1)
+    ordered, order = table.sort()
+    place = torch.searchsorted(ordered, keys).clamp(max=len(table) - 1)
+    return torch.where(ordered[place] == keys, order[place], -1)
+
+
+# --- voxels ----------------------------------------------------------------------------------------------------------
+
+
+def _fuse(
+    voxels: Voxels, at: Tensor, view: View, s: TsdfSettings, color: Tensor | None, labels: Tensor | None
+) -> Tensor:
+    """Updates the voxels of blocks at coordinates [n, 3]; returns whether any came within the truncation, [n]."""
+    distance, z, pixel = _distances(at, view, s)
+    scale = FULL_WEIGHT / s.max_weight
+    drop = ((distance + s.truncation) / (s.truncation - s.voxel)).clamp(max=1)
+    measured = _rounded(scale / z**2 * drop).clamp(max=FULL_WEIGHT)
+    valid = (distance >= -s.truncation) & (measured >= 1)
+    value, weight = voxels.value.float(), voxels.weight.float()
+    behind = valid & (distance >= s.truncation)
+    scaled = FREE_VALUE / s.truncation * distance
+    if s.clearing > 0:
+        through = behind & (weight > 0) & (value < _FREE_FROM) & (scaled - value > _SURPRISE * FREE_VALUE)
+        through &= _eroded(view.depth).flatten()[pixel] >= z + s.truncation
+        weight = torch.where(through, _rounded(weight * (1 - s.clearing)), weight)
+    total = weight + measured
+    share = measured / total
+    mean = value + share * (scaled.clamp(max=FREE_VALUE) - value)
+    mean = torch.where(behind & (mean >= _FREE_FROM), FREE_VALUE, mean)
+    most = torch.where(mean >= FREE_VALUE, s.max_free_weight * scale, float(FULL_WEIGHT))
+    grown = torch.minimum(total, torch.maximum(most, weight - measured))
+    voxels.value = torch.where(valid, _rounded(mean).int(), voxels.value)
+    voxels.weight = torch.where(valid, grown.int(), voxels.weight)
+    band = valid & ~behind
+    if color is not None:
+        bare = (voxels.color == 0).all(-1)
+        part = torch.where(bare, 1.0, share.clamp(min=_COLOR_SHARE))[..., None]
+        before = voxels.color.float()
+        after = before + part * (color.reshape(-1, 3)[pixel].float() - before)
+        voxels.color = torch.where(band[..., None], (after + 0.5).to(torch.uint8), voxels.color)
+    if labels is not None:
+        _vote(voxels, band & (distance.abs() <= _LABEL_VOXELS * s.voxel), labels.flatten()[pixel])
+    return band.any(1)
+
+
+def _rounded(values: Tensor) -> Tensor:
+    return (values + 0.5).floor()
+
+
+def _distances(at: Tensor, view: View, s: TsdfSettings) -> tuple[Tensor, Tensor, Tensor]:
+    """Distance of voxels along the optical axis (-inf: unknown), their z, and the nearest pixel (0: none); [n, 512]."""
+    device, c = at.device, view.camera
+    side = torch.arange(SIDE, device=device, dtype=torch.float64)
+    within = torch.cartesian_prod(side, side, side).flip(1) + 0.5
+    origin = (at.double() * SIDE * s.voxel) @ view.rotation.T + view.translation
+    points = (origin[:, None] + (within * s.voxel) @ view.rotation.T).float()
+    x, y, z = points.unbind(-1)
+    safe = z.clamp(min=NEAR)
+    u, v = c.fx * x / safe + c.cx, c.fy * y / safe + c.cy
+    inside = (z > NEAR) & (u >= -0.5) & (u < c.width - 0.5) & (v >= -0.5) & (v < c.height - 0.5)
+    pixel = torch.where(inside, (v + 0.5).long() * c.width + (u + 0.5).long(), 0)
+    nearest = view.depth.flatten()[pixel]
+    depth = _interpolated(view, inside, u, v, nearest, s)
+    return torch.where(inside & (nearest > 0), depth - z, -torch.inf), safe, pixel
+
+
+def _interpolated(view: View, inside: Tensor, u: Tensor, v: Tensor, nearest: Tensor, s: TsdfSettings) -> Tensor:
+    """Depth between the four pixels around (u, v), where they are all there and differ little; else the nearest."""
+    height, width = view.depth.shape
+    inside = inside & (u >= 0) & (u < width - 1) & (v >= 0) & (v < height - 1)
+    u0, v0 = torch.where(inside, u, 0).long(), torch.where(inside, v, 0).long()
+    right, below = min(1, width - 1), width if height > 1 else 0
+    flat, at = view.depth.flatten(), v0 * width + u0
+    a, b, c, d = flat[at], flat[at + right], flat[at + below], flat[at + below + right]
+    low, high = a.minimum(b).minimum(c.minimum(d)), a.maximum(b).maximum(c.maximum(d))
+    smooth = inside & (low > 0) & (high - low <= (0.02 * low).clamp(min=s.edge_voxels * s.voxel))
+    x, y = u - u0, v - v0
+    top, bottom = a + x * (b - a), c + x * (d - c)
+    return torch.where(smooth, top + y * (bottom - top), nearest)
+
+
+def _eroded(depth: Tensor) -> Tensor:
+    """Smallest depth around each pixel; infinite where there is none."""
+    known = torch.where(depth > 0, depth, torch.inf)
+    return -max_pool2d(-known[None, None], 2 * _EROSION + 1, stride=1, padding=_EROSION)[0, 0]
+
+
+def _vote(voxels: Voxels, near: Tensor, seen: Tensor) -> None:
+    near = near & (seen > 0)
+    same = near & (seen == voxels.label)
+    taken = near & ~same & (voxels.votes == 0)
+    against = near & ~same & ~taken
+    voxels.votes = torch.where(same | taken, (voxels.votes + 1).clamp(max=255), voxels.votes - against.int())
+    voxels.label = torch.where(taken, seen, voxels.label)
