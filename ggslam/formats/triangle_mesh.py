@@ -57,6 +57,12 @@ class TriangleMesh:
         return np.cross(second - first, third - first)
 
 
+def majority_labels(labels: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Label of each triangle, [F], from those of its vertices, labels [V]: that of at least two, else of the first."""
+    first, second, third = labels[triangles].T
+    return np.where(second == third, second, first)
+
+
 def read_mesh(path: str | Path) -> TriangleMesh | None:
     """The mesh of a PLY file; None if it has no faces (it is a point cloud). Polygons are cut into fans of triangles.
 

@@ -36,30 +36,42 @@ def view_of(points: np.ndarray, width: int = 960, height: int = 720) -> View:
     A cloud around the origin is taken for the map of a run, whose world is the first camera: it is seen from there,
     a step back. Any other one is seen whole from outside, obliquely, with its direction of least extent upwards.
     """
-    focal = 0.5 * width / math.tan(_FIELD_OF_VIEW / 2)
-    camera = Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
     low, high = np.percentile(points, [1, 99], axis=0)
     size = float(np.linalg.norm(high - low)) or 1.0
-    pose = np.eye(4)
     if (points.min(0) <= 0).all() and (points.max(0) >= 0).all() and high[2] > 0.5 * size:
+        pose = np.eye(4)
         pose[2, 3] = -0.1 * size
-        return View(camera, pose)
-    upwards = int(np.argmin(high - low))
-    direction = np.full(3, 1.0)
-    direction[upwards] = 1.2
-    direction[(upwards + 1) % 3] = 0.4
+        return View(_camera(width, height), pose)
+    return outside_view(points, np.eye(3)[int(np.argmin(high - low))], width, height)
+
+
+def outside_view(points: np.ndarray, upwards: np.ndarray, width: int = 960, height: int = 720) -> View:
+    """A view of a whole cloud [N, 3] from outside, obliquely from above; `upwards` is a direction [3]."""
+    low, high = np.percentile(points, [1, 99], axis=0)
+    up = np.asarray(upwards, float) / np.linalg.norm(upwards)
+    side = np.eye(3)[(int(np.argmax(np.abs(up))) + 1) % 3]
+    side = side - (side @ up) * up
+    side /= np.linalg.norm(side)
+    direction = 1.2 * up + 0.4 * side + np.cross(up, side)
     direction /= np.linalg.norm(direction)
-    forward, down = -direction, -np.eye(3)[upwards]
+    forward, down = -direction, -up
     right = np.cross(down, forward)
     right /= np.linalg.norm(right)
+    pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - (low + high) / 2
     x, y, z = (corners @ pose[:3, :3]).T
     # As near as all corners of the cloud's box stay within the picture.
+    camera = _camera(width, height)
     wide, tall = np.abs(x) / width, np.abs(y) / height
-    distance = (2 * _FILLED * focal * np.maximum(wide, tall) - z).max()
+    distance = (2 * _FILLED * camera.fx * np.maximum(wide, tall) - z).max()
     pose[:3, 3] = (low + high) / 2 + direction * distance
     return View(camera, pose)
+
+
+def _camera(width: int, height: int) -> Camera:
+    focal = 0.5 * width / math.tan(_FIELD_OF_VIEW / 2)
+    return Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
 
 
 def draw_cloud(points: np.ndarray, colors: np.ndarray, view: View, point_size: float) -> np.ndarray:

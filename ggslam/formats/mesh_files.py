@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes meshes with normals, colours and objects: PLY by itself, OBJ and GLB (glTF 2.0) through trimesh.
+
+Coordinates are written as they are: metres, in the map's frame. glTF viewers take y for upwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from ggslam.errors import FormatError, MissingDependency
+from ggslam.formats.atomic import write_bytes
+from ggslam.formats.ply import write_ply
+from ggslam.formats.triangle_mesh import majority_labels
+
+ENDINGS = (".ply", ".obj", ".glb")
+
+
+def check_mesh_path(path: str | Path) -> None:
+    """Tells before the work whether a mesh can be written to a file of this name.
+
+    Raises:
+        FormatError: an ending that is none of `ENDINGS`.
+        MissingDependency: it needs trimesh, which is not installed.
+    """
+    ending = Path(path).suffix.lower()
+    if ending not in ENDINGS:
+        raise FormatError(f"{path}: meshes are written as {', '.join(ENDINGS)}, found the ending {ending!r}")
+    if ending != ".ply":
+        _trimesh(path)
+
+
+def write_mesh(
+    path: str | Path, vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray | None = None,
+    colors: np.ndarray | None = None, labels: np.ndarray | None = None, names: Mapping[int, str] | None = None,
+) -> None:  # fmt: skip
+    """Writes a mesh in the format that the file's ending names, whole or not at all.
+
+    PLY: binary; x y z, and what is given of nx ny nz, red green blue, object_id (ushort). OBJ: one object with normals
+    and colours (behind each vertex' position, as most programs read them), no object ids. GLB: with labels one node
+    for each object, called "ID NAME" or "object ID" ("unlabelled" for 0), else a single one.
+
+    Args:
+        path: ends in one of `ENDINGS`.
+        vertices: float [V, 3], metres.
+        triangles: int [F, 3], rows of vertices.
+        normals: float [V, 3], unit.
+        colors: uint8 [V, 3].
+        labels: uint16 [V], object of each vertex; a triangle belongs to that of most of its vertices.
+        names: of objects, for GLB.
+
+    Raises:
+        FormatError: another ending; or an empty mesh, which OBJ and GLB files cannot hold.
+        MissingDependency: OBJ or GLB without trimesh.
+        RunFolderError: the file cannot be written.
+    """
+    check_mesh_path(path)
+    if Path(path).suffix.lower() == ".ply":
+        _write_ply(path, vertices, triangles, normals, colors, labels)
+        return
+    if not len(triangles):
+        raise FormatError(f"{path}: the mesh has no triangles, and OBJ and GLB files cannot be empty; PLY files can")
+    _write_trimesh(path, vertices, triangles, normals, colors, labels, names or {})
+
+
+def _write_ply(
+    path: str | Path, vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray | None,
+    colors: np.ndarray | None, labels: np.ndarray | None,
+) -> None:  # fmt: skip
+    columns: dict[str, np.ndarray] = dict(zip("xyz", vertices.T.astype(np.float32), strict=True))
+    if normals is not None:
+        columns |= dict(zip(("nx", "ny", "nz"), normals.T.astype(np.float32), strict=True))
+    if colors is not None:
+        columns |= dict(zip(("red", "green", "blue"), colors.T.astype(np.uint8), strict=True))
+    if labels is not None:
+        columns["object_id"] = labels.astype(np.uint16)
+    rows = np.empty(len(vertices), [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    faces = np.empty(len(triangles), [("vertex_indices", np.int32, (3,))])
+    faces["vertex_indices"] = triangles
+    write_ply(path, {"vertex": rows, "face": faces})
+
+
+def _trimesh(path: str | Path) -> ModuleType:
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MissingDependency(
+            f"to write {path} the package trimesh is needed: `pip install 'ggslam[mesh]'`, or write a .ply ({error})"
+        ) from None
+    return trimesh
+
+
+def _write_trimesh(
+    path: str | Path, vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray | None,
+    colors: np.ndarray | None, labels: np.ndarray | None, names: Mapping[int, str],
+) -> None:  # fmt: skip
+    trimesh = _trimesh(path)
+
+    def geometry(chosen: np.ndarray) -> object:
+        used, corners = np.unique(chosen, return_inverse=True)
+        return trimesh.Trimesh(
+            vertices=vertices[used], faces=corners.reshape(-1, 3), process=False,
+            vertex_normals=None if normals is None else normals[used],
+            vertex_colors=None if colors is None else colors[used],
+        )  # fmt: skip
+
+    ending = Path(path).suffix.lower()[1:]
+    if ending == "obj":
+        data = geometry(triangles).export(file_type="obj", include_normals=normals is not None)  # type: ignore[attr-defined]
+        write_bytes(path, data.encode("utf-8"))
+        return
+    scene, of_triangle = trimesh.Scene(), np.zeros(len(triangles), np.uint16)
+    if labels is not None:
+        of_triangle = majority_labels(labels, triangles)
+    for label in np.unique(of_triangle).tolist():
+        name = _node_name(label, names) if labels is not None else "mesh"
+        scene.add_geometry(geometry(triangles[of_triangle == label]), node_name=name, geom_name=name)
+    write_bytes(path, scene.export(file_type="glb", include_normals=normals is not None))
+
+
+def _node_name(label: int, names: Mapping[int, str]) -> str:
+    if label == 0:
+        return "unlabelled"
+    return f"{label} {names[label]}" if label in names else f"object {label}"

@@ -1,0 +1,108 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "volumes/raycast.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "context.hpp"
+
+GGSLAM_DECLARE_KERNEL(void raycast_tile(const volumes::RaycastScene& scene, const volumes::RaycastView& view,
+                                        const volumes::RaycastTile& tile, const volumes::SurfaceImages& out))
+
+namespace ggslam::volumes {
+namespace {
+
+constexpr int kTile = 8;
+constexpr int kPart = kSide / 2;  // boxes of so many cells are projected
+
+// Depth range of the boxes with surface that may be seen through each tile of the image (the idea is that of V.
+// Prisacariu et al., "InfiniTAM", 2014).
+class TileRanges {
+ public:
+  TileRanges(const SurfaceCells& cells, const RaycastView& view)
+      : columns_((view.width + kTile - 1) / kTile), rows_((view.height + kTile - 1) / kTile), view_(view),
+        voxel_(cells.map.voxel) {
+    tiles_.resize(static_cast<std::size_t>(columns_) * rows_);
+    for (int r = 0; r < rows_; ++r)
+      for (int c = 0; c < columns_; ++c)
+        tiles_[r * columns_ + c] = {c * kTile, r * kTile, std::min((c + 1) * kTile, view.width),
+                                    std::min((r + 1) * kTile, view.height), view.far, view.near};
+    for (const SurfaceBlock& block : cells.blocks) add(block);
+  }
+
+  const std::vector<RaycastTile>& tiles() const { return tiles_; }
+
+ private:
+  const int columns_, rows_;
+  const RaycastView& view_;
+  const float voxel_;
+  std::vector<RaycastTile> tiles_;
+
+  void add(const SurfaceBlock& block) {
+    for (int z = 0; z < kSide; z += kPart) {
+      uint64_t layers = 0;
+      for (int k = 0; k < kPart; ++k) layers |= block.cells.word[z + k];
+      for (int y = 0; y < kSide; y += kPart)
+        for (int x = 0; x < kSide; x += kPart)
+          if ((layers >> (x + 8 * y)) & 0x0F0F0F0Full)
+            add_box(kSide * block.at.x + x, kSide * block.at.y + y, kSide * block.at.z + z);
+    }
+  }
+
+  // The box of kPart^3 cells from a voxel.
+  void add_box(int x, int y, int z) {
+    const float low_corner[3] = {voxel_ * (x + 0.5f), voxel_ * (y + 0.5f), voxel_ * (z + 0.5f)};
+    const float* R = view_.rotation;
+    float first[3];
+    for (int a = 0; a < 3; ++a) {
+      first[a] = 0;
+      for (int b = 0; b < 3; ++b) first[a] += R[3 * b + a] * (low_corner[b] - view_.position[b]);
+    }
+    int beyond[4] = {0, 0, 0, 0};  // corners beyond the planes through the camera and the image's sides
+    float low[3] = {1e30f, 1e30f, 1e30f}, high[3] = {-1e30f, -1e30f, -1e30f};  // column, row, depth
+    for (int c = 0; c < 8; ++c) {
+      float p[3];
+      for (int a = 0; a < 3; ++a)
+        p[a] = first[a] + kPart * voxel_ * ((c & 1) * R[a] + ((c >> 1) & 1) * R[3 + a] + (c >> 2) * R[6 + a]);
+      const float u = view_.fx * p[0] + view_.cx * p[2], v = view_.fy * p[1] + view_.cy * p[2];
+      beyond[0] += u < -p[2], beyond[1] += u > view_.width * p[2];
+      beyond[2] += v < -p[2], beyond[3] += v > view_.height * p[2];
+      // Beside the camera the projection is of no use: the box may be anywhere in the image.
+      const float inverse = 1 / std::max(p[2], 1e-6f);
+      const float seen[3] = {u * inverse, v * inverse, p[2]};
+      for (int a = 0; a < 3; ++a) low[a] = std::min(low[a], seen[a]), high[a] = std::max(high[a], seen[a]);
+    }
+    if (high[2] < view_.near || low[2] > view_.far || *std::max_element(beyond, beyond + 4) == 8) return;
+    const bool beside = low[2] <= 0;
+    const int left = beside ? 0 : tile_of(low[0], columns_), right = beside ? columns_ - 1 : tile_of(high[0], columns_);
+    const int top = beside ? 0 : tile_of(low[1], rows_), bottom = beside ? rows_ - 1 : tile_of(high[1], rows_);
+    for (int r = top; r <= bottom; ++r)
+      for (int c = left; c <= right; ++c) {
+        RaycastTile& tile = tiles_[r * columns_ + c];
+        tile.from = std::max(std::min(tile.from, low[2] - kMargin * voxel_), view_.near);
+        tile.to = std::min(std::max(tile.to, high[2] + kMargin * voxel_), view_.far);
+      }
+  }
+
+  static constexpr float kMargin = 0.01f;  // for rounding, voxels
+  static int tile_of(float pixel, int tiles) {
+    return std::clamp(static_cast<int>(std::floor(std::clamp(pixel, -1e6f, 1e6f) / kTile)), 0, tiles - 1);
+  }
+};
+
+}  // namespace
+}  // namespace ggslam::volumes
+
+GGSLAM_EXPORT void ggslam_raycast(void* context_, void* cells_, const ggslam::volumes::RaycastView* view,
+                                  const ggslam::volumes::SurfaceImages* out) {
+  using namespace ggslam::volumes;
+  ggslam::Context& context = *static_cast<ggslam::Context*>(context_);
+  const SurfaceCells& cells = *static_cast<SurfaceCells*>(cells_);
+  const auto kernel = GGSLAM_DISPATCH(context.isa, raycast_tile);
+  const TileRanges ranges(cells, *view);
+  const RaycastScene scene{cells.blocks.data(), cells.table.number.data(),
+                           static_cast<uint32_t>(cells.table.number.size() - 1), cells.map.voxel};
+  context.pool.parallel_for(ranges.tiles().size(), 16, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t t = begin; t < end; ++t) kernel(scene, *view, ranges.tiles()[t], *out);
+  });
+}

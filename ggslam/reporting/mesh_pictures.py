@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of triangle meshes, drawn by the compiled core."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import POINTER, Structure, c_float, c_int32, c_int64, c_void_p
+from functools import lru_cache
+
+import numpy as np
+
+from ggslam.native.loader import NativeContext, load_library
+from ggslam.reporting.cloud_pictures import View
+from ggslam.scene.poses import inverse
+
+_BACKGROUND = 255
+_AMBIENT = 0.35
+"""Share of its colour that a surface has which the light of the camera touches from the side."""
+
+
+class _Input(Structure):
+    _fields_ = (
+        [(name, c_void_p) for name in ("positions", "colors", "triangles")]
+        + [(name, c_int64) for name in ("vertices", "count")]
+        + [(name, c_float) for name in ("fx", "fy", "cx", "cy", "near")]
+        + [(name, c_int32) for name in ("width", "height", "cull")]
+    )
+
+
+@lru_cache(maxsize=1)
+def _library() -> ctypes.CDLL:
+    core = load_library()
+    core.ggslam_draw_mesh.argtypes = [c_void_p, POINTER(_Input), c_void_p, c_void_p]
+    core.ggslam_draw_mesh.restype = None
+    return core
+
+
+def draw_mesh(
+    vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray, colors: np.ndarray, view: View,
+    cull: bool = True, near: float = 0.05, context: NativeContext | None = None,
+) -> np.ndarray:  # fmt: skip
+    """A picture, uint8 [H, W, 3], of a mesh lit from the camera; white where there is none.
+
+    Args:
+        vertices: float [V, 3].
+        triangles: int [F, 3], rows of vertices, counter-clockwise seen from their front.
+        normals: float [V, 3], unit.
+        colors: uint8 [V, 3], of the surface, or of the objects (a row of a palette for each vertex' label).
+        view: where from.
+        cull: leave out triangles that are seen from behind, so that one looks into a room through its walls.
+        near: nothing nearer to the camera is drawn, nor triangles that reach there; in units of the positions.
+        context: threads to work on.
+
+    Raises:
+        ValueError: arrays whose lengths do not agree, or a triangle of vertices that are not there.
+    """
+    if not len(vertices) == len(normals) == len(colors):
+        raise ValueError(f"found {len(vertices)} vertices, {len(normals)} normals and {len(colors)} colors")
+    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
+        raise ValueError(f"triangles name vertices {triangles.min()} to {triangles.max()} of {len(vertices)}")
+    T = inverse(view.T_world_camera).astype(np.float32)
+    position = np.ascontiguousarray(vertices @ T[:3, :3].T + T[:3, 3], np.float32)
+    facing = np.abs(((normals @ T[:3, :3].T) * position).sum(1)) / np.maximum(np.linalg.norm(position, axis=1), 1e-9)
+    shade = _AMBIENT + (1 - _AMBIENT) * np.minimum(facing, 1)
+    shaded = np.ascontiguousarray(np.rint(colors * shade[:, None]), np.uint8)
+    corners = np.ascontiguousarray(triangles, np.int32)
+    camera = view.camera
+    picture = np.full((camera.height, camera.width, 3), _BACKGROUND, np.uint8)
+    inverse_depth = np.zeros((camera.height, camera.width), np.float32)
+    mesh = _Input(
+        position.ctypes.data, shaded.ctypes.data, corners.ctypes.data, len(position), len(corners),
+        camera.fx, camera.fy, camera.cx, camera.cy, near, camera.width, camera.height, int(cull),
+    )  # fmt: skip
+    context = context or NativeContext()
+    _library().ggslam_draw_mesh(context.handle, ctypes.byref(mesh), inverse_depth.ctypes.data, picture.ctypes.data)
+    return picture

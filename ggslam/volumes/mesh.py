@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The surface of a TSDF as a mesh (W. Lorensen and H. Cline, "Marching Cubes", 1987), with colours and objects."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ggslam.formats.triangle_mesh import TriangleMesh, majority_labels
+from ggslam.volumes.surface_native import MeshArrays, library, surface_cells
+from ggslam.volumes.tsdf import TsdfMap
+
+MIN_WEIGHT = 0.1
+"""In measurements from 1 m: voxels seen less count as unknown. One look from 3 m is enough."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles whose vertices are shared.
+
+    Attributes:
+        vertices: float32 [V, 3], metres.
+        normals: float32 [V, 3], unit, towards free space.
+        colors: uint8 [V, 3].
+        labels: uint16 [V], object; 0: none.
+        triangles: int32 [F, 3], rows of vertices, counter-clockwise seen from free space.
+    """
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
+    labels: np.ndarray
+    triangles: np.ndarray
+
+    def triangle_labels(self) -> np.ndarray:
+        """Object of each triangle, uint16 [F]: that of at least two of its vertices, else of the first."""
+        return majority_labels(self.labels, self.triangles)
+
+    def objects(self) -> list[int]:
+        """The objects that have triangles, in order."""
+        return [int(label) for label in np.unique(self.triangle_labels()) if label]
+
+    def of_object(self, label: int) -> Mesh:
+        """The triangles of one object (0: of none) and their vertices. Each triangle is in exactly one of these."""
+        return self.part(self.triangle_labels() == label)
+
+    def part(self, chosen: np.ndarray) -> Mesh:
+        """Some of the triangles (bool [F]) and their vertices, in their order."""
+        triangles = self.triangles[chosen]
+        used = np.zeros(len(self.vertices), bool)
+        used[triangles] = True
+        number = np.cumsum(used, dtype=np.int32) - 1
+        return Mesh(self.vertices[used], self.normals[used], self.colors[used], self.labels[used], number[triangles])
+
+    def geometry(self) -> TriangleMesh:
+        """Vertices and triangles alone, for sampling and areas."""
+        return TriangleMesh(self.vertices.astype(np.float64), self.triangles.astype(np.int64))
+
+
+def extract_mesh(tsdf: TsdfMap, min_weight: float = MIN_WEIGHT, min_triangles: int = 0) -> Mesh:
+    """The surface where the distance changes its sign, between voxels that are all known.
+
+    Neighbouring cells agree on their common face, so the mesh is closed but for borders with the unknown: no edge has
+    more than two triangles. No triangle is without area. The order of vertices and triangles follows the map's blocks
+    and does not depend on the number of threads.
+
+    Args:
+        tsdf: the map.
+        min_weight: voxels of less weight (in measurements from 1 m), or never seen, count as unknown.
+        min_triangles: connected pieces of fewer triangles are left out.
+    """
+    core, cells = library(), surface_cells(tsdf, min_weight)
+    sizes = (ctypes.c_int64 * 2)()
+    mesher = core.ggslam_mesher_create(tsdf.context.handle, cells.handle, sizes)
+    try:
+        vertices, normals = np.empty((2, sizes[0], 3), np.float32)
+        colors, labels = np.empty((sizes[0], 3), np.uint8), np.empty(sizes[0], np.uint16)
+        triangles = np.empty((sizes[1], 3), np.int32)
+        arrays = (vertices, normals, colors, labels, triangles)
+        pointers = MeshArrays(*(array.ctypes.data for array in arrays))
+        core.ggslam_mesher_write(tsdf.context.handle, mesher, ctypes.byref(pointers))
+    finally:
+        core.ggslam_mesher_destroy(mesher)
+    mesh = Mesh(*arrays)
+    return _without_small_pieces(mesh, min_triangles) if min_triangles > 1 else mesh
+
+
+def _without_small_pieces(mesh: Mesh, min_triangles: int) -> Mesh:
+    first, second, third = mesh.triangles.T
+    rows, columns = np.concatenate([first, second]), np.concatenate([second, third])
+    links = coo_array((np.ones(len(rows), bool), (rows, columns)), (len(mesh.vertices),) * 2)
+    piece = connected_components(links, directed=False)[1][first]
+    return mesh.part(np.bincount(piece)[piece] >= min_triangles if len(piece) else np.zeros(0, bool))
