@@ -1,0 +1,94 @@
+// SPDX-License-Identifier: Apache-2.0
+// Signed Euclidean distance field of a TSDF, brought up to date where the TSDF changed.
+#pragma once
+#include <memory>
+#include <vector>
+
+#include "buffer.hpp"
+#include "context.hpp"
+#include "volumes/esdf_types.hpp"
+#include "volumes/tsdf.hpp"
+
+namespace ggslam::volumes {
+
+struct FieldBlock {
+  std::vector<Site> sites;
+  std::unique_ptr<FieldVoxels> voxels;
+  uint64_t known[kSide] = {}, negative[kSide] = {};  // voxel (i, j, k): bit i + 8 j of word k
+  float required = 0;  // how far from its voxels sites were read last time at most, voxels; 0: never computed
+};
+
+struct FieldStats {
+  int64_t changed_blocks;     // of the TSDF since the last time, those that went counted
+  int64_t changed_sites;      // surface points that came, went or moved
+  int64_t recomputed_blocks;  // of the field
+  int64_t blocks;             // the field has now
+  int64_t transformed;        // voxels through the transform, with those computed again
+  double sites_ms, select_ms, transform_ms;
+};
+
+// Half-open range of blocks or voxels.
+struct Range {
+  int low[3], high[3];
+  int64_t size(int axis) const { return high[axis] - low[axis]; }
+};
+
+// A block to compute and how far around it sites are looked for.
+struct Task {
+  int32_t row;
+  float pad;
+};
+
+class Esdf {
+ public:
+  Esdf(const Tsdf& tsdf, float max_distance) : tsdf_(tsdf), max_distance_(max_distance / tsdf.voxel) {}
+
+  FieldStats update(Context& context);
+  void clear();
+  std::size_t size() const { return blocks_.size(); }
+  std::size_t bytes() const;
+  const BlockTable& table() const { return table_; }
+  const FieldBlock& block(std::size_t row) const { return blocks_[row]; }
+  float voxel() const { return tsdf_.voxel; }
+
+ private:
+  // esdf_sites.cpp
+  std::vector<int32_t> find_sites(Context& context, FieldStats& stats);  // rows of blocks whose known voxels changed
+  void erase_gone(FieldStats& stats, std::vector<BlockCoordinates>& touched);
+  void gather(BlockCoordinates at, int16_t* values) const;
+  // esdf_update.cpp
+  std::vector<Task> affected(Context& context, const std::vector<int32_t>& changed) const;
+  float first_pad(int32_t row) const;
+  void compute(Context& context, std::vector<Task> tasks, FieldStats& stats);
+  // esdf_box.cpp
+  void solve(Context& context, const std::vector<Task>& tasks, const Range& box, FieldStats& stats,
+             std::vector<Task>& again);
+  void collect(Context& context, const Range& padded, const Range& frame);
+  void transform(Context& context, const Range& box, const Range& frame);
+
+  const Tsdf& tsdf_;
+  const float max_distance_;  // voxels
+  uint32_t revision_ = 0;     // of the TSDF at the last update
+  BlockTable table_;
+  std::vector<FieldBlock> blocks_;        // by row of the table
+  std::vector<BlockCoordinates> site_changes_;  // blocks whose sites changed
+  Range bounds_{};                        // of all blocks with sites
+
+  // Of the box at work.
+  std::vector<SiteCell> cells_;
+  std::vector<BoxSite> sites_;
+  std::vector<int32_t> neighbours_, row_start_;
+  Buffer<int32_t> along_x_, nearest_;
+};
+
+// Splits tasks into boxes of blocks that together are cheap to compute, reordering them: `done` is called with a box
+// (blocks) and its tasks.
+struct TaskBox {
+  Range box;
+  std::size_t begin, end;
+};
+std::vector<TaskBox> split_into_boxes(std::vector<Task>& tasks, const BlockTable& table, const Range& bounds);
+// The voxels of `box` (blocks) and `pad` around, but not farther than `bounds` (blocks).
+Range padded_box(const Range& box, float pad, const Range& bounds);
+
+}  // namespace ggslam::volumes

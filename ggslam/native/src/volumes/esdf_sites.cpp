@@ -1,0 +1,138 @@
+// SPDX-License-Identifier: Apache-2.0
+// Which surface points came, went or moved since the last update of the distance field.
+#include <algorithm>
+#include <cstring>
+
+#include "volumes/esdf.hpp"
+
+GGSLAM_DECLARE_KERNEL(int esdf_crossings(const int16_t* values, ggslam::volumes::Site* out, uint64_t* known,
+                                         uint64_t* negative))
+
+namespace ggslam::volumes {
+namespace {
+
+constexpr BlockCoordinates kFaces[6] = {{-1, 0, 0}, {1, 0, 0}, {0, -1, 0}, {0, 1, 0}, {0, 0, -1}, {0, 0, 1}};
+
+BlockCoordinates operator+(BlockCoordinates a, BlockCoordinates b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+
+// Copies what a block has at [low, high) (its own voxels, -1: the halo before it, 8: behind) out of one at `shift`.
+void copy_values(const Tsdf& map, int64_t row, const int low[3], const int high[3], BlockCoordinates shift,
+                 int16_t* values) {
+  if (row < 0) return;
+  const Block& block = map.block(row);
+  const VoxelBlock* from = map.voxels(block);
+  if (from == nullptr && block.free_weight == 0) return;
+  for (int k = low[2]; k < high[2]; ++k)
+    for (int j = low[1]; j < high[1]; ++j)
+      for (int i = low[0]; i < high[0]; ++i) {
+        const int v = (i - kSide * shift.x) + (j - kSide * shift.y) * kSide + (k - kSide * shift.z) * kSide * kSide;
+        const int16_t value = from == nullptr ? kFreeValue
+                              : from->weight[v] == 0 ? kUnseen
+                                                     : std::max<int16_t>(from->value[v], -kFreeValue);
+        values[(i + 1) + (j + 1) * kHalo + (k + 1) * kHalo * kHalo] = value;
+      }
+}
+
+bool same_site(const Site& a, const Site& b) {
+  bool same = a.voxel == b.voxel;
+  for (int i = 0; i < 3; ++i) same = same && a.point[i] == b.point[i] && a.normal[i] == b.normal[i];
+  return same;
+}
+
+// How many came, went or moved. Both are in order of their voxels.
+int64_t count_changes(const std::vector<Site>& before, const Site* now, int count) {
+  int64_t changed = 0;
+  std::size_t b = 0;
+  for (int i = 0; i < count; ++i) {
+    for (; b < before.size() && before[b].voxel < now[i].voxel; ++b) ++changed;
+    const bool both = b < before.size() && before[b].voxel == now[i].voxel;
+    if (!both || !same_site(before[b], now[i])) ++changed;
+    b += both;
+  }
+  return changed + static_cast<int64_t>(before.size() - b);
+}
+
+}  // namespace
+
+// Values of a block and the voxels at its faces, as esdf_crossings reads them.
+void Esdf::gather(BlockCoordinates at, int16_t* values) const {
+  std::fill_n(values, kHalo * kHalo * kHalo, kUnseen);
+  const int low[3] = {0, 0, 0}, high[3] = {kSide, kSide, kSide};
+  copy_values(tsdf_, tsdf_.find(at), low, high, {0, 0, 0}, values);
+  for (const BlockCoordinates& face : kFaces) {
+    const int shift[3] = {face.x, face.y, face.z};
+    int from[3], to[3];
+    for (int a = 0; a < 3; ++a) {
+      from[a] = shift[a] > 0 ? kSide : shift[a] < 0 ? -1 : 0;
+      to[a] = shift[a] > 0 ? kSide + 1 : shift[a] < 0 ? 0 : kSide;
+    }
+    copy_values(tsdf_, tsdf_.find(at + face), from, to, face, values);
+  }
+}
+
+void Esdf::erase_gone(FieldStats& stats, std::vector<BlockCoordinates>& touched) {
+  for (std::size_t row = blocks_.size(); row-- > 0;) {
+    const BlockCoordinates at = table_.at(row);
+    if (tsdf_.find(at) >= 0) continue;
+    touched.push_back(at);
+    ++stats.changed_blocks;
+    stats.changed_sites += static_cast<int64_t>(blocks_[row].sites.size());
+    if (!blocks_[row].sites.empty()) site_changes_.push_back(at);
+    table_.erase(row);
+    blocks_[row] = std::move(blocks_.back());
+    blocks_.pop_back();
+  }
+}
+
+std::vector<int32_t> Esdf::find_sites(Context& context, FieldStats& stats) {
+  site_changes_.clear();
+  std::vector<BlockCoordinates> touched;
+  for (std::size_t row = 0; row < tsdf_.size(); ++row) {
+    const Block& block = tsdf_.block(row);
+    const bool is_new = table_.find(block.at) < 0;
+    if (!is_new && block.revision <= revision_) continue;
+    if (is_new) table_.insert(block.at), blocks_.emplace_back();
+    touched.push_back(block.at);
+  }
+  stats.changed_blocks = static_cast<int64_t>(touched.size());
+  if (blocks_.size() > tsdf_.size()) erase_gone(stats, touched);
+  // The sites of a block depend on the voxels at its faces, too.
+  std::vector<int32_t> rows;
+  std::vector<uint8_t> listed(blocks_.size(), 0);
+  const auto list = [&](BlockCoordinates at) {
+    const int32_t row = table_.find(at);
+    if (row >= 0 && !listed[row]) listed[row] = 1, rows.push_back(row);
+  };
+  for (const BlockCoordinates& at : touched) {
+    list(at);
+    for (const BlockCoordinates& face : kFaces) list(at + face);
+  }
+  std::vector<int64_t> moved(rows.size());
+  std::vector<uint8_t> seen_changed(rows.size());
+  const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_crossings);
+  context.pool.parallel_for(rows.size(), 16, [&](std::size_t begin, std::size_t end, int) {
+    int16_t values[kHalo * kHalo * kHalo];
+    std::vector<Site> found(kVoxels + 1);
+    for (std::size_t i = begin; i < end; ++i) {
+      FieldBlock& block = blocks_[rows[i]];
+      uint64_t known[kSide], negative[kSide];
+      gather(table_.at(rows[i]), values);
+      const int n = kernel(values, found.data(), known, negative);
+      moved[i] = count_changes(block.sites, found.data(), n);
+      seen_changed[i] = block.voxels == nullptr || std::memcmp(known, block.known, sizeof known) != 0 ||
+                        std::memcmp(negative, block.negative, sizeof negative) != 0;
+      std::memcpy(block.known, known, sizeof known);
+      std::memcpy(block.negative, negative, sizeof negative);
+      if (moved[i] > 0) block.sites.assign(found.begin(), found.begin() + n);
+    }
+  });
+  std::vector<int32_t> changed;
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    if (moved[i] > 0) site_changes_.push_back(table_.at(rows[i]));
+    if (seen_changed[i]) changed.push_back(rows[i]);
+    stats.changed_sites += moved[i];
+  }
+  return changed;
+}
+
+}  // namespace ggslam::volumes

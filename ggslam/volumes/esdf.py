@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The signed Euclidean distance to the nearest obstacle and its gradient, for planners.
+
+The TSDF of `ggslam.volumes.tsdf` measures along the camera's axis and only near surfaces; what it has exactly is where
+surfaces are. The field takes its zero crossings as surface points with normals, finds the nearest of them for every
+voxel that was seen, and measures the distance from there. An update looks only at what changed in the TSDF, and its
+result is the same as that of computing everything anew, also after an obstacle has gone.
+
+Unknown voxels, those that no frame has seen, have no distance. The field does not tell how far they are either: a
+distance in known space is that to the nearest *seen* surface, and a planner that may not enter unknown space must check
+`known` along its path, too.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.errors import ConfigError, check_ranges
+from ggslam.volumes.esdf_native import FieldStats, library
+from ggslam.volumes.tsdf import VOXELS, TsdfMap
+
+_MOST_VOXELS = 2000
+"""Largest distance in voxels; the core counts them in 16 bits."""
+
+
+@dataclass(frozen=True)
+class FieldSettings:
+    """What the distance field holds."""
+
+    max_distance: float = 2.0
+    """Distances are computed up to this, metres; farther voxels have this distance and no gradient."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, {"max_distance": (1e-3, 100)})
+
+
+@dataclass(frozen=True)
+class UpdateStats:
+    """What an update did.
+
+    Attributes:
+        revision: of the TSDF that the field now stands for.
+        changed_blocks: blocks of the TSDF that changed since the last update, those that went counted.
+        changed_sites: surface points that came, went or moved.
+        recomputed_blocks: blocks of the field that were computed.
+        blocks: blocks of the field.
+        transformed_voxels: voxels that went through the distance transform, with those beside and computed again.
+        sites_ms, select_ms, transform_ms: time spent finding surface points, finding out what to compute, computing.
+    """
+
+    revision: int
+    changed_blocks: int
+    changed_sites: int
+    recomputed_blocks: int
+    blocks: int
+    transformed_voxels: int
+    sites_ms: float
+    select_ms: float
+    transform_ms: float
+
+    @property
+    def milliseconds(self) -> float:
+        """Of the whole update."""
+        return self.sites_ms + self.select_ms + self.transform_ms
+
+
+@dataclass(frozen=True)
+class FieldValues:
+    """Answers of `DistanceField.query`.
+
+    Attributes:
+        distance: float32 [N], metres to the nearest surface, negative behind it; NaN where not known.
+        gradient: float32 [N, 3], unit vectors in which the distance grows; zero where not known, and where the nearest
+            surface is beyond the largest distance.
+        known: bool [N], whether the voxel that the point is in was seen.
+    """
+
+    distance: np.ndarray
+    gradient: np.ndarray
+    known: np.ndarray
+
+
+class DistanceField:
+    """The field of a map; its memory belongs to the compiled core. It is empty until the first `update`.
+
+    Args:
+        tsdf: the map, which the field reads at every update.
+        settings: how far distances are computed.
+
+    Raises:
+        ConfigError: `max_distance` is more than 2000 voxels.
+    """
+
+    def __init__(self, tsdf: TsdfMap, settings: FieldSettings | None = None) -> None:
+        self.tsdf = tsdf
+        self.settings = settings or FieldSettings()
+        most = _MOST_VOXELS * tsdf.settings.voxel
+        if self.settings.max_distance > most:
+            raise ConfigError(
+                f"FieldSettings.max_distance: expected at most {most:g} ({_MOST_VOXELS} voxels), found "
+                f"{self.settings.max_distance:g}"
+            )
+        self._library = library()
+        self._handle: int | None = self._library.ggslam_esdf_create(tsdf.handle, self.settings.max_distance)
+
+    def __del__(self) -> None:
+        if getattr(self, "_handle", None) is not None:
+            self._library.ggslam_esdf_destroy(self._handle)
+
+    def __len__(self) -> int:
+        """Number of blocks."""
+        return int(self._library.ggslam_esdf_size(self._handle))
+
+    @property
+    def voxel(self) -> float:
+        """Edge of a voxel, metres."""
+        return self.tsdf.settings.voxel
+
+    @property
+    def memory_bytes(self) -> int:
+        """Memory held by the field between updates."""
+        return int(self._library.ggslam_esdf_bytes(self._handle))
+
+    def update(self) -> UpdateStats:
+        """Brings the field up to date with the map."""
+        stats = FieldStats()
+        self._library.ggslam_esdf_update(self._handle, self.tsdf.context.handle, ctypes.byref(stats))
+        counts = (stats.changed_blocks, stats.changed_sites, stats.recomputed_blocks, stats.blocks, stats.transformed)
+        return UpdateStats(self.tsdf.revision, *counts, stats.sites_ms, stats.select_ms, stats.transform_ms)
+
+    def clear(self) -> None:
+        """Forgets everything; the next update computes the whole field."""
+        self._library.ggslam_esdf_clear(self._handle)
+
+    def query(self, points: np.ndarray) -> FieldValues:
+        """Distances and gradients at points [N, 3] in metres, interpolated between the voxels around.
+
+        A point is known if the voxel that it is in is. Where others of the eight voxels around it are not, they are
+        extrapolated from that one. Points that are not finite are not known.
+        """
+        where = np.ascontiguousarray(points, np.float64)
+        if where.ndim != 2 or where.shape[1] != 3:
+            raise ValueError(f"expected points [N, 3], found an array of shape {where.shape}")
+        n = len(where)
+        distance, gradient, known = np.empty(n, np.float32), np.empty((n, 3), np.float32), np.empty(n, np.uint8)
+        arrays = (a.ctypes.data for a in (where, distance, gradient, known))
+        self._library.ggslam_esdf_query(self._handle, self.tsdf.context.handle, n, *arrays)
+        return FieldValues(distance, gradient, known.astype(bool))
+
+    def is_free(self, points: np.ndarray, radius: float) -> np.ndarray:
+        """Whether a ball of `radius` metres around each of the points [N, 3] touches no seen surface, and its centre is
+        known and in front of surfaces: bool [N]. It may contain unknown voxels.
+
+        Raises:
+            ValueError: a radius of `max_distance` or more, for which the field cannot tell.
+        """
+        if not 0 <= radius < self.settings.max_distance:
+            raise ValueError(f"radius: expected 0 to below {self.settings.max_distance:g}, found {radius:g}")
+        values = self.query(points)
+        return values.known & (values.distance > radius)
+
+    def coordinates(self) -> np.ndarray:
+        """Coordinates of all blocks, int32 [B, 3], in no particular order."""
+        at = np.empty((len(self), 3), np.int32)
+        self._library.ggslam_esdf_list(self._handle, at.ctypes.data)
+        return at
+
+    def read(self, coordinates: np.ndarray) -> np.ndarray:
+        """Distances of the voxels of the blocks at coordinates [n, 3], float32 [n, 512], in metres; NaN: unknown."""
+        at = np.ascontiguousarray(coordinates, np.int32).reshape(-1, 3)
+        distance = np.empty((len(at), VOXELS), np.float32)
+        self._library.ggslam_esdf_read(self._handle, len(at), at.ctypes.data, distance.ctypes.data)
+        return distance
+
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """The surface points that distances are measured from: positions float32 [S, 3] in metres, and unit normals
+        [S, 3] to the side in front."""
+        n = int(self._library.ggslam_esdf_sites(self._handle, None, None))
+        points, normals = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+        self._library.ggslam_esdf_sites(self._handle, points.ctypes.data, normals.ctypes.data)
+        return points, normals

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plane slices through the distance field: arrays, pictures, and maps for ROS's map_server.
+
+A slice is a grid of square cells on an oriented plane. Arrays are [H, W] with row 0 at the top, where y is largest, as
+in pictures; column 0 is where x is smallest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ggslam.formats.atomic import atomic_write, write_bytes, write_text
+from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.tsdf import SIDE
+
+OCCUPIED, FREE, UNKNOWN = 0, 254, 205
+"""Grey values of a ROS map."""
+_MOST_CELLS = 50_000_000
+
+
+@dataclass(frozen=True)
+class SlicePlane:
+    """A rectangle in space.
+
+    Attributes:
+        origin: [3], metres, where the plane's coordinates are (0, 0).
+        x_axis, y_axis: [3], orthogonal unit vectors.
+        low, high: (x, y) of the rectangle's corners on the plane, metres.
+    """
+
+    origin: np.ndarray
+    x_axis: np.ndarray
+    y_axis: np.ndarray
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit vector; seen from its side, y is to the left of x."""
+        return np.cross(self.x_axis, self.y_axis)
+
+
+@dataclass(frozen=True)
+class FieldSlice:
+    """What the field has on a plane.
+
+    Attributes:
+        plane: where; its rectangle is that of the cells.
+        resolution: edge of a cell, metres.
+        distance: float32 [H, W], metres, at the cells' centres; of a band, the least over the heights. NaN: not known.
+        known: bool [H, W].
+        occupied: bool [H, W], whether a cell has a surface in it or is behind one.
+    """
+
+    plane: SlicePlane
+    resolution: float
+    distance: np.ndarray
+    known: np.ndarray
+    occupied: np.ndarray
+
+
+def plane_at_height(field: DistanceField, up: np.ndarray, height: float) -> SlicePlane:
+    """The plane at a height, as large as the field's blocks.
+
+    Args:
+        field: with blocks.
+        up: [3], direction of which heights are measured from the world's origin.
+        height: metres along `up`.
+
+    Returns:
+        Seen from above; x is the world's x axis as far as it is horizontal (if `up` is almost that axis: its z axis).
+    """
+    z = np.asarray(up, np.float64) / np.linalg.norm(up)
+    x = np.eye(3)[0 if abs(z[0]) < 0.9 else 2]
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    edge = SIDE * field.voxel
+    corners = np.concatenate([field.coordinates() + shift for shift in np.ndindex(2, 2, 2)]) * edge
+    if not len(corners):
+        corners = np.zeros((1, 3))
+    on_plane = corners @ np.stack([x, y], 1)
+    low, high = on_plane.min(axis=0), on_plane.max(axis=0)
+    return SlicePlane(height * z, x, y, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+
+
+def slice_field(
+    field: DistanceField, plane: SlicePlane, resolution: float, band: tuple[float, float] | None = None
+) -> FieldSlice:
+    """Slices the field.
+
+    A cell is occupied if a surface is within half a cell (or half a voxel, if that is more) of its centre, or its
+    centre is behind one. With a band, heights from `low` to `high` are looked at, a voxel apart: a cell is occupied if
+    it is at any of them, and free if it is known at one at least and occupied at none. A robot as high as the band may
+    therefore drive over a cell that was seen at some of its heights only.
+
+    Args:
+        field: to slice.
+        plane: where.
+        resolution: edge of a cell, metres.
+        band: lowest and highest offset along the plane's normal, metres; None: the plane alone.
+
+    Raises:
+        ValueError: a resolution or band that is not positive, or more than 50 million cells.
+    """
+    if not resolution > 0 or (band is not None and not band[0] <= band[1]):
+        raise ValueError(f"expected a positive resolution and an ascending band, found {resolution} and {band}")
+    width, height = (max(1, int(np.ceil((plane.high[a] - plane.low[a]) / resolution - 1e-6))) for a in (0, 1))
+    if width * height > _MOST_CELLS:
+        raise ValueError(f"resolution: {width} x {height} cells are more than {_MOST_CELLS}")
+    x = plane.low[0] + (np.arange(width) + 0.5) * resolution
+    y = plane.low[1] + (np.arange(height) + 0.5) * resolution
+    centres = (plane.origin + y[::-1, None, None] * plane.y_axis + x[None, :, None] * plane.x_axis).reshape(-1, 3)
+    low, high = band or (0.0, 0.0)
+    offsets = np.linspace(low, high, int(np.ceil((high - low) / field.voxel - 1e-6)) + 1)
+    least = np.full(len(centres), np.nan, np.float32)
+    for offset in offsets:
+        least = np.fmin(least, field.query(centres + offset * plane.normal).distance)
+    distance = least.reshape(height, width)
+    known = ~np.isnan(distance)
+    occupied = known & (distance <= max(resolution, field.voxel) / 2)
+    top_right = (plane.low[0] + width * resolution, plane.low[1] + height * resolution)
+    whole = SlicePlane(plane.origin, plane.x_axis, plane.y_axis, plane.low, top_right)
+    return FieldSlice(whole, resolution, distance, known, occupied)
+
+
+def slice_picture(cut: FieldSlice, full_scale: float, smallest_side: int = 480) -> np.ndarray:
+    """A slice as colours with a scale below, uint8 [H, W, 3].
+
+    Distances go from red (0) to blue (`full_scale` metres and more), what is behind surfaces is dark red, outlines of
+    occupied cells are black, unknown cells grey. Cells are magnified by a whole number until the shorter side has
+    `smallest_side` pixels, if that takes more than one.
+    """
+    level = np.clip(1 - np.nan_to_num(cut.distance) / full_scale, 0, 1)
+    picture = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    picture[cut.known & (cut.distance < 0)] = (90, 0, 0)
+    inner = cv2.erode(cut.occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    picture[cut.occupied & ~inner] = 0
+    picture[~cut.known] = 128
+    times = max(1, -(-smallest_side // min(cut.known.shape)))
+    times = max(1, min(times, 4000 // max(cut.known.shape)))
+    picture = picture.repeat(times, 0).repeat(times, 1)
+    return np.concatenate([picture, _scale(picture.shape[1], full_scale, cut.resolution)])
+
+
+def _scale(width: int, full_scale: float, resolution: float) -> np.ndarray:
+    """The colours of distances with marks in metres."""
+    bar = np.full((46, width, 3), 255, np.uint8)
+    ramp = cv2.applyColorMap(np.linspace(255, 0, width).astype(np.uint8)[None], cv2.COLORMAP_TURBO)[..., ::-1]
+    bar[4:20] = ramp
+    marks = max(2, min(6, width // 90))
+    for i in range(marks):
+        text = f"{full_scale * i / (marks - 1):.2f}" + (" m" if i == marks - 1 else "")
+        size = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)[0][0]
+        x = int(np.clip(i * (width - 1) / (marks - 1) - size / 2, 2, max(2, width - size - 2)))
+        cv2.putText(bar, text, (x, 38), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+    return bar
+
+
+def write_slice_picture(cut: FieldSlice, path: str | Path, full_scale: float) -> None:
+    """Writes `slice_picture` as PNG.
+
+    Raises:
+        RunFolderError: the file cannot be written.
+    """
+    picture = slice_picture(cut, full_scale)
+    done, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+    assert done
+    write_bytes(path, data.tobytes())
+
+
+def ros_map(cut: FieldSlice) -> np.ndarray:
+    """A slice as a ROS map: uint8 [H, W], 0 occupied, 254 free, 205 unknown."""
+    return np.where(cut.occupied, OCCUPIED, np.where(cut.known, FREE, UNKNOWN)).astype(np.uint8)
+
+
+def write_ros_map(cut: FieldSlice, path: str | Path) -> tuple[Path, Path]:
+    """Writes a map that ROS's map_server reads: `path` with the endings .pgm (binary) and .yaml.
+
+    The map's frame is that of the plane: x and y along its axes, in metres; the yaml's origin is the lower left corner
+    of the lower left pixel.
+
+    Returns:
+        The two files.
+
+    Raises:
+        RunFolderError: a file cannot be written.
+    """
+    path = Path(path)
+    image, description = path.with_name(path.name + ".pgm"), path.with_name(path.name + ".yaml")
+    pixels = ros_map(cut)
+    with atomic_write(image) as temporary:
+        temporary.write_bytes(f"P5\n{pixels.shape[1]} {pixels.shape[0]}\n255\n".encode() + pixels.tobytes())
+    x, y = cut.plane.low
+    write_text(
+        description,
+        f"image: {image.name}\nmode: trinary\nresolution: {cut.resolution:.6g}\norigin: [{x:.6f}, {y:.6f}, 0.0]\n"
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
+    )
+    return image, description
