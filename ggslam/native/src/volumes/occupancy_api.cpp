@@ -1,0 +1,172 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <cstring>
+#include <limits>
+
+#include "buffer.hpp"
+#include "context.hpp"
+#include "volumes/occupancy_files.hpp"
+#include "volumes/occupancy_queries.hpp"
+#include "volumes/occupancy_update.hpp"
+
+GGSLAM_DECLARE_KERNEL(void depth_row_to_world(const float* depth, int width, float fx, float cx, float y,
+                                              const float T[12], float low, float high, float* points))
+
+namespace ggslam {
+namespace {
+
+struct OccupancyMap {
+  OccupancyTree tree;
+  Scan scan;
+  Buffer<float> points;
+  std::vector<std::uint8_t> output;  // of the last call that made some
+  explicit OccupancyMap(double resolution) : tree(resolution) {}
+};
+
+struct InsertSettings {
+  double max_range;
+  float origin[3];
+  float hit, miss, minimum, maximum;
+  std::int32_t quantize;
+};
+
+struct InsertResult {
+  std::uint64_t rays, free, occupied;  // rays walked; voxels of the scan, those both passed and hit counted as occupied
+};
+
+struct DepthImage {
+  const float* depth;
+  std::int32_t width, height;
+  float fx, fy, cx, cy, low, high;
+  float T_world_camera[12];
+};
+
+OccupancyMap& map_of(void* handle) { return *static_cast<OccupancyMap*>(handle); }
+
+// How many voxels a scan saw free that it did not see occupied.
+std::size_t free_voxels(const Scan& scan) {
+  std::size_t n = 0;
+  for (std::size_t b = 0; b < scan.free().blocks(); ++b) {
+    const std::uint64_t* occupied = scan.occupied().find(scan.free().code(b));
+    for (int w = 0; w < kMaskWords; ++w)
+      n += __builtin_popcountll(scan.free().words(b)[w] & ~(occupied ? occupied[w] : 0));
+  }
+  return n;
+}
+
+bool insert(Context& context, OccupancyMap& map, const float* points, std::size_t n, const InsertSettings& s,
+            InsertResult& result) {
+  ScanSettings settings{{s.origin[0], s.origin[1], s.origin[2]}, s.max_range, s.quantize != 0};
+  if (!map.scan.cast(context, map.tree.grid, settings, points, n)) return false;
+  apply_scan(context, map.scan, {s.hit, s.miss, s.minimum, s.maximum}, map.tree);
+  result = {map.scan.rays(), free_voxels(map.scan), map.scan.occupied().voxels()};
+  return true;
+}
+
+void put_keys(std::uint16_t*& out, std::uint64_t code) {
+  int key[3];
+  keys_of_morton(code, key);
+  for (int a = 0; a < 3; ++a) *out++ = static_cast<std::uint16_t>(key[a]);
+}
+
+}  // namespace
+}  // namespace ggslam
+
+using namespace ggslam;
+
+GGSLAM_EXPORT void* ggslam_occupancy_create(double resolution) { return new OccupancyMap(resolution); }
+GGSLAM_EXPORT void ggslam_occupancy_destroy(void* map) { delete static_cast<OccupancyMap*>(map); }
+
+// 0: the origin is outside the grid, nothing was done.
+GGSLAM_EXPORT int ggslam_occupancy_insert(void* context, void* map, const float* points, std::uint64_t n,
+                                          const InsertSettings* settings, InsertResult* result) {
+  return insert(*static_cast<Context*>(context), map_of(map), points, n, *settings, *result) ? 1 : 0;
+}
+
+GGSLAM_EXPORT int ggslam_occupancy_insert_depth(void* context_, void* map_, const DepthImage* image,
+                                                const InsertSettings* settings, InsertResult* result) {
+  Context& context = *static_cast<Context*>(context_);
+  OccupancyMap& map = map_of(map_);
+  const std::size_t width = image->width, pixels = width * image->height;
+  map.points.reserve(3 * pixels);
+  const auto kernel = GGSLAM_DISPATCH(context.isa, depth_row_to_world);
+  context.pool.parallel_for(image->height, 16, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t v = begin; v < end; ++v)
+      kernel(image->depth + v * width, image->width, image->fx, image->cx, (v - image->cy) / image->fy,
+             image->T_world_camera, image->low, image->high, map.points.data() + 3 * v * width);
+  });
+  return insert(context, map, map.points.data(), pixels, *settings, *result) ? 1 : 0;
+}
+
+GGSLAM_EXPORT void ggslam_occupancy_look_up(void* context, void* map, const float* points, std::uint64_t n,
+                                            float threshold, std::int8_t* states, float* log_odds) {
+  look_up(*static_cast<Context*>(context), map_of(map).tree, points, n, threshold, states, log_odds);
+}
+
+GGSLAM_EXPORT void ggslam_occupancy_summary(void* map, float threshold, OccupancySummary* summary) {
+  *summary = summarize(map_of(map).tree, threshold);
+}
+
+GGSLAM_EXPORT void ggslam_occupancy_compare(void* one, void* other, float threshold_one, float threshold_other,
+                                            std::uint64_t counts[9]) {
+  count_states(map_of(one).tree, map_of(other).tree, threshold_one, threshold_other, counts);
+}
+
+// The following make an output, kept until the next of them is called, and return its size in bytes.
+GGSLAM_EXPORT const void* ggslam_occupancy_output(void* map) { return map_of(map).output.data(); }
+
+GGSLAM_EXPORT std::uint64_t ggslam_occupancy_leaves(void* map_, float threshold, int which) {
+  OccupancyMap& map = map_of(map_);
+  const std::vector<OccupancyLeaf> leaves = list_leaves(map.tree, threshold, which);
+  const auto* bytes = reinterpret_cast<const std::uint8_t*>(leaves.data());
+  map.output.assign(bytes, bytes + leaves.size() * sizeof(OccupancyLeaf));
+  return map.output.size();
+}
+
+GGSLAM_EXPORT std::uint64_t ggslam_occupancy_write(void* map_, int format, float threshold, std::uint64_t* nodes) {
+  OccupancyMap& map = map_of(map_);
+  OctomapText text = write_octomap(map.tree, static_cast<OctomapFormat>(format), threshold);
+  map.output.swap(text.data);
+  *nodes = text.nodes;
+  return map.output.size();
+}
+
+// Returns an OctomapFault.
+GGSLAM_EXPORT int ggslam_occupancy_read(void* map, int format, const std::uint8_t* data, std::uint64_t size, float free,
+                                        float occupied, std::uint64_t maximum_blocks, std::uint64_t* nodes) {
+  const OctomapReading reading =
+      read_octomap(map_of(map).tree, static_cast<OctomapFormat>(format), data, size, free, occupied, maximum_blocks);
+  *nodes = reading.nodes;
+  return static_cast<int>(reading.fault);
+}
+
+// Keys (uint16 [m, 3]) of the voxels that a scan sees, the free ones first; -1: the origin is outside the grid.
+GGSLAM_EXPORT std::int64_t ggslam_occupancy_scan_keys(void* context, void* map_, const float* points, std::uint64_t n,
+                                                      const InsertSettings* s, InsertResult* result) {
+  OccupancyMap& map = map_of(map_);
+  ScanSettings settings{{s->origin[0], s->origin[1], s->origin[2]}, s->max_range, s->quantize != 0};
+  if (!map.scan.cast(*static_cast<Context*>(context), map.tree.grid, settings, points, n)) return -1;
+  *result = {map.scan.rays(), free_voxels(map.scan), map.scan.occupied().voxels()};
+  map.output.resize((result->free + result->occupied) * 3 * sizeof(std::uint16_t));
+  auto* out = reinterpret_cast<std::uint16_t*>(map.output.data());
+  std::uint64_t last = ~std::uint64_t{0};
+  const std::uint64_t* hits = nullptr;
+  for_each_voxel(map.scan.free(), [&](std::uint64_t code) {
+    if (code >> 9 != last) hits = map.scan.occupied().find(last = code >> 9);
+    if (hits == nullptr || !(hits[(code >> 6) & 7] >> (code & 63) & 1)) put_keys(out, code);
+  });
+  for_each_voxel(map.scan.occupied(), [&](std::uint64_t code) { put_keys(out, code); });
+  return static_cast<std::int64_t>(map.output.size());
+}
+
+// Distinct voxels of n points: keys (uint16 [m, 3], room for n) and how many points lie in each (int32 [m]; may be
+// null). Returns m.
+GGSLAM_EXPORT std::uint64_t ggslam_quantize(void* context, double resolution, const float* points, std::uint64_t n,
+                                            std::uint16_t* keys, std::int32_t* counts) {
+  std::vector<std::int64_t> codes;
+  VoxelMasks voxels;
+  quantize(*static_cast<Context*>(context), KeyGrid(resolution), points, n, codes, voxels);
+  std::uint16_t* out = keys;
+  for_each_voxel(voxels, [&](std::uint64_t code) { put_keys(out, code); });
+  if (counts != nullptr) count_points(codes, voxels, counts);
+  return static_cast<std::uint64_t>(out - keys) / 3;
+}

@@ -1,0 +1,152 @@
+// SPDX-License-Identifier: Apache-2.0
+// Rays are set up here, in a file compiled without fused multiply-adds, with the mixture of float and double of
+// OctoMap's computeRayKeys, so that they pass exactly the same voxels (Amanatides and Woo, "A fast voxel traversal
+// algorithm for ray tracing", 1987).
+#include "volumes/scan_rays.hpp"
+
+#include <algorithm>
+#include <limits>
+
+GGSLAM_DECLARE_KERNEL(void quantize_points(const float* points, std::size_t n, double factor, std::int64_t* codes))
+GGSLAM_DECLARE_KERNEL(void walk_rays(const RayBatch& batch, std::uint64_t start, VoxelMasks& free))
+
+namespace ggslam {
+namespace {
+
+constexpr std::size_t kRayChunk = 1024, kPointChunk = 8192;
+
+struct Origin {
+  const float* point;
+  int key[3];
+  std::uint64_t code;
+};
+
+double norm(const float v[3]) {
+  const float square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
+  return std::sqrt(static_cast<double>(square));
+}
+
+// Puts the ray from the origin to `end` into the batch; the two lie in different voxels.
+void prepare_ray(const KeyGrid& grid, const Origin& origin, const float end[3], std::uint64_t end_code,
+                 RayBatch& batch) {
+  const std::uint64_t axes[3] = {kAxisX, kAxisY, kAxisZ};
+  const int i = batch.count++;
+  float direction[3];
+  for (int a = 0; a < 3; ++a) direction[a] = end[a] - origin.point[a];
+  const float length = static_cast<float>(norm(direction));
+  for (int a = 0; a < 3; ++a) {
+    direction[a] /= length;
+    const int sign = direction[a] > 0 ? 1 : direction[a] < 0 ? -1 : 0;
+    // One less is, within an axis of a Morton code, the addition of all its bits.
+    batch.step[a][i] = sign > 0 ? std::int64_t{1} << a : sign < 0 ? static_cast<std::int64_t>(axes[a]) : 0;
+    batch.t[a][i] = batch.delta[a][i] = std::numeric_limits<double>::max();
+    if (sign == 0) continue;
+    double border = key_centre(grid, origin.key[a]);
+    border += static_cast<float>(sign * grid.resolution * 0.5);
+    batch.t[a][i] = (border - origin.point[a]) / direction[a];
+    batch.delta[a][i] = grid.resolution / std::fabs(static_cast<double>(direction[a]));
+  }
+  batch.length[i] = length;
+  batch.end[i] = static_cast<std::int64_t>(end_code);
+}
+
+// The end of a ray that is cut at the range; false: the point is nearer.
+bool cut_at_range(const Origin& origin, const float point[3], double max_range, float end[3]) {
+  float direction[3];
+  for (int a = 0; a < 3; ++a) direction[a] = point[a] - origin.point[a];
+  const double distance = norm(direction);
+  if (max_range < 0 || distance <= max_range) return false;
+  const float length = static_cast<float>(distance), range = static_cast<float>(max_range);
+  for (int a = 0; a < 3; ++a) end[a] = origin.point[a] + direction[a] / length * range;
+  return true;
+}
+
+void list_centres(const KeyGrid& grid, const VoxelMasks& voxels, std::vector<float>& centres) {
+  centres.clear();
+  for_each_voxel(voxels, [&](std::uint64_t code) {
+    int key[3];
+    keys_of_morton(code, key);
+    for (int a = 0; a < 3; ++a) centres.push_back(static_cast<float>(key_centre(grid, key[a])));
+  });
+}
+
+}  // namespace
+
+std::uint64_t* free_block(VoxelMasks& masks, std::uint64_t code) { return masks.block(code); }
+
+void quantize(Context& context, const KeyGrid& grid, const float* points, std::size_t n,
+              std::vector<std::int64_t>& codes, VoxelMasks& voxels) {
+  const auto kernel = GGSLAM_DISPATCH(context.isa, quantize_points);
+  codes.resize(n);
+  context.pool.parallel_for(n, kPointChunk, [&](std::size_t begin, std::size_t end, int) {
+    kernel(points + 3 * begin, end - begin, grid.factor, codes.data() + begin);
+  });
+  voxels.clear();
+  for (std::size_t i = 0; i < n; ++i)
+    if (codes[i] >= 0) voxels.insert(static_cast<std::uint64_t>(codes[i]));
+}
+
+void count_points(const std::vector<std::int64_t>& codes, const VoxelMasks& voxels, std::int32_t* counts) {
+  std::vector<std::size_t> first(voxels.blocks() * kMaskWords);  // the number of the first voxel of each word
+  std::size_t total = 0;
+  for (std::size_t b = 0; b < voxels.blocks(); ++b)
+    for (int w = 0; w < kMaskWords; ++w) {
+      first[b * kMaskWords + w] = total;
+      total += __builtin_popcountll(voxels.words(b)[w]);
+    }
+  std::fill_n(counts, total, 0);
+  for (const std::int64_t code : codes) {
+    if (code < 0) continue;
+    const std::size_t b = voxels.index(static_cast<std::uint64_t>(code) >> 9), w = (code >> 6) & 7;
+    const std::uint64_t below = (std::uint64_t{1} << (code & 63)) - 1;
+    ++counts[first[b * kMaskWords + w] + __builtin_popcountll(voxels.words(b)[w] & below)];
+  }
+}
+
+bool Scan::cast(Context& context, const KeyGrid& grid, const ScanSettings& settings, const float* points,
+                std::size_t n) {
+  Origin origin{settings.origin, {}, 0};
+  if (!key_of_point(grid, origin.point, origin.key)) return false;
+  origin.code = morton_code(origin.key);
+  while (workers_.size() < static_cast<std::size_t>(context.pool.size())) workers_.emplace_back(new Worker);
+  for (auto& worker : workers_) worker->free.clear(), worker->occupied.clear(), worker->rays = 0;
+  if (settings.quantize) {
+    quantize(context, grid, points, n, codes_, voxels_);
+    list_centres(grid, voxels_, centres_);
+    points = centres_.data(), n = centres_.size() / 3;
+  }
+  const auto walk = GGSLAM_DISPATCH(context.isa, walk_rays);
+  const auto flush = [&](Worker& worker) {
+    if (worker.batch.count == 0) return;
+    worker.free.insert(origin.code);
+    walk(worker.batch, origin.code, worker.free);
+    worker.batch.count = 0;
+  };
+  context.pool.parallel_for(n, kRayChunk, [&](std::size_t begin, std::size_t end, int thread) {
+    Worker& worker = *workers_[thread];
+    for (std::size_t i = begin; i < end; ++i) {
+      const float* point = points + 3 * i;
+      float cut[3];
+      int key[3];
+      if (!key_of_point(grid, point, key)) continue;
+      const bool beyond = cut_at_range(origin, point, settings.max_range, cut);
+      if (beyond && !key_of_point(grid, cut, key)) continue;
+      const std::uint64_t code = morton_code(key);
+      if (!beyond) worker.occupied.insert(code);
+      if (code == origin.code) continue;
+      ++worker.rays;
+      prepare_ray(grid, origin, beyond ? cut : point, code, worker.batch);
+      if (worker.batch.count == kRayBatch) flush(worker);
+    }
+    flush(worker);
+  });
+  rays_ = workers_[0]->rays;
+  for (std::size_t w = 1; w < workers_.size(); ++w) {
+    workers_[0]->free.unite(workers_[w]->free);
+    workers_[0]->occupied.unite(workers_[w]->occupied);
+    rays_ += workers_[w]->rays;
+  }
+  return true;
+}
+
+}  // namespace ggslam

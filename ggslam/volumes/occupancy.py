@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Occupancy of space on OctoMap's key grid, updated at the sensor's rate.
+
+The points of a scan are quantised on the map's own grid; one ray runs to the centre of each occupied voxel (voxel
+traversal of Amanatides and Woo, 1987, in OctoMap's arithmetic). As in OctoMap's insertPointCloud a voxel is updated
+once per scan: a hit where a point lies in it, else a miss where a ray passes. Rays set bits in blocks of 8^3 voxels,
+and one pass over the blocks applies them. What has one value throughout is a single leaf of an octree.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ggslam.errors import ConfigError
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.volumes import occupancy_native as native
+from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
+from ggslam.volumes.quantization import KEY_OFFSET, check_resolution
+
+UNKNOWN, FREE, OCCUPIED = -1, 0, 1
+_WHICH = {"all": 0, "occupied": 1, "free": 2}
+
+
+@dataclass(frozen=True)
+class ScanCounts:
+    """What one insertion did.
+
+    Attributes:
+        rays: rays walked.
+        free: voxels passed and not hit.
+        occupied: voxels hit.
+    """
+
+    rays: int
+    free: int
+    occupied: int
+
+
+@dataclass(frozen=True)
+class OccupancySummary:
+    """Size of a map.
+
+    Attributes:
+        occupied, free: voxels of the finest level.
+        blocks: blocks of 8^3 voxels that are stored voxel by voxel.
+        nodes: inner nodes above them.
+        memory_bytes: taken by blocks and nodes.
+        known_box, occupied_box: float64 [2, 3], lower and upper corner around all known and all occupied voxels in
+            metres; None where there are none.
+    """
+
+    occupied: int
+    free: int
+    blocks: int
+    nodes: int
+    memory_bytes: int
+    known_box: np.ndarray | None
+    occupied_box: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class OccupancyLeaves:
+    """Leaves of the map, pruned as OctoMap's: eight equal neighbours are one.
+
+    Attributes:
+        centers: float32 [N, 3], metres.
+        sizes: float32 [N], edges in metres.
+        log_odds: float32 [N].
+    """
+
+    centers: np.ndarray
+    sizes: np.ndarray
+    log_odds: np.ndarray
+
+
+class OccupancyMap:
+    """Log-odds of occupancy, unknown where no ray passed. One caller at a time.
+
+    Args:
+        resolution: edge of a voxel, metres. The grid spans 65536 voxels along each axis, around the world's origin.
+        settings: how a scan changes the map.
+        context: threads to work on; None: a context of its own.
+
+    Raises:
+        ConfigError: impossible resolution.
+    """
+
+    def __init__(
+        self, resolution: float, settings: OccupancySettings | None = None, context: NativeContext | None = None
+    ) -> None:
+        check_resolution(resolution)
+        self._handle: int | None = None
+        self.resolution = float(resolution)
+        self.settings = settings or OccupancySettings()
+        self.context = context or NativeContext()
+        self._library = native.library()
+        self._handle = self._library.ggslam_occupancy_create(self.resolution)
+
+    def __del__(self) -> None:
+        if getattr(self, "_handle", None) is not None:
+            self._library.ggslam_occupancy_destroy(self._handle)
+
+    @property
+    def handle(self) -> int:
+        """Pointer for the core."""
+        assert self._handle is not None
+        return self._handle
+
+    def insert(self, points: np.ndarray, origin: np.ndarray, max_range: float | None = None) -> ScanCounts:
+        """Inserts one scan.
+
+        Args:
+            points: [N, 3] in the world, metres. Those not finite or outside the grid are left out.
+            origin: [3], where the sensor stands in the world.
+            max_range: metres; rays to farther points end there, without a hit.
+
+        Raises:
+            ValueError: points of another shape.
+            ConfigError: the origin lies outside the grid.
+        """
+        points = native.contiguous_points(points)
+        core = self._library.ggslam_occupancy_insert
+        return self._inserted(
+            lambda settings, result: core(
+                self.context.handle, self.handle, points.ctypes.data, len(points), settings, result
+            ),
+            origin,
+            max_range,
+        )
+
+    def insert_depth(
+        self,
+        depth: np.ndarray,
+        camera: Camera,
+        T_world_camera: np.ndarray,
+        max_range: float | None = None,
+        min_depth: float = 0.1,
+        max_depth: float = 1000.0,
+    ) -> ScanCounts:
+        """Inserts one depth image.
+
+        Args:
+            depth: [H, W], metres along the optical axis; 0: none.
+            T_world_camera: float64 [4, 4].
+            max_range: metres from the camera; rays to farther points end there, without a hit.
+            min_depth, max_depth: pixels outside are left out, metres.
+
+        Raises:
+            ValueError: the image is not of the camera's size.
+            ConfigError: the camera stands outside the grid.
+        """
+        depth = np.ascontiguousarray(depth, np.float32)
+        if depth.shape != (camera.height, camera.width):
+            raise ValueError(f"depth: expected shape {[camera.height, camera.width]}, found {list(depth.shape)}")
+        T = np.asarray(T_world_camera, np.float64)
+        image = native.DepthImage(
+            depth.ctypes.data, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+            max(min_depth, 1e-6), max_depth, (ctypes.c_float * 12)(*T[:3].ravel()),
+        )  # fmt: skip
+        core = self._library.ggslam_occupancy_insert_depth
+        return self._inserted(
+            lambda settings, result: core(self.context.handle, self.handle, ctypes.byref(image), settings, result),
+            T[:3, 3],
+            max_range,
+        )
+
+    def states(self, points: np.ndarray) -> np.ndarray:
+        """Whether points [N, 3] are `UNKNOWN`, `FREE` or `OCCUPIED`, int8 [N]. Outside the grid all is unknown."""
+        points = native.contiguous_points(points)
+        states = np.empty(len(points), np.int8)
+        self._look_up(points, states.ctypes.data, None)
+        return states
+
+    def log_odds(self, points: np.ndarray) -> np.ndarray:
+        """Log-odds at points [N, 3], float32 [N]; not a number where unknown."""
+        points = native.contiguous_points(points)
+        values = np.empty(len(points), np.float32)
+        self._look_up(points, None, values.ctypes.data)
+        return values
+
+    def leaves(self, which: Literal["all", "occupied", "free"] = "all") -> OccupancyLeaves:
+        """The map's leaves, or the occupied or free ones alone."""
+        size = self._library.ggslam_occupancy_leaves(self.handle, self.settings.threshold, _WHICH[which])
+        rows = np.frombuffer(native.output_bytes(self.handle, size), native.LEAF)
+        return OccupancyLeaves(rows["centre"].copy(), rows["size"].copy(), rows["log_odds"].copy())
+
+    def occupied_centers(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centres float32 [N, 3] and edges float32 [N] of the occupied leaves, metres."""
+        leaves = self.leaves("occupied")
+        return leaves.centers, leaves.sizes
+
+    def summary(self) -> OccupancySummary:
+        """Counts, memory and extent."""
+        found = native.Summary()
+        self._library.ggslam_occupancy_summary(self.handle, self.settings.threshold, ctypes.byref(found))
+        return OccupancySummary(
+            int(found.occupied), int(found.free), int(found.blocks), int(found.nodes), int(found.bytes),
+            self._box(found.known_low, found.known_high), self._box(found.occupied_low, found.occupied_high),
+        )  # fmt: skip
+
+    def native_settings(self, origin: np.ndarray, max_range: float | None) -> native.InsertSettings:
+        """The settings of one insertion, for the core.
+
+        Raises:
+            ConfigError: a range that is not positive.
+        """
+        if max_range is not None and not max_range > 0:
+            raise ConfigError(f"max_range: expected a positive number of metres, found {max_range}")
+        s = self.settings
+        limits = (s.probability_hit, s.probability_miss, s.probability_minimum, s.probability_maximum)
+        where = (ctypes.c_float * 3)(*np.asarray(origin, np.float32).reshape(3))
+        return native.InsertSettings(
+            -1.0 if max_range is None else max_range, where, *map(log_odds, limits), int(s.quantize)
+        )
+
+    def _inserted(
+        self, insert: Callable[[object, object], int], origin: np.ndarray, max_range: float | None
+    ) -> ScanCounts:
+        settings, result = self.native_settings(origin, max_range), native.InsertResult()
+        if not insert(ctypes.byref(settings), ctypes.byref(result)):
+            raise self.origin_error(origin)
+        return ScanCounts(int(result.rays), int(result.free), int(result.occupied))
+
+    def origin_error(self, origin: np.ndarray) -> ConfigError:
+        """The error of a sensor outside the grid."""
+        reach = self.resolution * KEY_OFFSET
+        return ConfigError(f"origin: expected within {reach:g} m of the world's origin, found {np.asarray(origin)}")
+
+    def _look_up(self, points: np.ndarray, states: int | None, values: int | None) -> None:
+        self._library.ggslam_occupancy_look_up(
+            self.context.handle, self.handle, points.ctypes.data, len(points), self.settings.threshold, states, values
+        )
+
+    def _box(self, low: ctypes.Array, high: ctypes.Array) -> np.ndarray | None:
+        if low[0] > high[0]:
+            return None
+        return (np.array([low[:], [h + 1 for h in high]], np.float64) - KEY_OFFSET) * self.resolution

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""OctoMap's files, read and written without OctoMap.
+
+`.bt` holds free and occupied leaves (two bits a child), `.ot` the log-odds of every node (float32). Both are pruned as
+OctoMap prunes: eight equal children are one leaf, equal by state in `.bt` and by value in `.ot`. The layout is that of
+OctoMap 1.10's AbstractOcTree, AbstractOccupancyOcTree and their classes of nodes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import FormatError
+from ggslam.formats.atomic import write_bytes
+from ggslam.native.loader import NativeContext
+from ggslam.volumes import occupancy_native as native
+from ggslam.volumes.occupancy import OccupancyMap
+from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
+from ggslam.volumes.quantization import RESOLUTION_RANGE
+
+_BINARY, _FULL = 0, 1
+_FIRST_LINES = {_BINARY: "# Octomap OcTree binary file", _FULL: "# Octomap OcTree file"}
+_COMMENT = "# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
+_MAXIMUM_HEADER_BYTES = 1 << 16
+_BLOCK_BYTES = 2112
+_CUT_OFF = 1
+_FAULTS = {
+    2: "a node of the finest level has children",
+    3: "an inner node has no children",
+    4: "a leaf's value is not finite",
+}
+_TOO_LARGE = 5
+
+
+@dataclass(frozen=True)
+class _Header:
+    format: int
+    nodes: int
+    resolution: float
+    size: int
+    """Bytes before the tree."""
+
+
+def read_octomap(
+    path: str | Path,
+    settings: OccupancySettings | None = None,
+    context: NativeContext | None = None,
+    memory_limit: int = 8 << 30,
+) -> OccupancyMap:
+    """The map in a `.bt` or `.ot` file; which of the two is told by its first line.
+
+    Leaves of a `.bt` file get the settings' clamping thresholds as values, as in OctoMap.
+
+    Args:
+        path: the file.
+        settings: of the map, for later insertions.
+        context: threads for the map.
+        memory_limit: bytes that the map's blocks may take (a file of a few MB can hold a map of several GB).
+
+    Raises:
+        FormatError: the file is missing, of another kind, cut off, damaged or too large; names file and reason.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
+    return decode_octomap(data, str(path), settings, context, memory_limit)
+
+
+def decode_octomap(
+    data: bytes,
+    name: str,
+    settings: OccupancySettings | None = None,
+    context: NativeContext | None = None,
+    memory_limit: int = 8 << 30,
+) -> OccupancyMap:
+    """The map in the bytes of a `.bt` or `.ot` file; `name` stands for the file in messages, see `read_octomap`."""
+    header = _read_header(data, name)
+    result = OccupancyMap(header.resolution, settings, context)
+    if header.nodes == 0:
+        return result
+    tree = np.frombuffer(data, np.uint8, offset=header.size)
+    nodes = ctypes.c_uint64()
+    limits = (result.settings.probability_minimum, result.settings.probability_maximum)
+    fault = native.library().ggslam_occupancy_read(
+        result.handle, header.format, tree.ctypes.data, len(tree), *map(log_odds, limits),
+        max(1, memory_limit // _BLOCK_BYTES), ctypes.byref(nodes),
+    )  # fmt: skip
+    if fault == _CUT_OFF:
+        raise FormatError(f"{name}: cut off or damaged: the tree of {header.nodes} nodes ends after {nodes.value}")
+    if fault == _TOO_LARGE:
+        raise FormatError(f"{name}: the map needs more than the {memory_limit / 2**30:.1f} GiB allowed")
+    if fault:
+        raise FormatError(f"{name}: damaged: {_FAULTS[fault]}")
+    if nodes.value != header.nodes:
+        raise FormatError(f"{name}: damaged: the header tells {header.nodes} nodes, the tree has {nodes.value}")
+    return result
+
+
+def write_octomap(occupancy: OccupancyMap, path: str | Path) -> None:
+    """Writes a map as `.bt` or `.ot`, by the ending of `path`, atomically.
+
+    Raises:
+        FormatError: another ending.
+        RunFolderError: the file cannot be written.
+    """
+    path = Path(path)
+    formats = {".bt": _BINARY, ".ot": _FULL}
+    if path.suffix.lower() not in formats:
+        raise FormatError(f"{path}: expected the ending .bt (free or occupied) or .ot (log-odds)")
+    write_bytes(path, _encoded(occupancy, formats[path.suffix.lower()]))
+
+
+def binary_octomap(occupancy: OccupancyMap) -> bytes:
+    """The map as the bytes of a `.bt` file."""
+    return _encoded(occupancy, _BINARY)
+
+
+def full_octomap(occupancy: OccupancyMap) -> bytes:
+    """The map as the bytes of an `.ot` file."""
+    return _encoded(occupancy, _FULL)
+
+
+def _encoded(occupancy: OccupancyMap, kind: int) -> bytes:
+    nodes = ctypes.c_uint64()
+    size = native.library().ggslam_occupancy_write(
+        occupancy.handle, kind, occupancy.settings.threshold, ctypes.byref(nodes)
+    )
+    tree = native.output_bytes(occupancy.handle, size)
+    header = f"{_FIRST_LINES[kind]}\n{_COMMENT}id OcTree\nsize {nodes.value}\nres {occupancy.resolution!r}\ndata\n"
+    return header.encode() + tree
+
+
+def _read_header(data: bytes, name: str) -> _Header:
+    first_line = data[:64].split(b"\n", 1)[0].decode("latin-1").rstrip()
+    kind = next((kind for kind, line in _FIRST_LINES.items() if line == first_line), None)
+    if kind is None:
+        raise FormatError(f"{name}: no OctoMap file: the first line should be {' or '.join(_FIRST_LINES.values())!r}")
+    end = data.find(b"\ndata\n", 0, _MAXIMUM_HEADER_BYTES)
+    if end < 0:
+        raise FormatError(f"{name}: the header has no line 'data': cut off or damaged")
+    fields = {}
+    for line in data[:end].decode("latin-1").splitlines():
+        if not line.startswith("#") and line.strip():
+            key, _, value = line.strip().partition(" ")
+            fields[key] = value.strip()
+    if fields.get("id") != "OcTree":
+        raise FormatError(f"{name}: expected a map of kind OcTree, found {fields.get('id', 'none')!r}")
+    nodes, resolution = _number(fields, "size", name), _number(fields, "res", name)
+    low, high = RESOLUTION_RANGE
+    if not low <= resolution <= high:
+        raise FormatError(f"{name}: res: expected {low:g} to {high:g} m, found {fields['res']}")
+    if nodes < 0 or nodes != int(nodes):
+        raise FormatError(f"{name}: size: expected a number of nodes, found {fields['size']}")
+    return _Header(kind, int(nodes), resolution, end + len(b"\ndata\n"))
+
+
+def _number(fields: dict[str, str], key: str, name: str) -> float:
+    try:
+        value = float(fields[key])
+    except KeyError:
+        raise FormatError(f"{name}: the header has no line {key!r}") from None
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise FormatError(f"{name}: {key}: expected a number, found {fields[key]!r}")
+    return value
