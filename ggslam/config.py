@@ -27,6 +27,7 @@ from ggslam.object_masks import MaskSettings
 from ggslam.tracking.feature_settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
 from ggslam.tracking.tracker import TrackerSettings
+from ggslam.volumes.volume_settings import VolumeSettings
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class Config:
     identity: IdentitySettings = field(default_factory=IdentitySettings)
     masks: MaskSettings = field(default_factory=MaskSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    volumes: VolumeSettings = field(default_factory=VolumeSettings)
 
     def __post_init__(self) -> None:
         ranges = {

@@ -6,7 +6,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,10 +18,11 @@ from ggslam.progress import Observer, SilentObserver
 from ggslam.realtime import RealtimeSlam
 from ggslam.recordings import SequenceRequest, describe
 from ggslam.run_folder import RunFolder
+from ggslam.scene.frame import Frame
 from ggslam.scoring import score_run
 from ggslam.sequences import Sequence
 from ggslam.slam import Slam
-from ggslam.slam_result import SlamResult
+from ggslam.slam_result import SlamResult, StepReport
 from ggslam.starting import ancestors, start_in_map
 
 
@@ -61,9 +62,18 @@ class RunOutcome:
         return ", ".join(parts)
 
 
-def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome:
+Follower = Callable[[Slam, Frame, StepReport], None]
+"""Is called after every frame, in the thread that tracks."""
+
+
+def execute(request: RunRequest, observer: Observer | None = None, follower: Follower | None = None) -> RunOutcome:
     """Runs a recording into a run folder. If it stops in the middle (damaged frame, interrupt), what was done is saved
     all the same and the outcome carries the error.
+
+    Args:
+        request: what to do.
+        observer: is told how it goes on.
+        follower: does more with each frame.
 
     Raises:
         GgslamError: nothing could be done at all: settings, recording or output folder at fault.
@@ -85,7 +95,7 @@ def execute(request: RunRequest, observer: Observer | None = None) -> RunOutcome
     for warning in sequence.warnings:
         observer.note(warning)
     try:
-        result, error = run_slam(sequence, config, observer, earlier, not request.localize_only)
+        result, error = run_slam(sequence, config, observer, earlier, not request.localize_only, follower)
     except GgslamError:  # before the first frame: settings that do not fit the recording, a model that is none
         folder.discard()
         raise
@@ -153,8 +163,9 @@ def _names(earlier: RunFolder | None) -> dict[int, str]:
 
 
 def run_slam(
-    sequence: Sequence, config: Config, observer: Observer, earlier: RunFolder | None = None, growing: bool = True
-) -> tuple[SlamResult, BaseException | None]:
+    sequence: Sequence, config: Config, observer: Observer, earlier: RunFolder | None = None, growing: bool = True,
+    follower: Follower | None = None,
+) -> tuple[SlamResult, BaseException | None]:  # fmt: skip
     """The loop over a recording, synchronous or in real time as the settings say; with `earlier` in that run's map,
     which grows or stays as it is.
 
@@ -166,19 +177,22 @@ def run_slam(
     if earlier is not None:
         start_in_map(slam, earlier, growing)
     observer.begin("track + map" if growing else "localize", len(sequence))
+
+    def report(frame: Frame, step: StepReport) -> None:
+        observer.frame(step)
+        if follower is not None:
+            follower(slam, frame, step)
+
+    frames = sequence.stream(masks="lazy")  # only those of keyframes are read
     try:
         if config.realtime_fps > 0:
-            RealtimeSlam(slam, config.realtime_fps).run(sequence.stream(masks="lazy"), observer.frame)
+            RealtimeSlam(slam, config.realtime_fps).run(frames, report)
         else:
-            _run_synchronous(slam, sequence, observer)
+            for frame in frames:
+                report(frame, slam.step(frame))
         if config.refine_iterations:
             observer.begin("refine", config.refine_iterations)
         return slam.finish(observer.advance), None
     except (Exception, KeyboardInterrupt) as stopped:  # whatever it is: finished work is saved, then it is raised
         error = stopped
     return slam.result(), error
-
-
-def _run_synchronous(slam: Slam, sequence: Sequence, observer: Observer) -> None:
-    for frame in sequence.stream(masks="lazy"):  # only those of keyframes are read
-        observer.frame(slam.step(frame))

@@ -41,7 +41,7 @@ class RealtimeSlam:
         # The kernels of one context take turns; the tracker must not wait for the mapper's.
         slam.tracker.context = NativeContext(slam.context.threads, slam.context.instruction_set)
 
-    def run(self, frames: Iterable[Frame], report: Callable[[StepReport], None]) -> None:
+    def run(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
         """Processes all frames; `report` is called for each. Errors of either thread are raised here."""
         worker = threading.Thread(target=self._map, name="mapper", daemon=True)
         worker.start()
@@ -55,7 +55,7 @@ class RealtimeSlam:
 
     # --- tracker's thread --------------------------------------------------------------------------------------------
 
-    def _track(self, frames: Iterable[Frame], report: Callable[[StepReport], None]) -> None:
+    def _track(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
         slam, first_due = self.slam, 0.0
         for frame in frames:
             if not slam.frames:
@@ -68,13 +68,13 @@ class RealtimeSlam:
                 continue
             if late < 0:
                 time.sleep(-late)
-            report(self._step(frame))
+            report(frame, self._step(frame))
             if self._mapper_error is not None:
                 return
 
-    def _first(self, frame: Frame, report: Callable[[StepReport], None]) -> None:
+    def _first(self, frame: Frame, report: Callable[[Frame, StepReport], None]) -> None:
         """Nothing can be tracked before there is a map: the clock starts when the first keyframe is in."""
-        report(self._step(frame))
+        report(frame, self._step(frame))
         while self.slam.tracker.target is None and self._mapper_error is None and self._jobs.unfinished_tasks:
             time.sleep(1e-3)
 

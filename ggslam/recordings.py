@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,13 +60,16 @@ def fingerprint(folder: RunFolder) -> str:
         raise RunFolderError(f"{folder.path / 'keyframes.json'}: cannot be read: {error.strerror}") from None
 
 
-def open_recording_of(folder: RunFolder, path: Path | None = None, masks: Path | None = None) -> Sequence:
+def open_recording_of(
+    folder: RunFolder, path: Path | None = None, masks: Path | None = None, scale: float | None = None
+) -> Sequence:
     """Opens the recording of a run again, as the run did.
 
     Args:
         folder: of the run.
         path: where the recording is now, if it was moved.
         masks: folder of masks to use instead of those that the run had.
+        scale: of the images; None: the run's.
 
     Raises:
         SequenceError: it is not there any more.
@@ -81,8 +84,8 @@ def open_recording_of(folder: RunFolder, path: Path | None = None, masks: Path |
         request = SequenceRequest(**values)
     except (KeyError, TypeError) as error:
         raise RunFolderError(f"{folder.path / 'sequence.json'}: not as ggslam writes it: {error!r}") from None
-    sequence = request.open()
-    found = {"frames": len(sequence), "camera": asdict(sequence.camera)}
+    sequence = replace(request, scale=request.scale if scale is None else scale).open()
+    found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scaled(request.scale))}
     expected = {name: record.get(name) for name in found}
     if json_ready(found) != expected:
         raise RunFolderError(f"{sequence.path}: not the recording of {folder.path}: expected {expected}, found {found}")

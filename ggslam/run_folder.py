@@ -8,7 +8,7 @@
     points.ply       coloured cloud sampled from the map, metres; points_grid.ply: the same in integer grid cells
     places.npz       what another recording needs to start in this map
     config.yaml      all settings; sequence.json: where the recording was and how it was read
-    timing.json      seconds by part; metrics.json: scores; renders/: pictures
+    timing.json      seconds by part; metrics.json: scores; renders/: pictures; volumes/: by `ggslam volumes`
 of a run with objects, whose map.ply also holds each Gaussian's object id and identity vector:
     objects.json     the objects: ids, names, boxes, ...; there if and only if the other files of the objects are whole
     classifier.npz   turns identity vectors into objects; votes.npz: mask ids that each Gaussian was seen under
@@ -136,7 +136,8 @@ class RunFolder:
         self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
         for stale in ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", PLACES_FILE, *OBJECT_FILES):
             (self.path / stale).unlink(missing_ok=True)
-        shutil.rmtree(self.path / "renders", ignore_errors=True)
+        for stale in ("renders", "volumes"):
+            shutil.rmtree(self.path / stale, ignore_errors=True)
         save_config(config, self.path / "config.yaml")
         self.write_json("sequence.json", sequence)
         self.write_json("timing.json", timing(result))

@@ -203,6 +203,17 @@ class Slam:
         """How many corrections of the map the newest tracked pose knows of."""
         return self._moves_followed
 
+    @property
+    def corrections(self) -> int:
+        """How many times a closed loop has moved the map."""
+        return len(self._moves)
+
+    def pose_of(self, frame: TrackedFrame) -> np.ndarray:
+        """T_world_camera [4, 4] of a frame that was not lost, as far as is known by now."""
+        if frame.keyframe < len(self.mapper.keyframes):
+            return self.mapper.keyframes[frame.keyframe].T_world_camera @ frame.T_keyframe_camera
+        return self._anchor.T_world_camera @ frame.T_keyframe_camera  # its keyframe still waits for the mapper
+
     def wants_keyframe(self, frame: Frame, tracking: TrackingResult) -> bool:
         """Whether the frame becomes a keyframe: never when lost, and never when held out for scoring (but something
         has to be the first)."""

@@ -22,6 +22,7 @@ from ggslam.cli import (
     render_command,
     run_command,
     synth_command,
+    volumes_command,
 )
 from ggslam.errors import GgslamError
 
@@ -54,6 +55,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "compare": (compare_command.compare, compare_command.EPILOG),
     "edit": (edit_command.edit, edit_command.EPILOG),
     "encode": (encode_command.encode, encode_command.EPILOG), "decode": (decode_command.decode, decode_command.EPILOG),
+    "volumes": (volumes_command.volumes, volumes_command.EPILOG),
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
 }  # fmt: skip
 for _name, (_function, _epilog) in _COMMANDS.items():

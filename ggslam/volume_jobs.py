@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `ggslam volumes` does, usable from Python: frames with poses in; volumes, files and pictures out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.config import Config, config_to_dict, load_config
+from ggslam.errors import ConfigError, RunFolderError, SequenceError
+from ggslam.formats.atomic import make_folder
+from ggslam.formats.mesh_files import check_mesh_path
+from ggslam.pipeline import RunRequest, execute, uninterrupted
+from ggslam.progress import Observer, SilentObserver
+from ggslam.recordings import SequenceRequest
+from ggslam.run_folder import MARKER, RunFolder
+from ggslam.volume_frames import FrameSource, frames_of_recording, frames_of_run
+from ggslam.volume_maps import WINDOW, LiveVolumes, VolumeMaps
+from ggslam.volume_outputs import RECORD, OutputRequest, Outputs, write_outputs
+from ggslam.volumes.tsdf_file import load_tsdf
+from ggslam.volumes.volume_settings import VolumeSettings
+
+
+@dataclass(frozen=True)
+class VolumesRequest:
+    """What is wanted of which run or recording.
+
+    Attributes:
+        source: folder of a run or a recording.
+        sequence: how to read a recording.
+        scale: of the images of a run's recording; None: as the run did.
+        recording: where a run's recording is now, if it was moved.
+        out: folder of the results; None: `RUN/volumes`, or `volumes/NAME` of a recording.
+        voxel: of the TSDF, metres; None: as the settings say.
+        esdf: whether a distance field is wanted.
+        occupancy: voxel of the occupancy map in metres; None: none is wanted.
+        mesh: file of the mesh; None: mesh.ply in `out`.
+        object_meshes: whether each object gets a mesh of its own.
+        objects: whether object ids are voted for.
+        live: track the recording and fuse its frames on the way; `out` is the folder of the run.
+        realtime: with `live`, frames a second.
+        onto: file of a TSDF to go on in.
+        slice_height: metres above the floor of the slice through the distance field; None: as high as the camera was.
+        band: lowest and highest obstacle of the ROS map, metres above the floor.
+        latency: whether it is to be known how long all maps take with a frame.
+        device: of torch, for the TSDF, e.g. cuda; None: the compiled core.
+        config, overrides: settings, as for a run; for volumes their part `volumes` counts.
+        overwrite: with `live`, replace an earlier run.
+    """
+
+    source: Path
+    sequence: SequenceRequest
+    scale: float | None = None
+    recording: Path | None = None
+    out: Path | None = None
+    voxel: float | None = None
+    esdf: bool = False
+    occupancy: float | None = None
+    mesh: Path | None = None
+    object_meshes: bool = False
+    objects: bool = True
+    live: bool = False
+    realtime: float | None = None
+    onto: Path | None = None
+    slice_height: float | None = None
+    band: tuple[float, float] = (0.1, 1.5)
+    latency: bool = False
+    device: str | None = None
+    config: str | None = None
+    overrides: list[str] = field(default_factory=list)
+    overwrite: bool = False
+
+
+@dataclass
+class VolumesOutcome:
+    """What was made.
+
+    Attributes:
+        out: folder of the results.
+        files: that were written.
+        lines: facts for people.
+        times: milliseconds a frame, see `VolumeTimes.summary`.
+        window: frames that a mean of `by_window_ms` is over.
+        map_latency_s: 95 % of the frames were in all maps after this many seconds.
+        depth_range_m: 95 % of the depth was nearer.
+        error: why fusing stopped early, if it did.
+    """
+
+    out: Path
+    files: list[Path]
+    lines: list[str]
+    times: dict[str, dict[str, Any]]
+    window: int
+    map_latency_s: float
+    depth_range_m: float
+    error: BaseException | None = None
+
+
+@dataclass
+class _Fused:
+    """What fusing gave: the maps, where the cameras were, names of objects, and why it stopped early."""
+
+    maps: VolumeMaps
+    name: str
+    poses: list[np.ndarray] = field(default_factory=list)
+    depth_ranges: list[float] = field(default_factory=list)
+    names: dict[int, str] = field(default_factory=dict)
+    error: BaseException | None = None
+
+    def saw(self, depth: np.ndarray, T_world_camera: np.ndarray) -> None:
+        """Remembers where a frame was seen from and how far it saw."""
+        self.poses.append(T_world_camera)
+        seen = depth[::8, ::8]
+        seen = seen[seen > 0]
+        if len(seen):
+            self.depth_ranges.append(float(np.percentile(seen, 95)))
+
+
+def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> VolumesOutcome:
+    """Makes volumes of a run or a recording. If it stops in the middle (damaged frame, interrupt), what was fused is
+    written all the same and the outcome carries the error.
+
+    Raises:
+        GgslamError: nothing could be done at all: settings, source or output folder at fault.
+    """
+    observer = observer or SilentObserver()
+    is_run = (request.source / MARKER).is_file()
+    _check(request, is_run)
+    config = _config(request)
+    onto = None if request.onto is None else load_tsdf(request.onto)
+    maps = VolumeMaps(_paced(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
+    if request.live:
+        fused = _live(request, maps, observer)
+        out = Path(fused.name) / "volumes"
+        make_folder(out)
+    else:
+        source = _source(request, is_run)
+        out = _folder(request, is_run)
+        for note in [*source.sequence.warnings, *source.notes]:
+            observer.note(note)
+        fused = _fuse(source, maps, observer)
+    if not fused.poses:
+        raise fused.error if fused.error is not None else SequenceError(f"{request.source}: no frame could be fused")
+    with uninterrupted():
+        outputs = write_outputs(
+            maps, out, OutputRequest(
+                request.mesh, request.object_meshes, request.slice_height, request.band, fused.names
+            ), fused.poses, _record(request, config, fused), observer,
+        )  # fmt: skip
+    return _outcome(out, fused, outputs)
+
+
+def _config(request: VolumesRequest) -> Config:
+    config = load_config(request.config, request.overrides)
+    if request.voxel is None:
+        return config
+    if request.onto is not None:
+        raise ConfigError("--voxel: with --onto the voxels are those of the file")
+    tsdf = replace(config.volumes.tsdf, voxel=request.voxel)
+    return replace(config, volumes=replace(config.volumes, tsdf=tsdf))
+
+
+def _paced(settings: VolumeSettings, request: VolumesRequest) -> VolumeSettings:
+    """The settings with the pace of the distance field."""
+    with_each = (request.live or request.latency) and settings.esdf_every == 0
+    return replace(settings, esdf_every=1) if with_each else settings
+
+
+def _check(request: VolumesRequest, is_run: bool) -> None:
+    """Raises GgslamError for wishes that do not go together."""
+    if request.mesh is not None:
+        check_mesh_path(request.mesh)
+    if request.live and is_run:
+        raise ConfigError(f"--live tracks a recording, and {request.source} is a run: leave --live out")
+    if request.live and request.onto is not None:
+        raise ConfigError("--onto needs poses in the frame of that file: of a run or recording, not of --live")
+    if request.realtime is not None and not request.live:
+        raise ConfigError("--realtime needs --live")
+    if request.occupancy is not None and not 1e-3 <= request.occupancy <= 10:
+        raise ConfigError(f"--occupancy: expected a voxel of 0.001 to 10 m, found {request.occupancy:g}")
+    if request.slice_height is not None and not request.esdf:
+        raise ConfigError("--slice needs --esdf")
+    if request.recording is not None and not is_run:
+        raise ConfigError(f"--sequence says where the recording of a run is; {request.source} is no run")
+
+
+def _folder(request: VolumesRequest, is_run: bool) -> Path:
+    """The folder of the results, made or already ours."""
+    if request.out is not None:
+        out = request.out
+    else:
+        out = request.source / "volumes" if is_run else Path("volumes") / request.source.resolve().name
+    if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
+        raise RunFolderError(f"{out}: not empty and not made by `ggslam volumes`; choose another folder with --out")
+    make_folder(out)
+    RunFolder(out).check_writable()
+    return out
+
+
+def _source(request: VolumesRequest, is_run: bool) -> FrameSource:
+    if is_run:
+        return frames_of_run(RunFolder.open(request.source), request.recording, request.scale, request.objects)
+    return frames_of_recording(request.sequence, request.objects)
+
+
+def _fuse(source: FrameSource, maps: VolumeMaps, observer: Observer) -> _Fused:
+    fused = _Fused(maps, source.name, names=source.names)
+    observer.begin("fuse", len(source))
+    try:
+        for posed in source:
+            maps.add(posed.frame, posed.T_world_camera, posed.labels)
+            fused.saw(posed.frame.depth, posed.T_world_camera)
+            observer.advance(len(fused.poses), len(source))
+    except (Exception, KeyboardInterrupt) as stopped:  # what was fused is written, then it is raised
+        fused.error = stopped
+    maps.finish()
+    return fused
+
+
+def _live(request: VolumesRequest, maps: VolumeMaps, observer: Observer) -> _Fused:
+    """Tracks the recording into a run folder and fuses on the way."""
+    fused = _Fused(maps, str(request.source))
+    follower = LiveVolumes(maps, fused.saw)
+    pace = [] if request.realtime is None else [f"realtime_fps={request.realtime}"]
+    run = RunRequest(
+        request.sequence, request.out, request.config, [*request.overrides, *pace], evaluate=False,
+        overwrite=request.overwrite,
+    )  # fmt: skip
+    outcome = execute(run, observer, follower)
+    fused.name, fused.error = str(outcome.folder.path), outcome.error
+    if outcome.folder.has_objects():
+        objects = outcome.folder.object_table()
+        follower.settle(objects.ids())
+        fused.names = {o.id: o.name for o in objects.objects if o.name}
+    observer.note(f"{outcome.folder.path}: {outcome.headline()}")
+    maps.finish()
+    return fused
+
+
+def _record(request: VolumesRequest, config: Config, fused: _Fused) -> dict[str, Any]:
+    """What volumes.json says of where the volumes come from."""
+    return {
+        "source": fused.name, "live": request.live, "frames": len(fused.poses), "onto": request.onto,
+        "settings": config_to_dict(config)["volumes"], "times": fused.maps.times.summary(),
+        "frames_a_window": WINDOW, "blocks_by_window": fused.maps.times.blocks[WINDOW - 1 :: WINDOW],
+        "rebuilds_s": fused.maps.times.rebuilds,
+        "stopped_by": None if fused.error is None else repr(fused.error),
+    }  # fmt: skip
+
+
+def _outcome(out: Path, fused: _Fused, outputs: Outputs) -> VolumesOutcome:
+    times = fused.maps.times
+    return VolumesOutcome(
+        out, outputs.files, outputs.lines, times.summary(), WINDOW, float(np.percentile(times.per_frame(), 95)),
+        float(np.median(fused.depth_ranges)) if fused.depth_ranges else 0.0, fused.error,
+    )  # fmt: skip

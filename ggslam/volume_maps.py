@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The volumes of a recording, frame by frame: TSDF, and beside it what else is wanted; how long each frame took.
+
+After a loop was closed, what was fused before lies where the camera was thought to be. Weights are clamped and decay,
+so frames cannot be taken out again; they are fast to put in, though: the maps are begun anew and the keyframes, whose
+images the mapper keeps, are fused again where they are now.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from ggslam.errors import ConfigError
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.slam import Slam
+from ggslam.slam_result import StepReport
+from ggslam.tracking.tracker import TrackingStatus
+from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.occupancy import OccupancyMap
+from ggslam.volumes.tsdf import TsdfMap
+from ggslam.volumes.tsdf_torch import TorchTsdf
+from ggslam.volumes.volume_settings import VolumeSettings
+
+WINDOW = 50
+"""Frames over which times are averaged, to see whether they grow with the map."""
+
+
+@dataclass
+class VolumeTimes:
+    """Seconds by frame, and the size of the TSDF after it.
+
+    Attributes:
+        tracking, tsdf, esdf, occupancy: for each frame; empty for what is not wanted, or not done with each frame.
+            Frames without an update of the distance field count 0 there.
+        blocks: of the TSDF.
+        rebuilds: seconds of each time that the maps were made anew after a loop closure.
+        last_update: of the distance field, at the end.
+    """
+
+    tracking: list[float] = field(default_factory=list)
+    tsdf: list[float] = field(default_factory=list)
+    esdf: list[float] = field(default_factory=list)
+    occupancy: list[float] = field(default_factory=list)
+    blocks: list[int] = field(default_factory=list)
+    rebuilds: list[float] = field(default_factory=list)
+    last_update: float = 0.0
+
+    def parts(self) -> dict[str, list[float]]:
+        """The parts that were wanted, by name."""
+        named = {"tracking": self.tracking, "tsdf": self.tsdf, "esdf": self.esdf, "occupancy": self.occupancy}
+        return {name: seconds for name, seconds in named.items() if seconds}
+
+    def per_frame(self) -> np.ndarray:
+        """Seconds of each frame, all parts together, [n]."""
+        return np.sum(list(self.parts().values()), axis=0) if self.tsdf else np.zeros(0)
+
+    def summary(self) -> dict[str, dict[str, Any]]:
+        """Milliseconds a frame by part: mean, 95 %, largest, and means by `WINDOW` frames."""
+        found = {name: _statistics(np.array(seconds)) for name, seconds in self.parts().items()}
+        return {**found, "all": _statistics(self.per_frame())}
+
+
+def _statistics(seconds: np.ndarray) -> dict[str, Any]:
+    ms = 1e3 * seconds
+    if not len(ms):
+        return {"mean_ms": 0.0, "p95_ms": 0.0, "max_ms": 0.0, "by_window_ms": []}
+    windows = [float(ms[k : k + WINDOW].mean()) for k in range(0, len(ms), WINDOW)]
+    return {"mean_ms": float(ms.mean()), "p95_ms": float(np.percentile(ms, 95)), "max_ms": float(ms.max()),
+            "by_window_ms": windows}  # fmt: skip
+
+
+class VolumeMaps:
+    """TSDF, distance field and occupancy of one recording.
+
+    Args:
+        settings: of all of them.
+        esdf: whether a distance field is wanted.
+        occupancy: edge of the occupancy map's voxels in metres; None: no occupancy map.
+        onto: a TSDF to go on in; None: an empty one.
+        device: of torch, on which the TSDF is fused; the other maps follow at the end. None: the compiled core does.
+
+    Raises:
+        ConfigError: no such device, or something is wanted that is not done on one.
+    """
+
+    def __init__(
+        self, settings: VolumeSettings, esdf: bool = False, occupancy: float | None = None,
+        onto: TsdfMap | None = None, device: str | None = None,
+    ) -> None:  # fmt: skip
+        self.settings = settings
+        self._on_device = None if device is None else _fusion_on(device, settings, onto)
+        self.tsdf = TsdfMap(settings.tsdf) if onto is None else onto
+        self.context = self.tsdf.context
+        self.field = DistanceField(self.tsdf, settings.esdf) if esdf else None
+        self.occupancy = None if occupancy is None else self._occupancy(occupancy)
+        self.times = VolumeTimes()
+
+    @property
+    def _fusing(self) -> TsdfMap | TorchTsdf:
+        return self.tsdf if self._on_device is None else self._on_device
+
+    def _occupancy(self, resolution: float) -> OccupancyMap:
+        return OccupancyMap(resolution, self.settings.occupancy, self.context)
+
+    def add(self, frame: Frame, T_world_camera: np.ndarray, labels: np.ndarray | None = None) -> None:
+        """Fuses one frame.
+
+        Args:
+            frame: the images.
+            T_world_camera: [4, 4].
+            labels: object ids uint16 [H, W], 0 = none.
+        """
+        number = len(self.times.tsdf)
+        start = time.perf_counter()
+        self._fuse(frame.depth, frame.camera, T_world_camera, frame.color, labels)
+        every = self.settings.decay_every
+        if every and number % every == every - 1:
+            self.tsdf.decay()
+        self.times.tsdf.append(time.perf_counter() - start)
+        every = self.settings.esdf_every
+        if self.field is not None and every and self._on_device is None:
+            start = time.perf_counter()
+            if number % every == every - 1:
+                self.field.update()
+            self.times.esdf.append(time.perf_counter() - start)
+        if self.occupancy is not None:
+            start = time.perf_counter()
+            self._insert(frame.depth, frame.camera, T_world_camera)
+            self.times.occupancy.append(time.perf_counter() - start)
+        self.times.blocks.append(len(self._fusing))
+
+    def _fuse(
+        self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, color: np.ndarray,
+        labels: np.ndarray | None,
+    ) -> None:  # fmt: skip
+        self._fusing.integrate(depth, camera, T_world_camera, color, labels)
+
+    def _insert(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> None:
+        assert self.occupancy is not None
+        self.occupancy.insert_depth(depth, camera, T_world_camera)
+
+    def rebuild(self, keyframes: list[Keyframe]) -> None:
+        """Begins anew from keyframes, where they are now; for after a loop was closed."""
+        start = time.perf_counter()
+        self.tsdf.clear()
+        if self._on_device is not None:
+            self._on_device = TorchTsdf(self.settings.tsdf, self._on_device.device)
+        if self.occupancy is not None:
+            self.occupancy = self._occupancy(self.occupancy.resolution)
+        for keyframe in keyframes:
+            depth = keyframe.depth_m()
+            self._fuse(depth, keyframe.camera, keyframe.T_world_camera, keyframe.color, keyframe.mask)
+            if self.occupancy is not None:
+                self._insert(depth, keyframe.camera, keyframe.T_world_camera)
+        if self.field is not None and self._on_device is None:
+            self.field.update()
+        self.times.rebuilds.append(time.perf_counter() - start)
+
+    def finish(self) -> None:
+        """Brings the TSDF from its device, and the distance field up to date."""
+        if self._on_device is not None:
+            self.tsdf = self._on_device.to_native(self.context)
+            self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)
+        if self.field is not None:
+            self.times.last_update = self.field.update().milliseconds / 1e3
+
+    def relabel(self, table: np.ndarray) -> None:
+        """Gives every object its new id.
+
+        Args:
+            table: uint16 [65536], new id by old one; 0: none.
+        """
+        blocks = self.tsdf.blocks()
+        dense = blocks.coordinates[blocks.dense]
+        for start in range(0, len(dense), 4096):
+            at = dense[start : start + 4096]
+            old = self.tsdf.read(at).label
+            changed = (table[old] != old).any(1)
+            self.tsdf.write(at[changed], label=table[old[changed]])
+
+
+def _fusion_on(device: str, settings: VolumeSettings, onto: TsdfMap | None) -> TorchTsdf:
+    if onto is not None or settings.decay_every:
+        raise ConfigError("--device: on a device a TSDF neither decays nor is one gone on with")
+    try:
+        return TorchTsdf(settings.tsdf, torch.device(device))
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f"--device {device}: {str(error).splitlines()[0]}") from None
+
+
+class LiveVolumes:
+    """Fuses frames as a `Slam` locates them, and follows its loop closures.
+
+    Args:
+        maps: to fuse into.
+        saw: is told of every frame that was fused: its depth and T_world_camera.
+    """
+
+    def __init__(self, maps: VolumeMaps, saw: Callable[[np.ndarray, np.ndarray], None]) -> None:
+        self.maps = maps
+        self._saw = saw
+        self._corrections = 0
+        self._current: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def __call__(self, slam: Slam, frame: Frame, report: StepReport) -> None:
+        """A frame went through `slam.step`, or its real-time counterpart."""
+        if slam.mapper.identity is not None:
+            self._current = slam.mapper.identity.current
+        if slam.corrections > self._corrections:
+            self._corrections = slam.corrections
+            self.maps.rebuild(list(slam.mapper.keyframes))
+        if report.frame.status == TrackingStatus.LOST.value:
+            return
+        T = slam.pose_of(report.frame)
+        newest = slam.mapper.keyframes[-1] if slam.mapper.keyframes else None
+        labels = newest.mask if newest is not None and newest.frame_index == frame.index else None
+        self.maps.add(frame, T, labels)
+        self.maps.times.tracking.append(slam.times.tracking_by_frame[-1])
+        self._saw(frame.depth, T)
+
+    def settle(self, known_ids: list[int]) -> None:
+        """At the end: what became one object later is one, and what is not among `known_ids` is none."""
+        if self._current is None:
+            return
+        ids = self._current(np.arange(65536, dtype=np.uint16))
+        known = np.zeros(65536, bool)
+        known[known_ids] = True
+        self.maps.relabel(np.where(known[ids], ids, 0).astype(np.uint16))

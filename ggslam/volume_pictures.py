@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of meshes and occupancy maps: from above into the room, its nearer walls left out, and from a camera."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from ggslam.objects.colors import id_palette
+from ggslam.reporting.cloud_pictures import View, draw_cloud
+from ggslam.reporting.mesh_pictures import draw_mesh
+from ggslam.reporting.pictures import side_by_side
+from ggslam.scene.camera import Camera
+from ggslam.volumes.mesh import Mesh
+from ggslam.volumes.occupancy import OccupancyMap
+
+_WIDTH, _HEIGHT = 800, 600
+_FIELD_OF_VIEW = math.radians(60)
+_ELEVATION = math.radians(40)
+"""Angle at which one looks down."""
+
+
+def _camera() -> Camera:
+    focal = 0.5 * _WIDTH / math.tan(_FIELD_OF_VIEW / 2)
+    return Camera(_WIDTH, _HEIGHT, focal, focal, 0.5 * (_WIDTH - 1), 0.5 * (_HEIGHT - 1))
+
+
+def _looking(position: np.ndarray, forward: np.ndarray, up: np.ndarray) -> View:
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right /= max(float(np.linalg.norm(right)), 1e-9)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, 3] = position
+    return View(_camera(), pose)
+
+
+def from_above(poses: np.ndarray, points: np.ndarray, up: np.ndarray) -> View:
+    """A view from outside obliquely down upon points [N, 3], from behind where the cameras [n, 4, 4] mostly stood."""
+    low, high = np.percentile(points, [2, 98], axis=0)
+    middle = (low + high) / 2
+    forward = poses[:, :3, 2].mean(0)
+    forward = forward - (forward @ up) * up
+    if np.linalg.norm(forward) < 0.05:  # they looked all around
+        forward = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    forward /= np.linalg.norm(forward)
+    direction = math.cos(_ELEVATION) * forward - math.sin(_ELEVATION) * up
+    view = _looking(middle, direction, up)
+    x, y, z = ((points[:: max(1, len(points) // 20_000)] - middle) @ view.T_world_camera[:3, :3]).T
+    camera = view.camera
+    tangents = 2 * np.maximum(np.abs(x) / camera.width, np.abs(y) / camera.height) * camera.fx
+    back = float(np.percentile(tangents - z, 98))
+    return _looking(middle - back * direction, direction, up)
+
+
+def from_a_camera(poses: np.ndarray, up: np.ndarray) -> View:
+    """The view of the frame in the middle of the recording, from a step behind it."""
+    pose = poses[len(poses) // 2]
+    return _looking(pose[:3, 3] - 0.3 * pose[:3, 2], pose[:3, 2], up)
+
+
+def mesh_picture(mesh: Mesh, poses: np.ndarray, up: np.ndarray, by_object: bool = False) -> np.ndarray:
+    """A mesh from a camera and from above, uint8 [H, W, 3], in its colours or those of its objects."""
+    colors = id_palette()[mesh.labels] if by_object else mesh.colors
+    views = [from_a_camera(poses, up), from_above(poses, mesh.vertices, up)]
+    return side_by_side([draw_mesh(mesh.vertices, mesh.triangles, mesh.normals, colors, view) for view in views])
+
+
+def occupancy_picture(occupancy: OccupancyMap, poses: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """The occupied voxels below the cameras' heads from above, coloured by height, uint8 [H, W, 3]."""
+    centers = occupancy.occupied_centers()[0].astype(np.float64)
+    if not len(centers):
+        return np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
+    heights = centers @ up
+    head = float(np.percentile(poses[:, :3, 3] @ up, 90)) + 0.3
+    shown = heights < head  # no ceiling
+    centers, heights = (centers[shown], heights[shown]) if shown.any() else (centers, heights)
+    low, high = np.percentile(heights, [1, 99])
+    level = np.clip((heights - low) / max(high - low, 1e-6), 0, 1)
+    colors = cv2.applyColorMap((255 * level).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
+    return draw_cloud(centers, colors, from_above(poses, centers, up), occupancy.resolution)

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam volumes` on a small generated recording and a run of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from ggslam.cli.main import app
+from ggslam.errors import GgslamError
+from ggslam.formats.triangle_mesh import read_mesh
+from ggslam.volumes.octomap_files import read_octomap
+from ggslam.volumes.tsdf_file import load_tsdf
+
+QUICK = ["--voxel", 0.05, "--set", "volumes.tsdf.max_depth=4"]
+
+
+def ggslam(*arguments: object) -> Result:
+    """The command line within this process; an error of ours is in `exception`."""
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "120"})
+
+
+def made(*arguments: object) -> str:
+    result = ggslam("volumes", *arguments)
+    assert result.exit_code == 0 and result.exception is None, (result.output, result.exception)
+    return result.output
+
+
+def record(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "volumes.json").read_text())
+
+
+def one_error(result: Result, *words: str) -> None:
+    assert isinstance(result.exception, GgslamError) and result.exception.exit_code == 2, result
+    assert all(word in str(result.exception) for word in words), str(result.exception)
+
+
+@pytest.fixture(scope="module")
+def of_recording(room: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    out = tmp_path_factory.mktemp("volumes") / "room"
+    wanted = ["--esdf", "--occupancy", 0.1, "--object-meshes", "--report", "--speeds", "1,3"]
+    return out, made(room, "--out", out, *QUICK, *wanted)
+
+
+def test_a_recording_with_poses_needs_no_run(of_recording: tuple[Path, str]) -> None:
+    out, printed = of_recording
+    found = record(out)
+    assert found["complete"] and found["frames"] == 24 and not found["live"]
+    mesh = read_mesh(out / "mesh.ply")
+    assert mesh is not None and len(mesh.triangles) == found["mesh"]["triangles"] > 1000
+    assert len(load_tsdf(out / "tsdf.npz")) == found["tsdf"]["blocks"]
+    for picture in ("mesh.png", "objects.png", "esdf.png", "occupancy.png"):
+        image = cv2.imread(str(out / picture))
+        assert image is not None and image.std() > 10, picture
+    assert "poses of the recording itself" in printed
+
+
+def test_the_generated_room_stands_upright_on_its_floor(of_recording: tuple[Path, str]) -> None:
+    """Its floor is at y = 0 and its y axis points down, the camera is held at eye height."""
+    found = record(of_recording[0])["up"]
+    assert np.allclose(found["up"], [0, 0, 1], atol=0.02) or np.allclose(found["up"], [0, -1, 0], atol=0.02)
+    assert found["floor"] == pytest.approx(0, abs=0.05) and found["support"] > 0.1
+
+
+def test_the_ros_map_says_what_stands_in_the_way(of_recording: tuple[Path, str]) -> None:
+    out, _ = of_recording
+    image = cv2.imread(str(out / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    assert set(np.unique(image)) == {0, 205, 254}
+    assert "resolution: 0.05" in (out / "map.yaml").read_text()
+
+
+def test_the_occupancy_map_holds_the_surface(of_recording: tuple[Path, str]) -> None:
+    out, _ = of_recording
+    occupancy = read_octomap(out / "occupancy.bt")
+    mesh = read_mesh(out / "mesh.ply")
+    assert mesh is not None
+    near = np.zeros(len(mesh.vertices), bool)
+    for shift in 0.05 * np.array([*np.eye(3), *-np.eye(3), np.zeros(3)]):
+        near |= occupancy.states(mesh.vertices + shift) == 1
+    assert near.mean() > 0.9
+
+
+def test_objects_get_meshes_under_their_names(of_recording: tuple[Path, str], room: Path) -> None:
+    out, _ = of_recording
+    files = sorted((out / "objects").glob("*.ply"))
+    assert len(files) == len(record(out)["mesh"]["objects"]) > 5
+    total = sum(len(mesh.triangles) for mesh in map(read_mesh, files) if mesh is not None)
+    assert total <= record(out)["mesh"]["triangles"]
+
+
+def test_the_report_is_the_equation(of_recording: tuple[Path, str]) -> None:
+    out, printed = of_recording
+    latency = record(out)["times"]["all"]["p95_ms"] / 1e3 + 0.033 + 0.05
+    distance = 3 * latency + 9 / (2 * 0.5 * 9.81)
+    assert f"{3 * latency:.2f} m" in printed and f"{distance:.2f} m" in printed
+
+
+def test_a_run_gives_its_poses_and_its_objects(room: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert ggslam("run", room, "--out", run, "--stop", 12, "--iterations", 1, "--no-eval").exception is None
+    printed = made(run, *QUICK, "--mesh", tmp_path / "meshes" / "room.ply")
+    found = record(run / "volumes")
+    assert found["frames"] == 12 and found["mesh"]["objects"]
+    assert (tmp_path / "meshes" / "room.ply").is_file() and not (run / "volumes" / "esdf.png").exists()
+    assert str(run / "volumes") in printed.replace("\n", "")
+    # Once more, over what is there, at another size, with a distance field.
+    made(run, "--voxel", 0.08, "--scale", 0.5, "--esdf", "--slice", 1.0, "--no-objects")
+    found = record(run / "volumes")
+    assert found["settings"]["tsdf"]["voxel"] == 0.08 and not found["mesh"]["objects"]
+    assert found["esdf"]["slice_height"] == pytest.approx(1.0)
+    # A new run in the same place does not keep volumes of the old one.
+    again = ["--stop", 4, "--iterations", 1, "--no-eval", "--overwrite"]
+    assert ggslam("run", room, "--out", run, *again).exception is None
+    assert not (run / "volumes").exists()
+
+
+def test_live_volumes_come_with_a_run(room: Path, tmp_path: Path) -> None:
+    without_poses = Path(shutil.copytree(room, tmp_path / "room"))
+    (without_poses / "poses.txt").unlink()
+    out = tmp_path / "run"
+    one_error(ggslam("volumes", without_poses, "--out", out), "no poses", "--live")
+    few = ["--stop", 8, "--set", "mapping.iterations_per_frame=1"]
+    printed = made(without_poses, "--live", "--out", out, *few, *QUICK)
+    assert (out / "map.ply").is_file() and record(out / "volumes")["live"]
+    assert record(out / "volumes")["frames"] == 8 and "8 frames" in printed
+    assert record(out / "volumes")["mesh"]["objects"]
+
+
+def test_a_map_is_continued(of_recording: tuple[Path, str], room: Path, tmp_path: Path) -> None:
+    start = of_recording[0] / "tsdf.npz"
+    made(room, "--out", tmp_path / "more", "--stop", 2, "--onto", start)
+    assert record(tmp_path / "more")["tsdf"]["blocks"] >= record(of_recording[0])["tsdf"]["blocks"]
+    one_error(ggslam("volumes", room, "--out", tmp_path / "x", "--onto", start, "--voxel", 0.02), "--voxel", "--onto")
+
+
+def test_what_was_fused_before_a_damaged_frame_is_written(room: Path, tmp_path: Path) -> None:
+    damaged = Path(shutil.copytree(room, tmp_path / "room"))
+    victim = sorted((damaged / "depth").glob("*.png"))[5]
+    victim.write_bytes(victim.read_bytes()[:200])
+    one_error(ggslam("volumes", damaged, "--out", tmp_path / "out", *QUICK), victim.name)
+    found = record(tmp_path / "out")
+    assert found["frames"] == 5 and victim.name in found["stopped_by"]
+    made(damaged, "--out", tmp_path / "out", *QUICK, "--skip-bad-frames")
+    assert record(tmp_path / "out")["frames"] == 23
+
+
+def test_mistakes_are_named(room: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("keep me")
+    one_error(ggslam("volumes", room, "--out", tmp_path / "mine"), "not empty", "mine")
+    one_error(ggslam("volumes", room, "--voxel", 0), "voxel")
+    one_error(ggslam("volumes", room, "--occupancy", -1, "--out", tmp_path / "a"), "occupancy")
+    one_error(ggslam("volumes", room, "--mesh", "mesh.stl"), "mesh.stl", ".ply")
+    one_error(ggslam("volumes", room, "--band", "2,1"), "--band")
+    one_error(ggslam("volumes", room, "--realtime", 5), "--realtime", "--live")
+    one_error(ggslam("volumes", room, "--friction", 0), "friction")
+    one_error(ggslam("volumes", room, "--set", "volumes.tsdf.voxl=1"), "voxl", "voxel")
+    one_error(ggslam("volumes", room, "--onto", tmp_path / "none.npz"), "none.npz")
+    assert not Path("volumes").exists() and not (tmp_path / "a").exists()
