@@ -79,7 +79,7 @@ class RealtimeSlam:
             time.sleep(1e-3)
 
     def _step(self, frame: Frame) -> StepReport:
-        slam = self.slam
+        slam, start = self.slam, time.perf_counter()
         slam.times.start()
         tracking = slam.track(frame)
         is_keyframe = self._jobs.qsize() < MAX_WAITING and slam.wants_keyframe(frame, tracking)
@@ -88,7 +88,8 @@ class RealtimeSlam:
             self._jobs.put((frame, tracking, slam.moves_followed))
         slam.remember(frame, tracking)
         slam.times.stop()
-        return StepReport(slam.frames[-1], is_keyframe, slam.map.count, slam.mapper.last_psnr)
+        seconds = time.perf_counter() - start
+        return StepReport(slam.frames[-1], is_keyframe, slam.map.count, slam.mapper.last_psnr, seconds)
 
     # --- mapper's thread ---------------------------------------------------------------------------------------------
 

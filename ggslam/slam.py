@@ -113,6 +113,7 @@ class Slam:
         Raises:
             SequenceError: the frame's images do not fit the camera.
         """
+        start = time.perf_counter()
         self.times.start()
         tracking = self.track(frame)
         is_keyframe = self.wants_keyframe(frame, tracking)
@@ -125,7 +126,8 @@ class Slam:
             settings = self.config.mapping
             self.mapper.run(settings.first_frame_iterations if first else settings.iterations_per_frame)
         self.times.stop()
-        return StepReport(self.frames[-1], is_keyframe, self.map.count, self.mapper.last_psnr)
+        seconds = time.perf_counter() - start
+        return StepReport(self.frames[-1], is_keyframe, self.map.count, self.mapper.last_psnr, seconds)
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refine_iterations`), then the result. `progress(done, total)` is called now and then."""

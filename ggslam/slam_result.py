@@ -45,12 +45,13 @@ class TrackedFrame:
 
 @dataclass
 class StepReport:
-    """What one step did, for the progress line."""
+    """What one step did, for the progress line; `seconds` is how long it took."""
 
     frame: TrackedFrame
     is_keyframe: bool
     gaussians: int
     psnr: float
+    seconds: float
 
 
 @dataclass

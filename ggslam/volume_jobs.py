@@ -17,9 +17,10 @@ from ggslam.pipeline import RunRequest, execute, uninterrupted
 from ggslam.progress import Observer, SilentObserver
 from ggslam.recordings import SequenceRequest
 from ggslam.run_folder import MARKER, RunFolder
+from ggslam.scene.frame import Frame
 from ggslam.volume_frames import FrameSource, frames_of_recording, frames_of_run
 from ggslam.volume_maps import WINDOW, LiveVolumes, VolumeMaps
-from ggslam.volume_outputs import RECORD, OutputRequest, Outputs, write_outputs
+from ggslam.volume_outputs import RECORD, OutputRequest, Outputs, prepare_folder, write_outputs
 from ggslam.volumes.tsdf_file import load_tsdf
 from ggslam.volumes.volume_settings import VolumeSettings
 
@@ -106,17 +107,26 @@ class _Fused:
     maps: VolumeMaps
     name: str
     poses: list[np.ndarray] = field(default_factory=list)
+    timestamps: list[float] = field(default_factory=list)
     depth_ranges: list[float] = field(default_factory=list)
     names: dict[int, str] = field(default_factory=dict)
     error: BaseException | None = None
 
-    def saw(self, depth: np.ndarray, T_world_camera: np.ndarray) -> None:
-        """Remembers where a frame was seen from and how far it saw."""
+    def saw(self, frame: Frame, T_world_camera: np.ndarray) -> None:
+        """Remembers where a frame was seen from, and how far it saw of what was fused."""
         self.poses.append(T_world_camera)
-        seen = depth[::8, ::8]
-        seen = seen[seen > 0]
+        self.timestamps.append(frame.timestamp)
+        limits, seen = self.maps.settings.tsdf, frame.depth[::8, ::8]
+        seen = seen[(seen >= limits.min_depth) & (seen <= limits.max_depth)]
         if len(seen):
             self.depth_ranges.append(float(np.percentile(seen, 95)))
+
+    def latency(self) -> float:
+        """Seconds after which 95 % of the frames are in all maps, the wait for a distance field that is not updated
+        with every frame included."""
+        whole, every = self.maps.times.whole(), max(1, self.maps.settings.esdf_every)
+        wait = float(np.median(np.diff(self.timestamps))) * (every - 1) if len(self.timestamps) > 1 else 0.0
+        return (float(np.percentile(whole, 95)) if len(whole) else 0.0) + wait
 
 
 def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> VolumesOutcome:
@@ -136,6 +146,7 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
         fused = _live(request, maps, observer)
         out = Path(fused.name) / "volumes"
         make_folder(out)
+        prepare_folder(out)
     else:
         source = _source(request, is_run)
         out = _folder(request, is_run)
@@ -145,6 +156,12 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
     if not fused.poses:
         raise fused.error if fused.error is not None else SequenceError(f"{request.source}: no frame could be fused")
     with uninterrupted():
+        maps.finish()
+        if not len(maps.tsdf):
+            limits = config.volumes.tsdf
+            raise SequenceError(
+                f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
+            )
         outputs = write_outputs(
             maps, out, OutputRequest(
                 request.mesh, request.object_meshes, request.slice_height, request.band, fused.names
@@ -171,20 +188,41 @@ def _paced(settings: VolumeSettings, request: VolumesRequest) -> VolumeSettings:
 
 def _check(request: VolumesRequest, is_run: bool) -> None:
     """Raises GgslamError for wishes that do not go together."""
-    if request.mesh is not None:
-        check_mesh_path(request.mesh)
     if request.live and is_run:
         raise ConfigError(f"--live tracks a recording, and {request.source} is a run: leave --live out")
     if request.live and request.onto is not None:
         raise ConfigError("--onto needs poses in the frame of that file: of a run or recording, not of --live")
     if request.realtime is not None and not request.live:
         raise ConfigError("--realtime needs --live")
+    if request.overwrite and not request.live:
+        raise ConfigError("--overwrite is for the run that --live makes; volumes are replaced without it")
+    if request.latency and request.device is not None and request.esdf:
+        raise ConfigError("--report: with --device the distance field waits for the end, so its latency is not known")
     if request.occupancy is not None and not 1e-3 <= request.occupancy <= 10:
         raise ConfigError(f"--occupancy: expected a voxel of 0.001 to 10 m, found {request.occupancy:g}")
-    if request.slice_height is not None and not request.esdf:
-        raise ConfigError("--slice needs --esdf")
+    if request.slice_height is not None:
+        if not request.esdf:
+            raise ConfigError("--slice needs --esdf")
+        if not abs(request.slice_height) < 1e4:
+            raise ConfigError(f"--slice: expected a height in metres, found {request.slice_height:g}")
     if request.recording is not None and not is_run:
         raise ConfigError(f"--sequence says where the recording of a run is; {request.source} is no run")
+    if is_run and request.sequence != SequenceRequest(request.source, scale=request.sequence.scale):
+        raise ConfigError(
+            f"{request.source} is a run, read as it was made: --start, --stop, --stride, --format, --depth-scale and "
+            "--skip-bad-frames are for recordings"
+        )
+    if request.mesh is not None:
+        _check_mesh(request.mesh, request.source)
+
+
+def _check_mesh(path: Path, source: Path) -> None:
+    check_mesh_path(path)
+    protected = (path.parent / MARKER).is_file() or source.resolve() in path.resolve().parents
+    if path.exists() and protected and path.parent.name != "volumes":
+        raise ConfigError(f"--mesh {path}: is a file of a run or recording; choose another name")
+    make_folder(path.parent)
+    RunFolder(path.parent).check_writable()
 
 
 def _folder(request: VolumesRequest, is_run: bool) -> Path:
@@ -196,7 +234,7 @@ def _folder(request: VolumesRequest, is_run: bool) -> Path:
     if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
         raise RunFolderError(f"{out}: not empty and not made by `ggslam volumes`; choose another folder with --out")
     make_folder(out)
-    RunFolder(out).check_writable()
+    prepare_folder(out)
     return out
 
 
@@ -212,18 +250,17 @@ def _fuse(source: FrameSource, maps: VolumeMaps, observer: Observer) -> _Fused:
     try:
         for posed in source:
             maps.add(posed.frame, posed.T_world_camera, posed.labels)
-            fused.saw(posed.frame.depth, posed.T_world_camera)
+            fused.saw(posed.frame, posed.T_world_camera)
             observer.advance(len(fused.poses), len(source))
     except (Exception, KeyboardInterrupt) as stopped:  # what was fused is written, then it is raised
         fused.error = stopped
-    maps.finish()
     return fused
 
 
 def _live(request: VolumesRequest, maps: VolumeMaps, observer: Observer) -> _Fused:
     """Tracks the recording into a run folder and fuses on the way."""
     fused = _Fused(maps, str(request.source))
-    follower = LiveVolumes(maps, fused.saw)
+    follower = LiveVolumes(maps, fused.saw, request.objects)
     pace = [] if request.realtime is None else [f"realtime_fps={request.realtime}"]
     run = RunRequest(
         request.sequence, request.out, request.config, [*request.overrides, *pace], evaluate=False,
@@ -236,7 +273,6 @@ def _live(request: VolumesRequest, maps: VolumeMaps, observer: Observer) -> _Fus
         follower.settle(objects.ids())
         fused.names = {o.id: o.name for o in objects.objects if o.name}
     observer.note(f"{outcome.folder.path}: {outcome.headline()}")
-    maps.finish()
     return fused
 
 
@@ -254,6 +290,6 @@ def _record(request: VolumesRequest, config: Config, fused: _Fused) -> dict[str,
 def _outcome(out: Path, fused: _Fused, outputs: Outputs) -> VolumesOutcome:
     times = fused.maps.times
     return VolumesOutcome(
-        out, outputs.files, outputs.lines, times.summary(), WINDOW, float(np.percentile(times.per_frame(), 95)),
+        out, outputs.files, outputs.lines, times.summary(), WINDOW, fused.latency(),
         float(np.median(fused.depth_ranges)) if fused.depth_ranges else 0.0, fused.error,
     )  # fmt: skip

@@ -35,37 +35,35 @@ WINDOW = 50
 
 @dataclass
 class VolumeTimes:
-    """Seconds by frame, and the size of the TSDF after it.
+    """How long frames took.
 
     Attributes:
-        tracking, tsdf, esdf, occupancy: for each frame; empty for what is not wanted, or not done with each frame.
-            Frames without an update of the distance field count 0 there.
-        blocks: of the TSDF.
-        rebuilds: seconds of each time that the maps were made anew after a loop closure.
+        rows: for each frame, seconds by part: "slam" (from the frame to its pose and, where they come first, mapping
+            and making the volumes anew after a loop closure), "tsdf", "esdf", "occupancy"; parts that were not done
+            with a frame are missing.
+        blocks: of the TSDF after each frame.
+        rebuilds: seconds of each time that the maps were made anew.
         last_update: of the distance field, at the end.
     """
 
-    tracking: list[float] = field(default_factory=list)
-    tsdf: list[float] = field(default_factory=list)
-    esdf: list[float] = field(default_factory=list)
-    occupancy: list[float] = field(default_factory=list)
+    rows: list[dict[str, float]] = field(default_factory=list)
     blocks: list[int] = field(default_factory=list)
     rebuilds: list[float] = field(default_factory=list)
     last_update: float = 0.0
 
-    def parts(self) -> dict[str, list[float]]:
-        """The parts that were wanted, by name."""
-        named = {"tracking": self.tracking, "tsdf": self.tsdf, "esdf": self.esdf, "occupancy": self.occupancy}
-        return {name: seconds for name, seconds in named.items() if seconds}
+    def parts(self) -> dict[str, np.ndarray]:
+        """Seconds [n] of the frames with which a part was done, by part."""
+        names = [name for name in ("slam", "tsdf", "esdf", "occupancy") if any(name in row for row in self.rows)]
+        return {name: np.array([row[name] for row in self.rows if name in row]) for name in names}
 
-    def per_frame(self) -> np.ndarray:
-        """Seconds of each frame, all parts together, [n]."""
-        return np.sum(list(self.parts().values()), axis=0) if self.tsdf else np.zeros(0)
+    def whole(self) -> np.ndarray:
+        """Seconds [n] of the frames with which all parts were done, all together."""
+        parts = self.parts()
+        return np.array([sum(row.values()) for row in self.rows if len(row) == len(parts)])
 
     def summary(self) -> dict[str, dict[str, Any]]:
         """Milliseconds a frame by part: mean, 95 %, largest, and means by `WINDOW` frames."""
-        found = {name: _statistics(np.array(seconds)) for name, seconds in self.parts().items()}
-        return {**found, "all": _statistics(self.per_frame())}
+        return {name: _statistics(seconds) for name, seconds in {**self.parts(), "all": self.whole()}.items()}
 
 
 def _statistics(seconds: np.ndarray) -> dict[str, Any]:
@@ -110,32 +108,36 @@ class VolumeMaps:
     def _occupancy(self, resolution: float) -> OccupancyMap:
         return OccupancyMap(resolution, self.settings.occupancy, self.context)
 
-    def add(self, frame: Frame, T_world_camera: np.ndarray, labels: np.ndarray | None = None) -> None:
+    def add(
+        self, frame: Frame, T_world_camera: np.ndarray, labels: np.ndarray | None = None, waited: float = 0.0
+    ) -> None:
         """Fuses one frame.
 
         Args:
             frame: the images.
             T_world_camera: [4, 4].
             labels: object ids uint16 [H, W], 0 = none.
+            waited: seconds since the frame came.
         """
-        number = len(self.times.tsdf)
+        number = len(self.times.rows)
+        row = {"slam": waited} if waited else {}
         start = time.perf_counter()
         self._fuse(frame.depth, frame.camera, T_world_camera, frame.color, labels)
         every = self.settings.decay_every
         if every and number % every == every - 1:
             self.tsdf.decay()
-        self.times.tsdf.append(time.perf_counter() - start)
+        row["tsdf"] = time.perf_counter() - start
         every = self.settings.esdf_every
-        if self.field is not None and every and self._on_device is None:
+        if self.field is not None and every and self._on_device is None and number % every == every - 1:
             start = time.perf_counter()
-            if number % every == every - 1:
-                self.field.update()
-            self.times.esdf.append(time.perf_counter() - start)
+            self.field.update()
+            row["esdf"] = time.perf_counter() - start
         if self.occupancy is not None:
             start = time.perf_counter()
             self._insert(frame.depth, frame.camera, T_world_camera)
-            self.times.occupancy.append(time.perf_counter() - start)
+            row["occupancy"] = time.perf_counter() - start
         self.times.blocks.append(len(self._fusing))
+        self.times.rows.append(row)
 
     def _fuse(
         self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, color: np.ndarray,
@@ -147,8 +149,9 @@ class VolumeMaps:
         assert self.occupancy is not None
         self.occupancy.insert_depth(depth, camera, T_world_camera)
 
-    def rebuild(self, keyframes: list[Keyframe]) -> None:
-        """Begins anew from keyframes, where they are now; for after a loop was closed."""
+    def rebuild(self, keyframes: list[Keyframe], objects: bool = True) -> None:
+        """Begins anew from keyframes, where they are now, with the ids of their objects or without; for after a loop
+        was closed."""
         start = time.perf_counter()
         self.tsdf.clear()
         if self._on_device is not None:
@@ -157,7 +160,8 @@ class VolumeMaps:
             self.occupancy = self._occupancy(self.occupancy.resolution)
         for keyframe in keyframes:
             depth = keyframe.depth_m()
-            self._fuse(depth, keyframe.camera, keyframe.T_world_camera, keyframe.color, keyframe.mask)
+            mask = keyframe.mask if objects else None
+            self._fuse(depth, keyframe.camera, keyframe.T_world_camera, keyframe.color, mask)
             if self.occupancy is not None:
                 self._insert(depth, keyframe.camera, keyframe.T_world_camera)
         if self.field is not None and self._on_device is None:
@@ -191,8 +195,9 @@ def _fusion_on(device: str, settings: VolumeSettings, onto: TsdfMap | None) -> T
     if onto is not None or settings.decay_every:
         raise ConfigError("--device: on a device a TSDF neither decays nor is one gone on with")
     try:
-        return TorchTsdf(settings.tsdf, torch.device(device))
-    except (RuntimeError, AssertionError) as error:
+        torch.zeros(1, device=device).cpu()
+        return TorchTsdf(settings.tsdf, device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
         raise ConfigError(f"--device {device}: {str(error).splitlines()[0]}") from None
 
 
@@ -201,12 +206,13 @@ class LiveVolumes:
 
     Args:
         maps: to fuse into.
-        saw: is told of every frame that was fused: its depth and T_world_camera.
+        saw: is told of every frame that was fused, and its T_world_camera.
+        objects: whether object ids are voted for.
     """
 
-    def __init__(self, maps: VolumeMaps, saw: Callable[[np.ndarray, np.ndarray], None]) -> None:
+    def __init__(self, maps: VolumeMaps, saw: Callable[[Frame, np.ndarray], None], objects: bool = True) -> None:
         self.maps = maps
-        self._saw = saw
+        self._saw, self._objects = saw, objects
         self._corrections = 0
         self._current: Callable[[np.ndarray], np.ndarray] | None = None
 
@@ -214,17 +220,18 @@ class LiveVolumes:
         """A frame went through `slam.step`, or its real-time counterpart."""
         if slam.mapper.identity is not None:
             self._current = slam.mapper.identity.current
+        start = time.perf_counter()
         if slam.corrections > self._corrections:
             self._corrections = slam.corrections
-            self.maps.rebuild(list(slam.mapper.keyframes))
+            self.maps.rebuild(list(slam.mapper.keyframes), self._objects)
         if report.frame.status == TrackingStatus.LOST.value:
             return
         T = slam.pose_of(report.frame)
         newest = slam.mapper.keyframes[-1] if slam.mapper.keyframes else None
-        labels = newest.mask if newest is not None and newest.frame_index == frame.index else None
-        self.maps.add(frame, T, labels)
-        self.maps.times.tracking.append(slam.times.tracking_by_frame[-1])
-        self._saw(frame.depth, T)
+        known = self._objects and newest is not None and newest.frame_index == frame.index
+        labels = newest.mask if known and newest is not None else None
+        self.maps.add(frame, T, labels, report.seconds + time.perf_counter() - start)
+        self._saw(frame, T)
 
     def settle(self, known_ids: list[int]) -> None:
         """At the end: what became one object later is one, and what is not among `known_ids` is none."""

@@ -3,7 +3,7 @@
 
     tsdf.npz                   the signed distances, to go on in
     mesh.ply, mesh.png         the surface, with colours and object ids; the picture from where the camera was and above
-    objects.png, objects/      the same in colours of objects; a mesh of each of them
+    objects.png, object_*.ply  the same in colours of objects; a mesh of each of them
     esdf.png                   the distance field at one height
     map.pgm, map.yaml          obstacles between two heights, as ROS's map_server reads them
     occupancy.bt, .ot, .png    the occupancy map, as OctoMap reads it
@@ -22,18 +22,21 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.errors import RunFolderError
 from ggslam.formats.atomic import make_folder, write_text
 from ggslam.formats.mesh_files import write_mesh
+from ggslam.formats.staging import finish_saving, new_staging, publish
 from ggslam.progress import Observer
 from ggslam.reporting.pictures import write_picture
-from ggslam.run_folder import json_ready
+from ggslam.run_folder import RunFolder, json_ready
 from ggslam.volume_maps import VolumeMaps
 from ggslam.volume_pictures import mesh_picture, occupancy_picture
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.octomap_files import write_octomap
-from ggslam.volumes.slices import plane_at_height, slice_field, write_ros_map, write_slice_picture
+from ggslam.volumes.slices import FieldSlice, plane_at_height, slice_field, write_ros_map, write_slice_picture
+from ggslam.volumes.tsdf import SIDE
 from ggslam.volumes.tsdf_file import save_tsdf
 from ggslam.volumes.upright import Upright, estimate_up
 
@@ -43,6 +46,8 @@ _FILES = (
     "tsdf.npz", "mesh.ply", "mesh.png", "objects.png", "esdf.png", "map.pgm", "map.yaml", "occupancy.bt",
     "occupancy.ot", "occupancy.png",
 )  # fmt: skip
+MOST_CELLS = 20_000_000
+"""Of a slice."""
 SMALLEST_PIECE = 50
 """Triangles; smaller pieces of the mesh, specks of noise in the air, are left out."""
 
@@ -82,16 +87,18 @@ class Outputs:
 
 
 class _Writer:
-    """Writes into one folder and remembers what was written."""
+    """Writes into a hidden folder, from which all files go to `out` together."""
 
     def __init__(self, out: Path, request: OutputRequest, poses: np.ndarray) -> None:
         self.out, self.request, self.poses = out, request, poses
+        self.staged = new_staging(out)
         self.outputs = Outputs()
+        make_folder(self.staged)
 
     def path(self, name: str) -> Path:
-        """A file of the folder, noted as written."""
+        """Where to write a file of the folder; it is noted as written."""
         self.outputs.files.append(self.out / name)
-        return self.outputs.files[-1]
+        return self.staged / name
 
     def tell(self, line: str, **facts: Any) -> None:
         """A line for people, and the same for the record."""
@@ -113,29 +120,26 @@ class _Writer:
     def mesh(self, maps: VolumeMaps) -> Mesh:
         """The surface."""
         mesh = extract_mesh(maps.tsdf, min_triangles=SMALLEST_PIECE)
-        if self.request.mesh is None:
-            path = self.path("mesh.ply")
-        else:
-            path = self.request.mesh
-            make_folder(path.parent)
+        path = self.request.mesh or self.path("mesh.ply")
+        if self.request.mesh is not None:
             self.outputs.files.append(path)
         labels = mesh.labels if mesh.objects() else None
         arrays = (mesh.vertices, mesh.triangles, mesh.normals, mesh.colors)
         write_mesh(path, *arrays, labels, self.request.names)
         facts = {"vertices": len(mesh.vertices), "triangles": len(mesh.triangles), "objects": mesh.objects()}
-        self.tell(f"mesh: {facts['vertices']} vertices, {facts['triangles']} triangles: {path}", mesh=facts)
+        none = "" if facts["triangles"] else "; no surface was found: voxels may be too large, or depth seen too rarely"
+        self.tell(f"mesh: {facts['vertices']} vertices, {facts['triangles']} triangles{none}", mesh=facts)
         if self.request.object_meshes:
             self._object_meshes(mesh)
         return mesh
 
     def _object_meshes(self, mesh: Mesh) -> None:
-        make_folder(self.out / "objects")
         for number in mesh.objects():
             part, name = mesh.of_object(number), self.request.names.get(number, "object")
             safe = "".join(c if c.isalnum() else "_" for c in name)
-            path = self.path(f"objects/{number}_{safe}.ply")
+            path = self.path(f"object_{number}_{safe}.ply")
             write_mesh(path, part.vertices, part.triangles, part.normals, part.colors, part.labels)
-        self.tell(f"{len(mesh.objects())} objects have a mesh of their own in {self.out / 'objects'}")
+        self.tell(f"{len(mesh.objects())} objects have a mesh of their own: {self.out / 'object_*.ply'}")
 
     def upright(self, mesh: Mesh) -> Upright:
         """Which way is up, and where the floor is."""
@@ -154,14 +158,20 @@ class _Writer:
         base = upright.floor if upright.floor is not None else float(heights.min()) - 1.0
         wanted = self.request.slice_height
         height = float(np.median(heights)) if wanted is None else base + wanted
-        cut = slice_field(field_, plane_at_height(field_, upright.up, height), field_.voxel)
+        cut = _slice(field_, upright.up, height, field_.voxel)
         write_slice_picture(cut, self.path("esdf.png"), _full_scale(cut.distance[cut.known]))
-        low, high = self.request.band
+        if not cut.known.any():
+            self.outputs.lines.append(f"note: nothing is known {height - base:.2f} m up: esdf.png is empty")
+        # No farther than the field reaches.
+        edge = SIDE * field_.voxel
+        reached = (field_.coordinates() + 0.5) @ upright.up * edge - base
+        low = max(self.request.band[0], float(reached.min()) - edge)
+        high = max(low, min(self.request.band[1], float(reached.max()) + edge))
         plane = plane_at_height(field_, upright.up, base)
         image, description = write_ros_map(
-            slice_field(field_, plane, max(0.05, field_.voxel), (low, high)), self.out / "map"
+            _slice(field_, upright.up, base, max(0.05, field_.voxel), (low, high)), self.staged / "map"
         )
-        self.outputs.files += [image, description]
+        self.outputs.files += [self.out / image.name, self.out / description.name]
         axes = {"origin": plane.origin, "x_axis": plane.x_axis, "y_axis": plane.y_axis}
         held = field_.memory_bytes / 1e6
         ground = "the floor" if upright.floor is not None else "a metre below the camera"
@@ -185,6 +195,15 @@ class _Writer:
         )  # fmt: skip
 
 
+def _slice(
+    field_: DistanceField, up: np.ndarray, height: float, resolution: float, band: tuple[float, float] | None = None
+) -> FieldSlice:
+    """A slice, coarser than `resolution` where that would be too many cells."""
+    plane = plane_at_height(field_, up, height)
+    area = (plane.high[0] - plane.low[0]) * (plane.high[1] - plane.low[1])
+    return slice_field(field_, plane, max(resolution, math.sqrt(area / MOST_CELLS)), band)
+
+
 def _full_scale(distances: np.ndarray) -> float:
     """A round number of metres above nearly all of the distances."""
     return max(0.25, math.ceil(4 * float(np.percentile(distances, 99))) / 4) if len(distances) else 1.0
@@ -194,21 +213,51 @@ def write_outputs(
     maps: VolumeMaps, out: Path, request: OutputRequest, poses: Sequence[np.ndarray], record: dict[str, Any],
     observer: Observer,
 ) -> Outputs:  # fmt: skip
-    """Writes everything; files of earlier volumes in the folder go first.
+    """Writes everything; when all of it is on the disk, it takes the place of earlier volumes in the folder.
 
     Args:
         maps: what was made.
-        out: the folder; there.
+        out: the folder, see `prepare_folder`.
         request: what is wanted.
         poses: T_world_camera of the frames that were fused.
         record: for volumes.json, where the volumes are from.
         observer: is told how it goes on.
     """
-    write_text(out / RECORD, json.dumps({"complete": False}) + "\n")
-    for stale in _FILES:
-        (out / stale).unlink(missing_ok=True)
-    shutil.rmtree(out / "objects", ignore_errors=True)
+    earlier = _earlier_files(out)
     writer = _Writer(out, request, np.array(poses))
+    try:
+        _write_all(writer, maps, record, observer)
+    except BaseException:
+        shutil.rmtree(writer.staged, ignore_errors=True)
+        raise
+    publish(writer.staged, out, RECORD, earlier, {"complete": False})
+    return writer.outputs
+
+
+def prepare_folder(out: Path) -> None:
+    """Finds out before the work whether volumes can be written to a folder, and finishes a writing that was
+    interrupted.
+
+    Raises:
+        RunFolderError: they cannot.
+    """
+    RunFolder(out).check_writable()
+    for name in _FILES:
+        if (out / name).is_dir():
+            raise RunFolderError(f"{out / name}: is a folder; a file of this name is to be written")
+    finish_saving(out, RECORD)
+
+
+def _earlier_files(out: Path) -> list[str]:
+    """Names of the files that earlier volumes left in the folder, and that later ones replace."""
+    try:
+        names = json.loads((out / RECORD).read_text())["files"]
+        return [name for name in names if Path(name).name == name and name != RECORD and (out / name).is_file()]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def _write_all(writer: _Writer, maps: VolumeMaps, record: dict[str, Any], observer: Observer) -> None:
     observer.begin("mesh, pictures, files", 4)
     writer.tsdf(maps)
     observer.advance(1, 4)
@@ -225,6 +274,6 @@ def write_outputs(
     if maps.occupancy is not None:
         writer.occupancy(maps.occupancy, upright)
     observer.advance(4, 4)
-    writer.outputs.record = {"complete": True, **record, **writer.outputs.record}
+    names = [path.name for path in writer.outputs.files if path.parent == writer.out]
+    writer.outputs.record = {"complete": True, **record, **writer.outputs.record, "files": names}
     write_text(writer.path(RECORD), json.dumps(json_ready(writer.outputs.record), indent=1) + "\n")
-    return writer.outputs

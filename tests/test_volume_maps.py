@@ -36,7 +36,6 @@ class Played:
         self.corrections = 0
         self.mapper: Any = SimpleNamespace(keyframes=[], identity=None)
         self.poses: dict[int, np.ndarray] = {}
-        self.times = SimpleNamespace(tracking_by_frame=[0.5])
 
     def pose_of(self, frame: TrackedFrame) -> np.ndarray:
         return self.poses[frame.frame_index]
@@ -46,7 +45,7 @@ class Played:
         if status != "lost":
             self.mapper.keyframes.append(make_keyframe(len(self.mapper.keyframes), frame, T))
         tracked = TrackedFrame(frame.index, frame.index, 0.0, 0, np.eye(4), 1.0, 0.0, status)
-        live(self, frame, StepReport(tracked, status != "lost", 0, 0.0))  # type: ignore[arg-type]
+        live(self, frame, StepReport(tracked, status != "lost", 0, 0.0, 0.5))  # type: ignore[arg-type]
 
 
 def values(maps: VolumeMaps) -> dict[tuple[int, ...], np.ndarray]:
@@ -57,7 +56,7 @@ def values(maps: VolumeMaps) -> dict[tuple[int, ...], np.ndarray]:
 def test_after_a_correction_the_volumes_are_where_the_keyframes_are(frames: list[Frame]) -> None:
     drift = se3_exp(np.array([0.4, 0, 0, 0, 0.2, 0]))
     maps, slam = VolumeMaps(SETTINGS, esdf=True, occupancy=0.2), Played()
-    live = LiveVolumes(maps, lambda depth, T: None)
+    live = LiveVolumes(maps, lambda frame, T: None)
     for k, frame in enumerate(frames[:4]):
         slam.play(live, frame, (drift if k < 3 else np.eye(4)) @ frame.T_world_camera)
     slam.corrections = 1
@@ -84,19 +83,19 @@ def test_after_a_correction_the_volumes_are_where_the_keyframes_are(frames: list
 def test_lost_frames_are_left_out(frames: list[Frame]) -> None:
     maps, slam = VolumeMaps(SETTINGS), Played()
     seen: list[np.ndarray] = []
-    live = LiveVolumes(maps, lambda depth, T: seen.append(T))
+    live = LiveVolumes(maps, lambda frame, T: seen.append(T))
     slam.play(live, frames[0], frames[0].T_world_camera)
     before = maps.tsdf.revision
     slam.play(live, frames[1], np.full((4, 4), np.nan), status="lost")
-    assert maps.tsdf.revision == before and len(seen) == len(maps.times.tsdf) == 1
-    assert maps.times.summary()["all"]["mean_ms"] > 500  # a robot waits for tracking, too
+    assert maps.tsdf.revision == before and len(seen) == len(maps.times.rows) == 1
+    assert maps.times.summary()["all"]["mean_ms"] > 500  # a robot waits for the pose, too
 
 
 def test_objects_that_turn_out_to_be_one_get_one_id(frames: list[Frame]) -> None:
     maps, slam = VolumeMaps(SETTINGS), Played()
     alias = np.arange(65536, dtype=np.uint16)
     slam.mapper.identity = SimpleNamespace(current=lambda ids: alias[ids])
-    live = LiveVolumes(maps, lambda depth, T: None)
+    live = LiveVolumes(maps, lambda frame, T: None)
     for frame in frames[:3]:
         slam.play(live, frame, frame.T_world_camera)
     ids = extract_mesh(maps.tsdf).objects()
@@ -112,8 +111,10 @@ def test_the_distance_field_is_updated_as_often_as_told(frames: list[Frame]) -> 
     assert maps.field is not None and len(maps.field) == 0
     maps.add(frames[1], frames[1].T_world_camera)
     assert len(maps.field) > 0
-    summary = maps.times.summary()
-    assert summary["all"]["mean_ms"] == pytest.approx(summary["tsdf"]["mean_ms"] + summary["esdf"]["mean_ms"])
+    maps.add(frames[2], frames[2].T_world_camera)
+    assert [sorted(row) for row in maps.times.rows] == [["tsdf"], ["esdf", "tsdf"], ["tsdf"]]
+    whole = maps.times.whole()  # only the frame with which everything was done tells how long that takes
+    assert len(whole) == 1 and whole[0] == pytest.approx(sum(maps.times.rows[1].values()))
 
 
 def test_fusing_on_a_device_gives_the_same_volumes(frames: list[Frame]) -> None:

@@ -125,7 +125,7 @@ def _numbers(option: str, text: str) -> list[float]:
         values = [float(word) for word in text.split(",")]
     except ValueError:
         values = []
-    if not values or not all(0 <= value < 1e6 for value in values):
+    if not values or not all(abs(value) < 1e6 for value in values):
         raise ConfigError(f'{option}: expected numbers like "0.1,1.5", found {text!r}')
     return values
 
@@ -153,9 +153,10 @@ def _print_safety(outcome: VolumesOutcome, braking: Braking, speeds: list[float]
     from dataclasses import replace
 
     latencies = replace(braking.latencies, map=outcome.map_latency_s)
+    posed = "" if "slam" in outcome.times else " with its pose"
     braking = replace(braking, latencies=latencies)
     console.print(
-        f"the map knows of a frame {1e3 * latencies.map:.1f} ms after it came (95 % of the frames here); with sensor "
+        f"the maps know of a frame {1e3 * latencies.map:.1f} ms after it came{posed} (95 % of the frames); with sensor "
         f"{1e3 * latencies.sensor:g}, plan {1e3 * latencies.plan:g}, network {1e3 * latencies.network:g} ms a robot is "
         f"blind for {1e3 * latencies.total:.0f} ms", highlight=False
     )  # fmt: skip

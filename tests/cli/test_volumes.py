@@ -89,7 +89,7 @@ def test_the_occupancy_map_holds_the_surface(of_recording: tuple[Path, str]) -> 
 
 def test_objects_get_meshes_under_their_names(of_recording: tuple[Path, str], room: Path) -> None:
     out, _ = of_recording
-    files = sorted((out / "objects").glob("*.ply"))
+    files = sorted(out.glob("object_*.ply"))
     assert len(files) == len(record(out)["mesh"]["objects"]) > 5
     total = sum(len(mesh.triangles) for mesh in map(read_mesh, files) if mesh is not None)
     assert total <= record(out)["mesh"]["triangles"]
@@ -110,6 +110,8 @@ def test_a_run_gives_its_poses_and_its_objects(room: Path, tmp_path: Path) -> No
     assert found["frames"] == 12 and found["mesh"]["objects"]
     assert (tmp_path / "meshes" / "room.ply").is_file() and not (run / "volumes" / "esdf.png").exists()
     assert str(run / "volumes") in printed.replace("\n", "")
+    one_error(ggslam("volumes", run, "--mesh", run / "points.ply"), "points.ply", "run")
+    one_error(ggslam("volumes", run, "--stop", 3), "--stop", "recordings")
     # Once more, over what is there, at another size, with a distance field.
     made(run, "--voxel", 0.08, "--scale", 0.5, "--esdf", "--slice", 1.0, "--no-objects")
     found = record(run / "volumes")
@@ -161,6 +163,54 @@ def test_mistakes_are_named(room: Path, tmp_path: Path) -> None:
     one_error(ggslam("volumes", room, "--band", "2,1"), "--band")
     one_error(ggslam("volumes", room, "--realtime", 5), "--realtime", "--live")
     one_error(ggslam("volumes", room, "--friction", 0), "friction")
+    one_error(ggslam("volumes", room, "--esdf", "--slice", "nan"), "--slice")
+    one_error(ggslam("volumes", room, "--overwrite"), "--overwrite", "--live")
+    one_error(ggslam("volumes", room, "--device", "meta"), "--device")
+    one_error(ggslam("volumes", room, "--mesh", sorted((room / "rgb").glob("*"))[0] / "x.ply"), "cannot be made")
+    nothing = ["--set", "volumes.tsdf.min_depth=90", "--set", "volumes.tsdf.max_depth=95"]
+    one_error(ggslam("volumes", room, *nothing, "--out", tmp_path / "b"), "no depth")
     one_error(ggslam("volumes", room, "--set", "volumes.tsdf.voxl=1"), "voxl", "voxel")
     one_error(ggslam("volumes", room, "--onto", tmp_path / "none.npz"), "none.npz")
     assert not Path("volumes").exists() and not (tmp_path / "a").exists()
+
+
+def test_what_was_there_stays_if_anything_goes_wrong(
+    of_recording: tuple[Path, str], room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = Path(shutil.copytree(of_recording[0], tmp_path / "room"))
+    (out / "notes.txt").write_text("keep me")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+
+    def interrupted(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    from ggslam.volumes.esdf import DistanceField
+
+    few = ["--stop", 3, *QUICK]
+    with monkeypatch.context() as patched:
+        patched.setattr("ggslam.volume_outputs.write_octomap", interrupted)
+        assert ggslam("volumes", room, "--out", out, *few, "--occupancy", 0.1).exit_code == 130
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    update, calls = DistanceField.update, []
+
+    def second_is_interrupted(field: DistanceField) -> object:
+        calls.append(field)
+        return interrupted() if len(calls) == 2 else update(field)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(DistanceField, "update", second_is_interrupted)
+        assert ggslam("volumes", room, "--out", out, *few, "--esdf", "--report").exit_code == 130
+    found = record(out)
+    assert found["frames"] == 1 and "KeyboardInterrupt" in found["stopped_by"]
+    assert (out / "notes.txt").is_file() and not (out / "occupancy.bt").exists()
+    blocked = tmp_path / "blocked"
+    made(room, "--out", blocked, *few)
+    (blocked / "esdf.png").mkdir()
+    one_error(ggslam("volumes", room, "--out", blocked, *few), "esdf.png", "folder")
+    assert (blocked / "tsdf.npz").is_file()
+
+
+def test_a_band_higher_than_the_room_is_cut(room: Path, tmp_path: Path) -> None:
+    made(room, "--out", tmp_path / "a", "--stop", 3, *QUICK, "--esdf", "--band", "0.1,900000")
+    low, high = record(tmp_path / "a")["esdf"]["band"]
+    assert 0 < low < high < 10
