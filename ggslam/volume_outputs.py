@@ -35,7 +35,7 @@ from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.octomap_files import write_octomap
-from ggslam.volumes.slices import FieldSlice, plane_at_height, slice_field, write_ros_map, write_slice_picture
+from ggslam.volumes.slices import FieldSlice, plane_at_height, slice_field, slice_picture, write_ros_map
 from ggslam.volumes.tsdf import SIDE
 from ggslam.volumes.tsdf_file import save_tsdf
 from ggslam.volumes.upright import Upright, estimate_up
@@ -123,23 +123,25 @@ class _Writer:
         path = self.request.mesh or self.path("mesh.ply")
         if self.request.mesh is not None:
             self.outputs.files.append(path)
-        labels = mesh.labels if mesh.objects() else None
+        objects = mesh.objects()
+        labels = mesh.labels if objects else None
         arrays = (mesh.vertices, mesh.triangles, mesh.normals, mesh.colors)
         write_mesh(path, *arrays, labels, self.request.names)
-        facts = {"vertices": len(mesh.vertices), "triangles": len(mesh.triangles), "objects": mesh.objects()}
+        facts = {"vertices": len(mesh.vertices), "triangles": len(mesh.triangles), "objects": objects}
         none = "" if facts["triangles"] else "; no surface was found: voxels may be too large, or depth seen too rarely"
         self.tell(f"mesh: {facts['vertices']} vertices, {facts['triangles']} triangles{none}", mesh=facts)
         if self.request.object_meshes:
-            self._object_meshes(mesh)
+            self._object_meshes(mesh, objects)
         return mesh
 
-    def _object_meshes(self, mesh: Mesh) -> None:
-        for number in mesh.objects():
-            part, name = mesh.of_object(number), self.request.names.get(number, "object")
+    def _object_meshes(self, mesh: Mesh, objects: list[int]) -> None:
+        labels = mesh.triangle_labels()
+        for number in objects:
+            part, name = mesh.part(labels == number), self.request.names.get(number, "object")
             safe = "".join(c if c.isalnum() else "_" for c in name)
             path = self.path(f"object_{number}_{safe}.ply")
             write_mesh(path, part.vertices, part.triangles, part.normals, part.colors, part.labels)
-        self.tell(f"{len(mesh.objects())} objects have a mesh of their own: {self.out / 'object_*.ply'}")
+        self.tell(f"{len(objects)} objects have a mesh of their own: {self.out / 'object_*.ply'}")
 
     def upright(self, mesh: Mesh) -> Upright:
         """Which way is up, and where the floor is."""
@@ -159,7 +161,7 @@ class _Writer:
         wanted = self.request.slice_height
         height = float(np.median(heights)) if wanted is None else base + wanted
         cut = _slice(field_, upright.up, height, field_.voxel)
-        write_slice_picture(cut, self.path("esdf.png"), _full_scale(cut.distance[cut.known]))
+        write_picture(self.path("esdf.png"), slice_picture(cut, _full_scale(cut.distance[cut.known])))
         if not cut.known.any():
             self.outputs.lines.append(f"note: nothing is known {height - base:.2f} m up: esdf.png is empty")
         # No farther than the field reaches.
@@ -167,12 +169,10 @@ class _Writer:
         reached = (field_.coordinates() + 0.5) @ upright.up * edge - base
         low = max(self.request.band[0], float(reached.min()) - edge)
         high = max(low, min(self.request.band[1], float(reached.max()) + edge))
-        plane = plane_at_height(field_, upright.up, base)
-        image, description = write_ros_map(
-            _slice(field_, upright.up, base, max(0.05, field_.voxel), (low, high)), self.staged / "map"
-        )
+        plan = _slice(field_, upright.up, base, max(0.05, field_.voxel), (low, high))
+        image, description = write_ros_map(plan, self.staged / "map")
         self.outputs.files += [self.out / image.name, self.out / description.name]
-        axes = {"origin": plane.origin, "x_axis": plane.x_axis, "y_axis": plane.y_axis}
+        axes = {"origin": plan.plane.origin, "x_axis": plan.plane.x_axis, "y_axis": plan.plane.y_axis}
         held = field_.memory_bytes / 1e6
         ground = "the floor" if upright.floor is not None else "a metre below the camera"
         self.tell(
@@ -265,7 +265,7 @@ def _write_all(writer: _Writer, maps: VolumeMaps, record: dict[str, Any], observ
     upright = writer.upright(mesh)
     if len(mesh.triangles):
         write_picture(writer.path("mesh.png"), mesh_picture(mesh, writer.poses, upright.up))
-        if mesh.objects():
+        if writer.outputs.record["mesh"]["objects"]:
             write_picture(writer.path("objects.png"), mesh_picture(mesh, writer.poses, upright.up, by_object=True))
     observer.advance(2, 4)
     if maps.field is not None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ggslam.formats.atomic import atomic_write, write_bytes, write_text
+from ggslam.formats.atomic import write_bytes, write_text
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.tsdf import SIDE
 
@@ -161,18 +161,6 @@ def _scale(width: int, full_scale: float, resolution: float) -> np.ndarray:
     return bar
 
 
-def write_slice_picture(cut: FieldSlice, path: str | Path, full_scale: float) -> None:
-    """Writes `slice_picture` as PNG.
-
-    Raises:
-        RunFolderError: the file cannot be written.
-    """
-    picture = slice_picture(cut, full_scale)
-    done, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
-    assert done
-    write_bytes(path, data.tobytes())
-
-
 def ros_map(cut: FieldSlice) -> np.ndarray:
     """A slice as a ROS map: uint8 [H, W], 0 occupied, 254 free, 205 unknown."""
     return np.where(cut.occupied, OCCUPIED, np.where(cut.known, FREE, UNKNOWN)).astype(np.uint8)
@@ -193,8 +181,7 @@ def write_ros_map(cut: FieldSlice, path: str | Path) -> tuple[Path, Path]:
     path = Path(path)
     image, description = path.with_name(path.name + ".pgm"), path.with_name(path.name + ".yaml")
     pixels = ros_map(cut)
-    with atomic_write(image) as temporary:
-        temporary.write_bytes(f"P5\n{pixels.shape[1]} {pixels.shape[0]}\n255\n".encode() + pixels.tobytes())
+    write_bytes(image, f"P5\n{pixels.shape[1]} {pixels.shape[0]}\n255\n".encode() + pixels.tobytes())
     x, y = cut.plane.low
     write_text(
         description,

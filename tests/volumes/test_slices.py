@@ -12,6 +12,7 @@ import yaml
 from distance_scenes import block_range, box, plane, sphere, union, write_scene
 
 from ggslam.errors import RunFolderError
+from ggslam.reporting.pictures import write_picture
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.slices import (
@@ -22,7 +23,6 @@ from ggslam.volumes.slices import (
     slice_field,
     slice_picture,
     write_ros_map,
-    write_slice_picture,
 )
 from ggslam.volumes.tsdf import TsdfMap
 
@@ -120,10 +120,10 @@ def test_pictures_show_distances_and_what_is_unknown(field: DistanceField, tmp_p
     assert (shown[~cut.known] == 128).all()
     near, far = shown[at(cut, 0.5, 0.35)], shown[at(cut, -0.9, 0.7)]
     assert near[0] > near[2] and far[2] > far[0]  # red and blue
-    write_slice_picture(cut, tmp_path / "slice.png", 1.0)
+    write_picture(tmp_path / "slice.png", slice_picture(cut, 1.0))
     assert np.array_equal(cv2.imread(str(tmp_path / "slice.png"))[..., ::-1], picture)
     with pytest.raises(RunFolderError, match="nowhere"):
-        write_slice_picture(cut, tmp_path / "nowhere" / "slice.png", 1.0)
+        write_picture(tmp_path / "nowhere" / "slice.png", slice_picture(cut, 1.0))
 
 
 def test_wrong_numbers_are_refused(field: DistanceField) -> None:

@@ -5,9 +5,11 @@
 #include <cstdint>
 #include <vector>
 
-#include "volumes/tsdf.hpp"
-
 namespace ggslam::volumes {
+
+struct BlockCoordinates {
+  int32_t x, y, z;
+};
 
 // What a look-up reads. Kernels look up, too, hence the functions are static: each instruction set has its own copy.
 struct TableView {

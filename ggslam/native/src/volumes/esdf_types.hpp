@@ -4,7 +4,7 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "volumes/block_table.hpp"
+#include "volumes/tsdf.hpp"
 
 namespace ggslam::volumes {
 

@@ -107,7 +107,7 @@ void SurfaceCells::connect(SurfaceBlock& block, const std::vector<int32_t>& numb
       }
 }
 
-BlockTable::BlockTable(const std::vector<SurfaceBlock>& blocks) {
+SurfaceTable::SurfaceTable(const std::vector<SurfaceBlock>& blocks) {
   std::size_t size = 64;
   while (size < 4 * blocks.size()) size *= 2;  // most look-ups find nothing, and at once
   number.assign(size, -1);
@@ -132,7 +132,7 @@ SurfaceCells::SurfaceCells(ThreadPool& pool, Isa isa, const Tsdf& map_, uint16_t
       find_cells(blocks[n]);
     }
   });
-  table = BlockTable(blocks);
+  table = SurfaceTable(blocks);
 }
 
 }  // namespace ggslam::volumes

@@ -45,11 +45,11 @@ struct SurfaceBlock {
 };
 
 // Finds the blocks that have cells with surface: open addressing, -1 where nothing is.
-struct BlockTable {
+struct SurfaceTable {
   std::vector<int32_t> number;  // of a surface block, by the hash of its coordinates; a power of two of them
 
-  BlockTable() = default;
-  explicit BlockTable(const std::vector<SurfaceBlock>& blocks);
+  SurfaceTable() = default;
+  explicit SurfaceTable(const std::vector<SurfaceBlock>& blocks);
 };
 
 static inline uint32_t surface_hash(int32_t x, int32_t y, int32_t z) {
@@ -66,7 +66,7 @@ class SurfaceCells {
   const Tsdf& map;
   const uint16_t min_weight;  // voxels of at least this weight count
   std::vector<SurfaceBlock> blocks;
-  BlockTable table;
+  SurfaceTable table;
 
   // Layer k of a block, k <= 8: bits of `which` at the lower corners of its cells.
   static LayerBits layer(const SurfaceBlock& block, int k, BlockBits BlockSigns::*which);

@@ -7,6 +7,8 @@
 #include <memory>
 #include <vector>
 
+#include "volumes/block_table.hpp"
+
 namespace ggslam::volumes {
 
 constexpr int kSide = 8;
@@ -21,10 +23,6 @@ struct alignas(64) VoxelBlock {
   uint16_t label[kVoxels];   // 0: none
   uint8_t red[kVoxels], green[kVoxels], blue[kVoxels];
   uint8_t votes[kVoxels];    // for `label`, less those against it
-};
-
-struct BlockCoordinates {
-  int32_t x, y, z;
 };
 
 // The centre of voxel (i, j, k) of block (x, y, z) is at (8 x + i + 0.5, 8 y + j + 0.5, 8 z + k + 0.5) voxels.
@@ -76,11 +74,7 @@ class Tsdf {
   std::vector<std::unique_ptr<VoxelBlock[]>> pool_;
   std::vector<int32_t> free_slots_;
   std::size_t slots_used_ = 0;
-  std::vector<int32_t> table_;  // open addressing, rows; -1: empty
-  std::size_t mask_ = 0;
-
-  std::size_t place(BlockCoordinates at) const;
-  void grow();
+  BlockTable table_;  // rows of blocks_
 };
 
 }  // namespace ggslam::volumes
