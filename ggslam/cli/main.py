@@ -19,8 +19,10 @@ from ggslam.cli import (
     eval_command,
     export_command,
     inspect_command,
+    localize_command,
     render_command,
     run_command,
+    submaps_command,
     synth_command,
     volumes_command,
 )
@@ -55,6 +57,8 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "compare": (compare_command.compare, compare_command.EPILOG),
     "edit": (edit_command.edit, edit_command.EPILOG),
     "encode": (encode_command.encode, encode_command.EPILOG), "decode": (decode_command.decode, decode_command.EPILOG),
+    "localize": (localize_command.localize, localize_command.EPILOG),
+    "submaps": (submaps_command.submaps, submaps_command.EPILOG),
     "volumes": (volumes_command.volumes, volumes_command.EPILOG),
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
 }  # fmt: skip

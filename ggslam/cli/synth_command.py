@@ -17,6 +17,8 @@ EPILOG = """
   ggslam synth demo/room --frames 60
 
   ggslam synth demo/loop --scene loop
+
+  ggslam synth demo/corridor --scene corridor --frames 300
 """
 
 
@@ -25,6 +27,7 @@ class SceneName(str, Enum):
 
     room = "room"
     loop = "loop"
+    corridor = "corridor"
 
 
 def synth(
@@ -32,10 +35,13 @@ def synth(
     scene: Annotated[
         SceneName,
         typer.Option(
-            help="room: one furnished room; loop: a walk through four rooms and four corridors, back into the first."
+            help="room: one furnished room; loop: a walk through four rooms and four corridors, back into the first; "
+            "corridor: a walk along a furnished corridor, longer with more frames, that never sees anything again."
         ),
     ] = SceneName.room,
-    frames: Annotated[int | None, typer.Option(help="Number of frames; default 60, of the loop 480.", min=2)] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Number of frames; default 60, of the loop 480, of the corridor 720.", min=2)
+    ] = None,
     width: Annotated[int, typer.Option(help="Image width.", min=16)] = 320,
     height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
     seed: Annotated[int, typer.Option(help="Of textures, camera path and noise.", min=0)] = 0,

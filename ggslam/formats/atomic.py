@@ -49,10 +49,7 @@ def atomic_write(path: str | Path, fsync: bool = False) -> Iterator[Path]:
     except OSError as error:
         if error.filename not in (None, str(temporary), temporary):
             raise  # the block failed to read some other file: not ours to explain
-        failure = RunFolderError(f"cannot write {path}: {error.strerror or error}")
-        if error.errno in _MACHINE_ERRORS:
-            failure.exit_code = 1
-        raise failure from error
+        raise write_failure(path, error) from error
     finally:
         with suppress(OSError):  # a file system that cannot be written: the reason above is the one to tell
             temporary.unlink(missing_ok=True)
@@ -79,6 +76,14 @@ def make_folder(path: str | Path) -> None:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunFolderError(f"{path}: cannot be made: {error.strerror or error}") from None
+
+
+def write_failure(path: str | Path, error: OSError) -> RunFolderError:
+    """The error to raise when the operating system would not write `path`; a full or broken disk is not the user's."""
+    failure = RunFolderError(f"cannot write {path}: {error.strerror or error}")
+    if error.errno in _MACHINE_ERRORS:
+        failure.exit_code = 1
+    return failure
 
 
 def _sync(path: Path) -> None:

@@ -1,52 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LZF, the byte-oriented Lempel-Ziv code that compressed PCD files use (format of M. Lehmann's liblzf)."""
+"""LZF, the byte-oriented Lempel-Ziv code that compressed PCD files use (format of M. Lehmann's liblzf).
+
+Both directions run in the compiled core (ggslam/native/src/lzf_api.cpp) and release the interpreter's lock.
+"""
 
 from __future__ import annotations
 
+import ctypes
+from ctypes import c_int64, c_void_p
+from functools import lru_cache
+
+import numpy as np
+
+from ggslam.native.loader import load_library
+
 _MOST_GROWTH = 88
 """Three bytes of a match stand for at most 264."""
+_REASONS = {
+    -1: "the compressed data end within a match",
+    -2: "a match begins before the data",
+}
+
+
+@lru_cache(maxsize=1)
+def _library() -> ctypes.CDLL:
+    core = load_library()
+    for name in ("compress", "decompress"):
+        function = getattr(core, f"ggslam_lzf_{name}")
+        function.restype, function.argtypes = c_int64, [c_void_p, c_int64, c_void_p, c_int64]
+    return core
+
+
+def compress(data: bytes) -> bytes:
+    """The LZF code of `data`: at most len(data) / 32 + 1 bytes longer, usually shorter."""
+    out = np.empty(len(data) + len(data) // 32 + 1, np.uint8)
+    size = _library().ggslam_lzf_compress(data, len(data), out.ctypes.data, len(out))
+    return out[:size].tobytes()
 
 
 def decompress(data: bytes, size: int) -> bytes:
     """The `size` bytes that `data` stands for.
 
-    A byte below 32 says how many literal bytes, less one, follow. Another one begins a match: its upper 3 bits are the
-    length less two (7: a byte to add follows), its lower 5 bits and one more byte how far back it lies, less one.
-
     Raises:
         ValueError: the data are damaged, or stand for another number of bytes.
     """
-    if size > _MOST_GROWTH * len(data):
+    if not 0 <= size <= _MOST_GROWTH * len(data):
         raise ValueError(f"{len(data)} compressed bytes cannot hold {size}")
-    out = bytearray()
-    at, end = 0, len(data)
-    while at < end and len(out) <= size:
-        control = data[at]
-        at += 1
-        if control < 32:
-            out += data[at : at + control + 1]
-            at += control + 1
-            continue
-        length = control >> 5
-        if length == 7 and at < end:
-            length += data[at]
-            at += 1
-        if at >= end:
-            raise ValueError("the compressed data end within a match")
-        start = len(out) - ((control & 31) << 8) - data[at] - 1
-        at += 1
-        _copy(out, start, length + 2)
-    if at != end or len(out) != size:
-        raise ValueError(f"the compressed data stand for {len(out)} bytes or more, expected {size}")
-    return bytes(out)
-
-
-def _copy(out: bytearray, start: int, length: int) -> None:
-    """Appends `length` bytes from `start` on; the source may reach into what is being appended."""
-    if start < 0:
-        raise ValueError("a match begins before the data")
-    distance = len(out) - start
-    if distance >= length:
-        out += out[start : start + length]
-    else:
-        out += (out[start:] * (length // distance + 1))[:length]
+    out = np.empty(size, np.uint8)
+    failure = _library().ggslam_lzf_decompress(data, len(data), out.ctypes.data, size)
+    if failure:
+        raise ValueError(_REASONS.get(failure, f"the compressed data are damaged or do not stand for {size} bytes"))
+    return out.tobytes()

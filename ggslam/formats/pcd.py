@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point Cloud Data files (PCD 0.7, the Point Cloud Library's own): reads text, binary and compressed, writes binary.
+"""Point Cloud Data files (PCD 0.7, the Point Cloud Library's own): reads text, binary and compressed, writes binary and
+compressed.
 
 Specification: "The PCD (Point Cloud Data) file format", pointclouds.org.
 """
@@ -43,6 +44,12 @@ def read_pcd(path: str | Path) -> np.ndarray:
         data = path.read_bytes()
     except OSError as error:
         raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
+    return parse_pcd(data, path)
+
+
+def parse_pcd(data: bytes, path: str | Path) -> np.ndarray:
+    """The points of a PCD file's whole content; `path` is the name for error messages. See `read_pcd`."""
+    path = Path(path)
     header = _read_header(data, path)
     body = data[header.size :]
     if header.encoding == "ascii":
@@ -56,28 +63,52 @@ def read_pcd(path: str | Path) -> np.ndarray:
 
 
 def write_pcd(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Writes a binary PCD file, atomically.
-
-    Args:
-        path: the file to write.
-        columns: one array [N] of integers or floating-point numbers per field, in order, all of one length.
+    """Writes a binary PCD file, atomically. For `columns` see `pcd_bytes`.
 
     Raises:
         RunFolderError: the file cannot be written.
+        ValueError: see `pcd_bytes`.
     """
-    rows = np.empty(
-        len(next(iter(columns.values()))), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
-    )
+    write_bytes(path, pcd_bytes(columns))
+
+
+def pcd_bytes(columns: Mapping[str, np.ndarray], compressed: bool = False) -> bytes:
+    """The content of a binary PCD file.
+
+    Args:
+        columns: one array of integers or floating-point numbers per field, in order, all of one length: [N] or, for a
+            field with COUNT k > 1, [N, k].
+        compressed: writes DATA binary_compressed, unless DATA binary takes no more bytes.
+
+    Raises:
+        ValueError: a field is of a type that PCD files do not have.
+    """
+    for name, values in columns.items():
+        if values.dtype.itemsize not in _SIZES.get(values.dtype.kind.upper(), ()):
+            raise ValueError(f"field '{name}': PCD files hold no {values.dtype}")
+    fields = [(name, values.dtype.newbyteorder("<"), values.shape[1:]) for name, values in columns.items()]
+    count = len(next(iter(columns.values())))
+    if compressed:
+        planes = b"".join(columns[name].astype(stored).tobytes() for name, stored, _ in fields)
+        packed = lzf.compress(planes)
+        if len(packed) + 8 < len(planes):
+            sizes = np.array([len(packed), len(planes)], "<u4").tobytes()
+            return _header_text(fields, count, "binary_compressed") + sizes + packed
+    rows = np.empty(count, fields)
     for name, values in columns.items():
         rows[name] = values
-    types = [values.dtype for values in columns.values()]
+    return _header_text(fields, count, "binary") + rows.tobytes()
+
+
+def _header_text(fields: list[tuple[str, np.dtype, tuple[int, ...]]], count: int, encoding: str) -> bytes:
+    names, types, shapes = zip(*fields, strict=True)
     lines = [
-        "# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", f"FIELDS {' '.join(columns)}",
+        "# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", f"FIELDS {' '.join(names)}",
         f"SIZE {' '.join(str(t.itemsize) for t in types)}", f"TYPE {' '.join(t.kind.upper() for t in types)}",
-        f"COUNT {' '.join('1' for _ in types)}", f"WIDTH {len(rows)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0",
-        f"POINTS {len(rows)}", "DATA binary", "",
+        f"COUNT {' '.join(str(shape[0]) if shape else '1' for shape in shapes)}", f"WIDTH {count}", "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {count}", f"DATA {encoding}", "",
     ]  # fmt: skip
-    write_bytes(path, "\n".join(lines).encode("ascii") + rows.tobytes())
+    return "\n".join(lines).encode("ascii")
 
 
 def _read_header(data: bytes, path: Path) -> _Header:

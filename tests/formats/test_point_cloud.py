@@ -13,6 +13,7 @@ import torch
 from ggslam.errors import FormatError
 from ggslam.formats import lzf
 from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.formats.pcd import parse_pcd, pcd_bytes
 from ggslam.formats.ply import write_ply
 from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
 from ggslam.formats.point_ply import write_points
@@ -167,6 +168,56 @@ def test_lzf_inverts_a_compressor_and_refuses_damage() -> None:
         noise = bytes(generator.integers(0, 256, 40, np.uint8))
         with contextlib.suppress(ValueError):
             assert len(lzf.decompress(noise, 60)) == 60
+
+
+def lzf_expanded(packed: bytes) -> bytes:
+    """A plain decompressor, byte by byte."""
+    out, at = bytearray(), 0
+    while at < len(packed):
+        control, at = packed[at], at + 1
+        if control < 32:
+            out, at = out + packed[at : at + control + 1], at + control + 1
+            continue
+        length = control >> 5
+        if length == 7:
+            length, at = 7 + packed[at], at + 1
+        distance, at = ((control & 31) << 8) + packed[at] + 1, at + 1
+        for _ in range(length + 2):
+            out.append(out[-distance])
+    return bytes(out)
+
+
+def test_lzf_compresses_into_what_anyone_expands() -> None:
+    generator = np.random.default_rng(0)
+    for data in (
+        b"", b"a", b"ab", b"aaa", b"a" * 1000, b"abc" * 5000, bytes(generator.integers(0, 256, 3000, np.uint8)),
+        bytes(generator.integers(0, 3, 20_000, np.uint8)), bytes(9000) + b"x" + bytes(9000),
+        *(bytes(generator.integers(0, 2, n, np.uint8)) * 3 for n in range(1, 300)),
+        bytes(generator.integers(0, 256, 8192, np.uint8)) * 2, bytes(generator.integers(0, 256, 8193, np.uint8)) * 2,
+    ):  # fmt: skip
+        packed = lzf.compress(data)
+        assert lzf_expanded(packed) == data == lzf.decompress(packed, len(data))
+        assert len(packed) <= len(data) + len(data) // 32 + 1
+    assert len(lzf.compress(b"abc" * 5000)) < 200
+    block = bytes(generator.integers(0, 256, 8192, np.uint8))
+    assert len(lzf.compress(block * 2)) < 9000  # 8192 bytes back is the farthest that can be said
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_fields_of_several_numbers_and_compression(compressed: bool) -> None:
+    columns = {
+        "x": np.arange(3000, dtype=np.float32), "color": np.tile(COLORS, (1000, 1)), "far": np.arange(3000) * 1e9,
+        "big": np.arange(3000, dtype=">i4"),
+    }  # fmt: skip
+    data = pcd_bytes(columns, compressed)
+    assert (b"DATA binary_compressed" in data) == compressed and b"COUNT 1 3 1 1" in data
+    rows = parse_pcd(data, "a.pcd")
+    for name, values in columns.items():
+        np.testing.assert_array_equal(rows[name], values)
+    assert compressed == (len(data) < len(pcd_bytes(columns)))
+    noise = {"x": np.random.default_rng(0).integers(0, 1 << 63, 500)}
+    assert pcd_bytes(noise, compressed) == pcd_bytes(noise)  # what does not shrink is written as it is
+    assert len(parse_pcd(pcd_bytes({"x": np.empty(0)}, compressed), "a.pcd")) == 0
 
 
 def test_gaussian_maps_give_their_colours_and_object_ids(tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ def poses(house: Scene) -> np.ndarray:
 def quick_light(monkeypatch: pytest.MonkeyPatch, house: Scene) -> None:
     """A few patches a face instead of thousands, and the house that is there already."""
     monkeypatch.setattr(lighting, "LARGEST_MAP", 2)
-    monkeypatch.setitem(scenes.SCENES, "loop", replace(SCENES["loop"], build=lambda seed: house))
+    monkeypatch.setitem(scenes.SCENES, "loop", replace(SCENES["loop"], build=lambda seed, frames: house))
 
 
 def agreement(caster: RayCaster, T_a: np.ndarray, T_b: np.ndarray) -> tuple[float, float]:
@@ -154,7 +154,7 @@ def test_a_written_loop_repeats(quick_light: None, caster: RayCaster, house: Sce
     np.testing.assert_allclose(frame.depth, depth, atol=2e-4)
     assert frame.mask is not None and (frame.mask == mask).all()
     assert contents(tmp_path / "a")["depth/000000.png"] != contents(tmp_path / "c")["depth/000000.png"]
-    with pytest.raises(SequenceError, match="expected one of room, loop, found 'maze'"):
+    with pytest.raises(SequenceError, match="expected one of room, loop, corridor, found 'maze'"):
         write_synthetic_sequence(tmp_path / "d", scene="maze")
     with pytest.raises(SequenceError, match="depth_distortion: expected 0 to 10"):
         write_synthetic_sequence(tmp_path / "d", depth_distortion=-1.0)

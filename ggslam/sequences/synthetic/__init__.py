@@ -1,13 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A generated recording: a furnished room (`scene`, `room`) or a ring of rooms and corridors (`house`), ray-cast
-(`raycast`) and written out (`writer`)."""
+"""A generated recording: a furnished room (`scene`, `room`), a ring of rooms and corridors (`house`) or a long
+corridor (`corridor`), ray-cast (`raycast`) and written out (`writer`). And a large `world` of boxes for a laser
+scanner."""
 
+from ggslam.sequences.synthetic.corridor import furnished_corridor
 from ggslam.sequences.synthetic.house import ring_of_rooms
 from ggslam.sequences.synthetic.raycast import RayCaster, RayImages
 from ggslam.sequences.synthetic.room import furnished_room
 from ggslam.sequences.synthetic.scene import Scene, SceneBuilder, Shape
 from ggslam.sequences.synthetic.scenes import SCENES
 from ggslam.sequences.synthetic.trajectory import TRAJECTORIES, camera_path
+from ggslam.sequences.synthetic.world import World, cast_rays
+from ggslam.sequences.synthetic.world_cloud import cloud_tiles, world_cloud
+from ggslam.sequences.synthetic.world_plan import make_world
+from ggslam.sequences.synthetic.world_scanner import Scan, Scanner
+from ggslam.sequences.synthetic.world_walk import walk
 from ggslam.sequences.synthetic.writer import write_synthetic_sequence
 
 __all__ = [
@@ -15,11 +22,20 @@ __all__ = [
     "TRAJECTORIES",
     "RayCaster",
     "RayImages",
+    "Scan",
+    "Scanner",
     "Scene",
     "SceneBuilder",
     "Shape",
+    "World",
     "camera_path",
+    "cast_rays",
+    "cloud_tiles",
+    "furnished_corridor",
     "furnished_room",
+    "make_world",
     "ring_of_rooms",
+    "walk",
+    "world_cloud",
     "write_synthetic_sequence",
 ]

@@ -93,8 +93,9 @@ class Scene:
         bounds: lowest and highest corner of the inhabited space; what lies outside is never seen and gets no light.
         walk: centre (x, y, z) and radii (x, y) of an ellipse with free space around it, for the camera.
         interest: points [n, 3] worth looking at; the first is where a recording begins.
-        route: [n, 5] x, y, z in metres, heading (from the x axis towards y) and pitch (up) in degrees: a closed way for
-            the camera; headings run on past 360. Empty where the scene is one room.
+        route: [n, 5] x, y, z in metres, heading (from the x axis towards y) and pitch (up) in degrees: a way for
+            the camera, closed for the trajectory "route" and open for "walk"; headings run on past 360. Empty where the
+            scene is one room.
     """
 
     shapes: list[Shape] = field(default_factory=list)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ggslam.sequences.synthetic.corridor import furnished_corridor
 from ggslam.sequences.synthetic.house import ring_of_rooms
 from ggslam.sequences.synthetic.room import furnished_room
 from ggslam.sequences.synthetic.scene import Scene
@@ -13,10 +14,10 @@ from ggslam.sequences.synthetic.scene import Scene
 
 @dataclass(frozen=True)
 class SceneKind:
-    """A scene (a function of the seed) with the number of frames, frames per second, trajectory and distortion of the
-    depth camera (see `disparity_distortion`) that suit it."""
+    """A scene (a function of the seed and the number of frames) with the number of frames, frames per second,
+    trajectory and distortion of the depth camera (see `disparity_distortion`) that suit it."""
 
-    build: Callable[[int], Scene]
+    build: Callable[[int, int], Scene]
     frames: int
     frame_rate: float
     trajectory: str
@@ -24,6 +25,7 @@ class SceneKind:
 
 
 SCENES = {
-    "room": SceneKind(furnished_room, 60, 30.0, "loop", 0.0),
-    "loop": SceneKind(ring_of_rooms, 480, 10.0, "route", 0.3),
+    "room": SceneKind(lambda seed, frames: furnished_room(seed), 60, 30.0, "loop", 0.0),
+    "loop": SceneKind(lambda seed, frames: ring_of_rooms(seed), 480, 10.0, "route", 0.3),
+    "corridor": SceneKind(furnished_corridor, 720, 10.0, "walk", 0.0),
 }

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from ggslam.errors import SequenceError
 from ggslam.sequences.synthetic.scene import Scene
 
-TRAJECTORIES = ("loop", "round", "pan", "route")
+TRAJECTORIES = ("loop", "round", "pan", "route", "walk")
 LARGEST_STEP, LARGEST_TURN = 0.045, 1.9
 """Metres and degrees between frames that a path keeps to (short recordings see less of the scene)."""
 CLEARANCE = 0.18
@@ -33,7 +33,8 @@ def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int =
         frames: how many.
         trajectory: "loop": once around the ellipse, the view swinging over the points nearest to the first and back, so
             that the end meets the beginning; "round": around the ellipse while the view passes over all the points;
-            "pan": turning on the spot; "route": along the scene's route, past its beginning for `SEEN_AGAIN` of it.
+            "pan": turning on the spot; "route": along the scene's route, past its beginning for `SEEN_AGAIN` of it;
+            "walk": along the scene's route from its beginning, as far as one gets at the usual pace.
         seed: of the unrest.
 
     Raises:
@@ -43,8 +44,8 @@ def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int =
         raise SequenceError(f"trajectory: expected one of {', '.join(TRAJECTORIES)}, found '{trajectory}'")
     if frames < 2:
         raise SequenceError(f"frames: expected at least 2, found {frames}")
-    if trajectory == "route":
-        return _route(scene, frames, seed)
+    if trajectory in ("route", "walk"):
+        return _route(scene, frames, seed, closed=trajectory == "route")
     for size in (1.0, 0.7, 0.45, 0.25, 0.1):
         poses = _path(scene, frames, trajectory, seed, size)
         if _is_clear(scene, poses[:, :3, 3], CLEARANCE):
@@ -112,21 +113,11 @@ def _is_clear(scene: Scene, positions: np.ndarray, clearance: float) -> bool:
     return all(shape.distance(positions).min() >= clearance for shape in scene.shapes)
 
 
-def _route(scene: Scene, frames: int, seed: int) -> np.ndarray:
-    """Poses [frames, 4, 4] along the closed route of the scene, at an even pace."""
+def _route(scene: Scene, frames: int, seed: int, closed: bool) -> np.ndarray:
+    """Poses [frames, 4, 4] along the route of the scene, at an even pace."""
     if len(scene.route) < 3:
         raise SequenceError("the scene has no route to follow")
-    where, period = _closed_spline(scene.route)
-    fine = np.linspace(0, period, 4096)
-    step = np.diff(where(fine), axis=0)
-    metres, degrees = np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
-    effort = np.hypot(metres / ROUTE_STEP, degrees / ROUTE_TURN)
-    effort = gaussian_filter1d(effort, 40, mode="wrap")  # the pace changes gently
-    spent = np.concatenate([[0.0], np.cumsum(effort)])
-    wanted = spent[-1] * (1 + SEEN_AGAIN) * np.arange(frames) / frames
-    laps, rest = np.divmod(wanted, spent[-1])
-    values = where(np.asarray(np.interp(rest, spent, fine)))
-    values[:, 3] += 360 * laps
+    values = _circuit(scene.route, frames) if closed else _one_way(scene.route, frames)
     unrest = _unrest(frames, seed)
     position = values[:, :3] + 0.015 * unrest[:, :3]
     heading = np.radians(values[:, 3]) + 0.014 * unrest[:, 3]
@@ -135,6 +126,37 @@ def _route(scene: Scene, frames: int, seed: int) -> np.ndarray:
     if not _is_clear(scene, position, ROUTE_CLEARANCE):
         raise SequenceError(f"the route leads nearer than {ROUTE_CLEARANCE} m to something")
     return np.stack([_looking(p, f, 0.012 * u) for p, f, u in zip(position, forward, unrest[:, 5], strict=True)])
+
+
+def _circuit(route: np.ndarray, frames: int) -> np.ndarray:
+    """Rows [frames, 5] of a closed route: all of it and `SEEN_AGAIN` of it again, in so many frames."""
+    where, period = _closed_spline(route)
+    fine = np.linspace(0, period, 4096)
+    spent = _spent(where(fine), 40, "wrap")
+    wanted = spent[-1] * (1 + SEEN_AGAIN) * np.arange(frames) / frames
+    laps, rest = np.divmod(wanted, spent[-1])
+    values = where(np.asarray(np.interp(rest, spent, fine)))
+    values[:, 3] += 360 * laps
+    return values
+
+
+def _one_way(route: np.ndarray, frames: int) -> np.ndarray:
+    """Rows [frames, 5] from the beginning of an open route, a frame for each `ROUTE_STEP` or `ROUTE_TURN`."""
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1))])
+    spline = CubicSpline(at, route)
+    fine = np.arange(0, at[-1], 0.01)
+    spent = _spent(spline(fine), 40, "nearest")
+    if spent[-1] < frames - 1:
+        raise SequenceError(f"the route is too short for {frames} frames")
+    return spline(np.interp(np.arange(frames), spent, fine))
+
+
+def _spent(rows: np.ndarray, smoothing: float, mode: str) -> np.ndarray:
+    """Frames spent up to each of the rows [n, 5] at the usual pace, which changes gently: [n]."""
+    step = np.diff(rows, axis=0)
+    metres, degrees = np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
+    effort = gaussian_filter1d(np.hypot(metres / ROUTE_STEP, degrees / ROUTE_TURN), smoothing, mode=mode)
+    return np.concatenate([[0.0], np.cumsum(effort)])
 
 
 def _closed_spline(route: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], float]:

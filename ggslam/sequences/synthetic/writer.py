@@ -43,20 +43,20 @@ def write_synthetic_sequence(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Ray-casts a recording of a furnished room or a house: rgb/, depth/, masks/, camera.yaml and poses.txt.
+    """Ray-casts a recording of a room, a house or a corridor: rgb/, depth/, masks/, camera.yaml and poses.txt.
 
     The same arguments give the same recording. The folder appears only when it is complete.
 
     Args:
         folder: to be made; must not exist or be empty, unless `overwrite`.
-        frames: how many; None: 60 of the room, 480 of the house.
+        frames: how many; None: 60 of the room, 480 of the house, 720 of the corridor, whose length follows.
         width, height: size of the images.
         seed: of textures, the unrest of the hand, and noise.
         noise: depth and colour noise of a sensor; otherwise depth is exact to 0.1 mm.
-        trajectory: see `camera_path`; None: "route" through the house, "loop" elsewhere.
-        frame_rate: frames per second, for the timestamps; None: 10 in the house, else 30.
-        scene: "room": a furnished room; "loop": a house with a ring of rooms and corridors; or a scene of one's own,
-            for which None means as for the room.
+        trajectory: see `camera_path`; None: "route" through the house, "walk" along the corridor, "loop" elsewhere.
+        frame_rate: frames per second, for the timestamps; None: 30 in the room, else 10.
+        scene: "room": a furnished room; "loop": a house with a ring of rooms and corridors; "corridor": a long
+            corridor; or a scene of one's own, for which None means as for the room.
         depth_distortion: what the depth camera always measures wrongly, in steps of disparity, see
             `disparity_distortion`; nothing without noise. None: 0.3 in the house, else 0.
         overwrite: replaces a recording of this generator that is already there.
@@ -76,7 +76,7 @@ def write_synthetic_sequence(
     distortion = kind.depth_distortion if depth_distortion is None else depth_distortion
     _check_numbers(width, height, frame_rate, distortion)
     _check_target(target, overwrite)
-    scene = scene if isinstance(scene, Scene) else kind.build(seed)
+    scene = scene if isinstance(scene, Scene) else kind.build(seed, frames)
     poses = camera_path(scene, frames, trajectory, seed)
     focal = FOCAL_LENGTH * width
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam localize`: find out where a recording was made, in a map of the place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ggslam.cli import options
+from ggslam.cli.console import console, progress_bar, table
+from ggslam.cli.observer import ProgressObserver
+
+if TYPE_CHECKING:
+    from ggslam.localization_report import LocalizationReport
+
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam localize runs/kitchen data/second_visit
+
+  ggslam localize office.grid scans/tuesday --start "12.5 3 1.3 0 0 0 1"
+
+  ggslam localize campus.pcd scans/tuesday --start given --full-map --out localized/full
+"""
+
+MapPath = Annotated[
+    Path,
+    typer.Argument(metavar="MAP", help="Folder of a grid store (`ggslam submaps`) or of a run, or a cloud: .ply, .pcd, "
+                   ".npy, .bin."),
+]  # fmt: skip
+RecordingPath = Annotated[
+    Path, typer.Argument(metavar="SEQUENCE", help="Folder of an RGB-D recording, or of laser scans (.bin, .npy, .pcd).")
+]
+
+
+def localize(
+    map_path: MapPath,
+    sequence: RecordingPath,
+    start_pose: Annotated[
+        str | None,
+        typer.Option("--start", metavar="POSE", help='Pose of the first frame: "x y z qx qy qz qw", sensor to map; or '
+                     "given: the recording's own."),
+    ] = None,
+    no_start: Annotated[
+        bool, typer.Option("--no-start", help="Look the first frame up among the map's places (default for images).")
+    ] = False,
+    full_map: Annotated[bool, typer.Option("--full-map", help="Align to the whole map, for comparison.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default localized/NAME.")] = None,
+    radius: Annotated[
+        float | None, typer.Option(help="R': cells with centres so near are aligned to, metres; default: the map's.")
+    ] = None,
+    voxel: Annotated[
+        float | None, typer.Option(help="Edge of the voxels that are aligned to, metres; default 0.03, of scans 0.15.")
+    ] = None,
+    first: Annotated[int, typer.Option("--first", help="First frame to use.")] = 0,
+    stop: options.Stop = None,
+    stride: options.Stride = 1,
+    scale: options.Scale = 1.0,
+    format_name: options.Format = None,
+    depth_scale: options.DepthScale = None,
+    columns: Annotated[int, typer.Option(help="Numbers of a point in .bin scans.", min=3)] = 4,
+    skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
+    threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.", min=1)] = None,
+) -> None:  # fmt: skip
+    """Locate each frame or scan of a recording in a map, of which only the surroundings are in memory."""
+    from ggslam.localization_jobs import LocalizeRequest
+    from ggslam.localization_jobs import localize as locate_all
+    from ggslam.recordings import SequenceRequest
+
+    request = LocalizeRequest(
+        map=map_path,
+        sequence=SequenceRequest(
+            sequence, format=format_name, start=first, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
+            on_bad_frame="skip" if skip_bad_frames else "error",
+        ),
+        start=start_pose, no_start=no_start, full=full_map, out=out, radius=radius, voxel=voxel, columns=columns,
+        threads=threads,
+    )  # fmt: skip
+    with progress_bar() as bar:
+        report = locate_all(request, ProgressObserver(bar))
+    _print(report)
+    folder = out or Path("localized") / sequence.resolve().name
+    console.print(f"wrote {folder}", highlight=False, markup=False)
+
+
+def _print(report: LocalizationReport) -> None:
+    s = report.summary()
+    ms = s["localization_ms"]
+
+    def centimetres(value: float | None) -> str:
+        return "-" if value is None else f"{100 * value:.2f} cm"
+
+    rows = [
+        ["localisation time, mean", f"{ms['mean']:.1f} ms"],
+        ["localisation time, 95 %", f"{ms['p95']:.1f} ms"],
+        ["of it on the map, mean", f"{s['map_ms_mean']:.1f} ms"],
+        ["points in the reference map, mean", f"{s['map_points_mean']:.0f}"],
+        ["RMSE against the given poses", centimetres(s["rmse_m"])],
+        ["RMSE after rigid alignment", centimetres(s["rmse_aligned_m"])],
+        ["frames located", f"{100 * s['located_share']:.1f} % of {s['frames']}"],
+    ]
+    console.print(table("full map" if report.full else "partial map", ["", ""], rows))
+    lost = {name: count for name, count in s["statuses"].items() if name not in ("ok", "degenerate")}
+    if lost:
+        console.print("frames " + ", ".join(f"{name}: {count}" for name, count in lost.items()), highlight=False)
+    for problem in report.damaged:
+        console.print(f"left out: {problem}", highlight=False, markup=False)

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam submaps`: a map in cells on disk: make one, add a visit to it, list it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ggslam.cli import options
+from ggslam.cli.console import console, progress_bar, table
+from ggslam.cli.observer import ProgressObserver
+
+if TYPE_CHECKING:
+    from ggslam.submap_jobs import StoreListing
+
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam submaps runs/kitchen --out kitchen.grid --visit monday
+
+  ggslam submaps data/kitchen_again --out kitchen.grid --visit tuesday --poses localized/kitchen_again/trajectory.txt
+
+  ggslam submaps kitchen.grid --since tuesday
+"""
+
+SourcePath = Annotated[
+    Path,
+    typer.Argument(metavar="SOURCE", help="A grid store, to list it; with --out: a run, a cloud, or a recording (RGB-D "
+                   "or laser scans) with poses."),
+]  # fmt: skip
+
+
+def submaps(
+    source: SourcePath,
+    out: Annotated[Path | None, typer.Option(metavar="STORE", help="Grid store to make, or to add a visit to.")] = None,
+    visit: Annotated[str | None, typer.Option(help="Name of the visit; default: of the source.")] = None,
+    since: Annotated[str | None, typer.Option(metavar="VISIT", help="List what changed since this visit.")] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="Trajectory file of the recording, if not its own poses; in the map's world.")
+    ] = None,
+    at: Annotated[
+        float | None, typer.Option(help="Seconds on the clock of all visits at which this one began; T counts by it.")
+    ] = None,
+    spacing: Annotated[float | None, typer.Option(help="S of a new store: edge of a cell, metres (2).")] = None,
+    axes: Annotated[str | None, typer.Option(help="World axes of a new store's grid: xyz, xz, xy (xyz).")] = None,
+    voxel: Annotated[float | None, typer.Option(help="One point a cube of this edge is kept, metres; 0: all.")] = None,
+    radius: Annotated[
+        float | None, typer.Option(help="R: a cell is recorded from so near its centre, metres (1).")
+    ] = None,
+    refresh: Annotated[float | None, typer.Option(help="T: seconds before a cell is recorded again (300).")] = None,
+    sensor_range: Annotated[float | None, typer.Option(help="Farther points are not recorded, metres (10).")] = None,
+    first: Annotated[int, typer.Option("--first", help="First frame to use.")] = 0,
+    stop: options.Stop = None,
+    stride: options.Stride = 1,
+    scale: options.Scale = 1.0,
+    columns: Annotated[int, typer.Option(help="Numbers of a point in .bin scans.", min=3)] = 4,
+) -> None:  # fmt: skip
+    """Make a grid store, add a visit to one, or list its cells, parts, visits and changes."""
+    from ggslam.recordings import SequenceRequest
+    from ggslam.submap_jobs import SubmapsRequest, list_store, make_store
+
+    if out is not None:
+        settings = {"spacing": spacing, "axes": axes, "voxel": voxel, "radius": radius, "refresh": refresh,
+                    "sensor_range": sensor_range}  # fmt: skip
+        request = SubmapsRequest(
+            source, out, visit, poses, at, {name: value for name, value in settings.items() if value is not None},
+            SequenceRequest(source, start=first, stop=stop, stride=stride, scale=scale), columns,
+        )  # fmt: skip
+        with progress_bar() as bar:
+            make_store(request, ProgressObserver(bar))
+    _print(list_store(source if out is None else out, since))
+
+
+def _print(listing: StoreListing) -> None:
+    s = listing.settings
+    console.print(
+        f"{listing.path}: {listing.cells} cells of {s.spacing:g} m along {s.axes}, {listing.bytes / 1e6:.1f} MB; "
+        f"R {s.radius:g} m, T {s.refresh:g} s, R' {s.partial_radius:g} m, voxels {100 * s.voxel:g} cm", highlight=False,
+        markup=False,
+    )  # fmt: skip
+    rows = [[name, str(p.cells), str(p.count), f"{p.bytes / 1e6:.2f} MB"] for name, p in listing.parts.items()]
+    console.print(table("parts", ["", "cells", "things", "size"], rows))
+    if listing.visits:
+        rows = [[v.name, str(v.added), str(v.refreshed)] for v in listing.visits]
+        console.print(table("visits", ["", "cells added", "cells refreshed"], rows))
+    if listing.changes is not None:
+        rows = [
+            [str(c.key), "yes" if c.added else "", "-" if c.changed is None else f"{100 * c.changed:.1f} %"]
+            for c in listing.changes
+        ]
+        console.print(table(f"{len(rows)} cells since {listing.since}", ["cell", "new", "changed"], rows))

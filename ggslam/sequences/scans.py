@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of laser scans: a folder with one file a scan, in the order of their names, and a file of poses.
+
+    scans/000000.bin ...    or the files in the folder itself: .bin (float32 x y z intensity), .npy [n, 3 or more], .pcd
+    trajectory.txt          TUM (timestamp tx ty tz qx qy qz qw) or one matrix a line (KITTI, Replica), a row a scan;
+                            or groundtruth.txt, or poses.txt; sensor to world; may be absent
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import FormatError, SequenceError
+from ggslam.formats.point_cloud import read_point_cloud
+from ggslam.formats.raw_points import read_raw_points
+from ggslam.formats.trajectory import read_trajectory
+
+_SUFFIXES = (".bin", ".npy", ".pcd")
+_POSES = ("trajectory.txt", "groundtruth.txt", "poses.txt")
+_RATE = 10.0
+"""Scans per second where nothing tells times."""
+
+
+@dataclass(frozen=True)
+class LaserScan:
+    """One scan: number in the selection, seconds, points float32 [n, 3] in the sensor's frame, metres."""
+
+    index: int
+    timestamp: float
+    points: np.ndarray
+
+
+class ScanSequence:
+    """The selected scans of a folder.
+
+    Attributes:
+        path: the folder.
+        timestamps: float64 [n], seconds.
+        ground_truth: float64 [n, 4, 4] T_world_sensor, or None.
+    """
+
+    def __init__(
+        self, path: Path, start: int = 0, stop: int | None = None, stride: int = 1, columns: int = 4
+    ) -> None:
+        """Finds the scans and reads the poses; `columns`: numbers of a point in .bin files.
+
+        Raises:
+            SequenceError: no scans, or none selected, or another number of poses.
+            FormatError: the poses are damaged.
+        """
+        self.path, self._columns = Path(path), columns
+        files = scan_files(self.path)
+        if not files:
+            raise SequenceError(f"{path}: no scans ({', '.join(_SUFFIXES)})")
+        times, poses = _poses(self.path, len(files))
+        chosen = np.arange(len(files))[start:stop:stride]
+        if not len(chosen):
+            raise SequenceError(f"{path}: no scan of {len(files)} is selected")
+        self._files = [files[i] for i in chosen.tolist()]
+        self.timestamps: np.ndarray = times[chosen]
+        self.ground_truth: np.ndarray | None = None if poses is None else poses[chosen]
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def scan(self, index: int) -> LaserScan:
+        """Reads a scan of the selection. Raises FormatError if it is damaged."""
+        return LaserScan(index, float(self.timestamps[index]), _points(self._files[index], self._columns))
+
+    def stream(self) -> Iterator[LaserScan]:
+        """All scans in order."""
+        return map(self.scan, range(len(self)))
+
+
+def scan_files(path: Path) -> list[Path]:
+    """The files of the scans in a folder, in order; empty if it is no recording of scans."""
+    for folder in (path / "scans", path):
+        if folder.is_dir():
+            files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES)
+            if files:
+                return files
+    return []
+
+
+def _poses(folder: Path, count: int) -> tuple[np.ndarray, np.ndarray | None]:
+    for name in _POSES:
+        if (folder / name).is_file():
+            found = read_trajectory(folder / name)
+            if len(found) != count:
+                raise SequenceError(f"{folder / name}: {len(found)} poses, but there are {count} scans")
+            by_row = np.array_equal(found.timestamps, np.arange(count))
+            return found.timestamps / (_RATE if by_row else 1.0), found.T_world_camera
+    return np.arange(count) / _RATE, None
+
+
+def _points(path: Path, columns: int) -> np.ndarray:
+    if path.suffix.lower() == ".bin":
+        return read_raw_points(path, columns)[:, :3]
+    if path.suffix.lower() == ".pcd":
+        return read_point_cloud(path).points.astype(np.float32)
+    try:
+        points = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise FormatError(f"{path}: cannot be read: {error}") from None
+    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind != "f":
+        shape = list(np.shape(points))
+        raise FormatError(f"{path}: expected floating-point numbers [n, 3 or more], found {shape}")
+    return np.ascontiguousarray(points[:, :3], np.float32)

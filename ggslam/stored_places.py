@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Places in the cells of a grid store: what keyframes that stood in a cell looked like, so that a camera whose pose is
+not known can be looked up (`loops.places`). The part `PLACES` of a cell holds arrays, one row or run of rows a view:
+
+    poses float64 [k, 4, 4] T_world_camera    counts int32 [k]    codes uint8 [k, ferns]
+    descriptors uint8 [n, 32] and points float32 [n, 3] of the views' landmarks, one view after another
+    camera float64 [6]: width, height, fx, fy, cx, cy
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.errors import ConfigError, FormatError
+from ggslam.features.orb import View
+from ggslam.loops.places import Place, PlaceIndex, PlaceMatch
+from ggslam.loops.settings import PlaceSettings
+from ggslam.scene.arrays import arrays_to_bytes
+from ggslam.scene.camera import Camera
+from ggslam.submaps.cell_keys import CellKey
+from ggslam.submaps.grid import GridStore
+
+PLACES = "places.npz"
+_NAMES = ("poses", "counts", "codes", "descriptors", "points", "camera")
+_CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
+_SAME = 1e-3
+"""Share of the image width by which the intrinsics of two cameras that are the same may differ."""
+
+
+@dataclass(frozen=True)
+class StoredView:
+    """A view as it is kept: its place and pose T_world_camera [4, 4]."""
+
+    place: Place
+    T_world_camera: np.ndarray
+
+
+def places_to_bytes(views: Sequence[StoredView], camera: Camera) -> bytes:
+    """The part `PLACES` of these views."""
+    landmarks = [view.place.landmarks for view in views]
+    return arrays_to_bytes(
+        poses=np.array([view.T_world_camera for view in views]).reshape(-1, 4, 4),
+        counts=np.array([len(marks) for marks in landmarks], np.int32),
+        codes=np.array([view.place.codes for view in views]),
+        descriptors=np.concatenate([marks.descriptors for marks in landmarks]),
+        points=np.concatenate([marks.points for marks in landmarks]),
+        camera=np.array([getattr(camera, name) for name in _CAMERA], float),
+    )
+
+
+class StoredPlaces:
+    """The places of all cells, in memory: about 45 KB a view, whatever else the map holds.
+
+    Args:
+        store: the map.
+        camera: of the views that are looked up.
+
+    Raises:
+        FormatError: a part is damaged.
+        ConfigError: the places were seen by another camera.
+    """
+
+    def __init__(self, store: GridStore, camera: Camera, settings: PlaceSettings | None = None) -> None:
+        parts = [(key, _arrays(store, key)) for key in store.cells() if PLACES in store.cell(key).parts]
+        for key, arrays in parts:
+            _check_camera(store, key, arrays["camera"], camera)
+        merged = {name: np.concatenate([arrays[name] for _, arrays in parts]) for name in _NAMES[:5]} if parts else {}
+        self.T_world_camera: np.ndarray = merged.pop("poses", np.zeros((0, 4, 4)))
+        """Of each view, float64 [k, 4, 4]."""
+        # Views are not told to be next in time: numbers two apart support nobody.
+        numbers = 2 * np.arange(len(self.T_world_camera), dtype=np.int32)
+        if parts:
+            self.index = PlaceIndex.from_arrays(camera, {**merged, "numbers": numbers}, settings)
+        else:
+            self.index = PlaceIndex(camera, settings)
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def describe(self, view: View) -> Place:
+        """What a view is known by."""
+        return self.index.describe(view)
+
+    def query(self, place: Place, count: int) -> list[tuple[PlaceMatch, StoredView]]:
+        """The views most like a place, the likeliest first, `count` at most."""
+        return [
+            (match, StoredView(self.index[match.number], self.T_world_camera[match.number // 2]))
+            for match in self.index.query(place, count)
+        ]
+
+
+def stored_views(store: GridStore, key: CellKey, camera: Camera) -> list[StoredView]:
+    """The views of one cell that has them.
+
+    Raises:
+        FormatError: the part is damaged.
+        ConfigError: another camera saw them.
+    """
+    arrays = _arrays(store, key)
+    _check_camera(store, key, arrays["camera"], camera)
+    numbers = np.arange(len(arrays["poses"]), dtype=np.int32)
+    index = PlaceIndex.from_arrays(camera, {**arrays, "numbers": numbers})
+    return [StoredView(index[number], T) for number, T in enumerate(arrays["poses"])]
+
+
+def _arrays(store: GridStore, key: CellKey) -> Mapping[str, np.ndarray]:
+    where = f"{store.path}: cell {key}: {PLACES}"
+    try:
+        with np.load(io.BytesIO(store.get(key, PLACES)), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in _NAMES}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise FormatError(f"{where}: damaged: {error}") from None
+    views, landmarks = len(arrays["poses"]), int(arrays["counts"].sum())
+    fits = len(arrays["counts"]) == len(arrays["codes"]) == views and arrays["poses"].shape[1:] == (4, 4)
+    if not fits or not len(arrays["descriptors"]) == len(arrays["points"]) == landmarks:
+        raise FormatError(f"{where}: damaged: its arrays do not fit each other")
+    return arrays
+
+
+def _check_camera(store: GridStore, key: CellKey, found: np.ndarray, camera: Camera) -> None:
+    expected = np.array([getattr(camera, name) for name in _CAMERA], float)
+    if found.shape != (6,) or (np.abs(found - expected) > _SAME * camera.width).any():
+        seen, own = (f"{int(c[0])}x{int(c[1])} pixels, fx {c[2]:.1f}" for c in (found, expected) if c.shape == (6,))
+        raise ConfigError(
+            f"{store.path}: cell {key}: its places were seen by a camera of {seen}, the images have {own}; see --scale"
+        )

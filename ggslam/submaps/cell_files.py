@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of a grid store: one folder per cell, in it one folder per version, in it one file per part.
+
+    cells/3_0_-2/17/points.pcd
+
+A version is written whole before the index speaks of it, and versions that the index does not speak of are leftovers.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+from ggslam.errors import RunFolderError
+from ggslam.formats.atomic import write_failure
+from ggslam.submaps.cell_keys import CellKey
+
+_WAITING_THREADS = 8
+_CELL = re.compile(r"(-?\d+)_(-?\d+)_(-?\d+)")
+_PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+
+class CellFiles:
+    """Reads, writes and clears the folder `cells` of a store."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, key: CellKey, version: int, part: str) -> Path:
+        """Where a part lies."""
+        return self._cell(key) / str(version) / part
+
+    def write(self, versions: Mapping[tuple[CellKey, int], Mapping[str, bytes]]) -> None:
+        """Writes new versions of cells and waits until they and their names are on the disk.
+
+        Raises:
+            RunFolderError: something cannot be written; leftovers stay.
+            ValueError: the name of a part is no plain file name.
+        """
+        for parts in versions.values():
+            if bad := [name for name in parts if not _PART.fullmatch(name)]:
+                raise ValueError(f"not a name for a part of a cell: {bad[0]!r}")
+        written, folders = [], {self.folder: None}
+        path = self.folder
+        try:
+            for (key, version), parts in versions.items():
+                path = self._cell(key) / str(version)
+                path.mkdir(parents=True)
+                folders |= {path: None, path.parent: None}
+                for name, data in parts.items():
+                    path = self.path(key, version, name)
+                    path.write_bytes(data)
+                    written.append(path)
+        except OSError as error:
+            raise write_failure(path, error) from error
+        # All are waited for at once: the file system commits its journal once for many instead of once for each.
+        with ThreadPoolExecutor(_WAITING_THREADS) as pool:
+            list(pool.map(wait_for_disk, [*written, *folders]))
+
+    def sweep(self, key: CellKey, kept: Mapping[str, int]) -> None:
+        """Removes a cell's files, except the versions to keep of its parts. What cannot be removed stays."""
+        cell = self._cell(key)
+        with suppress(OSError):
+            for folder in list(cell.iterdir()):
+                parts = {name for name, version in kept.items() if str(version) == folder.name}
+                if not parts:
+                    shutil.rmtree(folder, ignore_errors=True)
+                    continue
+                for file in list(folder.iterdir()):
+                    if file.name not in parts:
+                        file.unlink()
+            if not kept:
+                cell.rmdir()
+
+    def cells(self) -> Iterator[CellKey]:
+        """Every cell that has a folder."""
+        with suppress(FileNotFoundError):
+            for entry in self.folder.iterdir():
+                if match := _CELL.fullmatch(entry.name):
+                    yield int(match[1]), int(match[2]), int(match[3])
+
+    def _cell(self, key: CellKey) -> Path:
+        return self.folder / "_".join(map(str, key))
+
+
+class WriterLock:
+    """Held by the one writer of a store: a file, locked by the operating system as long as its process lives.
+
+    While it is held the file names the process; a name found in it is that of a writer which ended without `release`.
+
+    Raises:
+        RunFolderError: another writer has it, or the file cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._file = path.open("a+b")
+        except OSError as error:
+            raise write_failure(path, error) from error
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            owner = self._content()
+            self._file.close()
+            if isinstance(error, BlockingIOError):
+                raise RunFolderError(f"{path.parent}: is being written to by process {owner or 'unknown'}") from None
+            raise write_failure(path, error) from error
+        self.unfinished = bool(self._content())
+        self._fill(path, str(os.getpid()))
+
+    def release(self) -> None:
+        """Lets others write; nothing unfinished is left behind."""
+        with suppress(OSError):
+            self._file.truncate(0)
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Lets others write, who will look for what is left unfinished."""
+        self._file.close()
+
+    def _content(self) -> str:
+        self._file.seek(0)
+        return self._file.read(64).decode("ascii", "replace").strip()
+
+    def _fill(self, path: Path, text: str) -> None:
+        try:
+            self._file.truncate(0)
+            self._file.write(text.encode("ascii"))
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            with suppress(OSError):
+                self._file.close()
+            raise write_failure(path, error) from error
+
+
+def read_current(find: Callable[[], Path], attempts: int = 5) -> tuple[Path, bytes]:
+    """Reads the file that `find` names, asking again if a writer has replaced it meanwhile.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    path = find()
+    for _ in range(attempts):
+        try:
+            return path, path.read_bytes()
+        except FileNotFoundError:
+            found = find()
+            if found == path:
+                raise
+            path = found
+    return path, path.read_bytes()
+
+
+def wait_for_disk(path: Path) -> None:
+    """Waits until a file's content, or the names in a folder, are on the disk.
+
+    Raises:
+        RunFolderError: they cannot be; names it and the reason.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise write_failure(path, error) from error

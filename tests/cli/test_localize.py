@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam localize` and `ggslam submaps` on a small run, a recording, laser scans and clouds."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from ggslam.cli.main import app
+from ggslam.errors import GgslamError
+from ggslam.formats.trajectory import read_tum, write_tum
+from ggslam.map_stores import GAUSSIANS
+from ggslam.run_folder import RunFolder
+from ggslam.sequences.synthetic.world_cloud import cloud_tiles
+from ggslam.sequences.synthetic.world_plan import make_world
+from ggslam.sequences.synthetic.world_scanner import Scanner
+from ggslam.sequences.synthetic.world_walk import walk
+from ggslam.submaps.grid import GridStore
+
+ORIGIN = "0 0 0 0 0 0 1"
+
+
+def ggslam(*arguments: object) -> Result:
+    """The command line within this process; an error of ours is in `exception`."""
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "140"})
+
+
+def done(*arguments: object) -> str:
+    result = ggslam(*arguments)
+    assert result.exit_code == 0 and result.exception is None, (result.output, result.exception)
+    return result.output
+
+
+def summary(out: Path) -> dict[str, Any]:
+    return json.loads((out / "localization.json").read_text())["summary"]
+
+
+def one_error(result: Result, *words: str) -> None:
+    assert isinstance(result.exception, GgslamError) and result.exception.exit_code == 2, result
+    assert all(word in str(result.exception) for word in words), str(result.exception)
+
+
+@pytest.fixture(scope="module")
+def run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "room"
+    done("run", room, "--out", out, "--stop", 12, "--iterations", 1, "--set", "masks.source=none", "--no-eval")
+    return out
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the scans of a walk, their poses, and the cloud of the world around: cloud.npy beside it."""
+    folder = tmp_path_factory.mktemp("scans") / "walk"
+    (folder / "scans").mkdir(parents=True)
+    world = make_world(30.0, seed=0)
+    poses = walk(world, 2.0, seed=0)[:12]
+    for number, T in enumerate(poses):
+        np.save(folder / "scans" / f"{number:06d}.npy", Scanner(columns=450).scan(world, T, number).points)
+    write_tum(folder / "trajectory.txt", np.arange(len(poses)) / 10, poses)
+    points = np.concatenate([points for points, _ in cloud_tiles(world, 0.15)])
+    near = np.linalg.norm(points[:, :2] - poses[0, :2, 3], axis=1) < 8
+    np.save(folder.parent / "cloud.npy", points[near])
+    return folder
+
+
+def test_a_recording_is_located_in_a_run(run: Path, room: Path, tmp_path: Path) -> None:
+    output = done("localize", run, room, "--out", tmp_path / "out")
+    found = summary(tmp_path / "out")
+    assert found["located_share"] == 1 and found["frames"] == 24 and found["rmse_aligned_m"] < 0.01
+    assert "cut into cells" in output and "frames located" in output and "100.0 % of 24" in output
+    poses = read_tum(tmp_path / "out" / "trajectory.txt")
+    own = read_tum(run / "trajectory.txt")  # the map's world is the run's
+    apart = np.linalg.norm(poses.T_world_camera[:12, :3, 3] - own.T_world_camera[:, :3, 3], axis=1)
+    assert len(poses) == 24 and apart.max() < 0.02
+    with GridStore.open(run / "cells") as store:
+        cells = [store.cell(key) for key in store.cells()]
+    gaussians = sum(c.parts[GAUSSIANS].count for c in cells if GAUSSIANS in c.parts)
+    assert gaussians == len(RunFolder.open(run).gaussians())
+    assert "cut into cells" not in done("localize", run, room, "--stop", 2, "--out", tmp_path / "again")
+    full = ["--full-map", "--start", ORIGIN, "--stop", 6]
+    done("localize", run, room, *full, "--out", tmp_path / "full")
+    assert summary(tmp_path / "full")["full_map"] and summary(tmp_path / "full")["located_share"] == 1
+
+
+def test_scans_are_located_in_a_cloud(scans: Path, tmp_path: Path) -> None:
+    cloud = scans.parent / "cloud.npy"
+    done("localize", cloud, scans, "--start", "given", "--out", tmp_path / "out")
+    found = summary(tmp_path / "out")
+    assert found["located_share"] == 1 and found["rmse_m"] < 0.03 and found["map_points_mean"] > 0
+    done("submaps", cloud, "--out", tmp_path / "map.grid", "--axes", "xy", "--voxel", "0", "--visit", "survey")
+    output = done("submaps", tmp_path / "map.grid", "--since", "survey")
+    assert "along xy" in output and "points.pcd" in output and "cells since survey" in output
+    done("localize", tmp_path / "map.grid", scans, "--start", "given", "--radius", 6, "--out", tmp_path / "small")
+    small = summary(tmp_path / "small")
+    assert small["located_share"] == 1 and small["map_points_mean"] < found["map_points_mean"]
+    assert small["damaged_cells"] == []
+    with GridStore.open(tmp_path / "map.grid") as store:
+        version = store.cell(store.cells()[len(store.cells()) // 2]).version
+    damaged = next((tmp_path / "map.grid" / "cells").glob(f"*/{version}/points.pcd"))
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    output = done("localize", tmp_path / "map.grid", scans, "--start", "given", "--out", tmp_path / "torn")
+    assert summary(tmp_path / "torn")["located_share"] == 1 and "left out" in output and "points.pcd" in output
+
+
+def test_a_visit_is_recorded_with_poses_from_localisation(room: Path, run: Path, tmp_path: Path) -> None:
+    store = tmp_path / "room.grid"
+    done("submaps", run, "--out", store, "--visit", "first", "--at", 0)
+    done("localize", store, room, "--stop", 8, "--out", tmp_path / "out")
+    poses = ["--poses", tmp_path / "out" / "trajectory.txt"]
+    output = done(
+        "submaps", room, "--stop", 8, "--out", store, *poses, "--visit", "second", "--at", 1000, "--radius", 2
+    )
+    assert "cells written" in output
+    with GridStore.open(store) as opened:
+        assert opened.visits() == ["first", "second"] and opened.changed_since("second")
+
+
+def test_what_cannot_be_done_is_one_error(run: Path, room: Path, scans: Path, tmp_path: Path) -> None:
+    cloud = scans.parent / "cloud.npy"
+    one_error(ggslam("localize", tmp_path / "none", room), "none", "no such folder")
+    one_error(ggslam("localize", room, room), str(room), "neither a grid store")
+    one_error(ggslam("localize", tmp_path / "no.pcd", room, "--start", ORIGIN), "no.pcd")
+    one_error(ggslam("localize", cloud, scans), "--start is needed")
+    one_error(ggslam("localize", cloud, room), "no places")
+    one_error(ggslam("localize", run, room, "--scale", 0.5), "camera", "--scale")
+    one_error(ggslam("localize", run, room, "--start", "1 2 3"), "--start", "'1 2 3'")
+    one_error(ggslam("localize", run, room, "--start", ORIGIN, "--no-start"), "one of them")
+    one_error(ggslam("submaps", room), "no grid store")
+    one_error(ggslam("submaps", tmp_path / "none"), "none")
+    bare = shutil.copytree(scans, tmp_path / "bare")
+    (bare / "trajectory.txt").write_text("0 0 0 0 0 0 0 1\n")
+    one_error(ggslam("localize", cloud, bare, "--start", ORIGIN), "trajectory.txt", "1 poses", "12 scans")
+    (bare / "trajectory.txt").unlink()
+    one_error(ggslam("submaps", bare, "--out", tmp_path / "bare.grid"), "no poses")
+    one_error(ggslam("localize", cloud, bare, "--start", "given"), "no pose")
+    (bare / "scans" / "000001.npy").write_bytes(b"?")
+    one_error(ggslam("localize", cloud, bare, "--start", ORIGIN), "000001.npy", "cannot be read")
+    (scans.parent / "damaged.grid").mkdir()
+    (scans.parent / "damaged.grid" / "index.sqlite").write_bytes(b"nothing of the kind" * 100)
+    one_error(ggslam("localize", scans.parent / "damaged.grid", room), "damaged.grid")
