@@ -24,6 +24,7 @@ from ggslam.loop_closing import LoopSettings
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.settings import MapperSettings
 from ggslam.object_masks import MaskSettings
+from ggslam.submaps.paging_settings import PagingSettings
 from ggslam.tracking.feature_settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
 from ggslam.tracking.tracker import TrackerSettings
@@ -65,6 +66,8 @@ class Config:
     """0: synchronous. Otherwise frames arrive at this rate like from a camera; tracker and mapper run side by side."""
     refine_iterations: int = 0
     """Optimisation steps after the last frame."""
+    memory_limit_mb: float = 0.0
+    """Resident memory of the run in 10^6 bytes: what does not fit of map and keyframes is kept on disk; 0: no limit."""
     tracking: TrackerSettings = field(default_factory=TrackerSettings)
     features: FeatureTrackerSettings = field(default_factory=FeatureTrackerSettings)
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
@@ -73,12 +76,13 @@ class Config:
     identity: IdentitySettings = field(default_factory=IdentitySettings)
     masks: MaskSettings = field(default_factory=MaskSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    paging: PagingSettings = field(default_factory=PagingSettings)
     volumes: VolumeSettings = field(default_factory=VolumeSettings)
 
     def __post_init__(self) -> None:
         ranges = {
             "seed": (0, 2**63), "threads": (0, 1024), "sh_degree": (0, 3), "realtime_fps": (0, 1e4),
-            "refine_iterations": (0, 10**7),
+            "refine_iterations": (0, 10**7), "memory_limit_mb": (0, 1e9),
         }  # fmt: skip
         check_ranges(self, ranges)
 

@@ -15,6 +15,7 @@ from ggslam.formats.atomic import make_folder
 from ggslam.formats.point_ply import write_points
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.staging import new_staging, publish
+from ggslam.map_index import MAP_INDEX
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
 from ggslam.run_folder import MARKER, OBJECT_FILES, RunFolder
@@ -64,8 +65,9 @@ def save_edited(
         if isinstance(error, OSError):
             raise RunFolderError(f"{target.path}: the edited run cannot be written: {error}") from None
         raise
+    old = (*SCORES, *POINTS, *OBJECT_FILES, PLACES_FILE, MAP_INDEX, "renders")
     try:
-        publish(staged.path, target.path, MARKER, (*SCORES, *POINTS, *OBJECT_FILES, PLACES_FILE, "renders"), meanwhile)
+        publish(staged.path, target.path, MARKER, old, meanwhile)
     except RunFolderError:
         shutil.rmtree(staged.path, ignore_errors=True)
         raise

@@ -14,6 +14,7 @@ from typing import Any
 
 from ggslam.config import Config, load_config
 from ggslam.errors import ConfigError, GgslamError, SequenceError
+from ggslam.formats.staging import new_staging
 from ggslam.progress import Observer, SilentObserver
 from ggslam.realtime import RealtimeSlam
 from ggslam.recordings import SequenceRequest, describe
@@ -53,7 +54,7 @@ class RunOutcome:
         """One line for people."""
         r = self.result
         parts = [f"{len(r.frames)} frames", f"{r.frames_per_second():.1f} frames/s", f"{len(r.keyframes)} keyframes",
-                 f"{len(r.gaussians)} Gaussians"]  # fmt: skip
+                 f"{r.gaussian_count} Gaussians"]  # fmt: skip
         counts = Counter(frame.status for frame in r.frames)
         parts += [f"{counts[status]} frames {status}" for status in ("recovered", "lost") if counts[status]]
         parts += [f"{len(r.dropped_frames)} frames dropped"] if r.dropped_frames else []
@@ -94,8 +95,9 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     folder = RunFolder.create(out, overwrite=request.overwrite)
     for warning in sequence.warnings:
         observer.note(warning)
+    paging = new_staging(folder.path) if config.memory_limit_mb else None
     try:
-        result, error = run_slam(sequence, config, observer, earlier, not request.localize_only, follower)
+        result, error = run_slam(sequence, config, observer, earlier, not request.localize_only, follower, paging)
     except GgslamError:  # before the first frame: settings that do not fit the recording, a model that is none
         folder.discard()
         raise
@@ -114,10 +116,15 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
         if earlier is not None and not earlier.has_objects():
             reason = f"the map of {earlier.path} has none"
         observer.note(f"no objects were learned: {reason}")
+    for text in result.notes:
+        observer.note(text)
     with uninterrupted():
         names = {**_names(earlier), **sequence.instance_names}
         described = describe(request.sequence, sequence, earlier)
-        folder.save(config, described, result, None if error is None else repr(error), names)
+        try:
+            folder.save(config, described, result, None if error is None else repr(error), names)
+        finally:
+            result.close()
     outcome = RunOutcome(folder, result, error=error)
     if request.evaluate and error is None:
         outcome.metrics = score_run(folder, sequence, observer)
@@ -164,16 +171,16 @@ def _names(earlier: RunFolder | None) -> dict[int, str]:
 
 def run_slam(
     sequence: Sequence, config: Config, observer: Observer, earlier: RunFolder | None = None, growing: bool = True,
-    follower: Follower | None = None,
+    follower: Follower | None = None, paging: Path | None = None,
 ) -> tuple[SlamResult, BaseException | None]:  # fmt: skip
     """The loop over a recording, synchronous or in real time as the settings say; with `earlier` in that run's map,
-    which grows or stays as it is.
+    which grows or stays as it is. What does not fit into a limit of memory goes to the folder `paging`, see `Slam`.
 
     Raises:
         GgslamError: settings or map do not fit the recording.
     """
     error: BaseException | None = None
-    slam = Slam(sequence.camera, config, sequence.has_masks)
+    slam = Slam(sequence.camera, config, sequence.has_masks, paging)
     if earlier is not None:
         start_in_map(slam, earlier, growing)
     observer.begin("track + map" if growing else "localize", len(sequence))

@@ -89,7 +89,7 @@ class RealtimeSlam:
         slam.remember(frame, tracking)
         slam.times.stop()
         seconds = time.perf_counter() - start
-        return StepReport(slam.frames[-1], is_keyframe, slam.map.count, slam.mapper.last_psnr, seconds)
+        return StepReport(slam.frames[-1], is_keyframe, slam.gaussian_count, slam.mapper.last_psnr, seconds)
 
     # --- mapper's thread ---------------------------------------------------------------------------------------------
 

@@ -26,6 +26,7 @@ from ggslam.reporting.pictures import (
 )
 from ggslam.run_folder import RunFolder
 from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 
 KINDS = ("color", "depth", "alpha", "ids", "pca")
@@ -91,14 +92,16 @@ def render_frames(
     if width is not None:
         camera = camera.resized(width, round(camera.height * width / camera.width))
     segmented = folder.segmented_map() if set(what) & set(OBJECT_KINDS) else None
-    gaussians = folder.gaussians() if segmented is None else segmented.gaussians
+    view_of = map_views(folder, None if segmented is None else segmented.gaussians)
     make_folder(out)
     rasterizer = CpuRasterizer()
     painters = _painters() if segmented is None else {**_painters(), **_object_painters(segmented, rasterizer)}
     poses = frame_poses(folder.read_json("keyframes.json"))
     written = []
     for done, frame in enumerate(frames):
-        view = rasterizer.forward(gaussians, camera, inverse(poses[frame]), features=segmented is not None)
+        T_camera_world = inverse(poses[frame])
+        gaussians = view_of(camera, T_camera_world)
+        view = rasterizer.forward(gaussians, camera, T_camera_world, features=segmented is not None)
         for kind in what:
             written.append(out / f"frame{frame:06d}_{kind}.png")
             write_picture(written[-1], painters[kind](view))
@@ -107,6 +110,20 @@ def render_frames(
         written.append(out / "legend.png")
         write_picture(written[-1], legend([(f"{o.id} {o.name or ''}", o.color) for o in segmented.table.objects]))
     return written
+
+
+def map_views(folder: RunFolder, whole: GaussianMap | None = None) -> Callable[[Camera, np.ndarray], GaussianMap]:
+    """A function that gives what a camera at T_camera_world may see of a run's map.
+
+    Args:
+        folder: of the run. If its map was written cell by cell, no more of it is read than a view needs.
+        whole: the map, if it is in memory already.
+    """
+    parts = folder.map_in_parts() if whole is None else None
+    if parts is not None:
+        return parts.in_view
+    gaussians = folder.gaussians() if whole is None else whole
+    return lambda camera, T_camera_world: gaussians
 
 
 def object_ids(rasterizer: CpuRasterizer, view: RenderBuffers, segmented: SegmentedMap) -> np.ndarray:

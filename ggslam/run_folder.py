@@ -5,6 +5,7 @@
     trajectory.txt   TUM: timestamp tx ty tz qx qy qz qw, camera to world, the world being the first camera
     keyframes.json   poses, exposures and frame numbers of the keyframes; how each frame was tracked
     map.ply          Gaussians in the fields of 3DGS
+    map_cells.json   of a run whose memory was limited: which rows of map.ply lie in which cell
     points.ply       coloured cloud sampled from the map, metres; points_grid.ply: the same in integer grid cells
     places.npz       what another recording needs to start in this map
     config.yaml      all settings; sequence.json: where the recording was and how it was read
@@ -18,9 +19,7 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -38,9 +37,12 @@ from ggslam.formats.point_ply import write_points
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.staging import finish_saving, leftovers
 from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
+from ggslam.map_index import MAP_INDEX, MapIndex, MapInParts
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
+from ggslam.process_memory import peak_memory_bytes
 from ggslam.saved_places import PLACES_FILE
+from ggslam.saving_parts import save_map_in_parts, save_points_in_parts
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam_result import SlamResult
@@ -134,7 +136,8 @@ class RunFolder:
         """
         mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish"}
         self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
-        for stale in ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", PLACES_FILE, *OBJECT_FILES):
+        stale_files = ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", PLACES_FILE, MAP_INDEX)
+        for stale in (*stale_files, *OBJECT_FILES):
             (self.path / stale).unlink(missing_ok=True)
         for stale in ("renders", "volumes"):
             shutil.rmtree(self.path / stale, ignore_errors=True)
@@ -144,7 +147,9 @@ class RunFolder:
         self.write_json("keyframes.json", _keyframes(result))
         self.write_json("loops.json", _loops(result))
         write_tum(self.path / "trajectory.txt", result.timestamps(), result.trajectory())
-        if result.objects is None:
+        if result.cells is not None:
+            save_map_in_parts(self.path, result, names)
+        elif result.objects is None:
             write_gaussian_ply(self.path / "map.ply", result.gaussians)
         else:
             self.save_objects(segmented(result, names))
@@ -152,7 +157,11 @@ class RunFolder:
             write_bytes(self.path / PLACES_FILE, result.places)
         self.write_json(MARKER, {**mark, "complete": error is None, "stopped_by": error})
         # Last and largest; `ggslam export --format points` makes them again from the map.
-        write_points(self.path, sample_points(result.gaussians, with_object_id=result.objects is not None))
+        with_object_id = result.objects is not None
+        if result.cells is None:
+            write_points(self.path, sample_points(result.gaussians, with_object_id=with_object_id))
+        else:
+            save_points_in_parts(self.path, result.cells, with_object_id)
         self.write_json("timing.json", timing(result))  # once more: peak memory is that of the whole run
 
     def save_objects(self, segmented: SegmentedMap) -> None:
@@ -197,6 +206,16 @@ class RunFolder:
     def gaussians(self, with_moments: bool = False) -> GaussianMap:
         """The map; optimizer state, if there is room for it, begins anew."""
         return read_gaussian_ply(self.path / "map.ply", with_moments=with_moments)
+
+    def map_in_parts(self) -> MapInParts | None:
+        """The map, to be read as far as a view needs it; None if it was not written cell by cell.
+
+        Raises:
+            FormatError: map or index are damaged or do not belong together.
+        """
+        if not (self.path / MAP_INDEX).is_file():
+            return None
+        return MapInParts(self.path / "map.ply", MapIndex.read(self.path / MAP_INDEX))
 
     def trajectory(self) -> Trajectory:
         """Camera poses of all frames."""
@@ -286,15 +305,14 @@ def timing(result: SlamResult) -> dict[str, Any]:
         "wall_s": t.wall, "tracking_s": t.tracking, "loops_s": t.loops, "refinement_s": t.refinement,
         "tracking_ms_per_frame": 1e3 * t.tracking / frames, "tracking_ms_per_100_frames": t.tracking_ms_by_window(),
         "mapping_ms_per_iteration": m.iteration_ms,
-        "refine_iterations": result.refine_iterations, "mapping": asdict(m), "gaussians": len(result.gaussians),
-        "peak_rss_mb": peak_memory_mb(),
+        "refine_iterations": result.refine_iterations, "mapping": asdict(m), "gaussians": result.gaussian_count,
+        "peak_rss_mb": peak_memory_mb(), "paging": result.paging,
     }  # fmt: skip
 
 
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, in MB (10^6 bytes)."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+    return peak_memory_bytes() / 1e6
 
 
 def _loops(result: SlamResult) -> dict[str, Any]:

@@ -17,22 +17,29 @@ from ggslam.tracking.settings import DepthNoise
 
 if TYPE_CHECKING:
     from ggslam.slam import Slam
+    from ggslam.submaps.gaussian_cells import GaussianCells
 
 PLACES_FILE = "places.npz"
 
 
-def places_to_bytes(slam: Slam) -> bytes | None:
-    """Content of `places.npz`; None if the run looked for no loops and so remembers no places."""
+def places_to_bytes(slam: Slam, cells: GaussianCells | None = None) -> bytes | None:
+    """Content of `places.npz`; None if the run looked for no loops and so remembers no places.
+
+    Args:
+        slam: the run.
+        cells: its map, if that is on disk.
+    """
     if slam.loops is None or not len(slam.surface):
         return None
     noise = slam.tracker.noise or DepthNoise()
+    parts = [slam.map] if cells is None else (part for _, part in cells.parts())
     arrays = {f"surface_{name}": values for name, values in slam.surface.to_arrays().items()}
     arrays |= {f"loops_{name}": values for name, values in slam.loops.to_arrays().items()}
     arrays |= {
         "camera": _camera_row(slam.camera),
         "noise": np.array([noise.constant, noise.square]),
         "keyframe_poses": np.stack([k.T_world_camera for k in slam.mapper.keyframes]),
-        "birth": slam.map.birth_keyframe.numpy().astype(np.int32),
+        "birth": np.concatenate([np.zeros(0, np.int32), *(part.birth_keyframe.numpy() for part in parts)]),
     }  # fmt: skip
     return arrays_to_bytes(**arrays)
 

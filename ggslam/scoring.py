@@ -22,7 +22,7 @@ from ggslam.formats.atomic import make_folder, write_text
 from ggslam.object_scoring import ObjectScorer
 from ggslam.progress import Observer
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering_jobs import frame_poses
+from ggslam.rendering_jobs import frame_poses, map_views
 from ggslam.reporting.pictures import color_to_uint8, compare, write_picture
 from ggslam.run_folder import MARKER, RunFolder, json_ready
 from ggslam.scene.frame import Frame
@@ -180,13 +180,14 @@ def _shower(
     folder: RunFolder, poses: dict[int, np.ndarray], pictured: set[int], scorer: ObjectScorer | None
 ) -> Callable[[Frame], tuple[np.ndarray, np.ndarray] | None]:
     """A function that renders the map as a frame's camera sees it, and keeps some of the pictures."""
-    gaussians = folder.gaussians() if scorer is None else scorer.gaussians
+    view_of = map_views(folder, None if scorer is None else scorer.gaussians)
     rasterizer = CpuRasterizer()
 
     def show(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
         if frame.index not in poses:
             return None
         T_camera_world = inverse(poses[frame.index])
+        gaussians = view_of(frame.camera, T_camera_world)
         view = rasterizer.forward(gaussians, frame.camera, T_camera_world, features=scorer is not None)
         color = np.clip(view.image.numpy(), 0, 1).transpose(1, 2, 0)
         depth = np.where(view.alpha.numpy() > 0.5, view.expected_depth.numpy(), 0)

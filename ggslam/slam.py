@@ -10,21 +10,25 @@
 
 from __future__ import annotations
 
+import tempfile
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from ggslam.config import Config
-from ggslam.errors import SequenceError
+from ggslam.errors import ConfigError, SequenceError
 from ggslam.loop_closing import Correction, LoopCloser
+from ggslam.map_paging import MapPager
 from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.votes import vote_labels
+from ggslam.memory_budget import MB, MemoryBudget
 from ggslam.native.loader import NativeContext
 from ggslam.object_masks import ObjectMasks, observations
 from ggslam.saved_places import places_to_bytes
@@ -56,9 +60,15 @@ class Slam:
         camera: of all frames.
         config: all settings.
         has_masks: whether the recording has object masks; None: judged by the first keyframe's frame.
+        paging: folder that what does not fit into `memory_limit_mb` moves to; None: a temporary one.
+
+    Raises:
+        ConfigError: a limit of memory that is less than the program itself takes.
     """
 
-    def __init__(self, camera: Camera, config: Config | None = None, has_masks: bool | None = None) -> None:
+    def __init__(
+        self, camera: Camera, config: Config | None = None, has_masks: bool | None = None, paging: Path | None = None
+    ) -> None:
         self.camera = camera
         self.config = config or Config()
         self.context = NativeContext(self.config.threads or None)
@@ -67,12 +77,16 @@ class Slam:
         learner = IdentityLearner(self.config.identity, self.config.seed) if wanted else None
         self.map = GaussianMap(self.config.sh_degree, IDENTITY_CHANNELS if learner else 0)
         self.tracker = make_tracker(camera, self.config, self.context)
-        self.surface = MeasuredSurface(self.config.tracking.target, self.context)
+        self.pager = make_pager(camera, self.config, paging)
+        archive = None if self.pager is None else self.pager.archive
+        self.surface = MeasuredSurface(self.config.tracking.target, self.context, archive)
         self.loops: LoopCloser | None = None
         if self.config.loops.enabled:
             self.loops = LoopCloser(camera, self.config.loops, self.surface, self.tracker, self.context)
         self.policy = KeyframePolicy(self.config.keyframes)
         self.mapper = Mapper(self.map, self.config.mapping, self.context, self.config.seed, learner)
+        if self.pager is not None:
+            self.pager.serve(self.mapper)
         self.frames: list[TrackedFrame] = []
         self.dropped_frames: list[int] = []
         self.refine_iterations = 0
@@ -95,7 +109,12 @@ class Slam:
             gaussians: the map.
             keyframes: its keyframes.
             objects: its objects.
+
+        Raises:
+            ConfigError: memory is limited, and maps made before are taken whole.
         """
+        if self.pager is not None:
+            raise ConfigError("memory_limit_mb: a run that starts in the map of another (--map) has no limit of memory")
         self.map, self._objects, self._keyframes_made = gaussians, objects, len(keyframes)
         self.mapper.adopt(gaussians, keyframes)
         if objects is None or gaussians.feature_channels != IDENTITY_CHANNELS:
@@ -127,7 +146,12 @@ class Slam:
             self.mapper.run(settings.first_frame_iterations if first else settings.iterations_per_frame)
         self.times.stop()
         seconds = time.perf_counter() - start
-        return StepReport(self.frames[-1], is_keyframe, self.map.count, self.mapper.last_psnr, seconds)
+        return StepReport(self.frames[-1], is_keyframe, self.gaussian_count, self.mapper.last_psnr, seconds)
+
+    @property
+    def gaussian_count(self) -> int:
+        """Gaussians of the map, in memory and on disk."""
+        return self.map.count + (0 if self.pager is None else self.pager.on_disk)
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refine_iterations`), then the result. `progress(done, total)` is called now and then."""
@@ -143,10 +167,13 @@ class Slam:
     def result(self) -> SlamResult:
         """What there is so far. The first call settles the objects: it is for the end."""
         self.times.loops = self.loops.seconds if self.loops is not None else 0.0
+        objects = self._learned_objects()
+        cells = None if self.pager is None else self.pager.settle()
         return SlamResult(
             self.map, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
-            self.refine_iterations, self._learned_objects(), self.loops.events if self.loops else [],
-            places_to_bytes(self),
+            self.refine_iterations, objects, self.loops.events if self.loops else [], places_to_bytes(self, cells),
+            cells, None if self.pager is None else self.pager.report(),
+            [] if self.pager is None else self.pager.budget.notes, None if self.pager is None else self.pager.close,
         )  # fmt: skip
 
     def _learned_objects(self) -> LearnedObjects | None:
@@ -158,6 +185,8 @@ class Slam:
         earlier = None if self._objects is None else self._objects.observations
         seen = observations(self.mapper.keyframes, identity.current, earlier)
         sizes = np.bincount(vote_labels(self.map), minlength=65536)
+        if self.pager is not None:
+            sizes += self.pager.vote_sizes()
         noise = self.masks.noise(identity.classifier.class_ids, seen, len(self.mapper.keyframes), sizes)
         identity.forget(self.map, noise)
         self.mapper.finish_identity()
@@ -234,18 +263,25 @@ class Slam:
         """
         for T_new_old in self._moves[moves_followed:]:
             tracking = replace(tracking, T_world_camera=T_new_old @ tracking.T_world_camera)
-        self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
+        if self.pager is not None:
+            self.pager.prepare(tracking.T_world_camera, frame.depth)
+        before = self.map.count
+        keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
+        added = self.map.count - before
         with self._publishing:
             self.surface.add(tracking.points, tracking.T_world_camera)
-        if self.loops is None:
-            return
-        correction = self.loops.add(frame, tracking)
-        if correction is not None:
+        correction = None if self.loops is None else self.loops.add(frame, tracking)
+        if self.loops is not None and correction is not None:
             self._correct(self.loops, correction)
+        if self.pager is not None:
+            self.pager.inserted(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
 
     def _correct(self, loops: LoopCloser, correction: Correction) -> None:
         """Moves the map after its keyframes, takes out what is double now, and trains both ends of the loop."""
         self.mapper.move_keyframes(correction.T_new_old)
+        if self.pager is not None:
+            self.pager.move_keyframes(correction.T_new_old)
+            self.pager.bring_ends(correction.kept & correction.active)
         with self._publishing:
             loops.settle(correction)
             self._moves.append(correction.T_new_old[-1])
@@ -274,6 +310,14 @@ def make_tracker(camera: Camera, config: Config, context: NativeContext) -> Trac
     if config.tracker == "features":
         return FeatureTracker(camera, config.tracking, config.features, context)
     return Tracker(camera, config.tracking, context)
+
+
+def make_pager(camera: Camera, config: Config, folder: Path | None) -> MapPager | None:
+    """Who keeps a run within its limit of memory, if it has one."""
+    if not config.memory_limit_mb:
+        return None
+    budget = MemoryBudget(int(config.memory_limit_mb * MB), int(config.paging.budget_mb * MB))
+    return MapPager(camera, config.paging, budget, folder or Path(tempfile.mkdtemp(prefix="ggslam-")))
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:

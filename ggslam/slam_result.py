@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +16,7 @@ from ggslam.mapping.mapper import MapperTimes
 from ggslam.objects.table import Observation, Supervision
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.tracking.tracker import TrackingStatus
 
 
@@ -130,6 +132,10 @@ class SlamResult:
         objects: what was learned about objects; None if nothing was.
         places: content of `places.npz`; None if the run remembered no places.
         loop_events: closures and what became of other candidates, frames found again.
+        cells: the map, if memory was limited and not enough for it; `gaussians` is empty then. Use `parts`.
+        paging: figures of a run whose memory was limited, see `MapPager.report`.
+        notes: what the user should know of it.
+        release: removes its files.
     """
 
     gaussians: GaussianMap
@@ -142,6 +148,27 @@ class SlamResult:
     objects: LearnedObjects | None = None
     loop_events: list[LoopEvent] = field(default_factory=list)
     places: bytes | None = None
+    cells: GaussianCells | None = None
+    paging: dict[str, float] | None = None
+    notes: list[str] = field(default_factory=list)
+    release: Callable[[], None] | None = None
+
+    def close(self) -> None:
+        """Removes what is on disk of map and keyframes, if anything is; it cannot be read any more."""
+        if self.release is not None:
+            self.release()
+
+    @property
+    def gaussian_count(self) -> int:
+        """Gaussians of the map."""
+        return len(self.gaussians) if self.cells is None else self.cells.count
+
+    def parts(self) -> Iterator[GaussianMap]:
+        """The map in parts, in the order of map.ply: a map that was paged by cells, another one as a whole."""
+        if self.cells is None:
+            yield self.gaussians
+        else:
+            yield from (part for _, part in self.cells.parts())
 
     def trajectory(self) -> np.ndarray:
         """T_world_camera of every frame, float64 [n, 4, 4], NaN for lost ones; the world is the first keyframe's

@@ -9,14 +9,14 @@ On request, properties that viewers pass over: `object_id` (int) and `identity_0
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from ggslam.errors import FormatError
-from ggslam.formats.ply import read_ply, write_ply
+from ggslam.formats.ply import read_ply, write_ply_parts
 from ggslam.scene.gaussian_map import GaussianMap
 
 EXTRAS = ("object_id", "identity")
@@ -41,9 +41,36 @@ def write_gaussian_ply(
         ValueError: an unknown extra.
         RunFolderError: the file cannot be written.
     """
+    write_gaussian_parts(path, len(gaussians), [gaussians], gaussians, extra, comments)
+
+
+def write_gaussian_parts(
+    path: str | Path, count: int, parts: Iterable[GaussianMap], like: GaussianMap, extra: Collection[str] = (),
+    comments: Sequence[str] = (),
+) -> None:  # fmt: skip
+    """Writes a map that comes in parts, which need never be in memory all at once.
+
+    Args:
+        path, extra, comments: as in `write_gaussian_ply`.
+        count: Gaussians of all parts together.
+        parts: in the order of the file.
+        like: a map with the channels of the parts, empty perhaps.
+
+    Raises:
+        ValueError: an unknown extra, or another number of Gaussians than `count`.
+        RunFolderError: the file cannot be written.
+    """
     unknown = set(extra) - set(EXTRAS)
     if unknown:
         raise ValueError(f"unknown extra properties {sorted(unknown)}, expected some of {EXTRAS}")
+    empty = GaussianMap(like.sh_degree, like.features.shape[1], with_moments=False)
+    write_ply_parts(
+        path, "vertex", count, (_vertices(part, extra) for part in parts), _vertices(empty, extra).dtype, comments
+    )
+
+
+def _vertices(gaussians: GaussianMap, extra: Collection[str]) -> np.ndarray:
+    """The rows of a map as they are stored, a structured array [N]."""
     count, rest = len(gaussians), gaussians.sh.shape[1] - 1
     quaternions = torch.nn.functional.normalize(gaussians.quaternions, dim=1)
     columns: dict[str, np.ndarray] = {}
@@ -62,7 +89,7 @@ def write_gaussian_ply(
     rows = np.empty(count, [(name, column.dtype.str) for name, column in columns.items()])
     for name, column in columns.items():
         rows[name] = column
-    write_ply(path, {"vertex": rows}, comments)
+    return rows
 
 
 def _add(columns: dict[str, np.ndarray], names: Sequence[str], values: torch.Tensor) -> None:
@@ -80,7 +107,14 @@ def read_gaussian_ply(path: str | Path, device: torch.device | str = "cpu", with
     Raises:
         FormatError: no PLY file, no Gaussians in it, properties missing, or values that are not finite.
     """
-    vertex = read_ply(path).elements.get("vertex")
+    return gaussians_of_vertices(path, read_ply(path).elements.get("vertex"), device, with_moments)
+
+
+def gaussians_of_vertices(
+    path: str | Path, vertex: np.ndarray | None, device: torch.device | str = "cpu", with_moments: bool = True
+) -> GaussianMap:
+    """The map in the rows of a PLY file, or in some of them (structured array, None: the file has none); `path`,
+    arguments and errors as in `read_gaussian_ply`."""
     names = (vertex.dtype.names or ()) if vertex is not None else ()
     missing = [name for name in _REQUIRED if name not in names]
     if vertex is None or missing:

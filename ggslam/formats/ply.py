@@ -6,7 +6,7 @@ Specification: G. Turk, "The PLY Polygon File Format", 1994.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -69,16 +69,46 @@ def write_ply(
         ValueError: a name, type or comment that PLY cannot express.
         RunFolderError: the file cannot be written.
     """
+    with atomic_write(path, fsync) as temporary, temporary.open("wb") as file:
+        file.write(_header({name: (len(rows), rows.dtype) for name, rows in elements.items()}, comments))
+        for rows in elements.values():
+            file.write(_packed(rows).tobytes())
+
+
+def write_ply_parts(
+    path: str | Path, element: str, count: int, parts: Iterable[np.ndarray], dtype: np.dtype,
+    comments: Sequence[str] = (),
+) -> None:  # fmt: skip
+    """Writes a file of one element whose rows come in parts, atomically, so that they are never all in memory.
+
+    Args:
+        path, comments: as in `write_ply`.
+        element: its name ("vertex").
+        count: rows of all parts together.
+        parts: structured arrays of type `dtype`.
+
+    Raises:
+        ValueError: a name, type or comment that PLY cannot express, or another number of rows than `count`.
+        RunFolderError: the file cannot be written.
+    """
+    written = 0
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        file.write(_header({element: (count, dtype)}, comments))
+        for rows in parts:
+            file.write(_packed(rows).tobytes())
+            written += len(rows)
+        if written != count:
+            raise ValueError(f"{path}: {written} rows were given, {count} were announced")
+
+
+def _header(elements: Mapping[str, tuple[int, np.dtype]], comments: Sequence[str]) -> bytes:
     for text in comments:
         if not text.isascii() or not text.isprintable():
             raise ValueError(f"a PLY comment must be one line of ASCII, found {text!r}")
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
-    for name, rows in elements.items():
-        lines += [f"element {_checked_name(name)} {len(rows)}", *_declarations(rows.dtype)]
-    with atomic_write(path, fsync) as temporary, temporary.open("wb") as file:
-        file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
-        for rows in elements.values():
-            file.write(_packed(rows).tobytes())
+    for name, (count, dtype) in elements.items():
+        lines += [f"element {_checked_name(name)} {count}", *_declarations(dtype)]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
 def _checked_name(name: str) -> str:

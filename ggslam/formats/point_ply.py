@@ -7,19 +7,26 @@ metres = origin + voxel_size * (grid coordinate).
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.formats.ply import read_ply, write_ply
+from ggslam.formats.atomic import write_failure
+from ggslam.formats.ply import read_ply, write_ply, write_ply_parts
 from ggslam.formats.point_sampling import VoxelCloud, sample_points
 
 __all__ = ["GRID_FILE", "METRIC_FILE", "VoxelCloud", "grid_positions", "read_points", "sample_points",
-           "write_grid_points", "write_metric_points", "write_points"]  # fmt: skip
+           "write_grid_points", "write_metric_points", "write_points", "write_points_in_parts"]  # fmt: skip
 
 METRIC_FILE, GRID_FILE = "points.ply", "points_grid.ply"
 _COLORS = ("red", "green", "blue")
+_METRIC, _GRID = "x y z are metres", "x y z are grid coordinates; metres = origin + voxel_size * (x, y, z)"
+_ROWS_AT_ONCE = 1 << 15
 
 
 def write_points(folder: str | Path, cloud: VoxelCloud) -> None:
@@ -32,15 +39,67 @@ def write_points(folder: str | Path, cloud: VoxelCloud) -> None:
     write_grid_points(Path(folder) / GRID_FILE, cloud)
 
 
+def write_points_in_parts(folder: str | Path, clouds: Iterable[VoxelCloud]) -> int:
+    """Like `write_points` for a cloud that comes in parts on one grid, which are never all in memory; the order is
+    that of the parts. Returns the number of points.
+
+    Raises:
+        RunFolderError: a file cannot be written.
+    """
+    folder = Path(folder)
+    with _temporary_file(folder) as raw:  # until all parts are there, the corner is not known
+        whole, count, dtype = _gathered(raw, clouds)
+        for name, meaning, code in ((METRIC_FILE, _METRIC, "f4"), (GRID_FILE, _GRID, "i4")):
+            rows = (_vertices(c.points if code == "f4" else c.grid, code, c) for c in _read_back(raw, whole, dtype))
+            empty = _vertices(np.empty((0, 3)), code, whole)
+            write_ply_parts(folder / name, "vertex", count, rows, empty.dtype, _comments(whole, meaning))
+    return count
+
+
+@contextmanager
+def _temporary_file(folder: Path) -> Iterator[IO[bytes]]:
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            yield file
+    except OSError as error:
+        raise write_failure(folder, error) from error
+
+
+def _gathered(raw: IO[bytes], clouds: Iterable[VoxelCloud]) -> tuple[VoxelCloud, int, np.dtype]:
+    """Writes the rows of clouds, grid coordinates counted from the world's origin; gives an empty cloud with scale,
+    lowest corner and whether there are objects, the number of rows and their type."""
+    count, size, corner, dtype = 0, 1.0, np.full(3, np.iinfo(np.int64).max), np.dtype("u1")
+    ids: np.ndarray | None = None
+    for cloud in clouds:
+        size, ids = cloud.voxel_size, None if cloud.object_id is None else cloud.object_id[:0]
+        grid = cloud.grid + np.rint(cloud.origin / size).astype(np.int64)
+        corner = np.minimum(corner, grid.min(0))
+        rows = _vertices(grid, "i4", cloud)
+        raw.write(rows.tobytes())
+        count, dtype = count + len(rows), rows.dtype
+    corner = corner if count else np.zeros(3, np.int64)
+    nothing = np.empty((0, 3), np.int32)
+    return VoxelCloud(nothing, nothing.astype(np.uint8), ids, size, corner * size), count, dtype
+
+
+def _read_back(raw: IO[bytes], whole: VoxelCloud, dtype: np.dtype) -> Iterator[VoxelCloud]:
+    corner = np.rint(whole.origin / whole.voxel_size).astype(np.int64)
+    raw.seek(0)
+    while len(rows := np.frombuffer(raw.read(_ROWS_AT_ONCE * dtype.itemsize), dtype)):
+        grid = np.stack([rows[name] for name in "xyz"], 1).astype(np.int64) - corner
+        colors = np.stack([rows[name] for name in _COLORS], 1)
+        ids = None if whole.object_id is None else rows["object_id"]
+        yield VoxelCloud(grid.astype(np.int32), colors, ids, whole.voxel_size, whole.origin)
+
+
 def write_metric_points(path: str | Path, cloud: VoxelCloud) -> None:
     """Writes positions as float32 metres with uint8 colours; raises RunFolderError if that fails."""
-    write_ply(path, {"vertex": _vertices(cloud.points, "f4", cloud)}, _comments(cloud, "x y z are metres"))
+    write_ply(path, {"vertex": _vertices(cloud.points, "f4", cloud)}, _comments(cloud, _METRIC))
 
 
 def write_grid_points(path: str | Path, cloud: VoxelCloud) -> None:
     """Writes positions as int32 grid coordinates with uint8 colours; raises RunFolderError if that fails."""
-    comments = _comments(cloud, "x y z are grid coordinates; metres = origin + voxel_size * (x, y, z)")
-    write_ply(path, {"vertex": _vertices(cloud.grid, "i4", cloud)}, comments)
+    write_ply(path, {"vertex": _vertices(cloud.grid, "i4", cloud)}, _comments(cloud, _GRID))
 
 
 def read_points(path: str | Path) -> VoxelCloud:
@@ -81,7 +140,7 @@ def _vertices(position: np.ndarray, code: str, cloud: VoxelCloud) -> np.ndarray:
     fields = [(name, code) for name in "xyz"] + [(name, "u1") for name in _COLORS]
     if cloud.object_id is not None:
         fields.append(("object_id", "i4"))
-    rows = np.empty(len(cloud), fields)
+    rows = np.empty(len(position), fields)
     for axis, name in enumerate("xyz"):
         rows[name] = position[:, axis]
     for channel, name in enumerate(_COLORS):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,13 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import quaternion_to_matrix
 
 _CHUNK = 300_000
-"""Samples held in memory at a time."""
+"""Samples held in memory at a time..."""
+_SMALL_CHUNK = 40_000
+"""...and where memory is scarce (a sample takes some 350 bytes)."""
+_FEW = 150_000
+"""Voxels that are sampled, where Gaussians come in parts, before one looks which are finished."""
+_BLOCK_EDGE = 0.25
+"""Metres: how finely it is known where parts to come reach."""
 _SPACING = 0.7
 """Distance of samples in voxels; below 1/sqrt(2) a lattice turned in its plane still meets every voxel of the plane."""
 _MOST_STEPS = 40
@@ -70,8 +76,92 @@ def sample_points(
     """
     if not voxel_size > 0 or not 0 < minimum_opacity < 1:
         raise ValueError(f"impossible voxel size {voxel_size} or minimum opacity {minimum_opacity}")
-    merged, pending, waiting = _Sums.empty(), [], 0
-    for position, weight, color, object_id in _samples(gaussians, voxel_size, minimum_opacity):
+    merged = _summed(_Sums.empty(), gaussians, voxel_size, minimum_opacity, with_object_id)
+    return _cloud(merged, voxel_size, with_object_id)
+
+
+@dataclass(frozen=True)
+class MapPart:
+    """A part of a map that is not in memory: corners float64 [3] of the box its Gaussians reach to, and how to get
+    it."""
+
+    low: np.ndarray
+    high: np.ndarray
+    load: Callable[[], GaussianMap]
+
+
+def sample_parts(
+    parts: Sequence[MapPart], voxel_size: float = 0.01, minimum_opacity: float = 0.3, with_object_id: bool = False
+) -> Iterator[VoxelCloud]:
+    """Like `sample_points` of all parts together, in clouds one after the other, each with an origin of its own.
+
+    The parts are swept along the longest side of the map; voxels that no later part reaches are handed out. So no more
+    is in memory than one part, and voxels at the borders of those that were done to those that were not.
+    """
+    if not parts:
+        return
+    lows, highs = np.stack([part.low for part in parts]), np.stack([part.high for part in parts])
+    blocks = _Blocks(np.floor(lows / voxel_size) - 1, np.ceil(highs / voxel_size) + 1, voxel_size)
+    waiting, pending, sampled = _Sums.empty(), [], 0
+    for number in np.argsort(lows[:, int((highs.max(0) - lows.min(0)).argmax())], kind="stable").tolist():
+        part = parts[number].load()
+        pending.append(_summed(_Sums.empty(), part, voxel_size, minimum_opacity, with_object_id, _SMALL_CHUNK))
+        blocks.is_done(number)
+        sampled += len(pending[-1].key)
+        if sampled < max(_FEW, len(waiting.key)) and not blocks.all_done:  # joining costs as much as what waits
+            continue
+        waiting, pending, sampled = _Sums.of([waiting, *pending]), [], 0
+        done = blocks.finished(waiting.key)
+        if done.any():
+            yield _cloud(waiting.of_rows(done), voxel_size, with_object_id)
+            waiting = waiting.of_rows(~done)
+
+
+class _Blocks:
+    """The space that boxes reach into, in cubes; tells which voxels no box to come reaches.
+
+    Args:
+        low, high: corners of the boxes, voxels [M, 3].
+    """
+
+    def __init__(self, low: np.ndarray, high: np.ndarray, voxel_size: float) -> None:
+        self._edge = max(1, round(_BLOCK_EDGE / voxel_size))
+        self._of_box = [self._between(a, b) for a, b in zip(low // self._edge, high // self._edge, strict=True)]
+        self._keys, counts = np.unique(np.concatenate(self._of_box), return_counts=True)
+        self._to_come = counts
+        self._boxes_left = len(low)
+
+    @staticmethod
+    def _between(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        axes = [np.arange(int(a), int(b) + 1) for a, b in zip(low, high, strict=True)]
+        return _packed(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3))
+
+    @property
+    def all_done(self) -> bool:
+        """Whether no box is to come."""
+        return self._boxes_left == 0
+
+    def is_done(self, box: int) -> None:
+        """A box is not to come any more."""
+        self._to_come[np.searchsorted(self._keys, self._of_box[box])] -= 1
+        self._boxes_left -= 1
+
+    def finished(self, voxels: np.ndarray) -> np.ndarray:
+        """Whether voxels (packed, [N]) lie in the cubes of no box to come, bool [N]."""
+        if not len(voxels) or self.all_done:
+            return np.ones(len(voxels), bool)
+        key = _packed(_unpacked(voxels) // self._edge)
+        place = np.searchsorted(self._keys, key).clip(max=len(self._keys) - 1)
+        return (self._keys[place] != key) | (self._to_come[place] == 0)
+
+
+def _summed(
+    merged: _Sums, gaussians: GaussianMap, voxel_size: float, minimum_opacity: float, with_object_id: bool,
+    chunk: int = _CHUNK,
+) -> _Sums:  # fmt: skip
+    """The sums with those of a map's samples, of which `chunk` are in memory at a time."""
+    pending, waiting = [], 0
+    for position, weight, color, object_id in _samples(gaussians, voxel_size, minimum_opacity, chunk):
         lattice = np.rint(position / voxel_size)
         if np.abs(lattice).max(initial=0) >= 1 << (_BITS - 1):
             raise ValueError(f"the map spans more than 2^{_BITS} voxels of {voxel_size} m")
@@ -81,8 +171,7 @@ def sample_points(
         waiting += len(part.key)
         if waiting > len(merged.key):  # rarely, so that all merging together costs about as much as one sort
             merged, pending, waiting = _Sums.of([merged, *pending]), [], 0
-    merged = _Sums.of([merged, *pending])
-    return _cloud(merged, voxel_size, with_object_id)
+    return _Sums.of([merged, *pending])
 
 
 def _packed(lattice: np.ndarray) -> np.ndarray:
@@ -97,7 +186,7 @@ def _unpacked(key: np.ndarray) -> np.ndarray:
 
 
 def _samples(
-    gaussians: GaussianMap, voxel_size: float, minimum_opacity: float
+    gaussians: GaussianMap, voxel_size: float, minimum_opacity: float, chunk: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
     """Chunks of (position [M, 3], weight [M], colour [M, 3] in [0, 1], object id [M]), float64 and int32."""
     opacity = gaussians.opacities.detach().cpu().numpy().astype(np.float64)
@@ -118,7 +207,7 @@ def _samples(
     bounds = np.concatenate([[0], np.cumsum(per_gaussian)])
     start = 0
     while start < len(used):
-        stop = max(start + 1, int(np.searchsorted(bounds, bounds[start] + _CHUNK, side="right")) - 1)
+        stop = max(start + 1, int(np.searchsorted(bounds, bounds[start] + chunk, side="right")) - 1)
         owner = np.repeat(np.arange(start, stop), per_gaussian[start:stop])
         number = np.arange(bounds[start], bounds[stop]) - bounds[owner]
         offset = _lattice_point(number, steps[owner]) * step[owner]
@@ -147,6 +236,10 @@ class _Sums:
     @staticmethod
     def empty() -> _Sums:
         return _Sums(np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0), np.empty((0, 3)))
+
+    def of_rows(self, chosen: np.ndarray) -> _Sums:
+        """Some rows, bool [N]."""
+        return _Sums(self.key[chosen], self.label[chosen], self.weight[chosen], self.color[chosen])
 
     @staticmethod
     def of(parts: list[_Sums]) -> _Sums:

@@ -11,8 +11,7 @@ they are the ones that can be verified.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from itertools import chain
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,6 +19,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.features.orb import Landmarks, View
 from ggslam.loops.settings import PlaceSettings
+from ggslam.loops.word_lists import WordLists
 from ggslam.scene.camera import Camera
 
 _SEED = 0
@@ -32,7 +32,7 @@ class Place:
 
     Attributes:
         landmarks: its features with depth.
-        words: int64 [w], sorted.
+        words: int64 [w], sorted; empty in the index, which has them in its lists.
         codes: uint8 [ferns].
     """
 
@@ -70,10 +70,16 @@ class PlaceIndex:
         self._positions: dict[int, int] = {}
         self._places: list[Place] = []
         self._codes, self._sizes = np.zeros((16, s.ferns), np.uint8), np.zeros(16)
-        self._lists: dict[int, list[int]] = {}
+        self._lists = WordLists(s.tables << s.bits)
 
     def __len__(self) -> int:
         return len(self._numbers)
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory that the places take, about."""
+        marks = sum(place.landmarks.descriptors.nbytes + place.landmarks.points.nbytes for place in self._places)
+        return marks + self._lists.held_bytes + self._codes.nbytes
 
     def __contains__(self, number: int) -> bool:
         return number in self._positions
@@ -96,13 +102,12 @@ class PlaceIndex:
             raise ValueError(f"keyframe {number} is in the index already")
         position = self._positions[number] = len(self._numbers)
         self._numbers.append(number)
-        self._places.append(place)
+        self._places.append(replace(place, words=place.words[:0].copy()))  # only a query needs them
         if position == len(self._codes):
             self._codes = np.concatenate([self._codes, np.zeros_like(self._codes)])
             self._sizes = np.concatenate([self._sizes, np.zeros_like(self._sizes)])
         self._codes[position], self._sizes[position] = place.codes, len(place.words)
-        for word in place.words.tolist():
-            self._lists.setdefault(word, []).append(position)
+        self._lists.add(place.words, position)
 
     def query(
         self, place: Place, count: int, excluded: Callable[[int], bool] = lambda number: False
@@ -179,14 +184,8 @@ class PlaceIndex:
 
         The rarest words are looked up first, until so many entries were read: a query takes no longer in a large index.
         """
-        lists = [found for word in place.words.tolist() if (found := self._lists.get(word))]
-        lists.sort(key=len)
-        lengths = np.array([len(found) for found in lists], int)
-        read = int(np.searchsorted(np.cumsum(lengths), self.settings.entries, "right"))
-        lists, lengths = lists[:read], lengths[:read]
-        hits = np.fromiter(chain.from_iterable(lists), int, int(lengths.sum()))
-        weights = np.repeat(np.log((1 + len(self)) / lengths) ** 2, lengths)
-        scores = np.bincount(hits, weights, minlength=len(self))
+        hits, lengths = self._lists.hits(place.words, self.settings.entries)
+        scores = np.bincount(hits, np.log((1 + len(self)) / lengths) ** 2, minlength=len(self))
         return scores / np.sqrt(np.maximum(self._sizes[: len(self)], 1) * max(len(place.words), 1))
 
     @staticmethod

@@ -15,6 +15,7 @@ nearest neighbours. Otherwise than there
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -73,6 +74,7 @@ class IdentityLearner:
         self._alias = np.arange(65536, dtype=np.uint16)
         self._whole_of = np.zeros(65536, np.uint16)
         self._shown: np.ndarray | None = None  # labels by votes, of the last keyframe's time
+        self._shown_order = -1
         self._pools: dict[int, PixelPool] = {}
         self._index = NeighbourIndex(self.settings.neighbours.growth)
         self._iterations = 0
@@ -85,6 +87,23 @@ class IdentityLearner:
     def resume(self, classifier: IdentityClassifier) -> None:
         """Goes on with the classes of a map made before, whose Gaussians bring their vectors and votes."""
         self.table.resume(classifier)
+
+    # --- a map that is partly on disk ---------------------------------------------------------------------------------
+
+    def catch_up(self, gaussians: GaussianMap) -> None:
+        """The votes of Gaussians that were on disk follow the merges and removals of objects since; their identity
+        vectors are left to further steps."""
+        if (self._alias != np.arange(65536)).any():
+            merge_votes(gaussians, self._alias)
+
+    def catch_up_and_label(self, gaussians: GaussianMap) -> None:
+        """The end for a part of the map that was on disk, see `label`."""
+        self.catch_up(gaussians)
+        self.label(gaussians)
+
+    def keep_pools(self, keyframes: Iterable[int]) -> None:
+        """Forgets the pixels that were drawn ahead from any but these keyframes."""
+        self._pools = {number: self._pools[number] for number in keyframes if number in self._pools}
 
     # --- objects ------------------------------------------------------------------------------------------------------
 
@@ -143,8 +162,8 @@ class IdentityLearner:
         """Labels of pixels, those of a whole replaced by its part's where the map shows the part."""
         if not self._whole_of.any():
             return labels
-        if self._shown is None or len(self._shown) != len(gaussians):
-            self._shown = vote_labels(gaussians)
+        if self._shown is None or self._shown_order != gaussians.order or len(self._shown) != len(gaussians):
+            self._shown, self._shown_order = vote_labels(gaussians), gaussians.order
         shown, _ = terms.labels(self._shown)
         return np.where((self._whole_of[shown] == labels) & (shown > 0), shown, labels)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ggslam.formats.array_archive import ArrayArchive
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
@@ -15,6 +16,7 @@ ELSEWHERE = -1
 """Frame index of keyframes that are of another recording than the run's: of the map that it began with."""
 DEPTH_UNITS_PER_METRE = 5000.0
 """Depth of keyframes is kept as uint16 in units of 0.2 mm (range 13.1 m), the resolution of the TUM recordings."""
+_IMAGES = ("color", "depth", "mask")
 
 
 @dataclass
@@ -38,9 +40,29 @@ class Keyframe:
     color: np.ndarray
     depth: np.ndarray
     T_camera_world: np.ndarray
-    mask: np.ndarray | None = None
+    mask: np.ndarray | None = field(default_factory=lambda: None)
     exposure: np.ndarray = field(default_factory=lambda: np.tile([1.0, 0.0], (3, 1)))
     iterations: int = 0
+    archive: ArrayArchive | None = None
+    """Has the images once they were put away; they are read from there."""
+
+    def put_away(self, archive: ArrayArchive) -> None:
+        """Hands the images to an archive, which keeps them in memory or not. They must not be changed any more."""
+        images = {name: image for name in _IMAGES if (image := getattr(self, name)) is not None}
+        archive.put(self._name, images)
+        self.archive = archive
+        for name in images:
+            delattr(self, name)
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        """Images that were put away; asked only for what the object itself does not have."""
+        if name not in _IMAGES or self.archive is None:
+            raise AttributeError(name)
+        return self.archive.get(self._name)[name]
+
+    @property
+    def _name(self) -> str:
+        return f"keyframe{self.index:06d}"
 
     @property
     def T_world_camera(self) -> np.ndarray:

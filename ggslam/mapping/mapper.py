@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,6 +20,7 @@ from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, m
 from ggslam.mapping.labelling import KeyframeLabels, Labeller, MapLabels
 from ggslam.mapping.losses import ImageLoss, KeyframeImages
 from ggslam.mapping.pruning import prune
+from ggslam.mapping.residency import Residency
 from ggslam.mapping.sampling import KeyframeSampler
 from ggslam.mapping.settings import MapperSettings
 from ggslam.mapping.votes import vote_labels
@@ -83,6 +84,8 @@ class Mapper:
         self.last_psnr = float("nan")
         self.depth_sigma = 0.004
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
+        self.residency: Residency | None = None
+        """Who keeps a part of the map on disk; None: all of it is in memory."""
         self._rasterizer = CpuRasterizer(context=context)
         self._loss = ImageLoss(context)
         self._standard_adam = self._adam(1.0)
@@ -138,7 +141,9 @@ class Mapper:
             iterations: optimisation steps, on keyframes of either end by turns.
         """
         remove_duplicates(self.map, np.array(kept, int), np.array(doubted, int), 2 * self.depth_sigma)
-        ends = [self.keyframes[n] for pair in zip(reversed(doubted), reversed(kept), strict=False) for n in pair]
+        there = set(self._trainable())
+        pairs = zip(reversed(doubted), reversed(kept), strict=False)
+        ends = [self.keyframes[n] for pair in pairs for n in pair if n in there]
         for i in range(iterations if ends else 0):
             self.iterate(ends[i % len(ends)])
 
@@ -195,8 +200,25 @@ class Mapper:
 
     def run(self, iterations: int) -> None:
         """Optimisation steps, see `KeyframeSampler` for their order."""
+        numbers = self._trainable()
         for _ in range(iterations):
-            self.iterate(self.keyframes[self._sampler.draw(len(self.keyframes))])
+            self.iterate(self._drawn(numbers))
+
+    def _trainable(self) -> Sequence[int]:
+        return range(len(self.keyframes)) if self.residency is None else self.residency.trainable()
+
+    def _drawn(self, numbers: Sequence[int]) -> Keyframe:
+        return self.keyframes[numbers[self._sampler.draw(len(numbers))]]
+
+    def _stages(self, steps: int) -> Iterator[tuple[Sequence[int], int]]:
+        """Keyframes to train together, and how many of `steps` are theirs: as many as their share of all keyframes."""
+        if self.residency is None:
+            yield range(len(self.keyframes)), steps
+            return
+        done = 0
+        for numbers in self.residency.stages():
+            before, done = done, done + len(numbers)
+            yield numbers, steps * done // len(self.keyframes) - steps * before // len(self.keyframes)
 
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
         """One optimisation step on one keyframe: forward, loss, backward with the optimizer fused in.
@@ -234,12 +256,15 @@ class Mapper:
         self.last_psnr = loss.psnr
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None) -> None:
-        """Final refinement: learning rates fall exponentially."""
-        for i in range(iterations):
-            factor = self.settings.refine_decay ** (i / max(1, iterations - 1))
-            self.iterate(self.keyframes[self._sampler.draw(len(self.keyframes))], factor)
-            if progress is not None and (i % 20 == 19 or i + 1 == iterations):
-                progress(i + 1, iterations)
+        """Final refinement: learning rates fall exponentially, for each part of a map that is in memory by turns."""
+        done = 0
+        for numbers, steps in self._stages(iterations):
+            for i in range(steps):
+                factor = self.settings.refine_decay ** (i / max(1, steps - 1))
+                self.iterate(self._drawn(numbers), factor)
+                done += 1
+                if progress is not None and (done % 20 == 0 or done == iterations):
+                    progress(done, iterations)
 
     def finish_identity(self) -> None:
         """The last identity steps, see `IdentitySettings.final_passes`, and every Gaussian's object. Colours, shapes
@@ -247,14 +272,15 @@ class Mapper:
         if self.identity is None:
             return
         start, settings = time.perf_counter(), self.identity.settings
-        steps = settings.final_passes * len(self.keyframes) if settings.schedule == "sampled" else 0
-        for i in range(0, steps, FINAL_STEPS_A_VIEW):
-            keyframe = self.keyframes[self._sampler.draw(len(self.keyframes))]
-            if keyframe.mask is None:
-                continue
-            view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
-            for _ in range(FINAL_STEPS_A_VIEW):
-                self.identity.step(self.map, self._rasterizer, keyframe, view, FINAL_DECAY ** (i / steps))
+        total = settings.final_passes * len(self.keyframes) if settings.schedule == "sampled" else 0
+        for numbers, steps in self._stages(total) if total else ():
+            for i in range(0, steps, FINAL_STEPS_A_VIEW):
+                keyframe = self._drawn(numbers)
+                if keyframe.mask is None:
+                    continue
+                view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
+                for _ in range(FINAL_STEPS_A_VIEW):
+                    self.identity.step(self.map, self._rasterizer, keyframe, view, FINAL_DECAY ** (i / steps))
         self.identity.label(self.map)
         self.times.identity_finish += time.perf_counter() - start
 

@@ -7,7 +7,7 @@ import difflib
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -108,22 +108,31 @@ class ObjectTable:
         Raises:
             ValueError: an object id outside 0 to 65535.
         """
-        ids = gaussians.object_id.numpy()
-        if len(ids) and not 0 <= ids.min() <= ids.max() < 1 << 16:
-            raise ValueError(f"object ids must be 0 to 65535, found {ids.min()} to {ids.max()}")
-        order = np.argsort(ids, kind="stable")
-        present, starts = np.unique(ids[order], return_index=True)
-        rows = dict(zip(present.tolist(), np.split(order, starts[1:]), strict=True)) if len(ids) else {}
-        unlabelled = len(rows.pop(0, []))
+        return ObjectTable.of_parts([gaussians], classifier, supervision, names, observations)
+
+    @staticmethod
+    def of_parts(
+        parts: Iterable[GaussianMap],
+        classifier: IdentityClassifier,
+        supervision: Supervision,
+        names: Mapping[int, str] | None = None,
+        observations: Mapping[int, Observation] | None = None,
+    ) -> ObjectTable:
+        """Like `build` for a map that comes in parts; of them, centres and opacities of labelled Gaussians are kept in
+        memory until the end (16 bytes each)."""
+        gathered: dict[int, _Gathered] = {}
+        unlabelled = 0
+        for part in parts:
+            unlabelled += _gather(part, classifier, gathered)
         known, seen = names or {}, observations or {}
-        means, opacities, features = gaussians.means.numpy(), gaussians.opacities.numpy(), gaussians.features.numpy()
         records = []
-        for name, own in rows.items():
+        for name, own in sorted(gathered.items()):
             observed = asdict(seen[name]) if name in seen else {}
+            means, opacities = np.concatenate(own.means), np.concatenate(own.opacities)
             records.append(
                 ObjectRecord(
-                    name, known.get(name), _color(name), len(own), _confidence(features[own], name, classifier),
-                    middle_of(means[own], opacities[own]), oriented_box(means[own]), **observed,
+                    name, known.get(name), _color(name), len(means), own.confidence(len(means)),
+                    middle_of(means, opacities), oriented_box(means), **observed,
                 )
             )  # fmt: skip
         return ObjectTable(supervision, unlabelled, records)
@@ -232,8 +241,43 @@ def _color(object_id: int) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _confidence(features: np.ndarray, object_id: int, classifier: IdentityClassifier) -> float | None:
-    """Mean probability of an object over identity vectors [M, F]; None if the classifier has no class for it."""
+@dataclass
+class _Gathered:
+    """What is known of an object so far; the sum of its probabilities is None if the classifier has no class for it."""
+
+    means: list[np.ndarray] = field(default_factory=list)
+    opacities: list[np.ndarray] = field(default_factory=list)
+    probability: float | None = 0.0
+
+    def confidence(self, count: int) -> float | None:
+        """Mean probability over its Gaussians."""
+        if self.probability is None or not math.isfinite(self.probability):
+            return None
+        return min(self.probability / count, 1.0)
+
+
+def _gather(part: GaussianMap, classifier: IdentityClassifier, gathered: dict[int, _Gathered]) -> int:
+    """Adds the labelled Gaussians of a part of a map to their objects; returns how many are not labelled."""
+    ids = part.object_id.numpy()
+    if len(ids) and not 0 <= ids.min() <= ids.max() < 1 << 16:
+        raise ValueError(f"object ids must be 0 to 65535, found {ids.min()} to {ids.max()}")
+    order = np.argsort(ids, kind="stable")
+    present, starts = np.unique(ids[order], return_index=True)
+    rows = dict(zip(present.tolist(), np.split(order, starts[1:]), strict=True)) if len(ids) else {}
+    unlabelled = len(rows.pop(0, []))
+    means, opacities, features = part.means.numpy(), part.opacities.numpy(), part.features.numpy()
+    for name, own in rows.items():
+        found = gathered.setdefault(name, _Gathered())
+        found.means.append(means[own])
+        found.opacities.append(opacities[own])
+        added = _probability(features[own], name, classifier)
+        found.probability = None if added is None or found.probability is None else found.probability + added
+    return unlabelled
+
+
+def _probability(features: np.ndarray, object_id: int, classifier: IdentityClassifier) -> float | None:
+    """Sum of the probabilities of an object over identity vectors [M, F]; None if the classifier has no class for
+    it."""
     try:
         number = classifier.class_of(object_id)
     except KeyError:
@@ -241,5 +285,4 @@ def _confidence(features: np.ndarray, object_id: int, classifier: IdentityClassi
     step, total = max(1, _VALUES_AT_ONCE // len(classifier)), 0.0
     for start in range(0, len(features), step):
         total += float(classifier.probabilities(features[start : start + step])[:, number].sum(dtype=np.float64))
-    confidence = total / len(features)
-    return min(confidence, 1.0) if math.isfinite(confidence) else None
+    return total

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -55,6 +57,9 @@ class GaussianMap:
     """Increases with every change of the set of Gaussians (insert, keep), so that indices can be seen to be stale."""
     order: int = 0
     """Increases when rows change their places or go: indices from before name other Gaussians now."""
+    growth: float = 0.5
+    """Share by which the room grows at least when it is used up, so that inserting is amortised; 0: not more than is
+    needed."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= 3:
@@ -96,9 +101,19 @@ class GaussianMap:
         return self._storage["means"].shape[0]
 
     def reserve(self, rows: int) -> None:
-        """Makes room for `rows` Gaussians in all; grows by half at least, so that inserting is amortised."""
+        """Makes room for `rows` Gaussians in all; grows by the share `growth` at least."""
         if rows > self.capacity:
-            self._allocate(max(rows, self.capacity + self.capacity // 2, 16384))
+            self._allocate(max(rows, self.capacity + int(self.capacity * self.growth), 16384 if self.growth else 0))
+
+    def shrink(self, rows: int) -> None:
+        """Gives back room beyond `rows` Gaussians, if there is more; those there are stay."""
+        if self.capacity > max(rows, self.count):
+            self._allocate(max(rows, self.count))
+
+    @property
+    def bytes_per_gaussian(self) -> int:
+        """Bytes that all arrays together take for one row."""
+        return sum(array.element_size() * math.prod(array.shape[1:]) for array in self._arrays(0).values())
 
     def __len__(self) -> int:
         return self.count
@@ -129,6 +144,39 @@ class GaussianMap:
     def rgb(self) -> torch.Tensor:
         """[N, 3] view-independent part of the colour, unclamped."""
         return sh_to_rgb(self.sh[:, 0])
+
+    # --- whole rows --------------------------------------------------------------------------------------------------
+
+    def _arrays(self, count: int) -> dict[str, torch.Tensor]:
+        """The first `count` rows of every array: parameters, bookkeeping, moments (`means.first`, `means.second`)."""
+        arrays = {name: array[:count] for name, array in self._storage.items()}
+        for name, (first, second) in self._moments.items():
+            arrays |= {f"{name}.first": first[:count], f"{name}.second": second[:count]}
+        return arrays
+
+    def take(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Copies of whole rows, index int64 [M]: everything that is known of these Gaussians, for `append`."""
+        return {name: array[index] for name, array in self._arrays(self.count).items()}
+
+    def append(self, rows: Mapping[str, torch.Tensor]) -> slice:
+        """Adds rows that `take` of a map with the same channels gave, bit for bit; returns where they are now.
+
+        Raises:
+            ValueError: an array is missing or has another shape or type.
+        """
+        added = len(rows["means"]) if "means" in rows else 0
+        for name, array in self._arrays(0).items():
+            found = rows.get(name)
+            if found is None or found.dtype != array.dtype or found.shape != (added, *array.shape[1:]):
+                shape = "nothing" if found is None else f"{found.dtype} {list(found.shape)}"
+                raise ValueError(f"rows of Gaussians: {name}: expected {array.dtype} of {added} rows, found {shape}")
+        self.reserve(self.count + added)
+        place = slice(self.count, self.count + added)
+        for name, array in self._arrays(place.stop).items():
+            array[place] = rows[name]
+        self.count += added
+        self.version += 1
+        return place
 
     # --- changes -----------------------------------------------------------------------------------------------------
 

@@ -11,10 +11,10 @@ G-ICP Gaussian SLAM escapes this by hardly training positions at all, at the pri
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.formats.array_archive import ArrayArchive, Arrays
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transformed
 from ggslam.tracking.gicp import GicpTarget
@@ -27,13 +27,31 @@ FLATNESS = 0.1
 _OPACITY_LOGIT = 3.0
 
 
-@dataclass
 class _Part:
-    """One keyframe's points and normals in its camera's frame, float32 [n, 3]."""
+    """One keyframe's points and normals in its camera's frame, float32 [n, 3]; in an archive if there is one."""
 
-    points: np.ndarray
-    normals: np.ndarray
-    T_world_camera: np.ndarray
+    def __init__(
+        self, number: int, points: np.ndarray, normals: np.ndarray, T_world_camera: np.ndarray,
+        archive: ArrayArchive | None,
+    ) -> None:  # fmt: skip
+        self._name, self._archive = f"surface{number:06d}", archive
+        self.T_world_camera = T_world_camera
+        self.count = len(points)
+        self._arrays: Arrays = {"points": points, "normals": normals}
+        if archive is not None:
+            archive.put(self._name, self._arrays)
+            self._arrays = {}
+
+    @property
+    def points(self) -> np.ndarray:
+        return self._get("points")
+
+    @property
+    def normals(self) -> np.ndarray:
+        return self._get("normals")
+
+    def _get(self, name: str) -> np.ndarray:
+        return (self._arrays if self._archive is None else self._archive.get(self._name))[name]
 
 
 class MeasuredSurface:
@@ -43,10 +61,11 @@ class MeasuredSurface:
     Args:
         settings: voxel sizes and bounds.
         context: threads to work on.
+        archive: keeps the keyframes' points, in memory or not; None: they stay in memory.
     """
 
-    def __init__(self, settings: TargetSettings, context: NativeContext) -> None:
-        self._settings, self._context = settings, context
+    def __init__(self, settings: TargetSettings, context: NativeContext, archive: ArrayArchive | None = None) -> None:
+        self._settings, self._context, self._archive = settings, context, archive
         self._parts: list[_Part] = []
         self.active: set[int] = set()
         """Numbers of the keyframes that take part."""
@@ -58,11 +77,15 @@ class MeasuredSurface:
 
     def add(self, points: FramePoints, T_world_camera: np.ndarray) -> GicpTarget:
         """Adds the points of a keyframe seen from `T_world_camera` [4, 4]; returns the new target."""
-        part = _Part(points.points.copy(), points.normals.copy(), np.array(T_world_camera, float))
-        self.active.add(len(self._parts))
-        self._parts.append(part)
+        part = self._append(points.points.copy(), points.normals.copy(), np.array(T_world_camera, float))
+        self.active.add(len(self._parts) - 1)
         self.target = self._gathered([part], self.target)
         return self.target
+
+    def _append(self, points: np.ndarray, normals: np.ndarray, T_world_camera: np.ndarray) -> _Part:
+        part = _Part(len(self._parts), points, normals, T_world_camera, self._archive)
+        self._parts.append(part)
+        return part
 
     @property
     def poses(self) -> np.ndarray:
@@ -93,7 +116,7 @@ class MeasuredSurface:
         """Everything, for a file: points to 1/32767 of the farthest of a keyframe, normals to half a degree."""
         points = [np.float32(np.abs(p.points).max(initial=1e-6)) for p in self._parts]
         return {
-            "counts": np.array([len(p.points) for p in self._parts], np.int64),
+            "counts": np.array([p.count for p in self._parts], np.int64),
             "reach": np.array(points, np.float32),
             "points": np.concatenate(
                 [np.empty((0, 3), np.int16)]
@@ -120,7 +143,7 @@ class MeasuredSurface:
         ):
             normals = n.astype(np.float32)
             normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-            self._parts.append(_Part(q.astype(np.float32) * (r / np.float32(32767)), normals, T.astype(float)))
+            self._append(q.astype(np.float32) * (r / np.float32(32767)), normals, T.astype(float))
         self.arrange(set(range(len(self._parts))))
 
     def _gathered(self, parts: list[_Part], base: GicpTarget | None) -> GicpTarget:

@@ -1,0 +1,17 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the mapper asks whoever keeps a part of the map on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+
+class Residency(Protocol):
+    """Knows which keyframes see nothing but Gaussians that are in memory."""
+
+    def trainable(self) -> Sequence[int]:
+        """Numbers of these keyframes, rising; at least one if there are any."""
+
+    def stages(self) -> Iterator[Sequence[int]]:
+        """All keyframes, some after the others: while numbers are handed out, these are trainable."""

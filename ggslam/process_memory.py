@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much memory this process takes, and giving back what it does not use."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import sys
+from pathlib import Path
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Numbers of glibc's `mallopt`."""
+_LARGE = 1 << 18
+
+
+def peak_memory_bytes() -> int:
+    """Largest resident memory of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process now; where the system does not tell, the largest so far."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return peak_memory_bytes()
+
+
+def trim() -> None:
+    """Hands freed memory back to the system, where the C library can (glibc keeps much of it for itself)."""
+    release = getattr(_c_library(), "malloc_trim", None)
+    if release is not None:
+        release(0)
+
+
+def release_early() -> None:
+    """From now on memory of large arrays goes back to the system as soon as they are freed, where the C library can be
+    told so (glibc otherwise keeps more and more of them for itself). Costs some time, but not what is computed."""
+    adjust = getattr(_c_library(), "mallopt", None)
+    if adjust is not None:
+        adjust(_MMAP_THRESHOLD, _LARGE)
+        adjust(_TRIM_THRESHOLD, _LARGE)
+
+
+def _c_library() -> ctypes.CDLL | None:
+    try:
+        return ctypes.CDLL(None)
+    except (OSError, TypeError):
+        return None
