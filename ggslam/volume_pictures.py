@@ -9,32 +9,15 @@ import cv2
 import numpy as np
 
 from ggslam.objects.colors import id_palette
-from ggslam.reporting.cloud_pictures import View, draw_cloud
+from ggslam.reporting.cloud_pictures import View, draw_cloud, looking
 from ggslam.reporting.mesh_pictures import draw_mesh
 from ggslam.reporting.pictures import side_by_side
-from ggslam.scene.camera import Camera
 from ggslam.volumes.mesh import Mesh
 from ggslam.volumes.occupancy import OccupancyMap
 
 _WIDTH, _HEIGHT = 800, 600
-_FIELD_OF_VIEW = math.radians(60)
 _ELEVATION = math.radians(40)
 """Angle at which one looks down."""
-
-
-def _camera() -> Camera:
-    focal = 0.5 * _WIDTH / math.tan(_FIELD_OF_VIEW / 2)
-    return Camera(_WIDTH, _HEIGHT, focal, focal, 0.5 * (_WIDTH - 1), 0.5 * (_HEIGHT - 1))
-
-
-def _looking(position: np.ndarray, forward: np.ndarray, up: np.ndarray) -> View:
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, up)
-    right /= max(float(np.linalg.norm(right)), 1e-9)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-    pose[:3, 3] = position
-    return View(_camera(), pose)
 
 
 def from_above(poses: np.ndarray, points: np.ndarray, up: np.ndarray) -> View:
@@ -47,18 +30,18 @@ def from_above(poses: np.ndarray, points: np.ndarray, up: np.ndarray) -> View:
         forward = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     forward /= np.linalg.norm(forward)
     direction = math.cos(_ELEVATION) * forward - math.sin(_ELEVATION) * up
-    view = _looking(middle, direction, up)
+    view = looking(middle, direction, up, _WIDTH, _HEIGHT)
     x, y, z = ((points[:: max(1, len(points) // 20_000)] - middle) @ view.T_world_camera[:3, :3]).T
     camera = view.camera
     tangents = 2 * np.maximum(np.abs(x) / camera.width, np.abs(y) / camera.height) * camera.fx
     back = float(np.percentile(tangents - z, 98))
-    return _looking(middle - back * direction, direction, up)
+    return looking(middle - back * direction, direction, up, _WIDTH, _HEIGHT)
 
 
 def from_a_camera(poses: np.ndarray, up: np.ndarray) -> View:
     """The view of the frame in the middle of the recording, from a step behind it."""
     pose = poses[len(poses) // 2]
-    return _looking(pose[:3, 3] - 0.3 * pose[:3, 2], pose[:3, 2], up)
+    return looking(pose[:3, 3] - 0.3 * pose[:3, 2], pose[:3, 2], up, _WIDTH, _HEIGHT)
 
 
 def mesh_picture(mesh: Mesh, poses: np.ndarray, up: np.ndarray, by_object: bool = False) -> np.ndarray:

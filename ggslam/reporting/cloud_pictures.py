@@ -54,19 +54,26 @@ def outside_view(points: np.ndarray, upwards: np.ndarray, width: int = 960, heig
     side /= np.linalg.norm(side)
     direction = 1.2 * up + 0.4 * side + np.cross(up, side)
     direction /= np.linalg.norm(direction)
-    forward, down = -direction, -up
-    right = np.cross(down, forward)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    view = looking(np.zeros(3), -direction, up, width, height)
+    pose, camera = view.T_world_camera, view.camera
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - (low + high) / 2
     x, y, z = (corners @ pose[:3, :3]).T
     # As near as all corners of the cloud's box stay within the picture.
-    camera = _camera(width, height)
     wide, tall = np.abs(x) / width, np.abs(y) / height
     distance = (2 * _FILLED * camera.fx * np.maximum(wide, tall) - z).max()
     pose[:3, 3] = (low + high) / 2 + direction * distance
     return View(camera, pose)
+
+
+def looking(position: np.ndarray, forward: np.ndarray, up: np.ndarray, width: int = 960, height: int = 720) -> View:
+    """A view from a position [3] in a direction [3] of any length, with `up` [3] upwards in the picture."""
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right /= max(float(np.linalg.norm(right)), 1e-9)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, 3] = position
+    return View(_camera(width, height), pose)
 
 
 def _camera(width: int, height: int) -> Camera:
