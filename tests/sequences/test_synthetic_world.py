@@ -126,7 +126,7 @@ def test_the_seed_decides(world: World, poses: np.ndarray) -> None:
     assert not np.array_equal(world_cloud(world, 0.4, 3), world_cloud(world, 0.4, 2))
 
 
-@pytest.mark.parametrize("size", [25.0, 30.0, 40.0])
+@pytest.mark.parametrize("size", [25.0, 30.0])
 def test_there_is_a_walk_through_every_world(size: float) -> None:
     for seed in range(20):
         made = make_world(size, seed)
