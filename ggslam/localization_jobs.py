@@ -83,7 +83,10 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         recording = _open_recording(request)
         start = _start(request, recording.ground_truth)
         if start is None and isinstance(recording, ScanSequence):
-            raise ConfigError(f"{recording.path}: scans show no places to look up: --start is needed")
+            raise ConfigError(
+                f"{recording.path}: laser scans have no images to look the place of the first one up by: give its pose "
+                f'with --start "x y z qx qy qz qw", or --start {GIVEN} where the recording has poses of its own'
+            )
         store = open_map(request.map, opened, observer)
         context = NativeContext(request.threads)
         settings = store.settings

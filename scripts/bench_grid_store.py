@@ -29,8 +29,9 @@ import numpy as np
 
 from ggslam.submaps.cell_points import POINTS, decode_points, encode_points
 from ggslam.submaps.cell_records import CellWrite
+from ggslam.submaps.cells_around import MapStatus
 from ggslam.submaps.grid import GridStore
-from ggslam.submaps.partial_map import MapStatus, PartialMap
+from ggslam.submaps.partial_map import PartialMap
 from ggslam.submaps.recorder import load_points, store_cloud
 from ggslam.submaps.settings import SubmapSettings
 

@@ -22,6 +22,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
+from kdtree_gicp import TreeSurface, TreeTracker
 
 from ggslam.frame_localization import FrameTracker
 from ggslam.localization import Localization, Localizer, ScanTracker, ScanTrackerSettings
@@ -59,6 +60,7 @@ def main() -> None:
     locate.add_argument("store", type=Path)
     locate.add_argument("sequence", type=Path)
     locate.add_argument("--full", action="store_true")
+    locate.add_argument("--tree", action="store_true", help="the reference of scripts/kdtree_gicp.py")
     locate.add_argument("--voxel", type=float, default=0.15)
     locate.add_argument("--radius", type=float, default=10.0)
     locate.add_argument("--first", type=int, default=0)
@@ -71,7 +73,7 @@ def main() -> None:
     elif a.case == "room":
         found = make_room(a.folder, a.recording, a.stop, a.scale)
     else:
-        found = located(a.store, a.sequence, a.full, a.voxel, a.radius, a.first, a.stop, a.scale)
+        found = located(a.store, a.sequence, a.full, a.tree, a.voxel, a.radius, a.first, a.stop, a.scale)
     print(json.dumps(json_ready({**found, "seconds": time.perf_counter() - began, "peak_mb": peak_memory_mb()})))
 
 
@@ -112,21 +114,26 @@ def make_room(folder: Path, recording: Path, stop: int, scale: float) -> dict[st
 
 
 def located(
-    path: Path, sequence: Path, full: bool, voxel: float, radius: float, first: int, stop: int | None, scale: float
-) -> dict[str, Any]:
+    path: Path, sequence: Path, full: bool, tree: bool, voxel: float, radius: float, first: int, stop: int | None,
+    scale: float,
+) -> dict[str, Any]:  # fmt: skip
     """Locates a recording from its first given pose; times by frame."""
     before = peak_memory_mb()
     context = NativeContext()
     with GridStore.open(path) as store:
         target = replace(SCAN_TARGET if scan_files(sequence) else TargetSettings(), voxel=voxel)
         submaps = replace(store.settings, partial_radius=radius)
-        surface = FullSurface(store, target, context) if full else PartialSurface(store, target, context, submaps)
+        surface: Any
+        if tree:
+            surface = TreeSurface(store, submaps, full)
+        else:
+            surface = FullSurface(store, target, context) if full else PartialSurface(store, target, context, submaps)
         if scan_files(sequence):
             scans = ScanSequence(sequence, first, stop)
             truth, times = scans.ground_truth, scans.timestamps
             assert truth is not None
-            by_scan = Localizer(surface, ScanTracker(ScanTrackerSettings(), context, truth[0]), truth[0])
-            results, processor = timed(by_scan, [scan.points for scan in scans.stream()])
+            tracker: Any = TreeTracker(truth[0]) if tree else ScanTracker(ScanTrackerSettings(), context, truth[0])
+            results, processor = timed(Localizer(surface, tracker, truth[0]), [scan.points for scan in scans.stream()])
         else:
             frames = open_sequence(sequence, start=first, stop=stop, scale=scale)
             truth, times = frames.ground_truth, frames.timestamps

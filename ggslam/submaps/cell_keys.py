@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -42,7 +43,11 @@ class Grid:
 
     def key_of(self, position: np.ndarray) -> CellKey:
         """The cell of a position [3] in metres; see `keys_of`."""
-        x, y, z = self.keys_of(np.reshape(position, (1, 3)))[0].tolist()
+        # Asked for at every frame, where arrays of one row cost more than the arithmetic.
+        places = [at / self.spacing + 0.5 for at in np.asarray(position, np.float64).reshape(3).tolist()]
+        if not all(abs(at) < (_LIMIT if n in self.axes else math.inf) for at, n in zip(places, "xyz", strict=True)):
+            raise ConfigError(f"positions must be finite and within 2^31 cells of {self.spacing:g} m of the origin")
+        x, y, z = (math.floor(at) if name in self.axes else 0 for at, name in zip(places, "xyz", strict=True))
         return x, y, z
 
     def centres_of(self, keys: np.ndarray) -> np.ndarray:

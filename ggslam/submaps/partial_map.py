@@ -4,21 +4,15 @@ cell (SRT-PM), with the cells ahead along the motion loaded in the background.""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
-from enum import Enum
-from functools import partial
-from types import TracebackType
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ggslam.errors import FormatError
-from ggslam.submaps.cell_cache import CellCache, byte_count
+from ggslam.submaps.cell_cache import byte_count
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import POINTS, CellArrays
-from ggslam.submaps.grid import GridStore, check_same_grid
-from ggslam.submaps.loading_ahead import BackgroundLoader
+from ggslam.submaps.cells_around import CellsAround
+from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import load_points
 from ggslam.submaps.settings import SubmapSettings
 
@@ -28,164 +22,35 @@ Loader = Callable[[GridStore, CellKey], CellArrays]
 _NOTHING: CellArrays = {"points": np.empty((0, 3), np.float32)}
 
 
-class MapStatus(Enum):
-    """What `PartialMap.update` found."""
-
-    UNCHANGED = "unchanged"
-    """The map is the one of the last update."""
-    CHANGED = "changed"
-    """Cells came or went, or were written anew."""
-    EMPTY = "empty"
-    """No cell of the store that can be read is within R'; the map has no points."""
-
-
-class PartialMap:
+class PartialMap(CellsAround[CellArrays]):
     """Points and attributes of the cells around the sensor, as arrays that are never written to again.
 
-    One thread calls `update`; others may read `arrays`, which is replaced at once. Memory: the arrays of the union
-    (twice while they are put together), the cache (bounded), and a cell being decoded for each of the two threads.
+    The union takes its memory twice while it is put together; `cells` are views of it.
 
     Args:
         store: where the cells are; it must stay open.
         settings: None: the store's.
         loader: decodes a cell.
-        part: the part that `loader` decodes: cells without it are left out, cells where it was written anew are loaded
-            again.
 
     Raises:
         ConfigError: `settings` have another grid than the store.
     """
 
-    def __init__(
-        self,
-        store: GridStore,
-        settings: SubmapSettings | None = None,
-        loader: Loader = load_points,
-        part: str = POINTS,
-    ) -> None:
-        self.store = store
-        self.settings = settings or store.settings
-        check_same_grid(store.path, store.settings, self.settings)
+    def __init__(self, store: GridStore, settings: SubmapSettings | None = None, loader: Loader = load_points) -> None:
+        super().__init__(store, loader, POINTS, byte_count, settings)
         self.arrays: CellArrays = _NOTHING
         """The union: "points" [N, 3] in metres, world, and the attributes that all its cells have."""
         self.slices: Mapping[CellKey, slice] = {}
         """The rows of each cell in `arrays`."""
-        self.damaged: Mapping[CellKey, str] = {}
-        """Cells within R' that cannot be read and are left out, with the reason."""
-        self.cache = CellCache(int(self.settings.cache_megabytes * 1e6))
-        self._loader, self._part = loader, part
-        self._versions: dict[CellKey, int] = {}
-        self._entered: CellKey | None = None
-        self._last_position: np.ndarray | None = None
-        self._last_ahead: CellKey | None = None
-        self._updating = threading.Lock()
-        self._ahead = BackgroundLoader(self._steps_ahead) if self.settings.lookahead > 0 else None
 
     @property
     def points(self) -> np.ndarray:
         """Points of the union, [N, 3] in metres, world."""
         return self.arrays["points"]
 
-    @property
-    def versions(self) -> dict[CellKey, int]:
-        """The version of each cell in `arrays`; written anew, a cell has another one."""
-        return {key: self._versions[key] for key in self.slices}
-
-    def update(self, position: np.ndarray, velocity: np.ndarray | None = None) -> MapStatus:
-        """Puts the map together anew if the sensor has entered another cell since the last update.
-
-        Args:
-            position: of the sensor, [3] metres, world.
-            velocity: its direction is where cells are loaded ahead, [3] in the world; None: from the last position.
-
-        Raises:
-            ConfigError: the position is not finite.
-            FormatError: the index of the store is damaged. (Cells that are damaged are listed in `damaged`.)
-        """
-        position = np.array(position, np.float64)
-        with self._updating:
-            key = self.store.key_of(position)
-            changed = key != self._entered and self._assemble(position)
-            self._entered = key
-            self._look_ahead(position, velocity)
-            self._last_position = position
-            if not self.slices:
-                return MapStatus.EMPTY
-            return MapStatus.CHANGED if changed else MapStatus.UNCHANGED
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Waits, at most `timeout` seconds, until loading ahead has nothing left to do; returns whether that is so."""
-        return self._ahead is None or self._ahead.wait(timeout)
-
-    def close(self) -> None:
-        """Ends loading ahead. The arrays stay."""
-        if self._ahead is not None:
-            self._ahead.close()
-        self.cache.clear()
-
-    def __enter__(self) -> PartialMap:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def _assemble(self, position: np.ndarray) -> bool:
-        """Loads what came, drops what went; whether there was anything to do."""
-        wanted = self.store.part_versions(self._part, position, self.settings.partial_radius)
-        if wanted == self._versions:
-            return False
-        cells: dict[CellKey, CellArrays] = {}
-        damaged: dict[CellKey, str] = {}
-        for key, version in wanted.items():
-            if key in self.slices and self._versions[key] == version:
-                cells[key] = {name: values[self.slices[key]] for name, values in self.arrays.items()}
-                continue
-            try:
-                cells[key] = self._load(key, version)
-            except FormatError as error:
-                damaged[key] = str(error)
-            except KeyError:  # removed since
-                continue
-        self._versions = wanted
-        self.arrays, self.slices, self.damaged = *_union(cells), damaged
-        return True
-
-    def _load(self, key: CellKey, version: int) -> CellArrays:
-        return self.cache.get((key, version), lambda: self._loader(self.store, key))
-
-    def _look_ahead(self, position: np.ndarray, velocity: np.ndarray | None) -> None:
-        if self._ahead is None:
-            return
-        if velocity is None:
-            velocity = np.zeros(3) if self._last_position is None else position - self._last_position
-        speed = float(np.linalg.norm(velocity))
-        if not speed > 0:
-            return
-        ahead = position + np.asarray(velocity, np.float64) * (self.settings.lookahead / speed)
-        key = self.store.key_of(ahead)
-        if key != self._last_ahead:
-            self._last_ahead = key
-            self._ahead.request(ahead)
-
-    def _steps_ahead(self, position: np.ndarray) -> Iterator[Callable[[], None]]:
-        """Loads cells around a place, nearest first, until one more could push the first out of the cache."""
-        wanted = self.store.part_versions(self._part, position, self.settings.partial_radius)
-        current = self._versions
-        loaded = largest = 0
-
-        def step(key: CellKey, version: int) -> None:
-            nonlocal loaded, largest
-            with suppress(FormatError, KeyError):  # `update` says so if the sensor gets there
-                size = byte_count(self._load(key, version))
-                loaded, largest = loaded + size, max(largest, size)
-
-        for key, version in wanted.items():
-            if loaded + largest > self.cache.limit:
-                return
-            if current.get(key) != version:
-                yield partial(step, key, version)
+    def _held(self, cells: Mapping[CellKey, CellArrays]) -> Mapping[CellKey, CellArrays]:
+        self.arrays, self.slices = _union(cells)
+        return {key: {name: v[rows] for name, v in self.arrays.items()} for key, rows in self.slices.items()}
 
 
 def _union(cells: Mapping[CellKey, CellArrays]) -> tuple[CellArrays, dict[CellKey, slice]]:

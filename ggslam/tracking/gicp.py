@@ -28,6 +28,8 @@ class GicpTarget:
         self._handle: int | None = self._library.ggslam_gicp_target_create()
         self.voxel = 0.0
         """Edge of a fine voxel, metres."""
+        self.composed_with: TargetSettings | None = None
+        """Settings of the parts, if it was made by `target_parts.composed_target`."""
 
     def __del__(self) -> None:
         if getattr(self, "_handle", None) is not None:
@@ -95,15 +97,14 @@ class GicpTarget:
         cameras = 0 if camera_positions is None else len(camera_positions)
         positions = np.ascontiguousarray(np.zeros((1, 3)) if camera_positions is None else camera_positions, np.float32)
         target.voxel = settings.voxel if voxel is None else voxel
+        if base is not None and base.composed_with is not None:
+            raise ValueError("a target that was composed of parts grows by parts")
         arrays = (means, quaternions, log_scales, opacity_logits)
         given = native.TargetInput(
             *(native.address(a) for a in arrays), None if birth is None else native.address(birth),
             native.address(positions), len(means), cameras,
         )  # fmt: skip
-        arguments = native.TargetSettings(
-            target.voxel, math.log(settings.min_opacity / (1 - settings.min_opacity)), settings.min_thickness,
-            settings.max_thickness, settings.max_elongation, settings.scatter_weight, settings.neighbour_weight,
-        )  # fmt: skip
+        arguments = native_target_settings(settings, target.voxel)
         earlier = None if base is None else base.handle
         target._library.ggslam_gicp_target_build(context.handle, target.handle, earlier, given, arguments)
         return target
@@ -118,6 +119,14 @@ class GicpTarget:
         rows = np.empty((count, 16), np.float32)
         self._library.ggslam_gicp_target_voxels(self.handle, level, native.address(rows))
         return {"means": rows[:, :3], "weights": rows[:, 3], "normals": rows[:, 4:7], "covariances": rows[:, 8:14]}
+
+
+def native_target_settings(settings: TargetSettings, voxel: float) -> native.TargetSettings:
+    """The core's form of the settings, with `voxel` metres for the edge of a fine voxel."""
+    return native.TargetSettings(
+        voxel, math.log(settings.min_opacity / (1 - settings.min_opacity)), settings.min_thickness,
+        settings.max_thickness, settings.max_elongation, settings.scatter_weight, settings.neighbour_weight,
+    )  # fmt: skip
 
 
 class AlignmentStatus(enum.Enum):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_void_p
+from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_int64, c_uint64, c_void_p
 from functools import lru_cache
 
 import numpy as np
@@ -100,6 +100,16 @@ def library() -> ctypes.CDLL:
     core.ggslam_gicp_target_size.argtypes = [c_void_p, ctypes.c_int]
     core.ggslam_gicp_target_voxels.argtypes = [c_void_p, ctypes.c_int, c_void_p]
     core.ggslam_gicp_target_voxels.restype = None
+    core.ggslam_target_part_create.argtypes = [c_void_p, POINTER(TargetInput), POINTER(TargetSettings), c_uint64]
+    core.ggslam_target_part_create.restype = c_void_p
+    core.ggslam_target_part_destroy.argtypes = [c_void_p]
+    core.ggslam_target_part_destroy.restype = None
+    core.ggslam_target_part_bytes.argtypes = [c_void_p]
+    core.ggslam_target_part_bytes.restype = c_int64
+    core.ggslam_gicp_target_compose.argtypes = [
+        c_void_p, c_void_p, c_void_p, POINTER(c_void_p), ctypes.c_int, POINTER(TargetSettings)
+    ]  # fmt: skip
+    core.ggslam_gicp_target_compose.restype = None
     core.ggslam_gicp_align.argtypes = [
         c_void_p, c_void_p, POINTER(AlignPoints), POINTER(AlignSettings), POINTER(PhotometricPoints),
         POINTER(PhotometricReferenceView), c_void_p, c_void_p, c_void_p, POINTER(AlignResult),

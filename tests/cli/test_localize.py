@@ -126,7 +126,7 @@ def test_what_cannot_be_done_is_one_error(run: Path, room: Path, scans: Path, tm
     one_error(ggslam("localize", tmp_path / "none", room), "none", "no such folder")
     one_error(ggslam("localize", room, room), str(room), "neither a grid store")
     one_error(ggslam("localize", tmp_path / "no.pcd", room, "--start", ORIGIN), "no.pcd")
-    one_error(ggslam("localize", cloud, scans), "--start is needed")
+    one_error(ggslam("localize", cloud, scans), "laser scans", "--start given")
     one_error(ggslam("localize", cloud, room), "no places")
     one_error(ggslam("localize", run, room, "--scale", 0.5), "camera", "--scale")
     one_error(ggslam("localize", run, room, "--start", "1 2 3"), "--start", "'1 2 3'")

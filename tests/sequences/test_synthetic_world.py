@@ -126,6 +126,14 @@ def test_the_seed_decides(world: World, poses: np.ndarray) -> None:
     assert not np.array_equal(world_cloud(world, 0.4, 3), world_cloud(world, 0.4, 2))
 
 
+@pytest.mark.parametrize("size", [25.0, 30.0])
+def test_there_is_a_walk_through_every_world(size: float) -> None:
+    for seed in range(20):
+        made = make_world(size, seed)
+        places = np.array([walk(made, 5.0, start)[:, :2, 3] for start in range(3)])
+        assert places.shape == (3, 41, 2) and (places > 0).all() and (places < size).all(), f"seed {seed}"
+
+
 def test_walk_is_smooth_and_stays_clear(world: World, poses: np.ndarray) -> None:
     assert poses.shape == (1000, 4, 4)
     motion = inverse(poses[:-1]) @ poses[1:]

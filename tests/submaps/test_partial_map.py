@@ -13,8 +13,9 @@ from ggslam.errors import ConfigError
 from ggslam.submaps.cell_cache import CellCache, byte_count
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import CellArrays
+from ggslam.submaps.cells_around import MapStatus
 from ggslam.submaps.grid import GridStore
-from ggslam.submaps.partial_map import MapStatus, PartialMap
+from ggslam.submaps.partial_map import PartialMap
 from ggslam.submaps.recorder import load_points, store_cloud
 from ggslam.submaps.settings import SubmapSettings
 
@@ -140,7 +141,7 @@ def test_the_bound_holds_while_loading_ahead(folder: Path) -> None:
 
 
 def test_the_least_recently_used_cell_goes_first() -> None:
-    cache = CellCache(100)
+    cache = CellCache(100, byte_count)
     cell = {"points": np.zeros(5)}  # 40 bytes
     for key in "ab":
         cache.get(key, lambda: cell)
@@ -155,7 +156,7 @@ def test_the_least_recently_used_cell_goes_first() -> None:
 
 
 def test_threads_wait_for_one_loading() -> None:
-    cache, begun, go_on, loads = CellCache(10**6), threading.Event(), threading.Event(), []
+    cache, begun, go_on, loads = CellCache(10**6, byte_count), threading.Event(), threading.Event(), []
 
     def slow() -> CellArrays:
         begun.set()

@@ -24,19 +24,6 @@ constexpr std::size_t kChunk = 4096;  // Gaussians that one thread sorts at a ti
 
 int partition_of(uint64_t key) { return static_cast<int>(hash_key(key) >> 58); }
 
-void block_coordinates(uint64_t key, int c[3]) {
-  for (int a = 0; a < 3; ++a) c[a] = static_cast<int>(key >> (21 * a) & ((1u << 21) - 1)) - (1 << 20);
-}
-
-VoxelMoments empty_moments(uint64_t key, int bit, float size) {
-  VoxelMoments m{};
-  int block[3];
-  block_coordinates(key, block);
-  const int local[3] = {bit & 3, bit >> 2 & 3, bit >> 4};
-  for (int a = 0; a < 3; ++a) m.centre[a] = (4 * block[a] + local[a] + 0.5f) * size;
-  return m;
-}
-
 // The members of one partition, its blocks in the order of their first member, and its voxels' moments.
 struct Partition {
   std::vector<int32_t> members, voxels;  // Gaussian, and its voxel in `moments`
@@ -199,6 +186,12 @@ void VoxelLevel::index_blocks() {
     slot_key[slot] = block_keys[b];
     slot_block[slot] = static_cast<int32_t>(b);
   }
+}
+
+int VoxelLevel::block_of(uint64_t key) const {
+  std::size_t slot = hash_key(key) & (slot_key.size() - 1);
+  while (slot_key[slot] != kEmptyKey && slot_key[slot] != key) slot = (slot + 1) & (slot_key.size() - 1);
+  return slot_key[slot] == key ? slot_block[slot] : -1;
 }
 
 VoxelLevelView VoxelLevel::view() const {

@@ -48,6 +48,8 @@ def _tour(world: World, length: float, rng: np.random.Generator) -> np.ndarray:
         neighbours[other].append((int(one), number))
     times = np.zeros(len(world.ways), np.int64)
     node, last, total, ahead = int(rng.integers(len(world.nodes))), -1, 0.0, np.zeros(2)
+    while not neighbours[node]:  # the middle of a block that two rooms share is on no way
+        node = int(rng.integers(len(world.nodes)))
     corners = [world.nodes[node]]
     while total < length:
         choices = []

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cells of a stored map are around the sensor, decoded: looked up when the sensor enters a cell (SRT-PM), those
+ahead along the motion loaded in the background."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from enum import Enum
+from functools import partial
+from types import TracebackType
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from ggslam.errors import FormatError
+from ggslam.submaps.cell_cache import Cell, CellCache
+from ggslam.submaps.cell_keys import CellKey
+from ggslam.submaps.grid import GridStore, check_same_grid
+from ggslam.submaps.loading_ahead import BackgroundLoader
+from ggslam.submaps.settings import SubmapSettings
+
+Own = TypeVar("Own", bound="CellsAround[Any]")
+
+
+class MapStatus(Enum):
+    """What `CellsAround.update` found."""
+
+    UNCHANGED = "unchanged"
+    """The map is the one of the last update."""
+    CHANGED = "changed"
+    """Cells came or went, or were written anew."""
+    EMPTY = "empty"
+    """No cell of the store that can be read is within R'."""
+
+
+class CellsAround(Generic[Cell]):
+    """The cells within R' of the sensor, decoded by a loader.
+
+    One thread calls `update`; others may read `cells`, which is replaced at once. Memory: the cells, the cache
+    (bounded), and a cell being decoded for each of the two threads.
+
+    Args:
+        store: where the cells are; it must stay open.
+        loader: decodes a cell.
+        part: the part that `loader` decodes: cells without it are left out, cells where it was written anew are loaded
+            again.
+        size: gives the bytes of a decoded cell, for the cache.
+        settings: None: the store's.
+
+    Raises:
+        ConfigError: `settings` have another grid than the store.
+    """
+
+    def __init__(
+        self,
+        store: GridStore,
+        loader: Callable[[GridStore, CellKey], Cell],
+        part: str,
+        size: Callable[[Cell], int],
+        settings: SubmapSettings | None = None,
+    ) -> None:
+        self.store = store
+        self.settings = settings or store.settings
+        check_same_grid(store.path, store.settings, self.settings)
+        self.cells: Mapping[CellKey, Cell] = {}
+        """What the loader gave, nearest first."""
+        self.damaged: Mapping[CellKey, str] = {}
+        """Cells within R' that cannot be read and are left out, with the reason."""
+        self.cache = CellCache(int(self.settings.cache_megabytes * 1e6), size)
+        self._loader, self._part, self._size = loader, part, size
+        self._versions: dict[CellKey, int] = {}
+        self._entered: CellKey | None = None
+        self._last_position: np.ndarray | None = None
+        self._last_ahead: CellKey | None = None
+        self._updating = threading.Lock()
+        self._ahead = BackgroundLoader(self._steps_ahead) if self.settings.lookahead > 0 else None
+
+    def update(self, position: np.ndarray, velocity: np.ndarray | None = None) -> MapStatus:
+        """Looks up and loads cells if the sensor has entered another cell since the last update.
+
+        Args:
+            position: of the sensor, [3] metres, world.
+            velocity: its direction is where cells are loaded ahead, [3] in the world; None: from the last position.
+
+        Raises:
+            ConfigError: the position is not finite.
+            FormatError: the index of the store is damaged. (Cells that are damaged are listed in `damaged`.)
+        """
+        position = np.array(position, np.float64)
+        with self._updating:
+            key = self.store.key_of(position)
+            changed = key != self._entered and self._assemble(position)
+            self._entered = key
+            self._look_ahead(position, velocity)
+            self._last_position = position
+            if not self.cells:
+                return MapStatus.EMPTY
+            return MapStatus.CHANGED if changed else MapStatus.UNCHANGED
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Waits, at most `timeout` seconds, until loading ahead has nothing left to do; returns whether that is so."""
+        return self._ahead is None or self._ahead.wait(timeout)
+
+    def close(self) -> None:
+        """Ends loading ahead. The arrays stay."""
+        if self._ahead is not None:
+            self._ahead.close()
+        self.cache.clear()
+
+    def __enter__(self: Own) -> Own:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _assemble(self, position: np.ndarray) -> bool:
+        """Loads what came, drops what went; whether there was anything to do."""
+        wanted = self.store.part_versions(self._part, position, self.settings.partial_radius)
+        if wanted == self._versions:
+            return False
+        cells: dict[CellKey, Cell] = {}
+        damaged: dict[CellKey, str] = {}
+        for key, version in wanted.items():
+            if key in self.cells and self._versions[key] == version:
+                cells[key] = self.cells[key]
+                continue
+            try:
+                cells[key] = self._load(key, version)
+            except FormatError as error:
+                damaged[key] = str(error)
+            except KeyError:  # removed since
+                continue
+        self._versions = wanted
+        self.cells, self.damaged = self._held(cells), damaged
+        return True
+
+    def _held(self, cells: Mapping[CellKey, Cell]) -> Mapping[CellKey, Cell]:
+        """What to keep as `cells`."""
+        return cells
+
+    def _load(self, key: CellKey, version: int) -> Cell:
+        return self.cache.get((key, version), lambda: self._loader(self.store, key))
+
+    def _look_ahead(self, position: np.ndarray, velocity: np.ndarray | None) -> None:
+        if self._ahead is None:
+            return
+        if velocity is None:
+            velocity = np.zeros(3) if self._last_position is None else position - self._last_position
+        speed = float(np.linalg.norm(velocity))
+        if not speed > 0:
+            return
+        ahead = position + np.asarray(velocity, np.float64) * (self.settings.lookahead / speed)
+        key = self.store.key_of(ahead)
+        if key != self._last_ahead:
+            self._last_ahead = key
+            self._ahead.request(ahead)
+
+    def _steps_ahead(self, position: np.ndarray) -> Iterator[Callable[[], None]]:
+        """Loads cells around a place, nearest first, until one more could push the first out of the cache."""
+        wanted = self.store.part_versions(self._part, position, self.settings.partial_radius)
+        current = self._versions
+        loaded = largest = 0
+
+        def step(key: CellKey, version: int) -> None:
+            nonlocal loaded, largest
+            with suppress(FormatError, KeyError):  # `update` says so if the sensor gets there
+                size = self._size(self._load(key, version))
+                loaded, largest = loaded + size, max(largest, size)
+
+        for key, version in wanted.items():
+            if loaded + largest > self.cache.limit:
+                return
+            if current.get(key) != version:
+                yield partial(step, key, version)
