@@ -24,7 +24,7 @@ repetitions of a case do the same work frame by frame: of each frame the least t
     aligning         of it the mean share of the frame itself, without the map
     processor        milliseconds of work a frame of all threads once the map is read, loading ahead included
 
-The k-d tree is the named reference (scripts/kdtree_gicp.py): G-ICP to the nearest of all points, as SRT-PM had it.
+The k-d tree is the named reference (scripts/kdtree_gicp.py): G-ICP to the nearest of all points, as is common.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference of `bench_submaps.py`: G-ICP with the nearest of all the map's points, found by a k-d tree.
 
-This is how localisation in a cloud is mostly done, and how it was done where partial maps come from (SRT-PM): a tree
+This is how localisation in a cloud is mostly done: a tree
 over the map's points, which takes the longer to build, to fill and to search the larger the map is. Nothing of
 `ggslam.tracking` is used, so that what the voxels of `GicpTarget` do for the time can be seen, too.
 """
