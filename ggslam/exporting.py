@@ -7,6 +7,7 @@ import dataclasses
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import torch
@@ -130,12 +131,13 @@ def _sample(folder: RunFolder, parts: MapInParts, path: Path, voxel_size: float,
     """Writes the points of a map, cell by cell if it has cells; returns how many."""
     with_object_id = folder.has_objects()
     if parts.in_cells:
-        return write_points_in_parts(path, sample_parts(parts.parts(), voxel_size, opacity, with_object_id))
-    cloud = sample_points(folder.gaussians(), voxel_size, opacity, with_object_id)
-    if not len(cloud):
-        raise RunFolderError(f"{folder.path}: the map has no points to export")
-    write_points(path, cloud)
-    return len(cloud)
+        clouds = sample_parts(parts.parts(), voxel_size, opacity, with_object_id)
+        if (first := next(clouds, None)) is not None:
+            return write_points_in_parts(path, chain([first], clouds))
+    elif len(cloud := sample_points(folder.gaussians(), voxel_size, opacity, with_object_id)):
+        write_points(path, cloud)
+        return len(cloud)
+    raise RunFolderError(f"{folder.path}: the map has no points to export")
 
 
 def export_trajectory(folder: RunFolder, path: Path) -> str:
