@@ -75,7 +75,8 @@ def main() -> None:
         for name, words in commands(run, out, arguments, times).items():
             if arguments.only and name not in arguments.only:
                 continue
-            used.setdefault(name, {})[times] = usage(words)
+            found = used.setdefault(name, {})[times] = usage(words)
+            print(f"  {name}: {found.peak_mb:.0f} MB, {found.seconds:.1f} s", flush=True)
     report(used, sizes)
 
 
