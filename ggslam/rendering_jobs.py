@@ -96,7 +96,7 @@ def render_frames(
     parts = folder.map_in_parts() if objects is None else objects.map
     make_folder(out)
     rasterizer = CpuRasterizer()
-    painters = _painters() if objects is None else {**_painters(), **_object_painters(objects, rasterizer)}
+    painters = _painters() if objects is None else {**_painters(), **_object_painters(objects, rasterizer, what)}
     poses = frame_poses(folder.read_json("keyframes.json"))
     written = []
     for done, frame in enumerate(frames):
@@ -136,12 +136,16 @@ def _painters() -> dict[str, Painter]:
     }
 
 
-def _object_painters(objects: ObjectsInParts, rasterizer: CpuRasterizer) -> dict[str, Painter]:
-    palette, colors = objects.table.palette(), objects.identity_colors()
+def _object_painters(objects: ObjectsInParts, rasterizer: CpuRasterizer, what: list[str]) -> dict[str, Painter]:
+    """Those of `OBJECT_KINDS` that are among `what`."""
+    palette = objects.table.palette()
 
     def ids(view: RenderBuffers, gaussians: GaussianMap) -> np.ndarray:
         return color_of_ids(object_ids(rasterizer, view, objects.around(gaussians)), palette, outlines=True)
 
+    if "pca" not in what:
+        return {"ids": ids}
+    colors = objects.identity_colors()
     return {"ids": ids, "pca": lambda view, _: identity_picture(view, colors)}
 
 

@@ -140,6 +140,7 @@ def test_exports_are_those_of_the_map_in_memory(pair: tuple[RunFolder, RunFolder
     gaussians = folder.gaussians()
     gaussians.opacity_logits[::3] = -1.0  # so that some are left out
     write_gaussian_ply(folder.path / "map.ply", gaussians, OBJECT_EXTRAS)
+    gaussians = folder.gaussians()
     name = folder.object_table().objects[1].id
     done("export", folder.path, "--min-opacity", 0.5, "--out", tmp_path / "all.ply")
     done("export", folder.path, "--objects", name, "--min-opacity", 0.5, "--plain", "--out", tmp_path / "one")
