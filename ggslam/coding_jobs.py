@@ -36,7 +36,7 @@ PRESETS = ("pointcloud", "splat")
 Box = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner, metres."""
 _MOST_IDS = 1 << 16
-_SAMPLED = 1 << 20
+_SAMPLED = 1 << 18
 """Gaussians that tell where most of them lie."""
 
 
