@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,15 @@ from ggslam.coding import (
     decode_slice,
     encode_cloud,
 )
+from ggslam.coding.block_encoder import encode_blocks
+from ggslam.coding.decoder import CloudInParts, decode_in_parts
 from ggslam.coding.listing import StreamListing, list_units
 from ggslam.coding.splats import gaussians_of, is_splat_cloud, splat_attributes, splat_settings
 from ggslam.coding.study import GridCloud, on_grid
 from ggslam.errors import ConfigError, FormatError
 from ggslam.formats.atomic import make_folder, write_bytes
-from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from ggslam.formats.gaussian_ply import write_gaussian_parts
+from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_point_cloud
 from ggslam.run_folder import RunFolder
 
@@ -33,6 +36,8 @@ PRESETS = ("pointcloud", "splat")
 Box = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner, metres."""
 _MOST_IDS = 1 << 16
+_SAMPLED = 1 << 18
+"""Gaussians that tell where most of them lie."""
 
 
 @dataclass(frozen=True)
@@ -73,28 +78,51 @@ def encode_file(
     notes: list[str] = []
     path = _input_file(source, preset)
     _refuse_itself(path, out)
-    if preset == "splat":
-        gaussians = read_gaussian_ply(path, with_moments=False)
-        if not len(gaussians):
-            raise FormatError(f"{path}: no Gaussians")
-        points: np.ndarray = gaussians.means.numpy().astype(np.float64)
-        attributes = splat_attributes(gaussians)
-        settings = splat_settings(settings, rate, attributes)
-        notes += _outliers(points)
-    else:
-        cloud = read_point_cloud(path)
-        points, settings, metadata = coded_points(cloud, settings)
-        attributes, labels = _coded_attributes(cloud, notes)
-        own = {name: AttributeSettings(lossless=True) for name in labels}
-        metadata |= {"preset": preset} | ({"label_offsets": labels} if any(labels.values()) else {})
-        settings = replace(settings, attributes={**settings.attributes, **own}, metadata=metadata)
     try:
-        encoded = encode_cloud(points, attributes, settings)
+        if preset == "splat":
+            report = _encode_splats(path, out, settings, rate, notes)
+        else:
+            report = _encode_points(path, out, settings, notes)
     except (ConfigError, FormatError) as error:
-        raise type(error)(f"{path}: {error}") from None
+        raise (error if str(path) in str(error) else type(error)(f"{path}: {error}")) from None
+    return Encoded(out, report, notes)
+
+
+def _encode_points(path: Path, out: Path, settings: CodecSettings, notes: list[str]) -> CodingReport:
+    cloud = read_point_cloud(path)
+    points, settings, metadata = coded_points(cloud, settings)
+    attributes, labels = _coded_attributes(cloud, notes)
+    own = {name: AttributeSettings(lossless=True) for name in labels}
+    metadata |= {"preset": "pointcloud"} | ({"label_offsets": labels} if any(labels.values()) else {})
+    settings = replace(settings, attributes={**settings.attributes, **own}, metadata=metadata)
+    encoded = encode_cloud(points, attributes, settings)
     make_folder(out.parent)
     write_bytes(out, encoded.data)
-    return Encoded(out, encoded.report, notes)
+    return encoded.report
+
+
+def _encode_splats(path: Path, out: Path, settings: CodecSettings, rate: str, notes: list[str]) -> CodingReport:
+    """Codes a 3DGS PLY that need not fit into memory."""
+    rows = GaussianRows(path)
+    if not len(rows):
+        raise FormatError(f"{path}: no Gaussians")
+    step, with_ids, sample = max(1, len(rows) // _SAMPLED), False, []
+    for block in rows.blocks():
+        sample.append(block.means.numpy()[::step].astype(np.float64))
+        with_ids = with_ids or bool(block.object_id.any())
+    settings = splat_settings(settings, rate, splat_attributes(rows.like, with_ids))
+    outliers = _Outliers(np.concatenate(sample))
+
+    def blocks() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        for block in rows.blocks():
+            points = block.means.numpy().astype(np.float64)
+            outliers.add(points)
+            yield points, splat_attributes(block, with_ids)
+
+    make_folder(out.parent)
+    report = encode_blocks(blocks(), settings, out)
+    notes += outliers.notes()
+    return report
 
 
 def study_cloud(source: Path, settings: CodecSettings) -> GridCloud:
@@ -132,16 +160,13 @@ def decode_file(
     _refuse_itself(source, out)
     data = read_bytes(source)
     try:
+        if slice_id is None and box is None and (splats := _splats_in_parts(data, workers)) is not None:
+            return _write_splats(splats, out)
         cloud = _decoded(data, slice_id, box, workers)
         if is_splat_cloud(cloud):
-            gaussians = gaussians_of(cloud)
-            if out.suffix.lower() != ".ply":
-                raise ConfigError(f"{out}: Gaussians are written as .ply")
             if not len(cloud):
                 raise FormatError("no Gaussians in the box")
-            make_folder(out.parent)
-            write_gaussian_ply(out, gaussians, ("object_id",) if "object_id" in cloud.attributes else ())
-            return Decoded(out, len(cloud), "Gaussians")
+            return _write_splats(CloudInParts(len(cloud), cloud, iter([cloud])), out)
         if not len(cloud):
             raise FormatError("no points in the box")
         labels = _labels_restored(cloud)
@@ -151,6 +176,23 @@ def decode_file(
     points, comments = _placed(cloud)
     write_point_cloud(out, points, labels, comments if out.suffix.lower() != ".pcd" else ())
     return Decoded(out, len(cloud), "points")
+
+
+def _splats_in_parts(data: bytes, workers: int | None) -> CloudInParts | None:
+    """The Gaussians of a stream; None if it is one of points."""
+    cloud = decode_in_parts(data, workers)
+    return cloud if is_splat_cloud(cloud.like) else None
+
+
+def _write_splats(cloud: CloudInParts, out: Path) -> Decoded:
+    """Writes Gaussians as they are decoded."""
+    like = gaussians_of(cloud.like)
+    if out.suffix.lower() != ".ply":
+        raise ConfigError(f"{out}: Gaussians are written as .ply")
+    make_folder(out.parent)
+    extra = ("object_id",) if "object_id" in cloud.like.attributes else ()
+    write_gaussian_parts(out, cloud.count, map(gaussians_of, cloud.parts), like, extra)
+    return Decoded(out, cloud.count, "Gaussians")
 
 
 def list_stream(path: Path) -> StreamListing:
@@ -258,14 +300,28 @@ def _refuse_itself(source: Path, out: Path) -> None:
         raise ConfigError(f"{out}: is the input itself")
 
 
-def _outliers(points: np.ndarray) -> list[str]:
-    """A note if a few Gaussians far outside cost the others their precision."""
-    low, high = np.quantile(points, [0.001, 0.999], axis=0)
-    bulk = float((high - low).max())
-    far = ((points < low - 10 * bulk) | (points > high + 10 * bulk)).any(1)
-    if not far.any() or bulk == 0:
-        return []
-    return [f"{int(far.sum())} Gaussians lie far outside the others; the grid spans them too and is coarser for it"]
+class _Outliers:
+    """Counts Gaussians far outside the others.
+
+    Args:
+        sample: of their means, float64 [N, 3].
+    """
+
+    def __init__(self, sample: np.ndarray) -> None:
+        low, high = np.quantile(sample, [0.001, 0.999], axis=0)
+        self._bulk = float((high - low).max())
+        self._low, self._high = low - 10 * self._bulk, high + 10 * self._bulk
+        self._far = 0
+
+    def add(self, points: np.ndarray) -> None:
+        """Means float64 [M, 3]."""
+        self._far += int(((points < self._low) | (points > self._high)).any(1).sum())
+
+    def notes(self) -> list[str]:
+        """A note if a few Gaussians cost the others their precision."""
+        if not self._far or self._bulk == 0:
+            return []
+        return [f"{self._far} Gaussians lie far outside the others; the grid spans them too and is coarser for it"]
 
 
 def _labels_restored(cloud: PointCloud) -> dict[str, np.ndarray]:

@@ -1,22 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run's map in other forms."""
+"""A run's map in other forms, made from blocks of its Gaussians or cell by cell."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import torch
 
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.atomic import make_folder, write_bytes
-from ggslam.formats.gaussian_ply import write_gaussian_ply
-from ggslam.formats.point_ply import write_points
-from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.gaussian_ply import write_gaussian_parts
+from ggslam.formats.gaussian_rows import GaussianRows
+from ggslam.formats.point_ply import write_points, write_points_in_parts
+from ggslam.formats.point_sampling import sample_parts, sample_points
 from ggslam.formats.trajectory import write_tum
-from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.map_index import MapInParts
 from ggslam.objects.table import ObjectRecord
+from ggslam.objects_in_parts import ObjectsInParts
 from ggslam.run_folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap, rgb_to_sh
 from ggslam.scene.identity import IdentityClassifier
@@ -31,15 +36,14 @@ def export_splats(folder: RunFolder, path: Path, min_opacity: float = 0.0, plain
     A run with objects writes each Gaussian's object id and identity vector, too, and the classifier beside the file
     (`NAME_classifier.npz`), unless `plain`.
     """
-    gaussians = folder.gaussians()
-    _drop_faint(folder, gaussians, min_opacity)
+    with_objects = folder.has_objects() and not plain
+    chosen = _Chosen.of(folder, folder.map_in_parts().rows, min_opacity)
     make_folder(path.parent)
-    if plain or not folder.has_objects():
-        write_gaussian_ply(path, gaussians)
-        return f"wrote {path}: {len(gaussians)} Gaussians"
-    write_gaussian_ply(path, gaussians, OBJECT_EXTRAS)
+    count = chosen.write(path, OBJECT_EXTRAS if with_objects else ())
+    if not with_objects:
+        return f"wrote {path}: {count} Gaussians"
     beside = _write_classifier(path, IdentityClassifier.from_file(folder.path / "classifier.npz"))
-    return f"wrote {path}: {len(gaussians)} Gaussians with object ids and identities, and {beside.name}"
+    return f"wrote {path}: {count} Gaussians with object ids and identities, and {beside.name}"
 
 
 def export_objects(
@@ -59,20 +63,17 @@ def export_objects(
         ConfigError: an object is not there.
         RunFolderError: the run has no objects, or the folder cannot be written.
     """
-    segmented = folder.segmented_map()
-    chosen = [segmented.table.record(i) for i in segmented.table.select(objects)]
+    scene = ObjectsInParts.of(folder)
+    chosen = [scene.table.record(i) for i in scene.table.select(objects)]
     if not chosen:
         raise RunFolderError(f"{folder.path}: the run found no object; nothing to export")
-    _drop_faint(folder, segmented.gaussians, min_opacity)
+    opaque, total = _Chosen.of(folder, scene.map.rows, min_opacity), 0
     make_folder(path)
-    total = 0
     for record in chosen:
-        part = _part(segmented.gaussians, segmented.gaussians.object_id == record.id)
-        write_gaussian_ply(path / object_file_name(record), part, () if plain else OBJECT_EXTRAS)
-        total += len(part)
-    dataclasses.replace(segmented.table, objects=chosen).save(path / "objects.json")
+        total += opaque.objects([record.id]).write(path / object_file_name(record), () if plain else OBJECT_EXTRAS)
+    dataclasses.replace(scene.table, objects=chosen).save(path / "objects.json")
     if not plain:
-        _write_classifier(path / "map.ply", segmented.classifier)
+        _write_classifier(path / "map.ply", scene.classifier)
     return f"wrote {len(chosen)} objects to {path}: {total} Gaussians"
 
 
@@ -90,25 +91,21 @@ def export_segmented(
     Raises:
         ConfigError, RunFolderError: as in `export_objects`.
     """
-    segmented = folder.segmented_map()
-    gaussians = segmented.gaussians
-    if objects is not None:
-        gaussians.keep(torch.isin(gaussians.object_id, torch.tensor(segmented.table.select(objects))))
-    _drop_faint(folder, gaussians, min_opacity)
+    scene = ObjectsInParts.of(folder)
+    ids = None if objects is None else scene.table.select(objects)
+    chosen = _Chosen.of(folder, scene.map.rows, min_opacity, ids)
     make_folder(path.parent)
-    write_gaussian_ply(path, colored_by_object(segmented), () if plain else OBJECT_EXTRAS)
+    palette = torch.from_numpy(scene.table.palette())
+    count = chosen.write(path, () if plain else OBJECT_EXTRAS, lambda part: _color_by_object(part, palette))
     if not plain:
-        _write_classifier(path, segmented.classifier)
-    return f"wrote {path}: {len(gaussians)} Gaussians in the colours of {len(segmented.table)} objects"
+        _write_classifier(path, scene.classifier)
+    return f"wrote {path}: {count} Gaussians in the colours of {len(scene.table)} objects"
 
 
-def colored_by_object(segmented: SegmentedMap) -> GaussianMap:
-    """The map with each Gaussian in the colour of its object, from all sides; unlabelled ones are grey."""
-    gaussians = _part(segmented.gaussians, torch.ones(len(segmented.gaussians), dtype=torch.bool))
-    rgb = torch.from_numpy(segmented.table.palette()[gaussians.object_id.numpy()]).float() / 255
+def _color_by_object(gaussians: GaussianMap, palette: torch.Tensor) -> None:
+    """Gives each Gaussian the colour of its object, from all sides; unlabelled ones become grey."""
     gaussians.sh[:] = 0
-    gaussians.sh[:, 0] = rgb_to_sh(rgb)
-    return gaussians
+    gaussians.sh[:, 0] = rgb_to_sh(palette[gaussians.object_id.long()].float() / 255)
 
 
 def object_file_name(record: ObjectRecord) -> str:
@@ -119,16 +116,28 @@ def object_file_name(record: ObjectRecord) -> str:
 
 def export_points(folder: RunFolder, path: Path, voxel_size: float, min_opacity: float = 0.0) -> str:
     """Writes points.ply (metres) and points_grid.ply (integer cells) into the folder `path`."""
+    opacity, parts = min_opacity if min_opacity > 0 else 0.3, folder.map_in_parts()
+    if not voxel_size > 0 or not 0 < opacity < 1:
+        raise ConfigError(f"impossible voxel size {voxel_size} or minimum opacity {opacity}")
+    make_folder(path)
     try:
-        opacity = min_opacity if min_opacity > 0 else 0.3
-        cloud = sample_points(folder.gaussians(), voxel_size, opacity, with_object_id=folder.has_objects())
+        count = _sample(folder, parts, path, voxel_size, opacity)
     except ValueError as error:
         raise ConfigError(str(error)) from None
-    if not len(cloud):
-        raise RunFolderError(f"{folder.path}: the map has no points to export")
-    make_folder(path)
-    write_points(path, cloud)
-    return f"wrote {path}/points.ply and points_grid.ply: {len(cloud)} points on a {voxel_size} m grid"
+    return f"wrote {path}/points.ply and points_grid.ply: {count} points on a {voxel_size} m grid"
+
+
+def _sample(folder: RunFolder, parts: MapInParts, path: Path, voxel_size: float, opacity: float) -> int:
+    """Writes the points of a map, cell by cell if it has cells; returns how many."""
+    with_object_id = folder.has_objects()
+    if parts.in_cells:
+        clouds = sample_parts(parts.parts(), voxel_size, opacity, with_object_id)
+        if (first := next(clouds, None)) is not None:
+            return write_points_in_parts(path, chain([first], clouds))
+    elif len(cloud := sample_points(folder.gaussians(), voxel_size, opacity, with_object_id)):
+        write_points(path, cloud)
+        return len(cloud)
+    raise RunFolderError(f"{folder.path}: the map has no points to export")
 
 
 def export_trajectory(folder: RunFolder, path: Path) -> str:
@@ -139,23 +148,59 @@ def export_trajectory(folder: RunFolder, path: Path) -> str:
     return f"wrote {path}: {written} poses"
 
 
-def _drop_faint(folder: RunFolder, gaussians: GaussianMap, min_opacity: float) -> None:
-    if min_opacity > 0:
-        gaussians.keep(gaussians.opacities >= min_opacity)
-    if not len(gaussians):
-        raise RunFolderError(f"{folder.path}: no Gaussian is at least {min_opacity} opaque; nothing to export")
+@dataclasses.dataclass(frozen=True)
+class _Chosen:
+    """Gaussians of a map on disk that are to be exported.
 
+    Attributes:
+        rows: the map.
+        min_opacity: fainter ones are left out.
+        ids: of the objects whose Gaussians are wanted; None: all.
+        found: of each block of rows, how many are opaque enough, by object id.
+    """
 
-def _part(gaussians: GaussianMap, selected: torch.Tensor) -> GaussianMap:
-    """A copy of the Gaussians where `selected` (bool [N]) is true."""
-    part = GaussianMap(gaussians.sh_degree, gaussians.features.shape[1], with_moments=False)
-    rows = part.insert(
-        gaussians.means[selected], gaussians.quaternions[selected], gaussians.log_scales[selected],
-        gaussians.opacity_logits[selected], torch.zeros(int(selected.sum()), 3), gaussians.features[selected],
-        object_id=gaussians.object_id[selected],
-    )  # fmt: skip
-    part.sh[rows] = gaussians.sh[selected]
-    return part
+    rows: GaussianRows
+    min_opacity: float
+    ids: Sequence[int] | None
+    found: Sequence[Counter[int]]
+
+    @staticmethod
+    def of(folder: RunFolder, rows: GaussianRows, min_opacity: float, ids: Sequence[int] | None = None) -> _Chosen:
+        """Finds out how many there are; raises RunFolderError if there is none."""
+        found = [Counter(b.object_id[b.opacities >= min_opacity].tolist()) for b in rows.blocks()]
+        chosen = _Chosen(rows, min_opacity, ids, found)
+        if not chosen.count:
+            raise RunFolderError(f"{folder.path}: no Gaussian is at least {min_opacity} opaque; nothing to export")
+        return chosen
+
+    def objects(self, ids: Sequence[int]) -> _Chosen:
+        """Those of some objects only."""
+        return dataclasses.replace(self, ids=ids)
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return sum(map(self._count, self.found))
+
+    def _count(self, found: Counter[int]) -> int:
+        return found.total() if self.ids is None else sum(found[i] for i in self.ids)
+
+    def write(
+        self, path: Path, extra: Collection[str], change: Callable[[GaussianMap], None] = lambda part: None
+    ) -> int:
+        """Writes a 3DGS PLY of them, changed; returns how many there are."""
+        write_gaussian_parts(path, self.count, self._parts(change), self.rows.like, extra)
+        return self.count
+
+    def _parts(self, change: Callable[[GaussianMap], None]) -> Iterator[GaussianMap]:
+        for number, found in enumerate(self.found):
+            if not self._count(found):
+                continue
+            part = self.rows.block(number)
+            wanted = part.opacities >= self.min_opacity
+            part.keep(wanted if self.ids is None else wanted & torch.isin(part.object_id, torch.tensor(self.ids)))
+            change(part)
+            yield part
 
 
 def _write_classifier(ply: Path, classifier: IdentityClassifier) -> Path:

@@ -7,15 +7,19 @@ Runs whose memory was limited write their map cell by cell and this beside it. O
 from __future__ import annotations
 
 import json
+from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ggslam.errors import FormatError
 from ggslam.formats.atomic import write_text
-from ggslam.formats.gaussian_ply import gaussians_of_vertices
-from ggslam.formats.ply_rows import PlyRows
+from ggslam.formats.gaussian_rows import GaussianRows
+from ggslam.formats.point_sampling import MapPart
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.submaps.frustums import Frustums
@@ -23,6 +27,9 @@ from ggslam.submaps.gaussian_cells import GaussianCells
 
 MAP_INDEX = "map_cells.json"
 _VERSION = 1
+_ANYWHERE = 1e12
+CACHE_BYTES = 64_000_000
+"""Cells that were read and may be in view again are kept up to this size."""
 
 
 def write_map_index(path: Path, cells: GaussianCells) -> None:
@@ -52,6 +59,12 @@ class MapIndex:
     high: np.ndarray
 
     @staticmethod
+    def of_whole(count: int) -> MapIndex:
+        """That of a map that is one cell, whose Gaussians may be anywhere."""
+        far = np.full((1, 3), _ANYWHERE)
+        return MapIndex(np.zeros(1, np.int64), np.array([count]), -far, far)
+
+    @staticmethod
     def read(path: Path) -> MapIndex:
         """Reads the file.
 
@@ -77,38 +90,72 @@ class MapInParts:
 
     Args:
         ply: the file of the map.
-        index: where its cells are.
+        index: where its cells are; None: the whole map is one cell, which every view needs.
+        cache_bytes: of cells that were read, in addition to those of the last view, as many are kept.
 
     Raises:
         FormatError: they do not fit together.
     """
 
-    def __init__(self, ply: Path, index: MapIndex) -> None:
-        self.path, self.index = ply, index
-        self._rows = PlyRows(ply, "vertex")
-        if self._rows.count != int(index.counts.sum()):
-            raise FormatError(f"{ply}: has {self._rows.count} Gaussians, {MAP_INDEX} beside it speaks of others")
+    def __init__(self, ply: Path, index: MapIndex | None, cache_bytes: int = CACHE_BYTES) -> None:
+        self.rows = GaussianRows(ply)
+        """For going through all of the map."""
+        self.in_cells = index is not None
+        """Whether there is an index."""
+        self.index = MapIndex.of_whole(len(self.rows)) if index is None else index
+        if len(self.rows) != int(self.index.counts.sum()):
+            raise FormatError(f"{ply}: has {len(self.rows)} Gaussians, {MAP_INDEX} beside it speaks of others")
+        self._cached: OrderedDict[int, GaussianMap] = OrderedDict()
+        self._room = cache_bytes // max(1, self.rows.like.bytes_per_gaussian)
         self._shown: tuple[int, ...] | None = None
         self._map: GaussianMap | None = None
 
     def __len__(self) -> int:
-        return self._rows.count
+        return len(self.rows)
 
     def cells(self) -> list[int]:
         """Numbers of the cells."""
         return list(range(len(self.index.counts)))
 
-    def read(self, cells: list[int]) -> GaussianMap:
+    def read(self, cells: Sequence[int]) -> GaussianMap:
         """The Gaussians of some cells, rising, without optimizer state."""
-        parts = [self._rows.read(int(self.index.starts[i]), int(self.index.counts[i])) for i in cells]
-        vertex = np.concatenate(parts) if parts else self._rows.read(0, 0)
-        return gaussians_of_vertices(self.path, vertex, with_moments=False)
+        if len(cells) == 1:
+            return self._cell(cells[0])
+        like = self.rows.like
+        out = GaussianMap(like.sh_degree, like.features.shape[1], with_moments=False)
+        out.growth = 0
+        out.reserve(int(self.index.counts[list(cells)].sum()))
+        for cell in cells:
+            part = self._cached.pop(cell, None)
+            part = self._cell(cell) if part is None else part
+            out.append(part.take(torch.arange(len(part))))
+            self._cached[cell] = part
+            self._forget_oldest()
+        return out
 
     def in_view(self, camera: Camera, T_camera_world: np.ndarray, reach: float = 1e6) -> GaussianMap:
-        """All Gaussians that a camera may see, read anew only when other cells come into view."""
+        """All Gaussians that a camera may see; those of the last view themselves if they lie in the same cells."""
         frustum = Frustums.of(camera, T_camera_world, [reach])
         cells = tuple(np.flatnonzero(frustum.touch(self.index.low, self.index.high)[0]).tolist())
         if self._map is None or cells != self._shown:
             self._map = None  # two of them need not fit into memory
-            self._map, self._shown = self.read(list(cells)), cells
+            self._map, self._shown = self.read(cells), cells
         return self._map
+
+    def shown_rows(self) -> np.ndarray:
+        """Where in the file the Gaussians of the last view are, int64 [N]."""
+        starts, shown = self.index.starts, self._shown or ()
+        rows = [np.arange(starts[i], starts[i] + self.index.counts[i]) for i in shown]
+        return np.concatenate(rows) if rows else np.empty(0, np.int64)
+
+    def parts(self) -> list[MapPart]:
+        """Its cells, to be read one at a time."""
+        index = self.index
+        return [MapPart(index.low[i], index.high[i], partial(self._cell, i)) for i in self.cells()]
+
+    def _cell(self, cell: int) -> GaussianMap:
+        return self.rows.read(int(self.index.starts[cell]), int(self.index.counts[cell]))
+
+    def _forget_oldest(self) -> None:
+        while self._cached and sum(map(len, self._cached.values())) > self._room:
+            self._cached.popitem(last=False)

@@ -12,18 +12,19 @@ import numpy as np
 
 from ggslam.evaluation.gaussian_labels import GaussianTruth
 from ggslam.evaluation.segmentation import Matching, SegmentationCounts
-from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.map_index import MapInParts
+from ggslam.objects_in_parts import ObjectsInParts
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import vote_label_image
 from ggslam.rendering.types import RenderBuffers
-from ggslam.rendering_jobs import identity_colors, identity_picture, object_ids
+from ggslam.rendering_jobs import identity_picture, object_ids
 from ggslam.reporting.pictures import color_of_ids
 from ggslam.scene.frame import Frame
-from ggslam.scene.gaussian_map import GaussianMap
 
 VOTE_STRIDE = 2
 """Labels by votes are scored at every second pixel of every second row: at all of them they would cost more than
 everything else that is scored."""
+_NOTHING = np.empty(0, np.int32), np.empty(0, np.float32)
 
 TRUTH_STRIDE = 3
 """The true labels of Gaussians are voted for by every third view: each Gaussian is seen by many."""
@@ -33,25 +34,25 @@ class ObjectScorer:
     """Compares rendered object ids with the masks of the frames.
 
     Args:
-        segmented: the map and its objects.
+        objects: the map and its objects.
         sets: name of each set of views -> the `Frame.index` values that belong to it; "all" must be one and hold the
             others.
         names: of true ids, where known.
     """
 
-    def __init__(self, segmented: SegmentedMap, sets: Mapping[str, set[int]], names: Mapping[int, str]) -> None:
-        self._segmented, self._sets, self._names = segmented, sets, names
+    def __init__(self, objects: ObjectsInParts, sets: Mapping[str, set[int]], names: Mapping[int, str]) -> None:
+        self._objects, self._sets, self._names = objects, sets, names
         self._learned = {name: SegmentationCounts() for name in sets}
         self._voted = {name: SegmentationCounts(boundary=None) for name in sets}
-        self._votes = None if segmented.votes is None else segmented.votes.labels()
-        self._truth = GaussianTruth(segmented.gaussians.means.numpy())
-        self._palette = segmented.table.palette()
-        self._colors = identity_colors(segmented)
+        self._votes = objects.vote_labels()
+        self._truth = GaussianTruth(len(objects.map))
+        self._palette = objects.table.palette()
+        self._colors = objects.identity_colors()
 
     @property
-    def gaussians(self) -> GaussianMap:
+    def map(self) -> MapInParts:
         """The map."""
-        return self._segmented.gaussians
+        return self._objects.map
 
     def add(
         self, frame: Frame, rasterizer: CpuRasterizer, view: RenderBuffers, T_camera_world: np.ndarray, pictured: bool
@@ -61,7 +62,7 @@ class ObjectScorer:
         Args:
             frame: the recorded frame.
             rasterizer: which rendered `view` last.
-            view: the rendered frame with features.
+            view: the rendered frame with features, of what `map.in_view` gave last.
             T_camera_world: [4, 4], the pose it was rendered from.
             pictured: whether pictures are wanted.
 
@@ -71,17 +72,20 @@ class ObjectScorer:
         """
         if frame.mask is None and not pictured:
             return None
-        ids = object_ids(rasterizer, view, self._segmented)
+        scene = self._objects.in_view(frame.camera, T_camera_world)
+        ids = object_ids(rasterizer, view, scene)
         truth = frame.mask if frame.mask is not None else np.zeros_like(ids)
         counts = SegmentationCounts()
         if frame.mask is not None:
             counts.add(ids, truth)
             self._merge(self._learned, frame.index, counts)
+            rows = self.map.shown_rows()
             if (self._learned["all"].frames - 1) % TRUTH_STRIDE == 0:
-                self._truth.add(frame.camera, T_camera_world, frame.depth, truth)
+                means = scene.gaussians.means.numpy()
+                self._truth.add(frame.camera, T_camera_world, frame.depth, truth, means, rows)
             if self._votes is not None:
                 voted = SegmentationCounts(boundary=None)
-                labels = vote_label_image(rasterizer, view, self._votes, stride=VOTE_STRIDE)
+                labels = vote_label_image(rasterizer, view, self._votes[rows], stride=VOTE_STRIDE)
                 voted.add(labels, truth[::VOTE_STRIDE, ::VOTE_STRIDE])
                 self._merge(self._voted, frame.index, voted)
         if not pictured:
@@ -105,7 +109,7 @@ class ObjectScorer:
             scores["votes_miou"] = math.nan if self._votes is None else self._voted[name].scores(voted).miou
             out[name] = scores
         out["matching"] = learned.kind
-        out["supervision"] = self._segmented.table.supervision
+        out["supervision"] = self._objects.table.supervision
         per_object = self._learned["all"].scores(learned).per_object
         out["per_object"] = {i: {"name": self._names.get(i), **asdict(score)} for i, score in per_object.items()}
         out["gaussians"] = self._gaussians(learned, voted)
@@ -123,8 +127,8 @@ class ObjectScorer:
         return palette
 
     def _gaussians(self, learned: Matching, voted: Matching) -> dict[str, Any]:
-        gaussians = self._segmented.gaussians
-        opacities = gaussians.opacities.numpy()
-        scores = asdict(self._truth.scores(gaussians.object_id.numpy(), opacities, learned))
+        blocks = [(b.object_id.numpy().copy(), b.opacities.numpy()) for b in self.map.rows.blocks()] or [_NOTHING]
+        labels, opacities = (np.concatenate(column) for column in zip(*blocks, strict=True))
+        scores = asdict(self._truth.scores(labels, opacities, learned))
         by_votes = None if self._votes is None else self._truth.scores(self._votes, opacities, voted).accuracy
         return {**scores, "votes_accuracy": by_votes}

@@ -12,6 +12,7 @@ import numpy as np
 from ggslam.errors import ConfigError, RenderError
 from ggslam.formats.atomic import make_folder
 from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.objects_in_parts import ObjectsInParts
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import label_image, vote_label_image
 from ggslam.rendering.types import RenderBuffers
@@ -32,7 +33,7 @@ from ggslam.scene.poses import inverse
 KINDS = ("color", "depth", "alpha", "ids", "pca")
 OBJECT_KINDS = ("ids", "pca")
 """Pictures of a run with objects only: each object in its colour; identity vectors by principal components."""
-Painter = Callable[[RenderBuffers], np.ndarray]
+Painter = Callable[[RenderBuffers, GaussianMap], np.ndarray]
 
 
 def frame_poses(record: dict[str, Any]) -> dict[int, np.ndarray]:
@@ -91,39 +92,25 @@ def render_frames(
     camera = run_camera(folder)
     if width is not None:
         camera = camera.resized(width, round(camera.height * width / camera.width))
-    segmented = folder.segmented_map() if set(what) & set(OBJECT_KINDS) else None
-    view_of = map_views(folder, None if segmented is None else segmented.gaussians)
+    objects = ObjectsInParts.of(folder) if set(what) & set(OBJECT_KINDS) else None
+    parts = folder.map_in_parts() if objects is None else objects.map
     make_folder(out)
     rasterizer = CpuRasterizer()
-    painters = _painters() if segmented is None else {**_painters(), **_object_painters(segmented, rasterizer)}
+    painters = _painters() if objects is None else {**_painters(), **_object_painters(objects, rasterizer, what)}
     poses = frame_poses(folder.read_json("keyframes.json"))
     written = []
     for done, frame in enumerate(frames):
         T_camera_world = inverse(poses[frame])
-        gaussians = view_of(camera, T_camera_world)
-        view = rasterizer.forward(gaussians, camera, T_camera_world, features=segmented is not None)
+        gaussians = parts.in_view(camera, T_camera_world)
+        view = rasterizer.forward(gaussians, camera, T_camera_world, features=objects is not None)
         for kind in what:
             written.append(out / f"frame{frame:06d}_{kind}.png")
-            write_picture(written[-1], painters[kind](view))
+            write_picture(written[-1], painters[kind](view, gaussians))
         progress(done + 1)
-    if segmented is not None and "ids" in what:
+    if objects is not None and "ids" in what:
         written.append(out / "legend.png")
-        write_picture(written[-1], legend([(f"{o.id} {o.name or ''}", o.color) for o in segmented.table.objects]))
+        write_picture(written[-1], legend([(f"{o.id} {o.name or ''}", o.color) for o in objects.table.objects]))
     return written
-
-
-def map_views(folder: RunFolder, whole: GaussianMap | None = None) -> Callable[[Camera, np.ndarray], GaussianMap]:
-    """A function that gives what a camera at T_camera_world may see of a run's map.
-
-    Args:
-        folder: of the run. If its map was written cell by cell, no more of it is read than a view needs.
-        whole: the map, if it is in memory already.
-    """
-    parts = folder.map_in_parts() if whole is None else None
-    if parts is not None:
-        return parts.in_view
-    gaussians = folder.gaussians() if whole is None else whole
-    return lambda camera, T_camera_world: gaussians
 
 
 def object_ids(rasterizer: CpuRasterizer, view: RenderBuffers, segmented: SegmentedMap) -> np.ndarray:
@@ -141,25 +128,25 @@ def identity_picture(view: RenderBuffers, colors: IdentityColors) -> np.ndarray:
     return colors.picture(view.features.numpy(), view.alpha.numpy())
 
 
-def identity_colors(segmented: SegmentedMap) -> IdentityColors:
-    """Colours of the identity vectors of a map, fitted to its labelled Gaussians."""
-    return IdentityColors(segmented.gaussians.features.numpy()[segmented.gaussians.object_id.numpy() > 0])
-
-
 def _painters() -> dict[str, Painter]:
     return {
-        "color": lambda view: color_to_uint8(view.image.numpy()),
-        "depth": lambda view: _depth_picture(view.expected_depth.numpy(), view.alpha.numpy()),
-        "alpha": lambda view: (255 * np.clip(view.alpha.numpy(), 0, 1) + 0.5).astype(np.uint8),
+        "color": lambda view, _: color_to_uint8(view.image.numpy()),
+        "depth": lambda view, _: _depth_picture(view.expected_depth.numpy(), view.alpha.numpy()),
+        "alpha": lambda view, _: (255 * np.clip(view.alpha.numpy(), 0, 1) + 0.5).astype(np.uint8),
     }
 
 
-def _object_painters(segmented: SegmentedMap, rasterizer: CpuRasterizer) -> dict[str, Painter]:
-    palette, colors = segmented.table.palette(), identity_colors(segmented)
-    return {
-        "ids": lambda view: color_of_ids(object_ids(rasterizer, view, segmented), palette, outlines=True),
-        "pca": lambda view: identity_picture(view, colors),
-    }
+def _object_painters(objects: ObjectsInParts, rasterizer: CpuRasterizer, what: list[str]) -> dict[str, Painter]:
+    """Those of `OBJECT_KINDS` that are among `what`."""
+    palette = objects.table.palette()
+
+    def ids(view: RenderBuffers, gaussians: GaussianMap) -> np.ndarray:
+        return color_of_ids(object_ids(rasterizer, view, objects.around(gaussians)), palette, outlines=True)
+
+    if "pca" not in what:
+        return {"ids": ids}
+    colors = objects.identity_colors()
+    return {"ids": ids, "pca": lambda view, _: identity_picture(view, colors)}
 
 
 def _depth_picture(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:

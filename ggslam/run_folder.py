@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -207,15 +207,14 @@ class RunFolder:
         """The map; optimizer state, if there is room for it, begins anew."""
         return read_gaussian_ply(self.path / "map.ply", with_moments=with_moments)
 
-    def map_in_parts(self) -> MapInParts | None:
-        """The map, to be read as far as a view needs it; None if it was not written cell by cell.
+    def map_in_parts(self) -> MapInParts:
+        """The map, to be read in blocks of rows, or as far as a view needs it if it was written cell by cell.
 
         Raises:
             FormatError: map or index are damaged or do not belong together.
         """
-        if not (self.path / MAP_INDEX).is_file():
-            return None
-        return MapInParts(self.path / "map.ply", MapIndex.read(self.path / MAP_INDEX))
+        index = self.path / MAP_INDEX
+        return MapInParts(self.path / "map.ply", MapIndex.read(index) if index.is_file() else None)
 
     def trajectory(self) -> Trajectory:
         """Camera poses of all frames."""
@@ -245,20 +244,29 @@ class RunFolder:
         """
         table, gaussians = self.object_table(), self.gaussians()
         classifier = IdentityClassifier.from_file(self.path / "classifier.npz")
-        channels = classifier.weight.shape[1]
-        if gaussians.features.shape[1] != channels:
-            found = gaussians.features.shape[1]
+        self.check_objects(table, classifier, gaussians, set(np.unique(gaussians.object_id.numpy()).tolist()))
+        votes = self.votes()
+        if votes is not None:
+            self.check_votes(len(votes), len(gaussians))
+        return SegmentedMap(gaussians, classifier, table, votes)
+
+    def check_objects(
+        self, table: ObjectTable, classifier: IdentityClassifier, like: GaussianMap, present: Collection[int]
+    ) -> None:
+        """Raises RunFolderError if a map with the channels of `like` and Gaussians of the objects `present` is not
+        what table and classifier speak of."""
+        channels, found = classifier.weight.shape[1], like.features.shape[1]
+        if found != channels:
             raise RunFolderError(f"{self.path / 'map.ply'}: expected {channels} properties identity_*, found {found}")
-        lacking = sorted(set(table.ids()) - set(np.unique(gaussians.object_id.numpy()).tolist()))
+        lacking = sorted(set(table.ids()) - set(present))
         if lacking:
             named = f"object {lacking[0]}" + (f" and {len(lacking) - 1} more" if lacking[1:] else "")
             raise RunFolderError(f"{self.path / 'map.ply'}: no Gaussian is of {named}, which objects.json lists")
-        votes = self.votes()
-        if votes is not None and len(votes) != len(gaussians):
-            raise RunFolderError(
-                f"{self.path / 'votes.npz'}: expected votes of {len(gaussians)} Gaussians, found {len(votes)}"
-            )
-        return SegmentedMap(gaussians, classifier, table, votes)
+
+    def check_votes(self, votes: int, gaussians: int) -> None:
+        """Raises RunFolderError if there are votes of another number of Gaussians."""
+        if votes != gaussians:
+            raise RunFolderError(f"{self.path / 'votes.npz'}: expected votes of {gaussians} Gaussians, found {votes}")
 
     def votes(self) -> ObjectVotes | None:
         """Votes of the Gaussians of map.ply, None if they were not counted.

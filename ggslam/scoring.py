@@ -20,9 +20,10 @@ from ggslam.evaluation.lpips import Lpips
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.formats.atomic import make_folder, write_text
 from ggslam.object_scoring import ObjectScorer
+from ggslam.objects_in_parts import ObjectsInParts
 from ggslam.progress import Observer
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering_jobs import frame_poses, map_views
+from ggslam.rendering_jobs import frame_poses
 from ggslam.reporting.pictures import color_to_uint8, compare, write_picture
 from ggslam.run_folder import MARKER, RunFolder, json_ready
 from ggslam.scene.frame import Frame
@@ -119,7 +120,7 @@ def _sets(folder: RunFolder, record: dict[str, Any], every: int) -> dict[str, se
 def _object_scorer(folder: RunFolder, sequence: Sequence, sets: dict[str, set[int]]) -> ObjectScorer | None:
     if not folder.has_objects():
         return None
-    return ObjectScorer(folder.segmented_map(), sets, sequence.instance_names)
+    return ObjectScorer(ObjectsInParts.of(folder), sets, sequence.instance_names)
 
 
 def _segmentation_notes(folder: RunFolder, scores: dict[str, Any] | None, masks: Path | None) -> list[str]:
@@ -180,14 +181,14 @@ def _shower(
     folder: RunFolder, poses: dict[int, np.ndarray], pictured: set[int], scorer: ObjectScorer | None
 ) -> Callable[[Frame], tuple[np.ndarray, np.ndarray] | None]:
     """A function that renders the map as a frame's camera sees it, and keeps some of the pictures."""
-    view_of = map_views(folder, None if scorer is None else scorer.gaussians)
+    parts = folder.map_in_parts() if scorer is None else scorer.map
     rasterizer = CpuRasterizer()
 
     def show(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
         if frame.index not in poses:
             return None
         T_camera_world = inverse(poses[frame.index])
-        gaussians = view_of(frame.camera, T_camera_world)
+        gaussians = parts.in_view(frame.camera, T_camera_world)
         view = rasterizer.forward(gaussians, frame.camera, T_camera_world, features=scorer is not None)
         color = np.clip(view.image.numpy(), 0, 1).transpose(1, 2, 0)
         depth = np.where(view.alpha.numpy() > 0.5, view.expected_depth.numpy(), 0)

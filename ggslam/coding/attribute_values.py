@@ -135,6 +135,30 @@ def _most_frequent(values: np.ndarray, starts: np.ndarray, counts: np.ndarray) -
     return first[best][of_run]
 
 
+@dataclass(frozen=True)
+class AttributeSummary:
+    """What the coding of an attribute depends on: type and number of components, lowest and highest value, and of a
+    lossless one its ids, rising."""
+
+    dtype: np.dtype
+    components: int
+    low: int
+    high: int
+    ids: np.ndarray
+
+    @staticmethod
+    def of(values: np.ndarray, own: AttributeSettings) -> AttributeSummary:
+        """That of whole numbers [N], [N, 1] or [N, 3], N > 0."""
+        components = 3 if values.ndim == 2 and values.shape[1] == 3 else 1
+        ids = np.unique(values) if own.lossless else np.empty(0, values.dtype)
+        return AttributeSummary(values.dtype, components, int(values.min()), int(values.max()), ids)
+
+    def joined(self, other: AttributeSummary) -> AttributeSummary:
+        """That of the values of both."""
+        ids = np.union1d(self.ids, other.ids)
+        return replace(self, low=min(self.low, other.low), high=max(self.high, other.high), ids=ids)
+
+
 def plan_attributes(
     attributes: Mapping[str, np.ndarray], count: int, settings: CodecSettings
 ) -> list[tuple[CodedAttribute, AttributeParameters]]:
@@ -143,18 +167,27 @@ def plan_attributes(
     Raises:
         ConfigError: an array of wrong shape, type or range, or settings that do not fit it.
     """
+    for name, values in attributes.items():
+        _check_array(name, np.asarray(values), count)
+    return plan_summaries(
+        {name: AttributeSummary.of(np.asarray(v), settings.attribute(name)) for name, v in attributes.items()}, settings
+    )
+
+
+def plan_summaries(
+    attributes: Mapping[str, AttributeSummary], settings: CodecSettings
+) -> list[tuple[CodedAttribute, AttributeParameters]]:
+    """`plan_attributes` of arrays of which only so much is known; errors as there."""
     unknown = set(settings.attributes) - set(attributes)
     if unknown:
         raise ConfigError(f"CodecSettings.attributes: there is no attribute {sorted(unknown)[0]!r}")
     plans: list[tuple[CodedAttribute, AttributeParameters]] = []
     sets: dict[AttributeParameters, int] = {}
-    for index, (name, values) in enumerate(attributes.items()):
+    for index, (name, summary) in enumerate(attributes.items()):
         own = settings.attribute(name)
-        values = np.asarray(values)
-        _check_array(name, values, count)
-        description = _describe(name, values, own)
+        description = _describe(name, summary, own)
         instance = sum(plan.description.label == description.label for plan, _ in plans)
-        table = IdTable.of(values) if own.lossless else None
+        table = IdTable.of(summary.ids) if own.lossless else None
         plan = CodedAttribute(name, index, replace(description, instance=instance), table)
         parameters = _parameters(own, settings, table)
         # Attributes that are coded alike share a set: its id has 4 bits, and whole Gaussians have up to 21 attributes.
@@ -175,8 +208,8 @@ def _check_array(name: str, values: np.ndarray, count: int) -> None:
         raise ConfigError(f"attribute {name!r}: expected whole numbers, found {values.dtype}")
 
 
-def _describe(name: str, values: np.ndarray, own: AttributeSettings) -> AttributeDescription:
-    components = 3 if values.ndim == 2 and values.shape[1] == 3 else 1
+def _describe(name: str, values: AttributeSummary, own: AttributeSettings) -> AttributeDescription:
+    components = values.components
     depth = own.bit_depth or (8 if values.dtype == np.uint8 else 16)
     space = own.color_space or ("ycbcr" if components == 3 and values.dtype == np.uint8 and depth == 8 else "none")
     if own.lossless:
@@ -188,8 +221,8 @@ def _describe(name: str, values: np.ndarray, own: AttributeSettings) -> Attribut
     if space == "ycbcr" and depth != 8:
         raise ConfigError(f"attribute {name!r}: colour space ycbcr needs 8 bits, found {depth}")
     narrow = values.dtype == np.uint8 and depth >= 8
-    if not narrow and (values.min() < 0 or values.max() >= 1 << depth):
-        raise ConfigError(f"attribute {name!r}: values {values.min()} to {values.max()} do not fit in {depth} bits")
+    if not narrow and (values.low < 0 or values.high >= 1 << depth):
+        raise ConfigError(f"attribute {name!r}: values {values.low} to {values.high} do not fit in {depth} bits")
     default = "material" if own.lossless else "color" if components == 3 else "reflectance"
     label = own.label or (name if name in KNOWN_LABELS else default)
     if label not in KNOWN_LABELS:

@@ -3,17 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ggslam.coding.cloud import PointCloud, WorldGrid
 from ggslam.coding.native import SliceCoder, raht_settings
+from ggslam.coding.side_by_side import in_order
 from ggslam.coding.stream import CodedSliceUnits, CodedStream, read_stream
 from ggslam.errors import FormatError
-from ggslam.native.loader import available_processors
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,32 @@ def decode_cloud(data: bytes | memoryview, workers: int | None = None) -> PointC
     """
     stream = read_stream(data)
     return _decode(stream, stream.slices, workers)
+
+
+@dataclass(frozen=True)
+class CloudInParts:
+    """A stream that is decoded slice by slice.
+
+    Attributes:
+        count: points of all slices.
+        like: a cloud without points, with the attributes and all that is known of them together.
+        parts: the slices as clouds, in the order of the stream; raises FormatError if one is damaged.
+    """
+
+    count: int
+    like: PointCloud
+    parts: Iterator[PointCloud]
+
+
+def decode_in_parts(data: bytes | memoryview, workers: int | None = None) -> CloudInParts:
+    """`decode_cloud` slice by slice: no more slices are decoded in memory than two for each worker."""
+    stream = read_stream(data)
+
+    def decoded(number: int) -> PointCloud:
+        return _joined(stream, [_decode_slice(stream, stream.slices[number])])
+
+    count = sum(units.header.points for units in stream.slices)
+    return CloudInParts(count, _joined(stream, []), in_order(decoded, len(stream.slices), workers))
 
 
 def list_slices(data: bytes | memoryview) -> list[SliceInfo]:
@@ -85,17 +110,11 @@ def decode_box(data: bytes | memoryview, low: Sequence[float], high: Sequence[fl
 
 
 def _decode(stream: CodedStream, slices: list[CodedSliceUnits], workers: int | None) -> PointCloud:
-    count = min(workers or available_processors(), len(slices))
-    if count <= 1:
-        parts = [_decode_slice(stream, units) for units in slices]
-    else:
-        with ThreadPoolExecutor(count, thread_name_prefix="slice") as pool:
-            futures = [pool.submit(_decode_slice, stream, units) for units in slices]
-            try:
-                parts = [future.result() for future in futures]
-            finally:
-                for future in futures:
-                    future.cancel()
+    parts = list(in_order(lambda number: _decode_slice(stream, slices[number]), len(slices), workers))
+    return _joined(stream, parts)
+
+
+def _joined(stream: CodedStream, parts: Sequence[tuple[np.ndarray, dict[str, np.ndarray]]]) -> PointCloud:
     grid = _concatenate([part[0] for part in parts], (0, 3), np.int32)
     attributes = {}
     for attribute in stream.attributes:

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,11 @@ from ggslam.coding.container import UnitType, unit_bytes
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.sequence_parameters import SequenceParameters
 from ggslam.coding.settings import CodecSettings
+from ggslam.coding.side_by_side import in_order
 from ggslam.coding.slice_encoder import CloudToCode, CodedSlice, encode_slice
 from ggslam.coding.slices import assign_slices
 from ggslam.coding.user_data import write_user_data
 from ggslam.errors import ConfigError, FormatError
-from ggslam.native.loader import available_processors
 
 
 def encode_cloud(
@@ -44,17 +43,18 @@ def encode_cloud(
     """
     start = time.perf_counter()
     settings = settings or CodecSettings()
-    points = _checked_points(points)
+    points = checked_points(points)
     arrays = {name: np.asarray(values) for name, values in (attributes or {}).items()}
     plans = plan_attributes(arrays, len(points), settings)
     quantization = choose_quantization(
         points, settings.voxel_size, settings.geometry_bits, settings.geometry_scale, settings.box
     )
     numbers = assign_slices(points, quantization, settings)
-    sequence = _sequence_parameters(quantization, [plan for plan, _ in plans])
+    sequence = sequence_parameters(quantization, [plan for plan, _ in plans])
     cloud = CloudToCode(points, arrays, numbers, plans, sequence, quantization, settings, reconstruct)
-    slices = _encode_slices(cloud, 1 if numbers is None else int(numbers.max()) + 1)
-    data = _parameter_units(cloud, slices) + b"".join(coded.data for coded in slices)
+    count = 1 if numbers is None else int(numbers.max()) + 1
+    slices = list(in_order(lambda number: encode_slice(cloud, number), count, settings.workers))
+    data = parameter_units(cloud, slices) + b"".join(coded.data for coded in slices)
     report = CodingReport(
         len(points), sum(coded.report.points for coded in slices), len(data),
         tuple(coded.report for coded in slices), time.perf_counter() - start,
@@ -62,7 +62,8 @@ def encode_cloud(
     return EncodedCloud(data, report, _reconstruction(cloud, slices) if reconstruct else None)
 
 
-def _checked_points(points: np.ndarray) -> np.ndarray:
+def checked_points(points: np.ndarray) -> np.ndarray:
+    """The points as an array; ConfigError, FormatError: see `encode_cloud`."""
     points = np.asarray(points)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ConfigError(f"points: expected [N, 3], found {list(points.shape)}")
@@ -73,7 +74,8 @@ def _checked_points(points: np.ndarray) -> np.ndarray:
     return points
 
 
-def _sequence_parameters(quantization: Quantization, plans: list[CodedAttribute]) -> SequenceParameters:
+def sequence_parameters(quantization: Quantization, plans: list[CodedAttribute]) -> SequenceParameters:
+    """The set that all slices share."""
     resolution, _ = quantization.resolution()
     return SequenceParameters(
         tuple(plan.description for plan in plans), False, quantization.origin, 0, quantization.size,
@@ -81,21 +83,7 @@ def _sequence_parameters(quantization: Quantization, plans: list[CodedAttribute]
     )  # fmt: skip
 
 
-def _encode_slices(cloud: CloudToCode, count: int) -> list[CodedSlice]:
-    """A worker holds the arrays of the slice in its hands and no other."""
-    workers = min(cloud.settings.workers or available_processors(), count)
-    if workers == 1:
-        return [encode_slice(cloud, number) for number in range(count)]
-    with ThreadPoolExecutor(workers, thread_name_prefix="slice") as pool:
-        futures = [pool.submit(encode_slice, cloud, number) for number in range(count)]
-        try:
-            return [future.result() for future in futures]
-        finally:
-            for future in futures:
-                future.cancel()
-
-
-def _parameter_units(cloud: CloudToCode, slices: list[CodedSlice]) -> bytes:
+def parameter_units(cloud: CloudToCode, slices: Sequence[CodedSlice]) -> bytes:
     """Parameter sets, once for all slices, and the unit of what they cannot hold."""
     geometry = {coded.geometry.geometry_id: coded.geometry for coded in slices}
     attribute = {parameters.attribute_id: parameters for _, parameters in cloud.plans}

@@ -4,11 +4,22 @@ systems: equal numbers of points, or equal intervals, along the longest axis). P
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from ggslam.coding.grid_points import GridPoints
 from ggslam.coding.quantization import Quantization
 from ggslam.coding.settings import CodecSettings
+
+Points = tuple[GridPoints, np.ndarray | None]
+"""Points on the grid, and which of them (int64 [M]; None: all)."""
+
+
+def slices_wanted(count: int, settings: CodecSettings) -> int:
+    """Slices that so many points are cut into at least."""
+    return max(settings.slices, -(-count // settings.max_points))
 
 
 def assign_slices(points: np.ndarray, quantization: Quantization, settings: CodecSettings) -> np.ndarray | None:
@@ -16,14 +27,14 @@ def assign_slices(points: np.ndarray, quantization: Quantization, settings: Code
 
     No slice has more than `settings.max_points` points unless a single voxel has.
     """
-    wanted = max(settings.slices, -(-len(points) // settings.max_points))
+    wanted = slices_wanted(len(points), settings)
     if wanted == 1:
         return None
     grid = quantization.of(points)
     if settings.split == "cube":
         number = _by_cube(grid, wanted)
     elif settings.split == "interval":
-        number = _by_interval(grid, wanted)
+        number = PlaneCuts.by_interval(grid.size, wanted).numbers(grid)
     else:
         number = _by_count(grid, None, wanted)
     counts = np.bincount(number)
@@ -36,39 +47,91 @@ def assign_slices(points: np.ndarray, quantization: Quantization, settings: Code
     return rank.astype(np.min_scalar_type(rank[-1]))[number] if rank[-1] else None
 
 
-def _longest_first(grid: GridPoints) -> list[int]:
-    return sorted(range(3), key=lambda axis: -grid.size[axis])
+def _longest_first(size: Sequence[int]) -> list[int]:
+    return sorted(range(3), key=lambda axis: -size[axis])
 
 
-def _by_interval(grid: GridPoints, wanted: int) -> np.ndarray:
-    axis = _longest_first(grid)[0]
-    size = grid.size[axis]
-    numbers, _ = grid.number_planes(axis, np.arange(size) * wanted // size, np.zeros(size, int), np.zeros(size, bool))
-    return numbers
+@dataclass(frozen=True)
+class PlaneCuts:
+    """Slices along an axis: planes across it have a number each, or are cut by the other two axes.
+
+    Attributes:
+        axes: that axis, and the other two.
+        of_plane: slice of each plane; of one that is cut, of its first points.
+        cuts: by plane that is cut, the least keys (by the second axis, then the third) of its further slices, rising.
+    """
+
+    axes: Sequence[int]
+    of_plane: np.ndarray
+    cuts: Mapping[int, np.ndarray]
+
+    @staticmethod
+    def by_interval(size: Sequence[int], wanted: int) -> PlaneCuts:
+        """Equal intervals of the longest axis of a grid of that size."""
+        axes = _longest_first(size)
+        longest = size[axes[0]]
+        return PlaneCuts(axes, np.arange(longest) * wanted // longest, {})
+
+    @staticmethod
+    def by_count(blocks: Callable[[], Iterable[Points]], size: Sequence[int], wanted: int) -> PlaneCuts:
+        """Equal numbers of points along the longest axis.
+
+        Args:
+            blocks: the points, each time it is called.
+            size: of their grid.
+            wanted: slices.
+        """
+        axes = _longest_first(size)
+        counts = np.zeros(size[axes[0]], np.uint32)
+        for grid, rows in blocks():
+            counts += grid.plane_counts(axes[0], rows)
+        totals = np.cumsum(counts, dtype=np.int64)
+        ranks = totals[-1] * np.arange(1, wanted) // wanted
+        planes = np.searchsorted(totals, ranks, side="right")  # the plane that holds each cut
+        of_plane = np.searchsorted(planes, np.arange(len(totals)), side="left")
+        through = PlaneCuts(axes, of_plane, dict.fromkeys(planes.tolist(), np.empty(0, np.int64)))
+        found: dict[int, list[np.ndarray]] = {plane: [] for plane in through.cuts}
+        for grid, rows in blocks():
+            for plane, _, keys in through._inside(grid, rows)[1]:
+                found[plane].append(keys)
+        cuts = {}
+        for plane, parts in found.items():
+            local = ranks[planes == plane] - (totals[plane] - counts[plane])
+            cuts[plane] = np.partition(np.concatenate(parts), local)[local]
+        return PlaneCuts(axes, of_plane, cuts)
+
+    def numbers(self, grid: GridPoints, rows: np.ndarray | None = None) -> np.ndarray:
+        """Slice of each of the points `rows` (int64 [M]; None: all), uint16 [M]."""
+        numbers, inside = self._inside(grid, rows)
+        for plane, place, keys in inside:
+            numbers[place] += np.searchsorted(self.cuts[plane], keys, side="right").astype(np.uint16)
+        return numbers
+
+    def _inside(
+        self, grid: GridPoints, rows: np.ndarray | None
+    ) -> tuple[np.ndarray, Iterator[tuple[int, np.ndarray, np.ndarray]]]:
+        """Slices uint16 [M] of the points by their planes alone; of each plane that is cut, places and keys of its
+        points."""
+        cut = np.zeros(len(self.of_plane), bool)
+        cut[list(self.cuts)] = True
+        counts = grid.plane_counts(self.axes[0], rows) if self.cuts else np.zeros(len(cut), np.uint32)
+        numbers, inside = grid.number_planes(self.axes[0], self.of_plane, counts, cut, rows)
+        absolute = inside if rows is None else rows[inside]
+        coordinate = grid.coordinates(self.axes[0], absolute)
+
+        def planes() -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+            for plane in np.flatnonzero(cut & (counts > 0)).tolist():
+                own = coordinate == plane
+                keys = grid.coordinates(self.axes[1], absolute[own]).astype(np.int64) << 21
+                keys |= grid.coordinates(self.axes[2], absolute[own])
+                yield plane, inside[own], keys
+
+        return numbers, planes()
 
 
 def _by_count(grid: GridPoints, rows: np.ndarray | None, wanted: int) -> np.ndarray:
-    """Numbers in [0, wanted) of `rows` (None: all): by the longest axis, the points of a plane that is cut by the other
-    two."""
-    axes = _longest_first(grid)
-    counts = grid.plane_counts(axes[0], rows)
-    totals = np.cumsum(counts, dtype=np.int64)
-    ranks = totals[-1] * np.arange(1, wanted) // wanted
-    planes = np.searchsorted(totals, ranks, side="right")  # the plane that holds each cut
-    cut = np.zeros(len(totals), bool)
-    cut[planes] = True
-    of_plane = np.searchsorted(planes, np.arange(len(totals)), side="left")
-    number, inside = grid.number_planes(axes[0], of_plane, counts, cut, rows)
-    absolute = inside if rows is None else rows[inside]
-    coordinate = grid.coordinates(axes[0], absolute)
-    for plane in np.flatnonzero(cut):
-        own = coordinate == plane
-        keys = grid.coordinates(axes[1], absolute[own]).astype(np.int64) << 21
-        keys |= grid.coordinates(axes[2], absolute[own])
-        local = ranks[planes == plane] - (totals[plane] - counts[plane])
-        cuts = np.partition(keys, local)[local]
-        number[inside[own]] += np.searchsorted(cuts, keys, side="right").astype(np.uint16)
-    return number
+    """Numbers in [0, wanted) of `rows` (None: all)."""
+    return PlaneCuts.by_count(lambda: [(grid, rows)], grid.size, wanted).numbers(grid, rows)
 
 
 def _by_cube(grid: GridPoints, wanted: int) -> np.ndarray:

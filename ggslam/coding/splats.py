@@ -45,11 +45,12 @@ RATES = {
 }
 
 
-def splat_attributes(gaussians: GaussianMap) -> dict[str, np.ndarray]:
+def splat_attributes(gaussians: GaussianMap, with_ids: bool | None = None) -> dict[str, np.ndarray]:
     """The parameters of a map as uint16 attributes of 12 bits, values outside their ranges clipped.
 
     "sh_0" ... "sh_15" [N, 3] by coefficient, "opacity" [N], "scale" [N, 3], "rotation" [N, 3] (x, y, z of the
-    quaternion, whose sign is chosen so that w is not negative), "rotation_w" [N]; "object_id" [N] if any is set.
+    quaternion, whose sign is chosen so that w is not negative), "rotation_w" [N]; "object_id" [N] if any is set; of
+    parts of a map as `with_ids` says.
     """
     quaternions = torch.nn.functional.normalize(gaussians.quaternions.detach(), dim=1).cpu().numpy()
     quaternions = np.where(quaternions[:, :1] < 0, -quaternions, quaternions)
@@ -60,8 +61,8 @@ def splat_attributes(gaussians: GaussianMap) -> dict[str, np.ndarray]:
     out["rotation"] = _levels(quaternions[:, 1:], "rotation")
     out["rotation_w"] = _levels(quaternions[:, 0], "rotation")
     object_id = gaussians.object_id.cpu().numpy()
-    if object_id.any():
-        if object_id.min() < 0 or object_id.max() > 65535:
+    if object_id.any() if with_ids is None else with_ids:
+        if object_id.min(initial=0) < 0 or object_id.max(initial=0) > 65535:
             raise ConfigError(f"object ids from {object_id.min()} to {object_id.max()}: expected 0 to 65535")
         out["object_id"] = object_id.astype(np.uint16)
     return out

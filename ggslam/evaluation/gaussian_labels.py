@@ -39,16 +39,19 @@ class GaussianTruth:
     the measured depth says that it is seen.
 
     Args:
-        means: float32 [N, 3], world frame.
+        count: Gaussians there are.
     """
 
-    def __init__(self, means: np.ndarray) -> None:
-        self._means = np.ascontiguousarray(means.T, np.float32)
+    def __init__(self, count: int) -> None:
+        self._count = count
         self._keys = np.zeros(0, np.int64)
         self._counts = np.zeros(0, np.int64)
         self._new: list[np.ndarray] = []
 
-    def add(self, camera: Camera, T_camera_world: np.ndarray, depth: np.ndarray, truth: np.ndarray) -> None:
+    def add(
+        self, camera: Camera, T_camera_world: np.ndarray, depth: np.ndarray, truth: np.ndarray, means: np.ndarray,
+        numbers: np.ndarray,
+    ) -> None:  # fmt: skip
         """Takes one view in.
 
         Args:
@@ -56,6 +59,8 @@ class GaussianTruth:
             T_camera_world: [4, 4].
             depth: measured, float32 [H, W] metres, 0 = none.
             truth: true ids uint16 [H, W], 0 = unlabelled.
+            means: float32 [M, 3], world frame, of all Gaussians that the camera may see.
+            numbers: which Gaussians they are, int64 [M].
 
         Raises:
             ValueError: images of another size than the camera's.
@@ -64,7 +69,7 @@ class GaussianTruth:
         if depth.shape != size or truth.shape != size:
             raise ValueError(f"expected images of {size}, found depth {depth.shape}, truth {truth.shape}")
         T = T_camera_world.astype(np.float32)
-        x, y, z = T[:3, :3] @ self._means + T[:3, 3:]
+        x, y, z = T[:3, :3] @ np.ascontiguousarray(means.T) + T[:3, 3:]
         # Bounds without a division, so that only Gaussians in the image are divided and rounded.
         u, v = camera.fx * x + (camera.cx + 0.5) * z, camera.fy * y + (camera.cy + 0.5) * z
         rows = np.flatnonzero((z > 0.01) & (u >= 0) & (v >= 0) & (u < camera.width * z) & (v < camera.height * z))
@@ -76,14 +81,14 @@ class GaussianTruth:
         measured, ids = depth.reshape(-1)[pixel], truth.reshape(-1)[pixel]
         tolerance = np.maximum(DEPTH_TOLERANCE_M, DEPTH_TOLERANCE_SHARE * measured)
         seen = (measured > 0) & (np.abs(z - measured) <= tolerance) & (ids > 0)
-        self._new.append(rows[seen] * _IDS + ids[seen])
+        self._new.append(numbers[rows[seen]] * _IDS + ids[seen])
         if sum(map(len, self._new)) > _KEYS_AT_ONCE:
             self._gather()
 
     def labels(self) -> np.ndarray:
         """uint16 [N]: the most frequent true id of each Gaussian (the lowest of equals), 0 where none was seen."""
         self._gather()
-        out = np.zeros(self._means.shape[1], np.uint16)
+        out = np.zeros(self._count, np.uint16)
         order = np.lexsort((-self._keys, self._counts))  # the last one written wins
         out[self._keys[order] // _IDS] = self._keys[order] % _IDS
         return out

@@ -111,10 +111,11 @@ def read_gaussian_ply(path: str | Path, device: torch.device | str = "cpu", with
 
 
 def gaussians_of_vertices(
-    path: str | Path, vertex: np.ndarray | None, device: torch.device | str = "cpu", with_moments: bool = True
-) -> GaussianMap:
-    """The map in the rows of a PLY file, or in some of them (structured array, None: the file has none); `path`,
-    arguments and errors as in `read_gaussian_ply`."""
+    path: str | Path, vertex: np.ndarray | None, device: torch.device | str = "cpu", with_moments: bool = True,
+    first: int = 0,
+) -> GaussianMap:  # fmt: skip
+    """The map in the rows of a PLY file, or in some of them (structured array, None: the file has none), of which the
+    first has the number `first` in the file; `path`, arguments and errors as in `read_gaussian_ply`."""
     names = (vertex.dtype.names or ()) if vertex is not None else ()
     missing = [name for name in _REQUIRED if name not in names]
     if vertex is None or missing:
@@ -126,19 +127,20 @@ def gaussians_of_vertices(
         raise FormatError(f"{path}: {len(rest)} properties f_rest_*, expected 0, 9, 24 or 45 (SH degree 0 to 3)")
     out = GaussianMap(degree, len(features), torch.device(device), with_moments)
     out.insert(
-        means=_floats(path, vertex, _MEANS),
-        quaternions=_floats(path, vertex, _ROTATIONS),
-        log_scales=_floats(path, vertex, _SCALES),
-        opacity_logits=_floats(path, vertex, ["opacity"])[:, 0],
+        means=_floats(path, first, vertex, _MEANS),
+        quaternions=_floats(path, first, vertex, _ROTATIONS),
+        log_scales=_floats(path, first, vertex, _SCALES),
+        opacity_logits=_floats(path, first, vertex, ["opacity"])[:, 0],
         rgb=torch.zeros(len(vertex), 3),
-        features=_floats(path, vertex, features),
+        features=_floats(path, first, vertex, features),
         object_id=torch.from_numpy(vertex["object_id"].astype(np.int32)) if "object_id" in names else None,
     )
-    out.sh[:, 0] = _floats(path, vertex, _COLORS).to(out.sh)
-    out.sh[:, 1:] = _floats(path, vertex, rest).reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2).to(out.sh)
+    out.sh[:, 0] = _floats(path, first, vertex, _COLORS).to(out.sh)
+    channel_major = _floats(path, first, vertex, rest).reshape(len(vertex), 3, len(rest) // 3)
+    out.sh[:, 1:] = channel_major.transpose(1, 2).to(out.sh)
     norms = out.quaternions.norm(dim=1)
     if (norms < 1e-6).any():
-        raise FormatError(f"{path}: the quaternion of vertex {int(norms.argmin())} is zero")
+        raise FormatError(f"{path}: the quaternion of vertex {first + int(norms.argmin())} is zero")
     return out
 
 
@@ -151,7 +153,7 @@ def _numbered(path: str | Path, names: Sequence[str], prefix: str) -> list[str]:
     return expected
 
 
-def _floats(path: str | Path, vertex: np.ndarray, names: Sequence[str]) -> torch.Tensor:
+def _floats(path: str | Path, first: int, vertex: np.ndarray, names: Sequence[str]) -> torch.Tensor:
     """Columns as float32 [N, len(names)], all finite."""
     out = np.empty((len(vertex), len(names)), np.float32)
     for column, name in enumerate(names):
@@ -161,5 +163,6 @@ def _floats(path: str | Path, vertex: np.ndarray, names: Sequence[str]) -> torch
         bad = ~np.isfinite(out[:, column])
         if bad.any():
             row = int(bad.argmax())
-            raise FormatError(f"{path}: property '{name}' of vertex {row} is {vertex[name][row]}, expected a number")
+            where = f"property '{name}' of vertex {first + row}"
+            raise FormatError(f"{path}: {where} is {vertex[name][row]}, expected a number")
     return torch.from_numpy(out)

@@ -28,9 +28,15 @@ def halves() -> np.ndarray:
 
 
 def truth_of(points: list[list[float]], depth: float = 2.0, mask: np.ndarray | None = None) -> np.ndarray:
-    truth = GaussianTruth(np.array(points, np.float32))
-    truth.add(CAMERA, IDENTITY, np.full((6, 8), depth, np.float32), halves() if mask is None else mask)
+    truth = GaussianTruth(len(points))
+    depths = np.full((6, 8), depth, np.float32)
+    truth.add(CAMERA, IDENTITY, depths, halves() if mask is None else mask, *numbered(points))
     return truth.labels()
+
+
+def numbered(points: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:
+    """All of the points, and their numbers."""
+    return np.array(points, np.float32), np.arange(len(points))
 
 
 def test_only_what_is_seen_gets_a_label() -> None:
@@ -48,26 +54,34 @@ def test_the_nearer_tolerance_is_two_centimetres() -> None:
 
 def test_the_majority_of_views_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gaussian_labels, "_KEYS_AT_ONCE", 3)  # votes are gathered on the way, too
-    truth = GaussianTruth(np.array([at(1, 2, 2), at(6, 2, 2)], np.float32))
+    truth, points = GaussianTruth(2), numbered([at(1, 2, 2), at(6, 2, 2)])
     depth, one, other = np.full((6, 8), 2, np.float32), halves(), np.full((6, 8), 7, np.uint16)
     for mask in (one, other, other, one, other):
-        truth.add(CAMERA, IDENTITY, depth, mask)
+        truth.add(CAMERA, IDENTITY, depth, mask, *points)
     assert truth.labels().tolist() == [7, 7]
-    truth.add(CAMERA, IDENTITY, depth, one)
+    truth.add(CAMERA, IDENTITY, depth, one, *points)
     assert truth.labels().tolist() == [1, 2]  # three each: the lower id
 
 
 def test_the_pose_is_from_world_to_camera() -> None:
     T = np.eye(4)
     T[0, 3] = 1.0  # the camera stands a metre to the left of the origin
-    truth = GaussianTruth(np.array([at(6, 2, 2)], np.float32) - np.array([1, 0, 0], np.float32))
-    truth.add(CAMERA, T, np.full((6, 8), 2, np.float32), halves())
+    truth = GaussianTruth(1)
+    means = np.array([at(6, 2, 2)], np.float32) - np.array([1, 0, 0], np.float32)
+    truth.add(CAMERA, T, np.full((6, 8), 2, np.float32), halves(), means, np.arange(1))
     assert truth.labels().tolist() == [2]
 
 
+def test_views_of_parts_of_a_map() -> None:
+    truth, depth = GaussianTruth(5), np.full((6, 8), 2, np.float32)
+    truth.add(CAMERA, IDENTITY, depth, halves(), np.array([at(1, 2, 2), at(6, 2, 2)], np.float32), np.array([3, 1]))
+    truth.add(CAMERA, IDENTITY, depth, halves(), np.array([at(6, 3, 2)], np.float32), np.array([4]))
+    assert truth.labels().tolist() == [0, 2, 0, 1, 2]
+
+
 def test_accuracy_by_hand() -> None:
-    truth = GaussianTruth(np.array([at(1, 2, 2), at(2, 2, 2), at(6, 2, 2), at(6, 2, 5)], np.float32))
-    truth.add(CAMERA, IDENTITY, np.full((6, 8), 2, np.float32), halves())
+    truth, points = GaussianTruth(4), numbered([at(1, 2, 2), at(2, 2, 2), at(6, 2, 2), at(6, 2, 5)])
+    truth.add(CAMERA, IDENTITY, np.full((6, 8), 2, np.float32), halves(), *points)
     labels, opacities = np.array([5, 0, 6, 6]), np.array([0.5, 0.25, 0.25, 1.0])
     s = truth.scores(labels, opacities, Matching("assignment", {1: 5}))
     assert (s.labelled, s.gaussians) == (3, 4)
@@ -77,7 +91,7 @@ def test_accuracy_by_hand() -> None:
 
 
 def test_nothing_labelled_and_wrong_sizes() -> None:
-    truth = GaussianTruth(np.zeros((2, 3), np.float32))
+    truth = GaussianTruth(2)
     assert math.isnan(truth.scores(np.zeros(2, int), np.ones(2), Matching("same", {})).accuracy)
     with pytest.raises(ValueError, match="depth"):
-        truth.add(CAMERA, IDENTITY, np.zeros((8, 6), np.float32), halves())
+        truth.add(CAMERA, IDENTITY, np.zeros((8, 6), np.float32), halves(), *numbered([[0, 0, 1]] * 2))

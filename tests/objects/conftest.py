@@ -57,6 +57,12 @@ def build_segmented_room(folder: Path, numbers: tuple[int, ...] = (0, 8, 16)) ->
     return SegmentedRoom(sequence, frames, gaussians, classifier)
 
 
+@pytest.fixture(scope="module")
+def shared_segmented_room(room: Path) -> SegmentedRoom:
+    """One for all tests of a file, which leave it as it is."""
+    return build_segmented_room(room)
+
+
 @pytest.fixture
 def segmented_room(room: Path) -> SegmentedRoom:
     """Fresh for every test: edits do not leak."""

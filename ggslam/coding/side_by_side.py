@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Slices in several threads, results in order."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+from ggslam.native.loader import available_processors
+
+Result = TypeVar("Result")
+
+
+def in_order(work: Callable[[int], Result], count: int, workers: int | None) -> Iterator[Result]:
+    """What `work` makes of the numbers 0 to count, one after the other. A worker has one of them in its hands, and no
+    more results wait than there are workers.
+
+    Args:
+        work: called by several threads; what it raises is raised here.
+        count: of the numbers.
+        workers: threads; None: one for each processor.
+    """
+    workers = min(workers or available_processors(), count)
+    if workers <= 1:
+        yield from map(work, range(count))
+        return
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(workers, thread_name_prefix="slice") as pool:
+        try:
+            for number in range(count):
+                waiting.append(pool.submit(work, number))
+                if len(waiting) > workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
