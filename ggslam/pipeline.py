@@ -3,11 +3,8 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +12,7 @@ from typing import Any
 from ggslam.config import Config, load_config
 from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.formats.staging import new_staging
+from ggslam.interrupts import uninterrupted
 from ggslam.progress import Observer, SilentObserver
 from ggslam.realtime import RealtimeSlam
 from ggslam.recordings import SequenceRequest, describe
@@ -144,22 +142,6 @@ def tracking_notes(result: SlamResult) -> list[str]:
         ending = after if stretch.after is not None else " and not found again"
         notes.append(f"lost for {stretch.frames} frames ({stretch.seconds:.2f} s) from frame {stretch.first}{ending}")
     return notes
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits until the block is done (in the main thread; elsewhere it does not arrive anyway)."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    arrived: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: arrived.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if arrived:
-        raise KeyboardInterrupt
 
 
 def _names(earlier: RunFolder | None) -> dict[int, str]:
