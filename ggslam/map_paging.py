@@ -215,7 +215,8 @@ class MapPager:
         if self.cells is None:
             return None
         self.prune_nowhere()
-        self.cells.move_out(self.map, self.cells.cells_of(self.map))
+        with uninterrupted():
+            self.cells.move_out(self.map, self.cells.cells_of(self.map))
         self.map.shrink(0)
         self.archive.limit = 0
         if self.mapper.identity is not None:

@@ -184,4 +184,12 @@ def run_slam(
         return slam.finish(observer.advance), None
     except (Exception, KeyboardInterrupt) as stopped:  # whatever it is: finished work is saved, then it is raised
         error = stopped
-    return slam.result(), error
+    try:
+        with uninterrupted():
+            result = slam.result()
+    except KeyboardInterrupt as again:  # by now there is the result
+        error = again
+    except Exception:  # the disk is full, and what is there goes to make room
+        slam.close()
+        raise
+    return result, error
