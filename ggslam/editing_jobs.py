@@ -15,6 +15,7 @@ import numpy as np
 from ggslam.edited_run import save_edited
 from ggslam.editing_pictures import before_and_after
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.interrupts import uninterrupted
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.editing import (
@@ -36,7 +37,6 @@ from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import joined
 from ggslam.objects.table import ObjectTable
 from ggslam.objects.traces import drop_traces, places
-from ggslam.pipeline import uninterrupted
 from ggslam.recordings import open_recording_of
 from ggslam.rendering_jobs import frame_poses, run_camera
 from ggslam.run_folder import MARKER, RunFolder

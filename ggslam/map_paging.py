@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from ggslam.formats.array_archive import ArrayArchive
+from ggslam.interrupts import uninterrupted
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper
@@ -45,6 +46,8 @@ _RENDERER_BYTES = 110
 _GROWTH = 0.1
 _INSERTIONS = 8
 """As much room is kept as the largest of so many last keyframes took (the first, for which all is new, aside)."""
+_AT_ONCE = 64
+"""Keyframes that are asked together which of them saw something last, from the newest to the oldest."""
 
 
 class MapPager:
@@ -185,7 +188,8 @@ class MapPager:
         if self.cells is None:
             return
         moved = np.flatnonzero(np.abs(T_new_old - np.eye(4)).max((1, 2)) > 0).tolist()
-        self.cells.change(lambda gaussians: move_with_keyframes(gaussians, T_new_old), moved)
+        with uninterrupted():
+            self.cells.change(lambda gaussians: move_with_keyframes(gaussians, T_new_old), moved)
 
     def bring_ends(self, kept: Iterable[int]) -> None:
         """After a loop was closed: as much as there is room for of what the newest keyframe and those at the older end
@@ -211,7 +215,8 @@ class MapPager:
         if self.cells is None:
             return None
         self.prune_nowhere()
-        self.cells.move_out(self.map, self.cells.cells_of(self.map))
+        with uninterrupted():
+            self.cells.move_out(self.map, self.cells.cells_of(self.map))
         self.map.shrink(0)
         self.archive.limit = 0
         if self.mapper.identity is not None:
@@ -281,7 +286,8 @@ class MapPager:
         if self.cells is None or not keys:
             return
         begin = len(self.map)
-        rows = self.cells.move_in(self.map, keys)
+        with uninterrupted():
+            rows = self.cells.move_in(self.map, keys)
         self.moved_in += rows.stop - begin
         self.most_resident = max(self.most_resident, len(self.map))
         self._trainable = None
@@ -318,16 +324,21 @@ class MapPager:
                 "view of one keyframe: the limit will be exceeded (a larger memory_limit_mb, a smaller --scale or "
                 "paging.view_range helps)"
             )
-        self.moved_out += cells.move_out(self.map, chosen) if chosen else 0
+        with uninterrupted():
+            self.moved_out += cells.move_out(self.map, chosen) if chosen else 0
         self._trainable = None
 
     def _last_seen(self, boxes: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """Number of the last keyframe that sees each box, int64 [M], -1 for none."""
-        numbers = np.arange(len(self.mapper.keyframes))
-        if not len(numbers):
-            return np.full(len(boxes[0]), -1)
-        seen = self._frustums(self._views(numbers.tolist())).touch(*boxes)
-        return np.where(seen, numbers[:, None], -1).max(0)
+        last, unseen = np.full(len(boxes[0]), -1), np.arange(len(boxes[0]))
+        for end in range(len(self.mapper.keyframes), 0, -_AT_ONCE):
+            numbers = np.arange(max(0, end - _AT_ONCE), end)
+            seen = self._frustums(self._views(numbers.tolist())).touch(boxes[0][unseen], boxes[1][unseen])
+            last[unseen] = np.where(seen, numbers[:, None], -1).max(0)
+            unseen = unseen[last[unseen] < 0]
+            if not len(unseen):
+                break
+        return last
 
     def _opened(self) -> GaussianCells:
         if self.cells is None:

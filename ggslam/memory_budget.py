@@ -36,7 +36,8 @@ class MemoryBudget:
         if self.limit:
             release_early()
         self.program_bytes = resident_bytes()
-        """What is not map, as measured last."""
+        """The most that was found to be not map: what stays, and what passes within a step."""
+        self._peak = 0
         self.notes: list[str] = []
         if self.limit and self.program_bytes + _LEAST > self.limit:
             raise ConfigError(
@@ -53,7 +54,8 @@ class MemoryBudget:
         """
         if self.map_bytes is not None or not self.limit:
             return
-        self.program_bytes = max(peak_memory_bytes() - held, 0)
+        self.program_bytes = 0
+        self._measure_program(held)
         left = self.limit - self.program_bytes
         if left < _LEAST:
             self.notes.append(
@@ -66,14 +68,22 @@ class MemoryBudget:
         """After each further keyframe: what the program took more since then is taken from the map; whether it is.
 
         Args:
-            held: as in `measure`.
+            held: as in `measure`, and no less than at any moment since the last call.
         """
-        if not self.limit or self.map_bytes is None or self.given or self.map_bytes <= _LEAST:
+        if not self.limit or self.map_bytes is None:
             return False
-        if resident_bytes() - held <= self.limit - self.map_bytes:
+        if resident_bytes() > self.limit - _STEP:
+            trim()
+        self._measure_program(held)
+        if self.given or self.map_bytes <= _LEAST or self.program_bytes <= self.limit - self.map_bytes:
             return False
-        trim()
-        self.program_bytes = max(self.program_bytes, resident_bytes() - held)
         left = max(_LEAST, (self.limit - self.program_bytes) // _STEP * _STEP)
         before, self.map_bytes = self.map_bytes, min(self.map_bytes, left)
         return self.map_bytes < before
+
+    def _measure_program(self, held: int) -> None:
+        """The largest resident memory so far counts where it is new: it passed since the last call."""
+        peak = peak_memory_bytes()
+        found = peak if peak > self._peak else resident_bytes()
+        self._peak = max(self._peak, peak)
+        self.program_bytes = max(self.program_bytes, found - held)

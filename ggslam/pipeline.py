@@ -3,11 +3,8 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +12,7 @@ from typing import Any
 from ggslam.config import Config, load_config
 from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.formats.staging import new_staging
+from ggslam.interrupts import uninterrupted
 from ggslam.progress import Observer, SilentObserver
 from ggslam.realtime import RealtimeSlam
 from ggslam.recordings import SequenceRequest, describe
@@ -146,22 +144,6 @@ def tracking_notes(result: SlamResult) -> list[str]:
     return notes
 
 
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits until the block is done (in the main thread; elsewhere it does not arrive anyway)."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    arrived: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: arrived.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if arrived:
-        raise KeyboardInterrupt
-
-
 def _names(earlier: RunFolder | None) -> dict[int, str]:
     """Names of the objects of the run that this one began with."""
     if earlier is None or not earlier.has_objects():
@@ -202,4 +184,12 @@ def run_slam(
         return slam.finish(observer.advance), None
     except (Exception, KeyboardInterrupt) as stopped:  # whatever it is: finished work is saved, then it is raised
         error = stopped
-    return slam.result(), error
+    try:
+        with uninterrupted():
+            result = slam.result()
+    except KeyboardInterrupt as again:  # by now there is the result
+        error = again
+    except Exception:  # the disk is full, and what is there goes to make room
+        slam.close()
+        raise
+    return result, error

@@ -10,9 +10,11 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 import threading
 import time
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -176,6 +178,11 @@ class Slam:
             [] if self.pager is None else self.pager.budget.notes, None if self.pager is None else self.pager.close,
         )  # fmt: skip
 
+    def close(self) -> None:
+        """Removes what is on disk of map and keyframes, for a run that has no result."""
+        if self.pager is not None:
+            self.pager.close()
+
     def _learned_objects(self) -> LearnedObjects | None:
         """The last identity steps, and every Gaussian's object; once."""
         identity = self.mapper.identity
@@ -317,7 +324,10 @@ def make_pager(camera: Camera, config: Config, folder: Path | None) -> MapPager 
     if not config.memory_limit_mb:
         return None
     budget = MemoryBudget(int(config.memory_limit_mb * MB), int(config.paging.budget_mb * MB))
-    return MapPager(camera, config.paging, budget, folder or Path(tempfile.mkdtemp(prefix="ggslam-")))
+    pager = MapPager(camera, config.paging, budget, folder or Path(tempfile.mkdtemp(prefix="ggslam-")))
+    if folder is None:
+        weakref.finalize(pager, shutil.rmtree, pager.folder, ignore_errors=True)
+    return pager
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:

@@ -13,7 +13,8 @@ from ggslam.config import Config, config_to_dict, load_config
 from ggslam.errors import ConfigError, RunFolderError, SequenceError
 from ggslam.formats.atomic import make_folder
 from ggslam.formats.mesh_files import check_mesh_path
-from ggslam.pipeline import RunRequest, execute, uninterrupted
+from ggslam.interrupts import uninterrupted
+from ggslam.pipeline import RunRequest, execute
 from ggslam.progress import Observer, SilentObserver
 from ggslam.recordings import SequenceRequest
 from ggslam.run_folder import MARKER, RunFolder

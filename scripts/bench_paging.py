@@ -20,6 +20,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,8 @@ def main() -> None:
     parser.add_argument("--limit", type=float, help="resident memory of the limited run, 10^6 bytes")
     parser.add_argument("--budget", type=float, default=40.0, help="without --limit: 10^6 bytes for map and keyframes")
     parser.add_argument("--set", action="append", default=[], dest="overrides", help="a setting of both runs")
+    parser.add_argument("--stop", type=int, help="frames of the recording to use")
+    parser.add_argument("--together", action="store_true", help="both runs at the same time, on the same processors")
     parser.add_argument("--objects", action="store_true", help="learn objects, too")
     arguments = parser.parse_args()
     recording = arguments.recording or generated(arguments.folder, arguments.frames, arguments.width)
@@ -48,11 +51,11 @@ def main() -> None:
     if limit is None:
         limit = needed(recording, arguments.folder, common) + arguments.budget
         print(f"limit: {limit:.0f} MB, {arguments.budget:g} MB more than a run of 24 frames takes")
-    runs = {
-        "no limit": run(recording, arguments.folder / "unlimited", common),
-        "limited": run(recording, arguments.folder / "limited", [*common, f"memory_limit_mb={limit}"]),
-    }
-    report(runs, limit)
+    more = [] if arguments.stop is None else ["--stop", str(arguments.stop)]
+    with ThreadPoolExecutor(2 if arguments.together else 1) as workers:
+        settings = {"unlimited": common, "limited": [*common, f"memory_limit_mb={limit}"]}
+        found = workers.map(lambda name: run(recording, arguments.folder / name, settings[name], more), settings)
+        report(dict(zip(("no limit", "limited"), found, strict=True)), limit)
 
 
 def generated(folder: Path, frames: int, width: int) -> Path:
@@ -66,17 +69,17 @@ def generated(folder: Path, frames: int, width: int) -> Path:
 
 def needed(recording: Path, folder: Path, settings: list[str]) -> float:
     """Resident memory of a short run without its map, MB."""
-    found = run(recording, folder / "short", [*settings, "memory_limit_mb=100000"], ["--stop", "24"])
+    found = run(recording, folder / "short", [*settings, "memory_limit_mb=100000"], ["--stop", "24"], scored=False)
     paging = found["timing"]["paging"]
     return float(paging["program_mb"])
 
 
-def run(recording: Path, out: Path, settings: list[str], more: list[str] | None = None) -> dict[str, Any]:
-    """One run in a process of its own; what it left in its folder."""
+def run(recording: Path, out: Path, settings: list[str], more: list[str], scored: bool = True) -> dict[str, Any]:
+    """One run in a process of its own, and scoring in another; what they left in the folder."""
     overrides = [word for setting in settings for word in ("--set", setting)]
-    peak = command("run", str(recording), "--out", str(out), "--overwrite", "--no-eval", *overrides, *(more or []))
+    peak = command("run", str(recording), "--out", str(out), "--overwrite", "--no-eval", *overrides, *more)
     found: dict[str, Any] = {"timing": json.loads((out / "timing.json").read_text()), "peak_mb": peak}
-    if more is None:
+    if scored:
         found["scoring_mb"] = command("eval", str(out), "--no-lpips")
         found["metrics"] = json.loads((out / "metrics.json").read_text())
     found["disk_mb"] = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
@@ -114,7 +117,7 @@ def report(runs: dict[str, dict[str, Any]], limit: float) -> None:
         )
     free, bound = runs.values()
     paging = bound["timing"]["paging"]
-    rows = paging["map_mb"] / max(1, bound["timing"]["gaussians"])
+    state, room = paging["map_mb"] + paging["images_on_disk_mb"], limit - paging["program_mb"]
     print(f"paging: {json.dumps({key: round(value, 1) for key, value in paging.items()})}")
     print(
         f"limited / no limit: frames/s {ratio('frames_per_s', bound, free):.2f}, Gaussians "
@@ -122,9 +125,14 @@ def report(runs: dict[str, dict[str, Any]], limit: float) -> None:
         f"{bound['metrics']['images']['held_out']['psnr'] - free['metrics']['images']['held_out']['psnr']:+.2f} dB"
     )
     print(
-        f"peak RSS / limit: {bound['peak_mb'] / limit:.3f}; Gaussians / the most in memory: "
-        f"{bound['timing']['gaussians'] / max(1, paging['most_resident']):.1f}; map / budget of Gaussians: "
-        f"{paging['map_mb'] / max(1e-9, paging['gaussian_budget_mb']):.1f}; {1e6 * rows:.0f} bytes per Gaussian"
+        f"peak RSS / limit: {bound['peak_mb'] / limit:.3f}, scoring {bound['scoring_mb'] / limit:.3f}; Gaussians / the "
+        f"most in memory: {bound['timing']['gaussians'] / max(1, paging['most_resident']):.1f}"
+    )
+    print(
+        f"state (Gaussians with optimizer state {paging['map_mb']:.0f} MB, images and points of keyframes "
+        f"{paging['images_on_disk_mb']:.0f} MB) / what the limit leaves beside the program's own "
+        f"{paging['program_mb']:.0f} MB: {state / max(room, 1e-9):.1f}; Gaussians / their part of it: "
+        f"{paging['map_mb'] / max(1e-9, paging['gaussian_budget_mb']):.1f}; state / limit: {state / limit:.2f}"
     )
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 from ggslam.config import load_config
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.point_ply import read_points
 from ggslam.formats.point_sampling import sample_points
@@ -27,6 +28,7 @@ from ggslam.sequences import open_sequence
 from ggslam.sequences.synthetic import write_synthetic_sequence
 from ggslam.slam import Slam
 from ggslam.slam_result import SlamResult
+from ggslam.submaps.grid import GridStore
 
 PLENTY = "memory_limit_mb=100000"
 SMALL = [PLENTY, "paging.budget_mb=3.0", "paging.cell=0.5", "paging.keep_radius=0.5", "paging.view_margin=1"]
@@ -162,3 +164,54 @@ def test_a_limited_run_repeats(turning: Path, limited: RunOutcome, tmp_path: Pat
 def test_a_limit_below_the_program_is_refused(turning: Path) -> None:
     with pytest.raises(ConfigError, match=r"memory_limit_mb=50: the program itself takes \d+ MB"):
         Slam(open_sequence(turning).camera, load_config(None, ["memory_limit_mb=50"]))
+
+
+def test_an_interrupt_keeps_what_was_done(
+    turning: Path, limited: RunOutcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C arrives twice while cells are written to disk."""
+    real, calls = GridStore.put_cells, []
+
+    def put(store: GridStore, writes) -> None:
+        calls.append(writes)
+        if len(calls) == 2:
+            signal.raise_signal(signal.SIGINT)
+        real(store, writes)
+        if len(calls) == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(GridStore, "put_cells", put)
+    outcome = executed(turning, tmp_path / "stopped", *SMALL)
+    folder = outcome.folder.path
+    assert isinstance(outcome.error, KeyboardInterrupt) and 5 < len(outcome.result.frames) < 44
+    run = json.loads((folder / "run.json").read_text())
+    assert run["complete"] is False and "KeyboardInterrupt" in run["stopped_by"]
+    means = read_gaussian_ply(folder / "map.ply").means.numpy()
+    assert len(means) == outcome.result.gaussian_count and len(np.unique(means, axis=0)) > 0.99 * len(means)
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def test_a_full_disk_is_named_and_nothing_is_left(
+    turning: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def put(store: GridStore, writes) -> None:
+        raise RunFolderError("cannot write cells: No space left on device")
+
+    monkeypatch.setattr(GridStore, "put_cells", put)
+    with pytest.raises(RunFolderError, match="No space left on device"):
+        executed(turning, tmp_path / "full", *SMALL)
+    assert not (tmp_path / "full").exists()
+
+
+def test_what_a_killed_run_left_goes_with_the_next_one(turning: Path, tmp_path: Path) -> None:
+    left = tmp_path / "run" / ".staged-999999999-0123abcd" / "keyframes"
+    left.mkdir(parents=True)
+    (left / "keyframe000000.npz").write_bytes(b"x")
+    outcome = execute(RunRequest(SequenceRequest(turning, stop=3), tmp_path / "run", None, [*PLAIN, PLENTY], False))
+    assert outcome.error is None and not [p for p in outcome.folder.path.iterdir() if p.name.startswith(".")]
+
+
+def test_a_map_made_before_is_taken_whole(turning: Path, limited: RunOutcome, tmp_path: Path) -> None:
+    request = RunRequest(SequenceRequest(turning), tmp_path / "on", None, [*PLAIN, *SMALL], map=limited.folder.path)
+    with pytest.raises(ConfigError, match=r"memory_limit_mb.*--map"):
+        execute(request)

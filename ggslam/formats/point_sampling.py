@@ -15,10 +15,12 @@ _CHUNK = 300_000
 """Samples held in memory at a time..."""
 _SMALL_CHUNK = 40_000
 """...and where memory is scarce (a sample takes some 350 bytes)."""
-_FEW = 150_000
+_FEW = 50_000
 """Voxels that are sampled, where Gaussians come in parts, before one looks which are finished."""
 _BLOCK_EDGE = 0.25
 """Metres: how finely it is known where parts to come reach."""
+_SECTION = 0.5
+"""Metres along the map that are sampled together where memory is scarce."""
 _SPACING = 0.7
 """Distance of samples in voxels; below 1/sqrt(2) a lattice turned in its plane still meets every voxel of the plane."""
 _MOST_STEPS = 40
@@ -76,7 +78,8 @@ def sample_points(
     """
     if not voxel_size > 0 or not 0 < minimum_opacity < 1:
         raise ValueError(f"impossible voxel size {voxel_size} or minimum opacity {minimum_opacity}")
-    merged = _summed(_Sums.empty(), gaussians, voxel_size, minimum_opacity, with_object_id)
+    discs = _Discs.of(gaussians, minimum_opacity)
+    merged = _summed(_Sums.empty(), gaussians, discs, voxel_size, with_object_id)
     return _cloud(merged, voxel_size, with_object_id)
 
 
@@ -95,59 +98,80 @@ def sample_parts(
 ) -> Iterator[VoxelCloud]:
     """Like `sample_points` of all parts together, in clouds one after the other, each with an origin of its own.
 
-    The parts are swept along the longest side of the map; voxels that no later part reaches are handed out. So no more
-    is in memory than one part, and voxels at the borders of those that were done to those that were not.
+    Parts are read twice: at first to see which cubes of space each has samples in. Then they are swept along the
+    longest side of the map, each cut in sections; voxels in cubes that no later section reaches are handed out. So no
+    more is in memory than one part, the samples of a section, and voxels at the borders of what was done to what was
+    not.
     """
     if not parts:
         return
     lows, highs = np.stack([part.low for part in parts]), np.stack([part.high for part in parts])
-    blocks = _Blocks(np.floor(lows / voxel_size) - 1, np.ceil(highs / voxel_size) + 1, voxel_size)
+    axis = int((highs.max(0) - lows.min(0)).argmax())
+    order = np.argsort(lows[:, axis], kind="stable").tolist()
+    sections: list[np.ndarray] = []
+    for number in order:
+        sections += [_cubes(discs, voxel_size) for discs in _Discs.of(parts[number].load(), minimum_opacity).cut(axis)]
+    blocks, done = _Blocks(sections, voxel_size), 0
     waiting, pending, sampled = _Sums.empty(), [], 0
-    for number in np.argsort(lows[:, int((highs.max(0) - lows.min(0)).argmax())], kind="stable").tolist():
+    for number in order:
         part = parts[number].load()
-        pending.append(_summed(_Sums.empty(), part, voxel_size, minimum_opacity, with_object_id, _SMALL_CHUNK))
-        blocks.is_done(number)
-        sampled += len(pending[-1].key)
-        if sampled < max(_FEW, len(waiting.key)) and not blocks.all_done:  # joining costs as much as what waits
-            continue
-        waiting, pending, sampled = _Sums.of([waiting, *pending]), [], 0
-        done = blocks.finished(waiting.key)
-        if done.any():
-            yield _cloud(waiting.of_rows(done), voxel_size, with_object_id)
-            waiting = waiting.of_rows(~done)
+        for discs in _Discs.of(part, minimum_opacity).cut(axis):
+            pending.append(_summed(_Sums.empty(), part, discs, voxel_size, with_object_id, _SMALL_CHUNK))
+            blocks.is_done(done)
+            done, sampled = done + 1, sampled + len(pending[-1].key)
+            if sampled < max(_FEW, len(waiting.key)) and not blocks.all_done:  # joining costs as much as what waits
+                continue
+            waiting, pending, sampled = _Sums.of([waiting, *pending]), [], 0
+            finished = blocks.finished(waiting.key)
+            if finished.any():
+                yield _cloud(waiting.of_rows(finished), voxel_size, with_object_id)
+                waiting = waiting.of_rows(~finished)
+
+
+def _cube_edge(voxel_size: float) -> int:
+    """Of the cubes that finished space is counted in, voxels."""
+    return max(1, round(_BLOCK_EDGE / voxel_size))
+
+
+def _cubes(discs: _Discs, voxel_size: float) -> np.ndarray:
+    """The cubes that samples may fall into, packed, sorted."""
+    # A disc reaches along an axis of the world as far as its two half axes do together, and samples are rounded.
+    reach = np.sqrt(((discs.axes * discs.reach[:, None, :]) ** 2).sum(2)) + voxel_size
+    edge = voxel_size * _cube_edge(voxel_size)
+    low, high = (np.floor((discs.means + side * reach) / edge).astype(np.int64) for side in (-1, 1))
+    few = ((high - low) <= 1).all(1)
+    corners = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    found = [np.unique(_packed(np.minimum(low[few] + corner, high[few]))) for corner in corners]
+    for a, b in zip(low[~few], high[~few], strict=True):
+        axes = [np.arange(start, stop + 1) for start, stop in zip(a, b, strict=True)]
+        found.append(_packed(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)))
+    return np.unique(np.concatenate(found))
 
 
 class _Blocks:
-    """The space that boxes reach into, in cubes; tells which voxels no box to come reaches.
+    """Tells which voxels no section to come reaches.
 
     Args:
-        low, high: corners of the boxes, voxels [M, 3].
+        of_section: the cubes that each reaches into, from `_cubes`.
     """
 
-    def __init__(self, low: np.ndarray, high: np.ndarray, voxel_size: float) -> None:
-        self._edge = max(1, round(_BLOCK_EDGE / voxel_size))
-        self._of_box = [self._between(a, b) for a, b in zip(low // self._edge, high // self._edge, strict=True)]
-        self._keys, counts = np.unique(np.concatenate(self._of_box), return_counts=True)
-        self._to_come = counts
-        self._boxes_left = len(low)
-
-    @staticmethod
-    def _between(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        axes = [np.arange(int(a), int(b) + 1) for a, b in zip(low, high, strict=True)]
-        return _packed(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3))
+    def __init__(self, of_section: list[np.ndarray], voxel_size: float) -> None:
+        self._edge, self._of_section = _cube_edge(voxel_size), of_section
+        self._keys, self._to_come = np.unique(np.concatenate(of_section), return_counts=True)
+        self._left = len(of_section)
 
     @property
     def all_done(self) -> bool:
-        """Whether no box is to come."""
-        return self._boxes_left == 0
+        """Whether no section is to come."""
+        return self._left == 0
 
-    def is_done(self, box: int) -> None:
-        """A box is not to come any more."""
-        self._to_come[np.searchsorted(self._keys, self._of_box[box])] -= 1
-        self._boxes_left -= 1
+    def is_done(self, section: int) -> None:
+        """A section is not to come any more."""
+        self._to_come[np.searchsorted(self._keys, self._of_section[section])] -= 1
+        self._left -= 1
 
     def finished(self, voxels: np.ndarray) -> np.ndarray:
-        """Whether voxels (packed, [N]) lie in the cubes of no box to come, bool [N]."""
+        """Whether voxels (packed, [N]) lie in the cubes of no section to come, bool [N]."""
         if not len(voxels) or self.all_done:
             return np.ones(len(voxels), bool)
         key = _packed(_unpacked(voxels) // self._edge)
@@ -156,12 +180,11 @@ class _Blocks:
 
 
 def _summed(
-    merged: _Sums, gaussians: GaussianMap, voxel_size: float, minimum_opacity: float, with_object_id: bool,
-    chunk: int = _CHUNK,
+    merged: _Sums, gaussians: GaussianMap, discs: _Discs, voxel_size: float, with_object_id: bool, chunk: int = _CHUNK,
 ) -> _Sums:  # fmt: skip
-    """The sums with those of a map's samples, of which `chunk` are in memory at a time."""
+    """The sums with those of samples of a map, of which `chunk` are in memory at a time."""
     pending, waiting = [], 0
-    for position, weight, color, object_id in _samples(gaussians, voxel_size, minimum_opacity, chunk):
+    for position, weight, color, object_id in _samples(gaussians, discs, voxel_size, chunk):
         lattice = np.rint(position / voxel_size)
         if np.abs(lattice).max(initial=0) >= 1 << (_BITS - 1):
             raise ValueError(f"the map spans more than 2^{_BITS} voxels of {voxel_size} m")
@@ -185,22 +208,52 @@ def _unpacked(key: np.ndarray) -> np.ndarray:
     return np.stack([key >> 2 * _BITS, (key >> _BITS) & limit, key & limit], 1) - (1 << (_BITS - 1))
 
 
+@dataclass(frozen=True)
+class _Discs:
+    """What of a map is sampled: rows [N] that are opaque enough, float64 opacity [N], means [N, 3], the two longest
+    axes [N, 3, 2] with their scales [N, 2], and how far samples go along them [N, 2], metres."""
+
+    minimum_opacity: float
+    used: np.ndarray
+    opacity: np.ndarray
+    means: np.ndarray
+    scales: np.ndarray
+    axes: np.ndarray
+    reach: np.ndarray
+
+    @staticmethod
+    def of(gaussians: GaussianMap, minimum_opacity: float) -> _Discs:
+        opacity = gaussians.opacities.detach().cpu().numpy().astype(np.float64)
+        used = np.nonzero(opacity >= minimum_opacity)[0]
+        opacity = opacity[used]
+        means = gaussians.means.detach().cpu().numpy().astype(np.float64)[used]
+        scales = gaussians.scales.detach().cpu().numpy().astype(np.float64)[used]
+        axes = quaternion_to_matrix(gaussians.quaternions.detach().cpu().numpy().astype(np.float64)[used])
+        longest = np.argsort(-scales, axis=1, kind="stable")[:, :2]
+        scales = np.take_along_axis(scales, longest, 1)
+        axes = np.take_along_axis(axes, longest[:, None, :], 2)
+        reach = scales * np.sqrt(2 * np.log(opacity / minimum_opacity))[:, None]
+        return _Discs(minimum_opacity, used, opacity, means, scales, axes, reach)
+
+    def cut(self, axis: int) -> list[_Discs]:
+        """Their sections along an axis of the world, in its direction; at least one, perhaps empty."""
+        section = np.floor(self.means[:, axis] / _SECTION)
+        cut = []
+        for chosen in (section == number for number in np.unique(section)):
+            arrays = (self.used, self.opacity, self.means, self.scales, self.axes, self.reach)
+            cut.append(_Discs(self.minimum_opacity, *(array[chosen] for array in arrays)))
+        return cut or [self]
+
+
 def _samples(
-    gaussians: GaussianMap, voxel_size: float, minimum_opacity: float, chunk: int
+    gaussians: GaussianMap, discs: _Discs, voxel_size: float, chunk: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
     """Chunks of (position [M, 3], weight [M], colour [M, 3] in [0, 1], object id [M]), float64 and int32."""
-    opacity = gaussians.opacities.detach().cpu().numpy().astype(np.float64)
-    used = np.nonzero(opacity >= minimum_opacity)[0]
-    opacity = opacity[used]
-    means = gaussians.means.detach().cpu().numpy().astype(np.float64)[used]
-    scales = gaussians.scales.detach().cpu().numpy().astype(np.float64)[used]
-    axes = quaternion_to_matrix(gaussians.quaternions.detach().cpu().numpy().astype(np.float64)[used])
-    longest = np.argsort(-scales, axis=1, kind="stable")[:, :2]
-    scales = np.take_along_axis(scales, longest, 1)
-    axes = np.take_along_axis(axes, longest[:, None, :], 2)  # [N, 3, 2]
+    used, opacity, means, scales, axes, reach = (
+        discs.used, discs.opacity, discs.means, discs.scales, discs.axes, discs.reach
+    )  # fmt: skip
     color = gaussians.rgb.detach().cpu().numpy().astype(np.float64)[used].clip(0, 1)
     object_id = gaussians.object_id.cpu().numpy()[used]
-    reach = scales * np.sqrt(2 * np.log(opacity / minimum_opacity))[:, None]
     step = np.maximum(_SPACING * voxel_size, reach / _MOST_STEPS)
     steps = np.floor(reach / step).astype(np.int64)
     per_gaussian = np.prod(2 * steps + 1, axis=1)
@@ -212,7 +265,7 @@ def _samples(
         number = np.arange(bounds[start], bounds[stop]) - bounds[owner]
         offset = _lattice_point(number, steps[owner]) * step[owner]
         alpha = opacity[owner] * np.exp(-0.5 * ((offset / scales[owner]) ** 2).sum(1))
-        visible = alpha >= minimum_opacity * (1 - 1e-9)
+        visible = alpha >= discs.minimum_opacity * (1 - 1e-9)
         owner, offset = owner[visible], offset[visible]
         position = means[owner] + (axes[owner] * offset[:, None, :]).sum(2)
         yield position, alpha[visible], color[owner], object_id[owner]

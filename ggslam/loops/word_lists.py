@@ -71,14 +71,18 @@ class WordLists:
         )
 
     def _merge(self) -> None:
-        words = np.repeat(self._words.astype(np.int64), np.diff(self._ends))
-        recent = np.array(sorted(self._recent), np.int64)
+        """The new positions go where the lists of their words end. Nothing else is as long as all lists together, which
+        may be most of the memory that a long run has."""
+        recent = np.array(sorted(self._recent), self._words.dtype)
         counts = np.array([len(self._recent[word]) for word in recent.tolist()], np.int64)
-        words = np.concatenate([words, np.repeat(recent, counts)])
         new = np.fromiter(chain.from_iterable(self._recent[word] for word in recent.tolist()), np.int32)
-        order = np.argsort(words, kind="stable")
-        self._positions = np.concatenate([self._positions, new])[order]
-        distinct, starts = np.unique(words[order], return_index=True)
-        self._words = distinct.astype(self._words.dtype)
-        self._ends = np.append(starts, len(words)).astype(np.int64)
         self._recent, self._waiting = {}, 0
+        place = np.searchsorted(self._words, recent)
+        known = place < len(self._words)
+        known[known] = self._words[place[known]] == recent[known]
+        self._positions = np.insert(self._positions, np.repeat(self._ends[place + known], counts), new)
+        words = np.union1d(self._words, recent)
+        lengths = np.zeros(len(words), np.int64)
+        lengths[np.searchsorted(words, self._words)] = np.diff(self._ends)
+        lengths[np.searchsorted(words, recent)] += counts
+        self._words, self._ends = words, np.concatenate([self._ends[:1], np.cumsum(lengths)])

@@ -114,17 +114,25 @@ class GaussianCells:
         return out
 
     def move_out(self, gaussians: GaussianMap, rows: Mapping[CellKey, np.ndarray]) -> int:
-        """Moves rows to disk; returns how many. Only when all are written do they leave the map.
+        """Moves rows to disk; returns how many. Those of a cell leave the map when they are written, so that all there
+        are is in one place also if the disk is full.
 
         Args:
             gaussians: the map.
             rows: by cell, as `cells_of` gave them.
+
+        Raises:
+            RunFolderError: they cannot be written; cells that were not are in the map.
         """
-        self._write((key, gaussians.take(torch.from_numpy(index))) for key, index in rows.items())
-        stays = torch.ones(len(gaussians), dtype=torch.bool)
-        for index in rows.values():
-            stays[torch.from_numpy(index)] = False
-        return gaussians.keep(stays)
+        written: list[CellKey] = []
+        try:
+            self._write(((key, gaussians.take(torch.from_numpy(i))) for key, i in rows.items()), written=written)
+        finally:
+            stays = torch.ones(len(gaussians), dtype=torch.bool)
+            for key in written:
+                stays[torch.from_numpy(rows[key])] = False
+            moved = gaussians.keep(stays)
+        return moved
 
     def move_in(self, gaussians: GaussianMap, keys: Iterable[CellKey]) -> slice:
         """Brings the Gaussians of cells back, in the order of `sorted_keys`; returns the rows they have now."""
@@ -202,24 +210,33 @@ class GaussianCells:
         self.count -= self._cells.pop(key).count
         self._emptied.add(key)
 
-    def _write(self, cells: Iterable[tuple[CellKey, Rows]], others: Mapping[str, bytes] | None = None) -> None:
-        """Adds rows to cells, many of them at a time."""
-        writes: list[CellWrite] = []
+    def _write(
+        self, cells: Iterable[tuple[CellKey, Rows]], others: Mapping[str, bytes] | None = None,
+        written: list[CellKey] | None = None,
+    ) -> None:  # fmt: skip
+        """Adds rows to cells, many of them at a time; `written` is told which, as they are."""
+        batch: list[tuple[CellWrite, _Held]] = []
         size = 0
         for key, added in cells:
             rows = joined([self._rows(key), added]) if key in self._cells else added
             data = encode_rows(rows)
-            count = len(rows["means"])
-            writes.append(CellWrite(key, {PART: data, **(others or {})}, counts={PART: count}))
+            held = _held(rows)
+            batch.append((CellWrite(key, {PART: data, **(others or {})}, counts={PART: held.count}), held))
             size += len(data)
             if size > _BATCH_BYTES:
-                self.store.put_cells(writes)
-                writes, size = [], 0
-            self.bytes_written += len(data)
-            self.count += count - (self._cells[key].count if key in self._cells else 0)
-            self._cells[key] = _held(rows)
-            self._emptied.discard(key)
-        self.store.put_cells(writes)
+                self._put(batch, written)
+                batch, size = [], 0
+        self._put(batch, written)
+
+    def _put(self, batch: list[tuple[CellWrite, _Held]], written: list[CellKey] | None) -> None:
+        self.store.put_cells([write for write, _ in batch])
+        for write, held in batch:
+            self.bytes_written += len(write.parts[PART])
+            self.count += held.count - (self._cells[write.key].count if write.key in self._cells else 0)
+            self._cells[write.key] = held
+            self._emptied.discard(write.key)
+            if written is not None:
+                written.append(write.key)
 
 
 def _unpacked(number: int) -> CellKey:

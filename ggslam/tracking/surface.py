@@ -147,17 +147,18 @@ class MeasuredSurface:
         self.arrange(set(range(len(self._parts))))
 
     def _gathered(self, parts: list[_Part], base: GicpTarget | None) -> GicpTarget:
-        points = np.concatenate([transformed(p.points, p.T_world_camera) for p in parts])
-        normals = np.concatenate([p.normals @ p.T_world_camera[:3, :3].T for p in parts])
-        sigma = SPACING * np.concatenate([p.points[:, 2] for p in parts])
-        log_scales = np.log(sigma)[:, None] + np.log([1.0, 1.0, FLATNESS])
-
-        def contiguous(array: np.ndarray) -> np.ndarray:
-            return np.ascontiguousarray(array, np.float32)
-
+        count = sum(part.count for part in parts)
+        points, quaternions, log_scales = (np.empty((count, width), np.float32) for width in (3, 4, 3))
+        begin = 0
+        for part in parts:  # one after the other: there may be far more points than a keyframe has
+            rows, own = slice(begin, begin + part.count), part.points
+            points[rows] = transformed(own, part.T_world_camera)
+            quaternions[rows] = quaternions_from_normals(part.normals @ part.T_world_camera[:3, :3].T)
+            log_scales[rows] = np.log(SPACING * own[:, 2])[:, None] + np.log([1.0, 1.0, FLATNESS])
+            begin += part.count
         return GicpTarget.from_arrays(
-            contiguous(points), contiguous(quaternions_from_normals(normals)), contiguous(log_scales),
-            np.full(len(points), _OPACITY_LOGIT, np.float32), self._settings, self._context, base=base,
+            points, quaternions, log_scales, np.full(count, _OPACITY_LOGIT, np.float32), self._settings, self._context,
+            base=base,
         )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.errors import FormatError
+from ggslam.errors import FormatError, RunFolderError
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, se3_exp
@@ -171,3 +171,25 @@ def test_what_a_camera_sees_is_needed(cells_for) -> None:
         visible = (z > 0) & (z < 6) & (u > -0.5) & (u < 63.5) & (v > -0.5) & (v < 47.5)
         seen = {key for key, index in rows.items() if visible[index].any()}
         assert seen and seen <= set(keys) and len(keys) < len(rows) / 3
+
+
+def test_a_full_disk_loses_and_doubles_nothing(cells_for, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some batches are written, then one is not: what was written is on disk, all else in the map."""
+    gaussians = random_map()
+    before, cells = content(gaussians), cells_for(gaussians)
+    monkeypatch.setattr("ggslam.submaps.gaussian_cells._BATCH_BYTES", 1)
+    real, calls = cells.store.put_cells, []
+
+    def put(writes) -> None:
+        calls.append(writes)
+        if len(calls) == 4:
+            raise RunFolderError("cannot write cell: No space left on device")
+        real(writes)
+
+    monkeypatch.setattr(cells.store, "put_cells", put)
+    with pytest.raises(RunFolderError, match="No space left"):
+        cells.move_out(gaussians, cells.cells_of(gaussians))
+    assert len(cells.sorted_keys()) == 3 and len(gaussians) + cells.count == 3000
+    assert content(gaussians, *(part for _, part in cells.parts())) == before
+    cells.move_out(gaussians, cells.cells_of(gaussians))
+    assert content(*(part for _, part in cells.parts())) == before
