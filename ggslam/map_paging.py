@@ -2,8 +2,8 @@
 """SLAM in bounded memory: Gaussians of far cells and the images of keyframes move to disk and come back.
 
 Rules:
-- Before a keyframe is inserted, every Gaussian on disk that it may see comes back (its frustum, as deep as
-  `PagingSettings` says), so that nothing is mapped again because it was away.
+- Before a keyframe is inserted, every Gaussian on disk that it may see comes back (its frustum, in each part of the
+  image as deep as was measured there and a little deeper), so that nothing is mapped again because it was away.
 - When the map is over its budget, cells go: first those that were in view of a keyframe the longest ago, of these the
   farthest from the camera first. So the newest keyframes stay complete. What the camera sees stays, and what is nearer
   than `keep_radius` as long as others can go.
@@ -33,7 +33,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 from ggslam.submaps.cell_keys import CellKey
-from ggslam.submaps.frustums import Frustums
+from ggslam.submaps.frustums import Frustums, depth_reach
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.paging_settings import PagingSettings
@@ -48,6 +48,11 @@ _INSERTIONS = 8
 """As much room is kept as the largest of so many last keyframes took (the first, for which all is new, aside)."""
 _AT_ONCE = 64
 """Keyframes that are asked together which of them saw something last, from the newest to the oldest."""
+_TILES = (6, 8)
+"""Rows and columns of parts of a view: each is as deep as what was measured in it, cells behind that are hidden."""
+
+View = tuple[np.ndarray, np.ndarray]
+"""A pose T_world_camera [4, 4] and how deep each tile of the image sees, metres [rows, columns]."""
 
 
 class MapPager:
@@ -71,7 +76,7 @@ class MapPager:
         """The most Gaussians that were in memory."""
         self._camera = camera
         self._mapper: Mapper | None = None
-        self._reach: list[float] = []
+        self._reach: list[np.ndarray] = []
         self._new: list[int] = []
         self._place_bytes = 0
         self._trainable: Sequence[int] | None = None
@@ -109,7 +114,8 @@ class MapPager:
             depth: what it measured, metres [H, W].
         """
         s = self.settings
-        self._reach.append(min(s.view_range, s.view_margin * float(depth.max(initial=0.0)) + s.cell))
+        deep = s.view_margin * depth_reach(depth, *_TILES) + s.view_spare
+        self._reach.append(np.minimum(deep, s.view_range))
         self._bring([(T_world_camera, self._reach[-1])], max(self._new[1:][-_INSERTIONS:], default=0))
 
     def inserted(self, keyframe: Keyframe, added: int, place_bytes: int = 0) -> None:
@@ -249,12 +255,12 @@ class MapPager:
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
-    def _views(self, numbers: Iterable[int]) -> list[tuple[np.ndarray, float]]:
+    def _views(self, numbers: Iterable[int]) -> list[View]:
         return [(self.mapper.keyframes[number].T_world_camera, self._reach[number]) for number in numbers]
 
-    def _frustums(self, views: Sequence[tuple[np.ndarray, float]]) -> Frustums:
+    def _frustums(self, views: Sequence[View]) -> Frustums:
         poses, reach = zip(*views, strict=True)
-        return Frustums.of(self._camera, np.stack([inverse(T) for T in poses]), reach)
+        return Frustums.of(self._camera, np.stack([inverse(T) for T in poses]), np.stack(reach))
 
     def _row_bytes(self) -> float:
         return (1 + _GROWTH) * self.map.bytes_per_gaussian + _RENDERER_BYTES
@@ -268,7 +274,7 @@ class MapPager:
         left = (1 - self.settings.images) * self.budget.map_bytes - self._place_bytes
         return max(1, int(left / self._row_bytes()))
 
-    def _bring(self, views: list[tuple[np.ndarray, float]], room: int = 0) -> None:
+    def _bring(self, views: list[View], room: int = 0) -> None:
         """Brings what the views may see into memory, and makes room for it and for `room` more."""
         if self.budget.map_bytes is None:
             return
@@ -294,7 +300,7 @@ class MapPager:
         if self.mapper.identity is not None:
             self.mapper.identity.catch_up(self.map)
 
-    def _send(self, views: list[tuple[np.ndarray, float]], excess: int) -> None:
+    def _send(self, views: list[View], excess: int) -> None:
         """Sends at least `excess` Gaussians to disk, if so many are not in these views."""
         if excess <= 0:
             return

@@ -18,9 +18,11 @@ class PagingSettings:
     """Cells whose centres are nearer to the camera than this, in metres, stay in memory, seen or not."""
     view_range: float = 12.0
     """Farther than this from the camera, in metres, the map is not needed to render a view..."""
-    view_margin: float = 1.25
-    """...nor farther than the deepest that the view measured, times this. Gaussians behind what is measured are hidden
-    by what lies before them; where nothing was measured, nothing is trained but colour."""
+    view_margin: float = 1.1
+    """...nor farther than the deepest that was measured in a part of the view (a tile of the image), times this..."""
+    view_spare: float = 0.3
+    """...and this many metres more. Gaussians behind what is measured are hidden by what lies before them; where
+    nothing was measured, nothing is trained but colour."""
     budget_mb: float = 0.0
     """10^6 bytes that map and keyframe images may take; 0: the memory limit less what the program itself was measured
     to need. With a number of one's own, a run repeats bit for bit; measured ones differ a little between runs."""
@@ -32,6 +34,7 @@ class PagingSettings:
     def __post_init__(self) -> None:
         ranges = {
             "cell": (0.1, 1e4), "keep_radius": (0, 1e6), "view_range": (0.1, 1e6), "view_margin": (1, 100),
+            "view_spare": (0, 1e6),
             "budget_mb": (0, 1e9), "images": (0.01, 0.9), "slack": (0, 0.9),
         }  # fmt: skip
         check_ranges(self, ranges)
