@@ -94,8 +94,8 @@ def _tracked(record: dict[str, Any]) -> dict[str, np.ndarray]:
         for name, key in columns.items()
     }
     status = np.array([f["status"] for f in frames], str)
-    lost = status == "lost"  # what was measured of a frame that was nowhere says nothing
-    numbers["overlap"][lost] = numbers["rmse_m"][lost] = np.nan
+    unmatched = np.isin(status, ("lost", "first"))  # matched with nothing, or not well
+    numbers["overlap"][unmatched] = numbers["rmse_m"][unmatched] = np.nan
     return {**numbers, "status": status}
 
 

@@ -21,7 +21,7 @@ _LIGHT = {
     **{f"series{number}": color for number, color in enumerate(PALETTE)},
 }  # fmt: skip
 _FILE_STYLE = "".join(
-    [".plot text{font:12px system-ui,sans-serif;fill:#30343b}.plot .strong{font-weight:600;font-size:14px}"]
+    [".plot text{font:13px system-ui,sans-serif;fill:#30343b}.plot .strong{font-weight:600;font-size:14px}"]
     + [f".plot .{name}{{stroke:{color};fill:none}}" for name, color in _LIGHT.items()]
     + [f".plot rect.band{{fill:{_LIGHT['band']};stroke:none}}"]
 )
@@ -63,7 +63,7 @@ def _element(item: Stroke | Word | Box) -> str:
     number = "" if item.number is None else f' data-n="{item.number}"'
     if item.dots:  # each dot is a line of no length with a round end: one element for all of them
         path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in item.points)
-        style = 'stroke-width="5" stroke-linecap="round"'
+        style = 'stroke-width="6" stroke-linecap="round"'
         return f'<path class="{item.color}" {style}{number} d="{path}"/>'
     dash = ' stroke-dasharray="6 4"' if item.dashed else ""
     points = " ".join(f"{x:.1f},{y:.1f}" for x, y in item.points)
@@ -89,7 +89,7 @@ def picture(drawing: Drawing) -> np.ndarray:
             _write(canvas, item)
         elif item.dots:
             for x, y in item.points:
-                cv2.circle(canvas, (round(s * x), round(s * y)), round(2.5 * s), _rgb(item.color), cv2.FILLED)
+                cv2.circle(canvas, (round(s * x), round(s * y)), 3 * s, _rgb(item.color), cv2.FILLED)
         else:
             for part in _dashes(item.points) if item.dashed else [item.points]:
                 pixels = np.rint(s * part).astype(np.int32).reshape(-1, 1, 2)

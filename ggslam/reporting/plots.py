@@ -16,8 +16,8 @@ import numpy as np
 MOST_POINTS = 800
 """Of a curve; longer ones are drawn by the lowest and highest value of each stretch."""
 COLORS = 8
-_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 14, 12, 42
-_CHARACTER = 6.6
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 16, 12, 46
+_CHARACTER = 7.2
 """Mean width of a letter of the legend, pixels."""
 _ROW = 20
 
@@ -236,7 +236,7 @@ def _equalised(
 
 def _axes(drawing: Drawing, plot: Plot) -> None:
     (left, top, right, bottom), (x0, x1, y0, y1) = drawing.frame, drawing.limits
-    xs = ticks(x0, x1, max(2, int((right - left) / 80)))
+    xs = ticks(x0, x1, max(2, int((right - left) / 90)))
     ys = ticks(y0, y1, max(2, int((bottom - top) / 40)))
     items = drawing.items
     for value in ys:
@@ -246,9 +246,9 @@ def _axes(drawing: Drawing, plot: Plot) -> None:
     for value in xs:
         x = left + (right - left) * (value - x0) / (x1 - x0)
         items.append(Stroke(np.array([[x, top], [x, bottom]]), "grid"))
-        items.append(Word(tick_text(value, _step(xs)), x, bottom + 17))
+        items.append(Word(tick_text(value, _step(xs)), x, bottom + 18))
     items.append(Stroke(np.array([[left, top], [left, bottom], [right, bottom]]), "axis"))
-    items.append(Word(plot.x_label, (left + right) / 2, bottom + 35))
+    items.append(Word(plot.x_label, (left + right) / 2, bottom + 38))
     items.append(Word(plot.y_label, 13, (top + bottom) / 2, upright=True))
 
 

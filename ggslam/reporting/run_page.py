@@ -20,6 +20,8 @@ from ggslam.reporting.run_plots import (
 )
 
 FOOTER = "Written by ggslam. The page needs nothing but itself: no network, no other files."
+_OPEN_VIEWS = 2
+"""Frames that are shown at once; the others are folded away."""
 _NO_STEPS = "This run did not note its steps (it is of an older version, or was edited); there is no course over time."
 
 
@@ -123,10 +125,13 @@ def _object_scores(scores: dict[str, Any]) -> Html:
 def _views(run: RunData) -> Html:
     if not run.views:
         return p.tag("p", "There are no pictures: no frame of this run was located.")
-    return p.joined(
+    shown = [
         p.tag("div", p.tag("h3", f"frame {view.frame}"), p.cells(view.pictures.items()), class_="view")
         for view in run.views
-    )
+    ]
+    more = shown[_OPEN_VIEWS:]
+    folded = [p.tag("details", p.tag("summary", f"{len(more)} more"), *more)] if more else []
+    return p.joined([*shown[:_OPEN_VIEWS], *folded])
 
 
 def _path(run: RunData) -> Html:

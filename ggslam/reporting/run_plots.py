@@ -130,7 +130,12 @@ def _steps(
 def time_plots(runs: Sequence[RunData]) -> list[Plot]:
     """Milliseconds a frame."""
     own = _steps(runs, [("step_ms", "whole step"), ("tracking_ms", "tracking"), ("insertion_ms", "inserting")], _as_is)
-    return [Plot("time", "Time a frame", FRAME, "time (ms)", own, from_zero=True)]
+    plots = [Plot("time", "Time a frame", FRAME, "time (ms)", own, from_zero=True)]
+    if len(runs) == 1:
+        parts = _steps(runs, [("forward_ms", "rendering"), ("loss_ms", "loss"), ("backward_ms", "gradients"),
+                              ("identity_ms", "objects")], _as_is)  # fmt: skip
+        plots.append(Plot("time_training", "Training of the map, a frame", FRAME, "time (ms)", parts, from_zero=True))
+    return plots
 
 
 def map_plots(runs: Sequence[RunData]) -> list[Plot]:
