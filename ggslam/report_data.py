@@ -99,7 +99,7 @@ def _tracked(record: dict[str, Any]) -> dict[str, np.ndarray]:
     return {**numbers, "status": status}
 
 
-# --- where the camera was ----------------------------------------------------------------------------------------------
+# --- where the camera was --------------------------------------------------------------------------------------------
 
 
 def camera_path(folder: RunFolder, record: dict[str, Any], sequence: Sequence | None = None) -> Path3D:
@@ -160,7 +160,7 @@ def save_truth(folder: RunFolder, sequence: Sequence) -> None:
         write_tum(folder.path / TRUTH_FILE, [f["timestamp"] for f in frames], poses)
 
 
-# --- what a user should know -------------------------------------------------------------------------------------------
+# --- what a user should know -----------------------------------------------------------------------------------------
 
 
 def run_warnings(

@@ -47,8 +47,12 @@ def comparison_page(runs: Sequence[RunData], views: Sequence[FrameView]) -> str:
 
 
 def _lead(runs: Sequence[RunData]) -> str:
-    recordings = {str(run.recording.get("open", {}).get("path")) for run in runs}
-    return f"{len(runs)} runs of {'one recording' if len(recordings) == 1 else f'{len(recordings)} recordings'}"
+    count = len(_recordings(runs))
+    return f"{len(runs)} runs of {'one recording' if count == 1 else f'{count} recordings'}"
+
+
+def _recordings(runs: Sequence[RunData]) -> set[str]:
+    return {str(run.recording.get("open", {}).get("path")) for run in runs}
 
 
 def _scores(runs: Sequence[RunData]) -> Html:
@@ -62,10 +66,11 @@ def _scores(runs: Sequence[RunData]) -> Html:
         return p.tag("p", "None of these runs was scored; ggslam eval does that.")
     unscored = [run.name for run in runs if not run.metrics]
     note = [p.tag("p", f"Not scored: {', '.join(unscored)}.")] if unscored else []
-    recordings = {str(run.recording.get("open", {}).get("path")) for run in runs}
-    if len(recordings) > 1:
+    if len(_recordings(runs)) > 1:
         note.append(p.tag("p", "The runs are of different recordings: their scores cannot be held against each other."))
-    words = p.tag("p", "The best of each row is marked, if there is one best as printed.", class_="note")
+    elif len({tuple(run.tracked.get("frame", ())) for run in runs}) > 1:
+        note.append(p.tag("p", "The runs are of different frames of the recording; so are their scores."))
+    words = p.tag("p", "The best of each row is marked, unless all are equal as printed.", class_="note")
     return p.joined([p.table(["", *(run.name for run in runs)], rows), words, *note])
 
 
@@ -75,10 +80,8 @@ def _marked(metric: Metric, values: Sequence[float | None]) -> list[str]:
     known = [value for value in values if value is not None and math.isfinite(value)]
     if metric.better and len(known) > 1:
         best = metric.text((max if metric.better == "higher" else min)(known))
-        if texts.count(best) < len(texts):
-            return [
-                p.tag("td", p.tag("span", text), class_="best") if text == best else text for text in texts
-            ]  # fmt: skip
+        if texts.count(best) < len(known):
+            return [p.tag("td", p.tag("span", text), class_="best") if text == best else text for text in texts]
     return texts
 
 
@@ -90,7 +93,8 @@ def _settings(runs: Sequence[RunData]) -> Html:
         if len(set(values)) > 1:
             rows.append([name, *values])
     for key in ("scale", "start", "stop", "stride", "masks"):
-        values = [str(run.recording.get("open", {}).get(key)) for run in runs]
+        opened = [run.recording.get("open", {}).get(key) for run in runs]
+        values = ["-" if value is None else str(value) for value in opened]
         if len(set(values)) > 1:
             rows.append([f"recording: {key}", *values])
     if not rows:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from ggslam.reporting.run_data import RunData
+from ggslam.reporting.run_data import RunData, number_at
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class Metric:
 
     Attributes:
         name: for people.
-        keys: where it stands in metrics.json.
+        keys: where it stands in metrics.json, or after "timing" in timing.json, which runs have that were not scored.
         factor: from the file's unit to the shown one.
         form: how the number is written.
         unit: shown.
@@ -32,7 +32,7 @@ class Metric:
 
     def of(self, run: RunData) -> float | None:
         """The value in the shown unit; None if the run does not have it."""
-        value = run.number(*self.keys)
+        value = number_at({**run.metrics, "timing": run.timing}, *self.keys)
         return None if value is None else self.factor * value
 
     def text(self, value: float | None) -> str:
@@ -50,12 +50,15 @@ METRICS = (
     Metric("RPE, translation", ("trajectory", "rpe_trans_m"), 100, ".2f", "cm", "lower"),
     Metric("RPE, rotation", ("trajectory", "rpe_rot_deg"), 1, ".3f", "deg", "lower"),
     Metric("mIoU of objects, held out", ("segmentation", "held_out", "miou"), 100, ".1f", "%", "higher"),
-    Metric("frames/s", ("speed", "frames_per_s"), 1, ".1f", "", "higher"),
-    Metric("tracking a frame", ("speed", "tracking_ms"), 1, ".1f", "ms", "lower"),
-    Metric("Gaussians", ("map", "gaussians"), 1, ".0f", "", ""),
-    Metric("peak memory", ("memory", "peak_rss_mb"), 1, ".0f", "MB", "lower"),
+    Metric("frames/s", ("timing", "frames_per_s"), 1, ".1f", "", "higher"),
+    Metric("tracking a frame", ("timing", "tracking_ms_per_frame"), 1, ".1f", "ms", "lower"),
+    Metric("Gaussians", ("timing", "gaussians"), 1, ",.0f", "", ""),
+    Metric("peak memory", ("timing", "peak_rss_mb"), 1, ",.0f", "MB", "lower"),
 )
-TILES = ("PSNR, held out", "SSIM, held out", "LPIPS, held out", "ATE RMSE", "mIoU of objects, held out")
+TILES = (
+    "PSNR, held out", "SSIM, held out", "LPIPS, held out", "ATE RMSE", "mIoU of objects, held out", "frames/s",
+    "Gaussians", "peak memory",
+)  # fmt: skip
 """Scores that stand on top of a report."""
 
 MEANINGS = (
@@ -65,8 +68,8 @@ MEANINGS = (
     ("LPIPS", "Distance of the images in the features of a neural network (AlexNet), 0 for equal ones; nearest to what "
      "people notice, blur above all."),
     ("depth L1", "Mean distance of rendered and measured depth, where both are known."),
-    ("keyframes, held out, all", "Keyframes were trained on. Held-out frames never were: their scores tell what the map "
-     "looks like from new poses. All: every frame of the recording."),
+    ("keyframes, held out, all", "Keyframes were trained on. Held-out frames never were: their scores tell what the "
+     "map looks like from new poses. All: every frame of the recording."),
     ("masked, unmasked", "Plain names count the pixels with measured depth; unmasked counts all of them."),
     ("ATE RMSE", "Absolute trajectory error: root mean square distance of estimated and true camera positions, after "
      "the whole trajectory has been laid upon the truth (rotation and translation, no scale)."),
@@ -75,6 +78,6 @@ MEANINGS = (
      "tracking is about to fail."),
     ("fit", "Root mean square distance of the matched points from the map's surface."),
     ("mIoU", "Mean over objects of (pixels that both masks share) / (pixels that either has)."),
-    ("loss", "What the optimiser makes small: 0.8 colour (mean absolute difference) + 0.2 (1 - SSIM) + 0.5 depth "
-     "(metres), with default weights, on the keyframes trained after each frame."),
+    ("loss", "What the optimiser makes small on the keyframes it trains after each frame: colour (mean absolute "
+     "difference), 1 - SSIM and depth (metres), added up with the weights of the settings mapping.loss."),
 )  # fmt: skip

@@ -16,9 +16,9 @@ import numpy as np
 MOST_POINTS = 800
 """Of a curve; longer ones are drawn by the lowest and highest value of each stretch."""
 COLORS = 8
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 16, 12, 46
-_CHARACTER = 7.2
-"""Mean width of a letter of the legend, pixels."""
+_LEFT, _RIGHT, _TOP, _BOTTOM = 74, 16, 12, 46
+_CHARACTER = 9.0
+"""Mean width of a letter of the legend, pixels; pages on narrow windows have letters larger than lines."""
 _ROW = 20
 
 

@@ -77,10 +77,6 @@ class RunData:
     warnings: list[str] = field(default_factory=list)
     views: list[FrameView] = field(default_factory=list)
 
-    def number(self, *keys: str) -> float | None:
-        """A number of `metrics`, or None."""
-        return number_at(self.metrics, *keys)
-
 
 def number_at(values: Any, *keys: str) -> float | None:
     """A number deep in nested dictionaries, or None."""

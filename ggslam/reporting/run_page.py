@@ -52,12 +52,6 @@ def _recording(run: RunData) -> str:
 
 def _tiles(run: RunData) -> Html:
     found = [(m.text(m.of(run)), m.unit, m.name) for m in METRICS if m.name in TILES and m.of(run) is not None]
-    for value, form, unit, name in (
-        (number_at(run.timing, "frames_per_s"), ".1f", "", "frames/s"),
-        (number_at(run.timing, "gaussians"), ",.0f", "", "Gaussians"),
-        (number_at(run.timing, "peak_rss_mb"), ",.0f", "MB", "peak memory"),
-    ):
-        found += [] if value is None else [(format(value, form), unit, name)]
     return p.tiles(found)
 
 
@@ -147,9 +141,7 @@ def _path(run: RunData) -> Html:
 def _quality(run: RunData) -> Html:
     if not run.scores:
         return p.tag("p", "This run was not scored; ggslam eval does that, and writes this page anew.")
-    missing = [
-        p.tag("p", f"{plot.title} was not scored.") for plot in score_plots([run]) if not plot.has_data()
-    ]
+    missing = [p.tag("p", f"{plot.title} was not scored.") for plot in score_plots([run]) if not plot.has_data()]
     return p.joined([p.figures(score_plots([run])), *missing])
 
 

@@ -32,7 +32,7 @@ def _paths(runs: Sequence[RunData], project: Callable[[np.ndarray], tuple[np.nda
         series.append(Series("truth", *project(truth), color=_TRUTH, dashed=True))
     for number, run in enumerate(runs):
         label = "estimate" if len(runs) == 1 else run.name
-        series.append(Series(label, *project(run.camera_path.positions), **_look(number)))
+        series.append(_curve(label, *project(run.camera_path.positions), number))
     if len(runs) == 1:
         path = runs[0].camera_path
         made = np.isin(path.frames, runs[0].keyframes)
@@ -40,17 +40,17 @@ def _paths(runs: Sequence[RunData], project: Callable[[np.ndarray], tuple[np.nda
     return series
 
 
-def _look(number: int) -> dict[str, int | bool]:
-    """Colour of a run among several; after all colours they begin again, dashed."""
+def _curve(label: str, x: np.ndarray, y: np.ndarray, number: int) -> Series:
+    """The curve of a run among several; after all colours they begin again, dashed."""
     usual = COLORS - 1
-    return {"color": number % usual, "dashed": number >= usual}
+    return Series(label, x, y, color=number % usual, dashed=number >= usual)
 
 
 def error_plot(runs: Sequence[RunData]) -> Plot:
     """Distance from the truth over the recording."""
     known = [(n, run) for n, run in enumerate(runs) if run.camera_path.error_m is not None]
     series = [
-        Series(_label(runs, run, "error"), run.camera_path.frames, 100 * run.camera_path.error_m, **_look(n))
+        _curve(_label(runs, run, "error"), run.camera_path.frames, 100 * run.camera_path.error_m, n)
         for n, run in known if run.camera_path.error_m is not None
     ]  # fmt: skip
     return Plot(
@@ -86,7 +86,7 @@ def score_plots(runs: Sequence[RunData]) -> list[Plot]:
             if column not in run.scores or "frame" not in run.scores:
                 continue
             frame, value = run.scores["frame"], factor * run.scores[column]
-            series.append(Series(_label(runs, run, "all frames"), frame, value, **_look(number)))
+            series.append(_curve(_label(runs, run, "all frames"), frame, value, number))
             if len(runs) == 1 and "kind" in run.scores:
                 kinds = run.scores["kind"]
                 for kind, label, color in (("keyframe", "keyframes", 1), ("held_out", "held out", 2)):
@@ -104,7 +104,7 @@ def tracking_plots(runs: Sequence[RunData]) -> list[Plot]:
     )
     return [
         Plot(f"tracking_{column}", title, FRAME, y_label, [
-            Series(_label(runs, run, title), run.tracked["frame"], factor * run.tracked[column], **_look(n))
+            _curve(_label(runs, run, title), run.tracked["frame"], factor * run.tracked[column], n)
             for n, run in enumerate(runs) if column in run.tracked
         ], _lost(runs), from_zero=column != "overlap")
         for column, title, y_label, factor in columns
@@ -117,7 +117,7 @@ def _steps(
     """Columns (name, label) of the steps of one run, or the first one of several."""
     if len(runs) > 1:
         return [
-            Series(run.name, run.steps["frame"], change(run.steps[columns[0][0]]), **_look(n))
+            _curve(run.name, run.steps["frame"], change(run.steps[columns[0][0]]), n)
             for n, run in enumerate(runs) if columns[0][0] in run.steps
         ]  # fmt: skip
     steps = runs[0].steps
