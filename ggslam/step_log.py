@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run notes of every step, for plots: `steps.csv`. A row costs some microseconds and 160 bytes."""
+"""What a run notes of every step, for plots: `steps.csv`. A row takes a tenth of a millisecond and 144 bytes."""
 
 from __future__ import annotations
 

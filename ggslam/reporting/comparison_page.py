@@ -105,7 +105,7 @@ def _settings(runs: Sequence[RunData]) -> Html:
 def _views(views: Sequence[FrameView], runs: int) -> Html:
     if not views:
         return p.tag("p", "No frame was located in all of these runs.")
-    columns = min(runs + 1, 4)
+    columns = min(runs + 1, 4)  # the recorded image comes first
     return p.joined(
         p.tag("div", p.tag("h3", f"frame {view.frame}"), p.cells(view.pictures.items(), columns), class_="view")
         for view in views

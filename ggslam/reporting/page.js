@@ -25,7 +25,11 @@
       if (!near.size) { tip.style.display = "none"; return; }
       const first = [...near.values()].sort((a, b) => a[0] - b[0])[0];
       const lines = [`${plot.dataset.x}: ${shown(x0 + (x1 - x0) * (first[1] - left) / (right - left))}`];
-      for (const [n, [, , y]] of near) lines.push(`${names[n]}: ${shown(y1 - (y1 - y0) * (y - top) / (bottom - top))}`);
+      for (const [n, [, x, y]] of near) {
+        if (Math.abs(x - first[1]) > 3) continue;
+        const value = y1 - (y1 - y0) * (y - top) / (bottom - top);
+        lines.push(`${names[n]}: ${shown(Math.abs(value) < 1e-6 * (y1 - y0) ? 0 : value)}`);
+      }
       tip.textContent = lines.join("\n");
       tip.style.display = "block";
       tip.style.left = Math.min(event.clientX + 14, innerWidth - tip.offsetWidth - 8) + "px";

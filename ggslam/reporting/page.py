@@ -106,10 +106,10 @@ def image(picture: np.ndarray, words: str) -> Html:
 
 
 def cells(pictures: Iterable[tuple[str, np.ndarray]], columns: int = 3) -> Html:
-    """Pictures with captions in rows."""
+    """Pictures with captions in rows of 2 to 4; of four only two on narrow windows."""
     return tag(
         "div", *(tag("figure", image(picture, words), tag("figcaption", words)) for words, picture in pictures),
-        class_="cells", style=f"grid-template-columns:repeat({columns},minmax(0,1fr))",
+        class_=f"cells columns{columns}",
     )  # fmt: skip
 
 
