@@ -24,7 +24,8 @@
       }
       if (!near.size) { tip.style.display = "none"; return; }
       const first = [...near.values()].sort((a, b) => a[0] - b[0])[0];
-      const lines = [`${plot.dataset.x}: ${shown(x0 + (x1 - x0) * (first[1] - left) / (right - left))}`];
+      const along = x0 + (x1 - x0) * (first[1] - left) / (right - left);
+      const lines = [`${plot.dataset.x}: ${plot.dataset.x === "frame" ? Math.round(along) : shown(along)}`];
       for (const [n, [, x, y]] of near) {
         if (Math.abs(x - first[1]) > 3) continue;
         const value = y1 - (y1 - y0) * (y - top) / (bottom - top);
