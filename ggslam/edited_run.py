@@ -18,10 +18,13 @@ from ggslam.formats.staging import new_staging, publish
 from ggslam.map_index import MAP_INDEX
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
-from ggslam.run_folder import MARKER, OBJECT_FILES, RunFolder
+from ggslam.run_folder import MARKER, OBJECT_FILES, REPORT_FILE, TRUTH_FILE, RunFolder
 from ggslam.saved_places import PLACES_FILE
+from ggslam.step_log import STEPS_FILE
 
-COPIED = ("trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "loops.json")
+RECORDS = (STEPS_FILE, TRUTH_FILE)
+"""Files that stay true, too, but older runs have none."""
+COPIED = ("trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "loops.json", *RECORDS)
 """Files that stay true of an edited run."""
 SCORES = ("metrics.json", "frames.csv")
 """Files that do not, unless objects were only renamed. `ggslam eval` makes them anew."""
@@ -65,7 +68,7 @@ def save_edited(
         if isinstance(error, OSError):
             raise RunFolderError(f"{target.path}: the edited run cannot be written: {error}") from None
         raise
-    old = (*SCORES, *POINTS, *OBJECT_FILES, PLACES_FILE, MAP_INDEX, "renders")
+    old = (*SCORES, *POINTS, *OBJECT_FILES, *RECORDS, REPORT_FILE, PLACES_FILE, MAP_INDEX, "renders", "plots")
     try:
         publish(staged.path, target.path, MARKER, old, meanwhile)
     except RunFolderError:

@@ -16,6 +16,7 @@ from ggslam.interrupts import uninterrupted
 from ggslam.progress import Observer, SilentObserver
 from ggslam.realtime import RealtimeSlam
 from ggslam.recordings import SequenceRequest, describe
+from ggslam.report_jobs import write_report
 from ggslam.run_folder import RunFolder
 from ggslam.scene.frame import Frame
 from ggslam.scoring import score_run
@@ -126,6 +127,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     outcome = RunOutcome(folder, result, error=error)
     if request.evaluate and error is None:
         outcome.metrics = score_run(folder, sequence, observer)
+    write_report(folder, sequence)
     return outcome
 
 

@@ -89,7 +89,7 @@ class RealtimeSlam:
         slam.remember(frame, tracking)
         slam.times.stop()
         seconds = time.perf_counter() - start
-        return StepReport(slam.frames[-1], is_keyframe, slam.gaussian_count, slam.mapper.last_psnr, seconds)
+        return slam.note_step(is_keyframe, seconds)
 
     # --- mapper's thread ---------------------------------------------------------------------------------------------
 

@@ -9,7 +9,9 @@
     points.ply       coloured cloud sampled from the map, metres; points_grid.ply: the same in integer grid cells
     places.npz       what another recording needs to start in this map
     config.yaml      all settings; sequence.json: where the recording was and how it was read
-    timing.json      seconds by part; metrics.json: scores; renders/: pictures; volumes/: by `ggslam volumes`
+    timing.json      seconds by part; steps.csv: the same, memory, Gaussians and losses step by step
+    metrics.json     scores; renders/: pictures; report.html: all of it to look at; ground_truth.txt: true poses for it
+    volumes/         by `ggslam volumes`; plots/: by `ggslam report --plots`
 of a run with objects, whose map.ply also holds each Gaussian's object id and identity vector:
     objects.json     the objects: ids, names, boxes, ...; there if and only if the other files of the objects are whole
     classifier.npz   turns identity vectors into objects; votes.npz: mask ids that each Gaussian was seen under
@@ -30,6 +32,7 @@ import yaml
 
 from ggslam import __version__
 from ggslam.config import Config, config_from_dict, save_config
+from ggslam.environment import environment
 from ggslam.errors import RunFolderError
 from ggslam.formats.atomic import write_bytes, write_text
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
@@ -46,9 +49,13 @@ from ggslam.saving_parts import save_map_in_parts, save_points_in_parts
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam_result import SlamResult
+from ggslam.step_log import STEPS_FILE
 
 MARKER = "run.json"
 """Is there if and only if a folder is a run of ggslam."""
+TRUTH_FILE = "ground_truth.txt"
+"""True poses of the frames that have both, with the times of trajectory.txt; written by the report."""
+REPORT_FILE = "report.html"
 OBJECT_FILES = ("objects.json", "classifier.npz", "votes.npz")
 """Files of a run with objects, in the order in which they are removed; they are written in the opposite one."""
 
@@ -134,12 +141,14 @@ class RunFolder:
             error: why the run stopped early, if it did.
             names: of object ids, as far as the recording knows them.
         """
-        mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish"}
+        mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish",
+                "environment": environment(config.threads)}  # fmt: skip
         self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
-        stale_files = ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", PLACES_FILE, MAP_INDEX)
+        stale_files = ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", PLACES_FILE, MAP_INDEX,
+                       STEPS_FILE, TRUTH_FILE, REPORT_FILE)  # fmt: skip
         for stale in (*stale_files, *OBJECT_FILES):
             (self.path / stale).unlink(missing_ok=True)
-        for stale in ("renders", "volumes"):
+        for stale in ("renders", "volumes", "plots"):
             shutil.rmtree(self.path / stale, ignore_errors=True)
         save_config(config, self.path / "config.yaml")
         self.write_json("sequence.json", sequence)
@@ -147,6 +156,8 @@ class RunFolder:
         self.write_json("keyframes.json", _keyframes(result))
         self.write_json("loops.json", _loops(result))
         write_tum(self.path / "trajectory.txt", result.timestamps(), result.trajectory())
+        if result.steps is not None:
+            write_text(self.path / STEPS_FILE, result.steps)
         if result.cells is not None:
             save_map_in_parts(self.path, result, names)
         elif result.objects is None:

@@ -40,6 +40,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.scene.poses import inverse
 from ggslam.slam_result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
+from ggslam.step_log import StepLog
 from ggslam.tracking.feature_tracker import FeatureTracker
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.surface import MeasuredSurface
@@ -93,6 +94,7 @@ class Slam:
         self.dropped_frames: list[int] = []
         self.refine_iterations = 0
         self.times = SlamTimes()
+        self.steps = StepLog()
         self._anchor = Anchor(-1, np.eye(4))
         self._keyframes_made = 0
         self.growing = True
@@ -148,7 +150,14 @@ class Slam:
             self.mapper.run(settings.first_frame_iterations if first else settings.iterations_per_frame)
         self.times.stop()
         seconds = time.perf_counter() - start
-        return StepReport(self.frames[-1], is_keyframe, self.gaussian_count, self.mapper.last_psnr, seconds)
+        return self.note_step(is_keyframe, seconds)
+
+    def note_step(self, is_keyframe: bool, seconds: float) -> StepReport:
+        """What the step did that has just ended and took `seconds`; `steps` remembers it."""
+        loops_s = 0.0 if self.loops is None else self.loops.seconds
+        return self.steps.add(
+            self.frames[-1], is_keyframe, seconds, self.times, loops_s, self.mapper, self.gaussian_count
+        )
 
     @property
     def gaussian_count(self) -> int:
@@ -176,6 +185,7 @@ class Slam:
             self.refine_iterations, objects, self.loops.events if self.loops else [], places_to_bytes(self, cells),
             cells, None if self.pager is None else self.pager.report(),
             [] if self.pager is None else self.pager.budget.notes, None if self.pager is None else self.pager.close,
+            self.steps.to_csv(),
         )  # fmt: skip
 
     def close(self) -> None:

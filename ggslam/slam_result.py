@@ -47,13 +47,15 @@ class TrackedFrame:
 
 @dataclass
 class StepReport:
-    """What one step did, for the progress line; `seconds` is how long it took."""
+    """What one step did, for the progress line; `seconds` is how long it took, `loss` the mean over its optimisation
+    steps (NaN without any)."""
 
     frame: TrackedFrame
     is_keyframe: bool
     gaussians: int
     psnr: float
     seconds: float
+    loss: float = float("nan")
 
 
 @dataclass
@@ -136,6 +138,7 @@ class SlamResult:
         paging: figures of a run whose memory was limited, see `MapPager.report`.
         notes: what the user should know of it.
         release: removes its files.
+        steps: what was noted of every step, content of `steps.csv`.
     """
 
     gaussians: GaussianMap
@@ -152,6 +155,7 @@ class SlamResult:
     paging: dict[str, float] | None = None
     notes: list[str] = field(default_factory=list)
     release: Callable[[], None] | None = None
+    steps: str | None = None
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, if anything is; it cannot be read any more."""

@@ -35,6 +35,7 @@ def evaluate(
 ) -> None:
     """Score a run against its recording: trajectory, images and objects of keyframes, held-out and all frames."""
     from ggslam.recordings import open_recording_of
+    from ggslam.report_jobs import write_report
     from ggslam.run_folder import RunFolder
     from ggslam.scoring import score_run
 
@@ -43,4 +44,5 @@ def evaluate(
     with progress_bar() as bar:
         metrics = score_run(folder, recording, ProgressObserver(bar), lpips=lpips, every=every, masks=masks)
     print_scores(metrics)
-    console.print(f"wrote {folder.path / 'metrics.json'}", highlight=False, markup=False)
+    for path in (folder.path / "metrics.json", write_report(folder, recording)):
+        console.print(f"wrote {path}", highlight=False, markup=False)

@@ -21,6 +21,7 @@ from ggslam.cli import (
     inspect_command,
     localize_command,
     render_command,
+    report_command,
     run_command,
     submaps_command,
     synth_command,
@@ -54,6 +55,7 @@ def _options(
 _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "run": (run_command.run, run_command.EPILOG), "eval": (eval_command.evaluate, eval_command.EPILOG),
     "render": (render_command.render, render_command.EPILOG), "export": (export_command.export, export_command.EPILOG),
+    "report": (report_command.report, report_command.EPILOG),
     "compare": (compare_command.compare, compare_command.EPILOG),
     "edit": (edit_command.edit, edit_command.EPILOG),
     "encode": (encode_command.encode, encode_command.EPILOG), "decode": (decode_command.decode, decode_command.EPILOG),

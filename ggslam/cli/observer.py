@@ -12,6 +12,10 @@ if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
     from ggslam.slam_result import StepReport
 
 
+_WIDE = 96
+"""Columns of a window that has room for more."""
+
+
 class ProgressObserver:
     """Feeds a progress bar: one line per stage."""
 
@@ -28,8 +32,11 @@ class ProgressObserver:
         """A frame was processed."""
         assert self._task is not None
         self._done += 1
+        loss = f"{report.loss:.3f}" if math.isfinite(report.loss) else "-"
         psnr = f"{report.psnr:.1f} dB" if math.isfinite(report.psnr) else "-"
-        info = f"overlap {report.frame.overlap:4.0%}  {report.gaussians / 1000:.0f}k Gaussians  PSNR {psnr}"
+        info = f"overlap {report.frame.overlap:4.0%}  {_count(report.gaussians)} Gaussians  loss {loss}"
+        if self._bar.console.width >= _WIDE:
+            info += f"  PSNR {psnr}"
         if report.frame.status != "ok":
             info += f"  [yellow]{report.frame.status}[/]"
         self._bar.update(self._task, completed=self._done, info=info)
@@ -42,3 +49,8 @@ class ProgressObserver:
     def note(self, text: str) -> None:
         """Something the user should know."""
         self._bar.console.print(f"note: {text}", highlight=False, markup=False)
+
+
+def _count(number: int) -> str:
+    """A large number in few letters."""
+    return f"{number / 1e6:.2f}M" if number >= 1e6 else f"{number / 1e3:.0f}k"

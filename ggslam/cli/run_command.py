@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,8 +25,14 @@ EPILOG = """
 
   ggslam run data/redkitchen --set mapping.insertion.opacity=0.7 --set seed=1
 
+  ggslam run data/redkitchen --scale 0.5 --log kitchen.rrd
+
   ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
 """
+
+
+if TYPE_CHECKING:
+    from ggslam.live_log import LiveLog
 
 
 class TrackerName(str, Enum):
@@ -70,6 +76,9 @@ def run(
     threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of all random draws.", min=0)] = None,
     skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
+    log: Annotated[
+        str | None, typer.Option(metavar="rerun|FILE.rrd", help="Stream poses, images and map to rerun, or to a file.")
+    ] = None,
     evaluate: Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")] = True,
     overwrite: Annotated[bool, typer.Option(help="Replace a finished run in the output folder.")] = False,
 ) -> None:
@@ -92,10 +101,25 @@ def run(
         out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite, map=earlier,
         localize_only=localize_only,
     )  # fmt: skip
-    with progress_bar() as bar:
-        outcome = execute(request, ProgressObserver(bar))
+    live = None if log is None else _live_log(log, sequence.name)
+    try:
+        with progress_bar() as bar:
+            outcome = execute(request, ProgressObserver(bar), live)
+    except BaseException:
+        if live is not None:
+            live.close()
+        raise
+    if live is not None:
+        live.finish(outcome.result)
     console.print(f"{outcome.folder.path}: {outcome.headline()}", highlight=False, markup=False)
     if outcome.metrics is not None:
         print_scores(outcome.metrics)
     if outcome.error is not None:
         raise outcome.error
+
+
+def _live_log(target: str, name: str) -> LiveLog:
+    from ggslam.live_log import LiveLog
+    from ggslam.reporting.rerun_log import RerunLog
+
+    return LiveLog(RerunLog(target, name))

@@ -56,6 +56,17 @@ class MapperTimes:
         return 1e3 * (self.forward + self.loss + self.backward + self.identity) / max(1, self.iterations)
 
 
+@dataclass
+class LossSums:
+    """Sums over all iterations so far of the terms of the loss, see `LossValues`: the loss itself, colour (L1), SSIM
+    and depth (metres)."""
+
+    total: float = 0.0
+    color: float = 0.0
+    ssim: float = 0.0
+    depth: float = 0.0
+
+
 class Mapper:
     """Holds the map and its keyframes.
 
@@ -81,6 +92,7 @@ class Mapper:
         self.identity = identity
         self.keyframes: list[Keyframe] = []
         self.times = MapperTimes()
+        self.losses = LossSums()
         self.last_psnr = float("nan")
         self.depth_sigma = 0.004
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
@@ -254,6 +266,10 @@ class Mapper:
         self.times.iterations += 1
         keyframe.iterations += 1
         self.last_psnr = loss.psnr
+        self.losses.total += loss.values.total
+        self.losses.color += loss.values.color
+        self.losses.ssim += loss.values.ssim
+        self.losses.depth += loss.values.depth
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None) -> None:
         """Final refinement: learning rates fall exponentially, for each part of a map that is in memory by turns."""

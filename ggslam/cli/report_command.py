@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam report`: a page to look at of a run, or of several side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ggslam.cli.console import console
+from ggslam.errors import ConfigError
+
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam report runs/kitchen
+
+  ggslam report runs/kitchen --plots figures
+
+  ggslam report runs/fast runs/slow runs/refined --out comparison.html
+"""
+
+
+def report(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs; of several: a comparison.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Of several runs: the page; default comparison.html in this folder.")
+    ] = None,
+    plots: Annotated[Path | None, typer.Option(help="Folder to write the plots to, as SVG and PNG.")] = None,
+) -> None:
+    """Write RUN/report.html anew, or one page that compares several runs. Pages need no network and no server."""
+    from ggslam.report_jobs import write_comparison, write_report
+    from ggslam.run_folder import RunFolder
+
+    folders = [RunFolder.open(path) for path in runs]
+    if len(folders) == 1:
+        if out is not None:
+            raise ConfigError("--out is for the comparison of several runs; one run's report is in its folder")
+        path = write_report(folders[0], plots=plots)
+    else:
+        path = write_comparison(folders, out or Path("comparison.html"), plots)
+    console.print(f"wrote {path}", highlight=False, markup=False)
+    if plots is not None:
+        console.print(f"wrote plots to {plots}", highlight=False, markup=False)

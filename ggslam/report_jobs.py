@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes reports: `report.html` of a run, a page that compares several, plots as files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from ggslam.errors import ConfigError, GgslamError
+from ggslam.formats.atomic import make_folder, write_text
+from ggslam.recordings import open_recording_of
+from ggslam.rendering_jobs import frame_poses
+from ggslam.report_data import load_run, save_truth
+from ggslam.report_views import RENDER, TRUTH, rendered_views, saved_views, spread
+from ggslam.reporting.comparison_page import comparison_page
+from ggslam.reporting.plot_files import write_plots
+from ggslam.reporting.run_data import FrameView, RunData
+from ggslam.reporting.run_page import run_page
+from ggslam.reporting.run_plots import all_plots
+from ggslam.run_folder import REPORT_FILE, RunFolder
+from ggslam.sequences import Sequence
+
+COMPARED_VIEWS = 3
+"""Frames that a comparison shows of each run."""
+
+
+def write_report(folder: RunFolder, sequence: Sequence | None = None, plots: Path | None = None) -> Path:
+    """Writes `report.html` into a run's folder; returns its path.
+
+    Args:
+        folder: of the run.
+        sequence: its recording, if it is open already. Its true poses are kept in the folder then.
+        plots: folder to write the plots to as SVG and PNG, too.
+
+    Raises:
+        RunFolderError, FormatError: a file of the run is missing or damaged, or a file cannot be written.
+    """
+    if sequence is not None:
+        save_truth(folder, sequence)
+    recording = sequence if sequence is not None else _recording(folder)
+    views = saved_views(folder)
+    if not views:
+        views = rendered_views(folder, recording, spread(frame_poses(folder.read_json("keyframes.json"))))
+    run = load_run(folder, recording, views)
+    path = folder.path / REPORT_FILE
+    write_text(path, run_page(run))
+    if plots is not None:
+        make_folder(plots)
+        write_plots(plots, all_plots([run]))
+    return path
+
+
+def _recording(folder: RunFolder) -> Sequence | None:
+    """The recording of a run, None if it is not there any more."""
+    try:
+        return open_recording_of(folder)
+    except GgslamError:
+        return None
+
+
+def write_comparison(folders: list[RunFolder], out: Path, plots: Path | None = None) -> Path:
+    """Writes a page that compares several runs; returns its path.
+
+    Args:
+        folders: of the runs, at least two.
+        out: the page.
+        plots: folder to write the plots to as SVG and PNG, too.
+
+    Raises:
+        ConfigError: fewer than two runs.
+        RunFolderError, FormatError: as `write_report`.
+    """
+    if len(folders) < 2:
+        raise ConfigError(f"expected at least two runs to compare, found {len(folders)}")
+    known = [set(frame_poses(folder.read_json("keyframes.json"))) for folder in folders]
+    frames = spread(set.intersection(*known), COMPARED_VIEWS)
+    runs = []
+    for folder in folders:
+        recording = _recording(folder)
+        runs.append(load_run(folder, recording, rendered_views(folder, recording, frames)))
+    runs = _named_apart(runs)
+    make_folder(out.parent)
+    write_text(out, comparison_page(runs, _same_views(runs, frames)))
+    if plots is not None:
+        make_folder(plots)
+        write_plots(plots, all_plots(runs))
+    return out
+
+
+def _same_views(runs: list[RunData], frames: list[int]) -> list[FrameView]:
+    """The same frames of each run side by side, and as recorded."""
+    views = []
+    for k, frame in enumerate(frames):
+        recorded = next((r.views[k].pictures[TRUTH] for r in runs if TRUTH in r.views[k].pictures), None)
+        pictures = {} if recorded is None else {TRUTH: recorded}
+        views.append(FrameView(frame, pictures | {run.name: run.views[k].pictures[RENDER] for run in runs}))
+    return views
+
+
+def _named_apart(runs: list[RunData]) -> list[RunData]:
+    """Runs whose folders have one name are told apart by the folders above, or numbers."""
+    names = [run.name for run in runs]
+    if len(set(names)) < len(names):
+        names = ["/".join(Path(run.path).parts[-2:]) for run in runs]
+    if len(set(names)) < len(names):
+        names = [f"{name} ({number})" for number, name in enumerate(names, start=1)]
+    return [replace(run, name=name) for run, name in zip(runs, names, strict=True)]

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A page that compares several runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from ggslam.reporting import page as p
+from ggslam.reporting.metric_words import MEANINGS, METRICS, Metric
+from ggslam.reporting.page import Html
+from ggslam.reporting.plots import Plot
+from ggslam.reporting.run_data import FrameView, RunData
+from ggslam.reporting.run_page import FOOTER
+from ggslam.reporting.run_plots import (
+    error_plot,
+    loss_plots,
+    map_plots,
+    score_plots,
+    time_plots,
+    tracking_plots,
+    trajectory_plots,
+)
+
+_ABSENT = "not there"
+
+
+def comparison_page(runs: Sequence[RunData], views: Sequence[FrameView]) -> str:
+    """The whole page as text.
+
+    Args:
+        runs: two or more.
+        views: frames as each run shows them.
+    """
+    parts = [
+        ("scores", "Scores", _scores(runs)), ("settings", "Settings that differ", _settings(runs)),
+        ("views", "The same views", _views(views, len(runs))),
+        ("trajectory", "Trajectory", _curves([*trajectory_plots(runs), error_plot(runs)])),
+        ("quality", "Image quality", _curves(score_plots(runs))),
+        ("tracking", "Tracking", _curves(tracking_plots(runs))),
+        ("course", "Time, map and memory", _curves([*time_plots(runs), *map_plots(runs), *loss_plots(runs)])),
+        ("meaning", "What the numbers mean", p.definitions(MEANINGS)), ("runs", "Runs", _folders(runs)),
+    ]  # fmt: skip
+    content = [p.section(title, anchor, body) for anchor, title, body in parts]
+    title = "Comparison of " + ", ".join(run.name for run in runs)
+    return p.page(title, _lead(runs), content, [(anchor, title) for anchor, title, _ in parts], FOOTER)
+
+
+def _lead(runs: Sequence[RunData]) -> str:
+    count = len(_recordings(runs))
+    return f"{len(runs)} runs of {'one recording' if count == 1 else f'{count} recordings'}"
+
+
+def _recordings(runs: Sequence[RunData]) -> set[str]:
+    return {str(run.recording.get("open", {}).get("path")) for run in runs}
+
+
+def _scores(runs: Sequence[RunData]) -> Html:
+    rows = []
+    for metric in METRICS:
+        values = [metric.of(run) for run in runs]
+        if any(value is not None for value in values):
+            unit = f", {metric.unit}" if metric.unit else ""
+            rows.append([f"{metric.name}{unit}", *_marked(metric, values)])
+    if not rows:
+        return p.tag("p", "None of these runs was scored; ggslam eval does that.")
+    unscored = [run.name for run in runs if not run.metrics]
+    note = [p.tag("p", f"Not scored: {', '.join(unscored)}.")] if unscored else []
+    if len(_recordings(runs)) > 1:
+        note.append(p.tag("p", "The runs are of different recordings: their scores cannot be held against each other."))
+    elif len({tuple(run.tracked.get("frame", ())) for run in runs}) > 1:
+        note.append(p.tag("p", "The runs are of different frames of the recording; so are their scores."))
+    words = p.tag("p", "The best of each row is marked, unless all are equal as printed.", class_="note")
+    return p.joined([p.table(["", *(run.name for run in runs)], rows), words, *note])
+
+
+def _marked(metric: Metric, values: Sequence[float | None]) -> list[str]:
+    """Cells of a row, the best one marked."""
+    texts = [metric.text(value) for value in values]
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    if metric.better and len(known) > 1:
+        best = metric.text((max if metric.better == "higher" else min)(known))
+        if texts.count(best) < len(known):
+            return [p.tag("td", p.tag("span", text), class_="best") if text == best else text for text in texts]
+    return texts
+
+
+def _settings(runs: Sequence[RunData]) -> Html:
+    names = list(dict.fromkeys(name for run in runs for name in run.settings))
+    rows = []
+    for name in names:
+        values = [str(run.settings.get(name, _ABSENT)) for run in runs]
+        if len(set(values)) > 1:
+            rows.append([name, *values])
+    for key in ("scale", "start", "stop", "stride", "masks"):
+        opened = [run.recording.get("open", {}).get(key) for run in runs]
+        values = ["-" if value is None else str(value) for value in opened]
+        if len(set(values)) > 1:
+            rows.append([f"recording: {key}", *values])
+    if not rows:
+        return p.tag("p", "All settings are equal.")
+    return p.table(["setting", *(run.name for run in runs)], rows, text_columns=range(1, len(runs) + 1))
+
+
+def _views(views: Sequence[FrameView], runs: int) -> Html:
+    if not views:
+        return p.tag("p", "No frame was located in all of these runs.")
+    columns = min(runs + 1, 4)  # the recorded image comes first
+    return p.joined(
+        p.tag("div", p.tag("h3", f"frame {view.frame}"), p.cells(view.pictures.items(), columns), class_="view")
+        for view in views
+    )
+
+
+def _curves(plots: Sequence[Plot]) -> Html:
+    shown = [plot for plot in plots if plot.has_data()]
+    return p.figures(shown) if shown else p.tag("p", "None of these runs has what would be shown here.")
+
+
+def _folders(runs: Sequence[RunData]) -> Html:
+    rows = []
+    for run in runs:
+        known = run.mark.get("environment") or {}
+        rows.append([run.name, run.path, str(known.get("ggslam", run.mark.get("ggslam", "unknown"))),
+                     str(known.get("processor", "unknown"))])  # fmt: skip
+    return p.table(["run", "folder", "ggslam", "processor"], rows, text_columns=(1, 2, 3))

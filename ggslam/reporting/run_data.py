@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What reports know of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Path3D:
+    """Where the camera was.
+
+    Attributes:
+        frames: int [N], indices of the frames that were located.
+        seconds: float [N], since the first of them.
+        positions: float [N, 3] metres, in the run's world: the first camera (x right, y down, z forward).
+        truth: float [N, 3], true positions laid upon these (rigidly, least squares), NaN where unknown; None: there
+            is no ground truth.
+        error_m: float [N], distance to the truth so laid, metres.
+        reason: why there is no truth.
+    """
+
+    frames: np.ndarray
+    seconds: np.ndarray
+    positions: np.ndarray
+    truth: np.ndarray | None = None
+    error_m: np.ndarray | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class FrameView:
+    """Pictures of one frame, uint8 [H, W, 3], by what they show."""
+
+    frame: int
+    pictures: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class RunData:
+    """A run as its folder tells it; what an older run did not write is empty.
+
+    Attributes:
+        name: of its folder.
+        path: of its folder.
+        camera_path: where the camera was.
+        tracked: of every frame: `frame`, `status`, `overlap`, `rmse_m` (arrays).
+        keyframes: int [K], frames that became keyframes.
+        steps: columns of steps.csv.
+        scores: columns of frames.csv, scores frame by frame.
+        metrics: metrics.json.
+        timing: timing.json.
+        settings: name -> value, all of them.
+        defaults: name -> value that a fresh run would have.
+        recording: sequence.json.
+        mark: run.json.
+        warnings: what a user should know.
+        views: pictures.
+    """
+
+    name: str
+    path: str
+    camera_path: Path3D
+    tracked: dict[str, np.ndarray]
+    keyframes: np.ndarray
+    steps: dict[str, np.ndarray] = field(default_factory=dict)
+    scores: dict[str, np.ndarray] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    timing: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+    defaults: dict[str, Any] = field(default_factory=dict)
+    recording: dict[str, Any] = field(default_factory=dict)
+    mark: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    views: list[FrameView] = field(default_factory=list)
+
+
+def number_at(values: Any, *keys: str) -> float | None:
+    """A number deep in nested dictionaries, or None."""
+    for key in keys:
+        values = values.get(key) if isinstance(values, dict) else None
+    return float(values) if isinstance(values, (int, float)) and not isinstance(values, bool) else None
+
+
+STAGES = (
+    ("tracking", "tracking", "locating each frame"),
+    ("insertion", "inserting", "new Gaussians of keyframes, pruning"),
+    ("forward", "rendering", "the map from a keyframe's pose"),
+    ("loss", "loss", "comparing with the keyframe's images"),
+    ("backward", "gradients", "back through the renderer, optimiser"),
+    ("identity", "objects", "identity vectors of the Gaussians"),
+    ("identity_finish", "objects, last", "final identity steps after the last frame"),
+    ("other", "other", "reading frames, loops, waiting"),
+)
+
+
+def stage_seconds(timing: dict[str, Any]) -> list[tuple[str, str, float]]:
+    """Where a run's time went: (stage, what it does, seconds), nothing that took no time.
+
+    In a real-time run stages of tracker and mapper go on side by side: they may add up to more than wall time.
+    """
+    wall = sum(number_at(timing, key) or 0.0 for key in ("wall_s", "refinement_s"))
+    spent = {"tracking": number_at(timing, "tracking_s") or 0.0}
+    spent |= {key: number_at(timing, "mapping", key) or 0.0 for key, *_ in STAGES[1:-1]}
+    within = sum(seconds for key, seconds in spent.items() if key != "identity_finish")
+    spent["other"] = max(0.0, wall - within)
+    return [(name, words, spent[key]) for key, name, words in STAGES if spent[key] > 0]
