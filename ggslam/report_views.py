@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 
 from ggslam.errors import FormatError, SequenceError
+from ggslam.objects_in_parts import ObjectsInParts
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering_jobs import frame_poses, map_views, object_ids, run_camera
+from ggslam.rendering_jobs import frame_poses, object_ids, run_camera
 from ggslam.reporting.pictures import color_of_depth, color_of_error, color_of_ids, color_to_uint8, depth_range
 from ggslam.reporting.run_data import FrameView
 from ggslam.run_folder import RunFolder
@@ -80,21 +81,19 @@ def rendered_views(folder: RunFolder, sequence: Sequence | None, frames: Iterabl
         frames: indices of frames that were located.
     """
     camera, poses = run_camera(folder), frame_poses(folder.read_json("keyframes.json"))
-    # Of a map that was written cell by cell the objects cannot be had without all of it.
-    segmented = folder.segmented_map() if folder.has_objects() and folder.map_in_parts() is None else None
-    view_of = map_views(folder, None if segmented is None else segmented.gaussians)
+    objects = ObjectsInParts.of(folder) if folder.has_objects() else None
+    parts = folder.map_in_parts() if objects is None else objects.map
     rasterizer, views = CpuRasterizer(), []
     for number in frames:
         T_camera_world = inverse(poses[number])
-        shown = rasterizer.forward(
-            view_of(camera, T_camera_world), camera, T_camera_world, features=segmented is not None
-        )
+        gaussians = parts.in_view(camera, T_camera_world)
+        shown = rasterizer.forward(gaussians, camera, T_camera_world, features=objects is not None)
         color = color_to_uint8(shown.image.numpy())
         depth = np.where(shown.alpha.numpy() > 0.5, shown.expected_depth.numpy(), 0)
         pictures = _beside(_recorded(sequence, number), color, depth)
-        if segmented is not None:
-            ids = object_ids(rasterizer, shown, segmented)
-            pictures[_CAPTIONS[2][1]] = color_of_ids(ids, segmented.table.palette(), outlines=True)
+        if objects is not None:
+            ids = object_ids(rasterizer, shown, objects.around(gaussians))
+            pictures[_CAPTIONS[2][1]] = color_of_ids(ids, objects.table.palette(), outlines=True)
         views.append(FrameView(number, {name: small(picture) for name, picture in pictures.items()}))
     return views
 

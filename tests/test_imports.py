@@ -15,7 +15,8 @@ MIDDLE = {"tracking", "mapping", "evaluation", "reporting", "loops", "objects", 
 
 
 def room(path: Path) -> str:
-    return path.relative_to(ROOT).parts[0].removesuffix(".py")
+    name = path.relative_to(ROOT).parts[0].removesuffix(".py")
+    return "cli" if name == "__main__" else name
 
 
 def imported_rooms(path: Path) -> set[str]:
