@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1] / "ggslam"
 BOTTOM = {"scene", "native", "errors"}
 LOWER = {"rendering", "sequences", "formats", "features"}
-MIDDLE = {"tracking", "mapping", "evaluation", "reporting", "loops", "objects", "volumes", "submaps", "coding"}
+MIDDLE = {"tracking", "mapping", "evaluation", "reporting", "loops", "objects", "volumes", "submaps", "coding", "viewer"}
 
 
 def room(path: Path) -> str:
