@@ -22,7 +22,7 @@ from ggslam.viewer.cameras import pose_along
 
 CELL_WIDTH = 320
 """Pixels of each picture in the comparison of a frame."""
-_GAP, _BAR = 6, 20
+_GAP, _BAR = 6, 26
 _PATCH = 5
 """Pixels that are rendered to find the object under the one in their middle."""
 
@@ -101,7 +101,7 @@ def table_of(cells: list[tuple[str, np.ndarray]], size: tuple[int, int]) -> np.n
     sheet = np.full((rows * (height + _BAR + _GAP) - _GAP, 2 * width + _GAP, 3), 36, np.uint8)
     for number, (name, picture) in enumerate(cells):
         left, top = number % 2 * (width + _GAP), number // 2 * (height + _BAR + _GAP)
-        cv2.putText(sheet, name, (left + 2, top + 15), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (225, 225, 225), 1, cv2.LINE_AA)
+        cv2.putText(sheet, name, (left + 2, top + 18), cv2.FONT_HERSHEY_SIMPLEX, 0.62, (225, 225, 225), 1, cv2.LINE_AA)
         shown = picture
         if picture.shape[:2] != (height, width):
             shown = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)

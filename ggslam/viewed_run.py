@@ -25,10 +25,12 @@ from ggslam.run_folder import RunFolder
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.sequences import Sequence
 from ggslam.viewed_pictures import ViewPictures
 from ggslam.viewer.model import Coloring, ListedObject
 from ggslam.viewer.splats import Splats, most_visible, splats_of
+from ggslam.viewer.static_page import static_page
 from ggslam.volumes.upright import estimate_up
 
 DEFAULT_SPLATS = 400_000
@@ -134,9 +136,9 @@ class ViewedRun:
         g = self._gaussians
         if coloring == "objects" and self._segmented is not None:
             return self._segmented.table.palette()[g.object_id.numpy()[rows]]
-        if coloring == "identity" and self._pictures.identity is not None:
-            features = np.ascontiguousarray(g.features.numpy()[rows].T)[:, :, None]
-            return self._pictures.identity.picture(features, np.ones(features.shape[1:], np.float32))[:, 0]
+        if coloring == "identity":
+            found = self._identity_colors(rows)
+            return splats.colors if found is None else found
         if coloring == "depth":
             T = self.frame_poses[frame]
             distance = np.linalg.norm(splats.centers - T[:3, 3], axis=1)
@@ -162,6 +164,21 @@ class ViewedRun:
         """See `ViewedMap`."""
         with self._lock:
             return self._pictures.picture(camera, T_world_camera, hidden)
+
+    def static_page(self, title: str) -> str:
+        """The map, up to the limit of splats, as one HTML file that needs neither server nor network."""
+        with self._lock:
+            rows = most_visible(self._gaussians, self._max_splats)
+            owners = self._gaussians.object_id.numpy()[rows].astype(np.uint16)
+            identity = self._identity_colors(rows)
+            return static_page(self, title, self._gaussians, rows, identity, owners)
+
+    def _identity_colors(self, rows: np.ndarray) -> np.ndarray | None:
+        """uint8 [N, 3] of the Gaussians' identity vectors; None if they have none."""
+        if self._pictures.identity is None:
+            return None
+        features = np.ascontiguousarray(self._gaussians.features.numpy()[rows].T)[:, :, None]
+        return self._pictures.identity.picture(features, np.ones(features.shape[1:], np.float32))[:, 0]
 
     # --- to be edited ------------------------------------------------------------------------------------------------
 
@@ -257,14 +274,12 @@ def _numbers(values: np.ndarray) -> str:
 def _up(gaussians: GaussianMap, poses: np.ndarray) -> np.ndarray:
     """The up direction of the map's surfaces: flat Gaussians are thinnest along their normals."""
     step = max(1, len(gaussians) // 20_000)
-    axes = splats_axes(gaussians, step)
+    axes = _thinnest_axes(gaussians, step)
     return estimate_up(poses, gaussians.means.numpy()[::step], axes).up
 
 
-def splats_axes(gaussians: GaussianMap, step: int) -> np.ndarray:
+def _thinnest_axes(gaussians: GaussianMap, step: int) -> np.ndarray:
     """Direction [M, 3] in which every `step`-th Gaussian is thinnest; zero where it is nearly as thick as wide."""
-    from ggslam.scene.poses import quaternion_to_matrix
-
     scales = gaussians.log_scales.numpy()[::step]
     thinnest, order = scales.argmin(axis=1), np.sort(scales, axis=1)
     rotations = quaternion_to_matrix(gaussians.quaternions.numpy()[::step])

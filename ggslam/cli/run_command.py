@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +14,9 @@ from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
 from ggslam.cli.summary import print_scores
+
+if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
+    from ggslam.pipeline import RunOutcome
 
 EPILOG = """
 [bold]Examples[/]
@@ -24,6 +28,8 @@ EPILOG = """
   ggslam run data/redkitchen --scale 0.5 --realtime 10
 
   ggslam run data/redkitchen --set mapping.insertion.opacity=0.7 --set seed=1
+
+  ggslam run data/redkitchen --scale 0.5 --view
 
   ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
 """
@@ -70,12 +76,16 @@ def run(
     threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of all random draws.", min=0)] = None,
     skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show the map in a browser while it grows, and after")] = False,
+    host: options.Host = "127.0.0.1",
+    port: options.Port = 8080,
     evaluate: Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")] = True,
     overwrite: Annotated[bool, typer.Option(help="Replace a finished run in the output folder.")] = False,
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
     from ggslam.pipeline import RunRequest, execute  # imports torch: only when needed
     from ggslam.recordings import SequenceRequest
+    from ggslam.viewing_jobs import live_page, wait_for_interrupt
 
     overrides = [*(settings or [])]
     shortcuts = {
@@ -92,10 +102,22 @@ def run(
         out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite, map=earlier,
         localize_only=localize_only,
     )  # fmt: skip
-    with progress_bar() as bar:
-        outcome = execute(request, ProgressObserver(bar))
+    viewing = nullcontext() if not view else live_page(host, port, sequence.resolve().name)
+    with viewing as page:
+        if page is not None:
+            console.print(f"the map as it grows: {page.address}", highlight=False, markup=False)
+        with progress_bar() as bar:
+            outcome = execute(request, ProgressObserver(bar), None if page is None else page.follow)
+        _print(outcome)
+        if page is not None and outcome.error is None:
+            page.show_result(outcome.folder)
+            console.print(f"{page.address} shows the run (Ctrl-C ends)", highlight=False, markup=False)
+            wait_for_interrupt()
+    if outcome.error is not None:
+        raise outcome.error
+
+
+def _print(outcome: RunOutcome) -> None:
     console.print(f"{outcome.folder.path}: {outcome.headline()}", highlight=False, markup=False)
     if outcome.metrics is not None:
         print_scores(outcome.metrics)
-    if outcome.error is not None:
-        raise outcome.error

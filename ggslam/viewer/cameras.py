@@ -26,10 +26,10 @@ class Viewpoint:
     near: float = 0.01
 
 
-def view_of_pose(T_world_camera: np.ndarray, distance: float, back: float = 0.0) -> Viewpoint:
-    """What a recorded camera saw, looking at what is `distance` metres before it, from `back` metres behind it."""
+def view_of_pose(T_world_camera: np.ndarray, distance: float) -> Viewpoint:
+    """What a recorded camera saw, looking at what is `distance` metres before it."""
     position, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
-    return Viewpoint(position - back * forward, position + distance * forward, -T_world_camera[:3, 1])
+    return Viewpoint(position, position + distance * forward, -T_world_camera[:3, 1])
 
 
 def top_view(centers: np.ndarray, positions: np.ndarray, forward: np.ndarray, up: np.ndarray, fov: float) -> Viewpoint:

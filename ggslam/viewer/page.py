@@ -77,7 +77,7 @@ class Page:
 
     def _draw_camera(self) -> None:
         poses = np.stack(list(self.model.frame_poses.values()))
-        self.depth = float(np.clip(0.04 * np.linalg.norm(np.ptp(self.centers, axis=0)), 0.03, 0.3))
+        self.depth = float(np.clip(0.01 * np.linalg.norm(np.ptp(self.centers, axis=0)), 0.02, 0.06))
         self.nodes.set_path(poses[:, :3, 3])
         self.nodes.set_keyframes(self.model.keyframe_poses, self.model.camera, self.depth)
 
@@ -88,8 +88,8 @@ class Page:
     # --- cameras -----------------------------------------------------------------------------------------------------
 
     def start_view(self) -> Viewpoint:
-        """As the first frame saw it, from a little behind."""
-        return view_of_pose(next(iter(self.model.frame_poses.values())), LOOK_AHEAD_M, back=0.3)
+        """As the first frame saw it."""
+        return view_of_pose(next(iter(self.model.frame_poses.values())), LOOK_AHEAD_M)
 
     def top_view(self) -> Viewpoint:
         """From above."""

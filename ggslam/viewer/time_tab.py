@@ -25,10 +25,10 @@ class TimeTab:
         self._play = gui.add_checkbox("Play", False)
         self._follow = gui.add_checkbox("Camera follows", False, hint="Look from where the frame was taken")
         self._text = gui.add_markdown("")
-        picture, recorded = page.model.frame_picture(self._frames[0])
+        picture, _ = page.model.frame_picture(self._frames[0])
         self._image = gui.add_image(picture, format="jpeg", jpeg_quality=85)
         self._wanted = threading.Event()
-        self._draw(self._frames[0], picture, recorded)
+        self._text.content = f"Frame {self._frames[0]}"
         threading.Thread(target=self._follow_slider, name="viewer-frames", daemon=True).start()
 
         @self.slider.on_update
