@@ -14,7 +14,7 @@ from ggslam.live_viewing import LiveView
 from ggslam.run_folder import RunFolder
 from ggslam.viewed_run import DEFAULT_SPLATS, ViewedRun
 from ggslam.viewer.page import Page
-from ggslam.viewer.server import DEFAULT_HOST, DEFAULT_PORT, address, close_server, open_server
+from ggslam.viewer.server import DEFAULT_HOST, DEFAULT_PORT, address, clear_page, close_server, open_server
 
 if TYPE_CHECKING:
     import viser
@@ -47,8 +47,7 @@ def serve_run(
 
 def show_run(server: viser.ViserServer, model: ViewedRun) -> None:
     """Shows a run on a server's page, in place of what was there."""
-    server.scene.reset()
-    server.gui.reset()
+    clear_page(server)
     Page(server, model, model if model.has_objects else None, model.folder.path.resolve().name)
 
 

@@ -60,6 +60,12 @@ def vertical_fov(camera: Camera) -> float:
     return 2 * math.atan(camera.height / 2 / camera.fy)
 
 
+def fitting_fov(camera: Camera, aspect: float) -> float:
+    """Vertical field of view in radians of a canvas, width by height `aspect`, that shows all that a camera sees."""
+    across = 2 * math.atan(camera.width / 2 / camera.fx / max(aspect, 1e-3))
+    return max(vertical_fov(camera), across)
+
+
 def canvas_camera(width: int, height: int, fov: float, longest: int | None = None) -> Camera:
     """The pinhole camera of a canvas with vertical field of view `fov` in radians; its size is changed so that the
     longer side has `longest` pixels, if that is given."""

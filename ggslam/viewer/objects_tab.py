@@ -24,7 +24,8 @@ class ObjectsTab:
     """The list and what can be done to the object that is selected."""
 
     def __init__(self, page: Page, model: EditableMap) -> None:
-        self._page, self._model, gui = page, model, page.server.gui
+        self._page, self._model = page, model
+        gui: Any = page.server.gui
         self.selected: int | None = None
         self._records: dict[int, ListedObject] = {}
         self._gizmo: viser.TransformControlsHandle | None = None
@@ -189,17 +190,18 @@ class ObjectsTab:
 
 
 def object_list(records: list[ListedObject], hidden: set[int], selected: int | None) -> str:
-    """The objects as a table in HTML: colour, number, name, Gaussians; hidden ones are dimmed."""
+    """The objects in HTML: colour, number, name, Gaussians; hidden ones are dimmed."""
     rows = []
     for record in records:
-        style = "opacity:.4;" if record.id in hidden else ""
-        style += "background:rgba(64,130,230,.35);" if record.id == selected else ""
-        swatch = f"background:rgb{record.color};width:.8em;height:.8em;border-radius:2px;display:inline-block"
-        name = html.escape(record.name or "object")
+        style = "display:flex;gap:8px;align-items:center;padding:1px 6px;border-radius:3px;"
+        style += "opacity:.4;" if record.id in hidden else ""
+        style += "background:rgba(64,130,230,.45);" if record.id == selected else ""
+        swatch = f"background:rgb{record.color};width:11px;height:11px;border-radius:2px;flex:none"
+        label = html.escape(record.label)
+        clipped = "flex:1;min-width:0;overflow:hidden;text-overflow:ellipsis;white-space:nowrap"
         rows.append(
-            f'<tr style="{style}"><td style="padding:1px 6px"><span style="{swatch}"></span></td>'
-            f'<td style="text-align:right;padding-right:8px">{record.id}</td><td style="width:99%">{name}</td>'
-            f'<td style="text-align:right;padding-right:6px">{record.gaussians:,}</td></tr>'
+            f'<div style="{style}"><span style="{swatch}"></span><span style="{clipped}">{label}</span>'
+            f"<span>{record.gaussians:,}</span></div>"
         )
-    table = f'<table style="font-size:13px;border-collapse:collapse;width:100%">{"".join(rows)}</table>'
-    return f'<div style="max-height:{_LIST_HEIGHT}px;overflow-y:auto;margin:4px 10px">{table}</div>'
+    limits = f"max-height:{_LIST_HEIGHT}px;overflow-y:auto;margin:4px 10px;font-size:13px"
+    return f'<div style="{limits}">{"".join(rows)}</div>'

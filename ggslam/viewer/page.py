@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ggslam.errors import GgslamError
-from ggslam.viewer.cameras import Viewpoint, top_view, vertical_fov, view_of_pose
+from ggslam.viewer.cameras import Viewpoint, fitting_fov, top_view, vertical_fov, view_of_pose
 from ggslam.viewer.model import Coloring, EditableMap, ViewedMap
 from ggslam.viewer.objects_tab import ObjectsTab
 from ggslam.viewer.scene_nodes import SceneNodes
@@ -58,11 +58,16 @@ class Page:
             with tabs.add_tab("Objects"):
                 self.objects = ObjectsTab(self, editable)
         self.describe()
-        server.scene.set_up_direction(tuple(float(x) for x in model.up))
+        server.scene.set_up_direction(model.up)
         start = self.start_view()
         first = server.initial_camera
         first.position, first.look_at, first.up = start.position, start.look_at, model.up
         first.fov, first.near = vertical_fov(model.camera), start.near
+        server.on_client_connect(self._fit)
+
+    def _fit(self, client: viser.ClientHandle) -> None:
+        """Narrow windows see as wide as the recording's camera."""
+        client.camera.fov = fitting_fov(self.model.camera, client.camera.aspect)
 
     # --- space -------------------------------------------------------------------------------------------------------
 

@@ -94,11 +94,11 @@ class SceneNodes:
 
     def set_frame(self, T_world_camera: np.ndarray, camera: Camera, depth: float, picture: np.ndarray) -> None:
         """The camera of one frame with its picture, uint8 [H, W, 3]."""
-        pose = {"wxyz": matrix_to_quaternion(T_world_camera[:3, :3]), "position": T_world_camera[:3, 3]}
         fov = 2 * float(np.arctan(camera.height / 2 / camera.fy))
         self._marks["/camera/now"] = self._server.scene.add_camera_frustum(
             "/camera/now", fov=fov, aspect=camera.width / camera.height, scale=depth, color=_PATH, image=picture,
-            line_width=2.5, **pose,
+            thickness=2.5, thickness_units="screen", wxyz=matrix_to_quaternion(T_world_camera[:3, :3]),
+            position=T_world_camera[:3, 3],
         )  # fmt: skip
 
     def show_lines(self, name: str, visible: bool) -> None:

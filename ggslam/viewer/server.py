@@ -46,11 +46,19 @@ def open_server(host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, title: str =
 
     with _quiet():
         server = LocalServer(host=host, port=port, label=title, verbose=False)
+    clear_page(server, title)
+    return server
+
+
+def clear_page(server: viser.ViserServer, title: str = "ggslam") -> None:
+    """Takes everything off the page but its looks and its title."""
+    server.scene.reset()
+    server.gui.reset()
+    server.gui.set_panel_label(title)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(64, 130, 230))
     server.gui.main_panel.dock_right()
     server.gui.main_panel.set_width(PANEL_WIDTH)
     server.scene.world_axes.visible = False
-    return server
 
 
 def close_server(server: viser.ViserServer) -> None:

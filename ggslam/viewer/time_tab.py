@@ -18,7 +18,8 @@ class TimeTab:
     """Slider, playing, following with the page's camera, pictures."""
 
     def __init__(self, page: Page) -> None:
-        self._page, gui = page, page.server.gui
+        self._page = page
+        gui: Any = page.server.gui
         self._frames = list(page.model.frame_poses)
         last = max(1, len(self._frames) - 1)
         self.slider = gui.add_slider("Frame", 0, last, 1, 0, hint="Frames of the recording that were located")

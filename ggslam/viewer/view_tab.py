@@ -25,7 +25,8 @@ class ViewTab:
     """Colours, lines, camera presets, saving a picture."""
 
     def __init__(self, page: Page) -> None:
-        self._page, gui = page, page.server.gui
+        self._page = page
+        gui: Any = page.server.gui
         names = {COLORINGS[c]: c for c in page.model.colorings}
         coloring = gui.add_dropdown("Colour by", list(names), hint="What the splats are coloured by")
         places = gui.add_button_group("Camera", ["Start", "Frame", "Top"], hint="Where to look from")
