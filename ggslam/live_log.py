@@ -53,7 +53,7 @@ class LiveLog:
             self._keyframes += 1
 
     def finish(self, result: SlamResult) -> None:
-        """Sends path and map as they came out, and closes.
+        """Sends path and map as they came out.
 
         Args:
             result: of the run. Of a map that is on disk what was sent last remains.
@@ -63,10 +63,9 @@ class LiveLog:
         self._send_path()
         if len(result.gaussians):
             self._send_map(result.gaussians)
-        self._log.close()
 
     def close(self) -> None:
-        """Closes without more."""
+        """Nothing more comes."""
         self._log.close()
 
     def _send_path(self) -> None:

@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[1] / "ggslam"
 BOTTOM = {"scene", "native", "errors"}
 LOWER = {"rendering", "sequences", "formats", "features"}
 MIDDLE = {"tracking", "mapping", "evaluation", "reporting", "loops", "objects", "volumes", "submaps", "coding"}
+MIDDLE |= {"viewer"}
 
 
 def room(path: Path) -> str:

@@ -25,6 +25,7 @@ from ggslam.cli import (
     run_command,
     submaps_command,
     synth_command,
+    view_command,
     volumes_command,
 )
 from ggslam.errors import GgslamError
@@ -61,6 +62,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "encode": (encode_command.encode, encode_command.EPILOG), "decode": (decode_command.decode, decode_command.EPILOG),
     "localize": (localize_command.localize, localize_command.EPILOG),
     "submaps": (submaps_command.submaps, submaps_command.EPILOG),
+    "view": (view_command.view, view_command.EPILOG),
     "volumes": (volumes_command.volumes, volumes_command.EPILOG),
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
 }  # fmt: skip

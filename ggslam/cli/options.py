@@ -19,3 +19,5 @@ Scale = Annotated[float, typer.Option(help="Resize the images by this factor, e.
 Format = Annotated[str | None, typer.Option("--format", help="Recording format, if it is not recognised.")]
 DepthScale = Annotated[float | None, typer.Option(help="Raw depth units per metre, to override the recording's.")]
 Masks = Annotated[Path | None, typer.Option(help="Folder with instance masks, if not the recording's own.")]
+Host = Annotated[str, typer.Option(help="Address of the page; 0.0.0.0: other machines can connect, too.")]
+Port = Annotated[int, typer.Option(help="Port of the page; 0: any free one.", min=0, max=65535)]

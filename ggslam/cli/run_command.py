@@ -14,6 +14,9 @@ from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
 from ggslam.cli.summary import print_scores
 
+if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
+    from ggslam.pipeline import RunOutcome
+
 EPILOG = """
 [bold]Examples[/]
 
@@ -27,12 +30,10 @@ EPILOG = """
 
   ggslam run data/redkitchen --scale 0.5 --log kitchen.rrd
 
+  ggslam run data/redkitchen --scale 0.5 --view
+
   ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
 """
-
-
-if TYPE_CHECKING:
-    from ggslam.live_log import LiveLog
 
 
 class TrackerName(str, Enum):
@@ -79,12 +80,17 @@ def run(
     log: Annotated[
         str | None, typer.Option(metavar="rerun|FILE.rrd", help="Stream poses, images and map to rerun, or to a file.")
     ] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show the map in a browser while it grows, and after")] = False,
+    host: options.Host = "127.0.0.1",
+    port: options.Port = 8080,
     evaluate: Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")] = True,
     overwrite: Annotated[bool, typer.Option(help="Replace a finished run in the output folder.")] = False,
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
     from ggslam.pipeline import RunRequest, execute  # imports torch: only when needed
     from ggslam.recordings import SequenceRequest
+    from ggslam.viewing_jobs import wait_for_interrupt
+    from ggslam.watching import watching
 
     overrides = [*(settings or [])]
     shortcuts = {
@@ -101,25 +107,22 @@ def run(
         out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite, map=earlier,
         localize_only=localize_only,
     )  # fmt: skip
-    live = None if log is None else _live_log(log, sequence.name)
-    try:
+    with watching(log, (host, port) if view else None, sequence.resolve().name) as watchers:
+        page = watchers.page
+        if page is not None:
+            console.print(f"the map as it grows: {page.address}", highlight=False, markup=False)
         with progress_bar() as bar:
-            outcome = execute(request, ProgressObserver(bar), live)
-    except BaseException:
-        if live is not None:
-            live.close()
-        raise
-    if live is not None:
-        live.finish(outcome.result)
-    console.print(f"{outcome.folder.path}: {outcome.headline()}", highlight=False, markup=False)
-    if outcome.metrics is not None:
-        print_scores(outcome.metrics)
+            outcome = execute(request, ProgressObserver(bar), watchers.follower)
+        _print(outcome)
+        watchers.finish(outcome)
+        if page is not None and outcome.error is None:
+            console.print(f"{page.address} shows the run (Ctrl-C ends)", highlight=False, markup=False)
+            wait_for_interrupt()
     if outcome.error is not None:
         raise outcome.error
 
 
-def _live_log(target: str, name: str) -> LiveLog:
-    from ggslam.live_log import LiveLog
-    from ggslam.reporting.rerun_log import RerunLog
-
-    return LiveLog(RerunLog(target, name))
+def _print(outcome: RunOutcome) -> None:
+    console.print(f"{outcome.folder.path}: {outcome.headline()}", highlight=False, markup=False)
+    if outcome.metrics is not None:
+        print_scores(outcome.metrics)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam view`: a run in the browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ggslam.cli import options
+from ggslam.cli.console import console
+
+if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
+    from ggslam.viewed_run import ViewedRun
+
+EPILOG = """
+[bold]Examples[/]
+
+  ggslam view runs/kitchen
+
+  ggslam view runs/kitchen --port 9000
+
+  ggslam view runs/kitchen --html kitchen.html
+"""
+
+
+def view(
+    run: options.RunPath,
+    host: options.Host = "127.0.0.1",
+    port: options.Port = 8080,
+    page: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="Serve nothing; write one file that opens from disk.")
+    ] = None,
+    max_splats: Annotated[int, typer.Option(help="Show no more Gaussians, the most visible ones.", min=1000)] = 400_000,
+    sequence: Annotated[Path | None, typer.Option(help="Where the recording is now, if it was moved.")] = None,
+) -> None:
+    """Look at a run in the browser: map, camera, frames; select, name, move, delete and export objects."""
+    from ggslam.run_folder import RunFolder
+    from ggslam.viewer.server import address, close_server
+    from ggslam.viewing_jobs import serve_run, wait_for_interrupt, write_page
+
+    folder = RunFolder.open(run)
+    if page is not None:
+        model, size = write_page(folder, page, max_splats, sequence)
+        _say(model, f"wrote {page}: {size / 1e6:.1f} MB")
+        return
+    server, model = serve_run(folder, host, port, max_splats, sequence)
+    try:
+        _say(model, f"{address(server)} (Ctrl-C ends)")
+        wait_for_interrupt()
+    finally:
+        close_server(server)
+
+
+def _say(model: ViewedRun, text: str) -> None:
+    for line in [*(f"note: {note}" for note in model.notes), f"{model.describe()}", text]:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Places to look at a map from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.scene.camera import Camera
+
+TOP_MARGIN = 1.15
+"""How much more than the map the view from the top shows."""
+HEADROOM_M = 0.35
+"""The view from the top leaves out what is so much higher than the recording cameras: ceilings."""
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera that looks at a point; all [3], metres, world frame. `near`: nearer things are left out, metres."""
+
+    position: np.ndarray
+    look_at: np.ndarray
+    up: np.ndarray
+    near: float = 0.01
+
+
+def view_of_pose(T_world_camera: np.ndarray, distance: float) -> Viewpoint:
+    """What a recorded camera saw, looking at what is `distance` metres before it."""
+    position, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
+    return Viewpoint(position, position + distance * forward, -T_world_camera[:3, 1])
+
+
+def top_view(centers: np.ndarray, positions: np.ndarray, forward: np.ndarray, up: np.ndarray, fov: float) -> Viewpoint:
+    """Straight down on a map.
+
+    Args:
+        centers: [N, 3], of the Gaussians.
+        positions: [K, 3], of the recording cameras.
+        forward: [3], direction that will point up in the picture, if it is not parallel to `up`.
+        up: [3], unit vector.
+        fov: of the view along its shorter side, radians.
+    """
+    low, high = np.percentile(centers, [1, 99], axis=0)
+    middle = (low + high) / 2
+    size = float(np.linalg.norm((high - low) - ((high - low) @ up) * up))
+    ceiling = float((positions @ up).max()) + HEADROOM_M
+    cut = min(ceiling, float((centers @ up).max()))
+    height = TOP_MARGIN * size / 2 / math.tan(fov / 2)
+    position = middle + (cut + height - float(middle @ up)) * up
+    level = forward - (forward @ up) * up
+    if np.linalg.norm(level) < 1e-3:
+        level = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    return Viewpoint(position, middle, level / np.linalg.norm(level), near=max(0.01, height))
+
+
+def vertical_fov(camera: Camera) -> float:
+    """Vertical field of view in radians."""
+    return 2 * math.atan(camera.height / 2 / camera.fy)
+
+
+def fitting_fov(camera: Camera, aspect: float) -> float:
+    """Vertical field of view in radians of a canvas, width by height `aspect`, that shows all that a camera sees."""
+    across = 2 * math.atan(camera.width / 2 / camera.fx / max(aspect, 1e-3))
+    return max(vertical_fov(camera), across)
+
+
+def canvas_camera(width: int, height: int, fov: float, longest: int | None = None) -> Camera:
+    """The pinhole camera of a canvas with vertical field of view `fov` in radians; its size is changed so that the
+    longer side has `longest` pixels, if that is given."""
+    factor = 1.0 if longest is None else longest / max(width, height)
+    width, height = max(1, round(width * factor)), max(1, round(height * factor))
+    focal = height / 2 / math.tan(fov / 2)
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def pose_along(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """T_world_camera [4, 4] of a camera at `origin` [3] that looks along `direction` [3], rolled in any way."""
+    forward = direction / np.linalg.norm(direction)
+    right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    T[:3, 3] = origin
+    return T
+
+
+def frustum_lines(T_world_camera: np.ndarray, camera: Camera, depth: float) -> np.ndarray:
+    """Edges of the pyramids that cameras see, float32 [8 K, 2, 3].
+
+    Args:
+        T_world_camera: [K, 4, 4].
+        camera: of all of them.
+        depth: of the pyramids, metres.
+    """
+    w, h = camera.width / 2 / camera.fx * depth, camera.height / 2 / camera.fy * depth
+    corners = np.array([[0, 0, 0], [-w, -h, depth], [w, -h, depth], [w, h, depth], [-w, h, depth]])
+    edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+    world = corners @ np.swapaxes(T_world_camera[:, :3, :3], 1, 2) + T_world_camera[:, None, :3, 3]
+    return world[:, edges].reshape(-1, 2, 3).astype(np.float32)
+
+
+def box_lines(center: np.ndarray, axes: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """The twelve edges of a box, float32 [12, 2, 3]; `axes` [3, 3] has its directions as rows, `size` [3] metres."""
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
+    pairs = [(i, j) for i in range(8) for j in range(i + 1, 8) if np.count_nonzero(signs[i] != signs[j]) == 1]
+    corners = center + (signs * size) @ axes
+    return corners[np.array(pairs)].astype(np.float32)

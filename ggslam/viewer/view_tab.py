@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Controls of what is drawn and from where."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.viewer.cameras import canvas_camera
+from ggslam.viewer.model import COLORINGS
+
+if TYPE_CHECKING:
+    from ggslam.viewer.page import Page
+
+PICTURE_SIZE = 1920
+"""Pixels of the longer side of a saved picture."""
+_LINES = {"path": "Camera path", "keyframes": "Keyframes", "now": "Current frame"}
+
+
+class ViewTab:
+    """Colours, lines, camera presets, saving a picture."""
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        gui: Any = page.server.gui
+        names = {COLORINGS[c]: c for c in page.model.colorings}
+        coloring = gui.add_dropdown("Colour by", list(names), hint="What the splats are coloured by")
+        places = gui.add_button_group("Camera", ["Start", "Frame", "Top"], hint="Where to look from")
+        with gui.add_folder("Show"):
+            for name, label in _LINES.items():
+                self._line_box(name, label)
+        save = gui.add_button("Save picture", icon="camera", hint=f"Rendered by ggslam, {PICTURE_SIZE} pixels wide")
+
+        @coloring.on_update
+        @page.guarded
+        def _recolor(event: Any) -> None:
+            page.coloring = names[coloring.value]
+            page.draw_map()
+
+        @places.on_click
+        @page.guarded
+        def _go(event: Any) -> None:
+            views = {"Start": page.start_view, "Frame": page.frame_view, "Top": page.top_view}
+            page.go(event.client, views[places.value]())
+
+        @save.on_click
+        @page.guarded
+        def _save(event: Any) -> str:
+            return self._save(event.client)
+
+    def _line_box(self, name: str, label: str) -> None:
+        box = self._page.server.gui.add_checkbox(label, True)
+
+        @box.on_update
+        @self._page.guarded
+        def _show(event: Any) -> None:
+            self._page.nodes.show_lines(name, box.value)
+
+    def _save(self, client: Any) -> str:
+        camera = canvas_camera(client.camera.image_width, client.camera.image_height, client.camera.fov, PICTURE_SIZE)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = quaternion_to_matrix(client.camera.wxyz), client.camera.position
+        picture = self._page.model.picture(camera, T, self._page.hidden)
+        client.send_file_download(f"{self._page.title}.png", png(picture), save_immediately=True)
+        return f"rendered {camera.width}x{camera.height} pixels from here"
+
+
+def png(picture: np.ndarray) -> bytes:
+    """uint8 [H, W, 3] as a PNG file."""
+    buffer = io.BytesIO()
+    buffer.write(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+    return buffer.getvalue()

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import is_valid_pose, se3_exp, transformed
+from ggslam.viewer.cameras import (
+    HEADROOM_M,
+    box_lines,
+    canvas_camera,
+    fitting_fov,
+    frustum_lines,
+    pose_along,
+    top_view,
+    vertical_fov,
+    view_of_pose,
+)
+
+CAMERA = Camera(320, 240, 300.0, 290.0, 160.0, 119.0)
+
+
+def test_a_camera_looks_along_a_ray() -> None:
+    for direction in ([0, 0, 2.0], [1, 0, 0], [0.3, -5, 0.1], [0, 0, -1]):
+        T = pose_along(np.array([1.0, 2.0, 3.0]), np.array(direction, float))
+        assert is_valid_pose(T)
+        assert np.allclose(T[:3, 2], np.array(direction) / np.linalg.norm(direction))
+        assert np.allclose(T[:3, 3], [1, 2, 3])
+
+
+def test_a_view_of_a_pose_looks_where_it_looked() -> None:
+    T = se3_exp(np.array([0.2, 0.1, -0.4, 0.3, -0.2, 0.5]))
+    view = view_of_pose(T, 2.0)
+    assert np.allclose(transformed(view.look_at[None], np.linalg.inv(T)), [[0, 0, 2.0]])
+    assert np.allclose(view.up, -T[:3, 1])
+
+
+def test_the_top_view_sees_the_map_from_above_without_the_ceiling() -> None:
+    draw = np.random.default_rng(0)
+    up = np.array([0.0, -1.0, 0.0])
+    centers = draw.uniform([-2, -1.5, 0], [2, 1.0, 6], (5000, 3))
+    fov = math.radians(50)
+    view = top_view(centers, np.zeros((3, 3)), np.array([0.0, 0, 1]), up, fov)
+    depth = (view.position - centers) @ up
+    assert (depth[(centers @ up) > HEADROOM_M + 0.01] < view.near).all()  # cut away
+    below = (centers @ up) < HEADROOM_M - 0.01
+    assert (depth[below] > view.near).all()
+    sideways = np.linalg.norm((centers - view.position)[:, [0, 2]], axis=1)[below]
+    assert (sideways < math.tan(fov / 2) * depth[below] * 1.05).all()
+    assert abs(view.up @ up) < 1e-9 and np.allclose(view.up, [0, 0, 1])
+
+
+def test_a_narrow_canvas_shows_all_that_the_camera_sees() -> None:
+    assert fitting_fov(CAMERA, 2.0) == vertical_fov(CAMERA)
+    narrow = canvas_camera(300, 600, fitting_fov(CAMERA, 0.5))
+    assert math.isclose(narrow.width / 2 / narrow.fx, CAMERA.width / 2 / CAMERA.fx)
+    assert max(canvas_camera(300, 600, 1.0, 1920).height, 1920) == 1920
+
+
+def test_lines_of_frustums_and_boxes() -> None:
+    T = np.stack([np.eye(4), se3_exp(np.array([1.0, 0, 0, 0, 0, 0]))])
+    lines = frustum_lines(T, CAMERA, 0.3)
+    assert lines.shape == (16, 2, 3)
+    assert np.allclose(lines[8:], lines[:8] + [1, 0, 0], atol=1e-6)
+    assert np.isclose(np.abs(lines[:8, :, 0]).max(), 0.3 * 160 / 300)
+    edges = box_lines(np.array([1.0, 0, 0]), np.eye(3), np.array([1.0, 2, 3]))
+    lengths = np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1)
+    assert sorted(lengths.round(5).tolist()) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
+    assert np.allclose(edges.reshape(-1, 3).mean(axis=0), [1, 0, 0])

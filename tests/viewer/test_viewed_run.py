@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ggslam.editing_jobs import Edit, edit_run
+from ggslam.errors import ConfigError
+from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.labels import vote_label_image
+from ggslam.run_folder import RunFolder
+from ggslam.scene.poses import inverse, quaternion_to_matrix
+from ggslam.viewed_run import ViewedRun
+
+
+@pytest.fixture
+def viewed(run: RunFolder) -> ViewedRun:
+    return ViewedRun(run)
+
+
+def some_object(viewed: ViewedRun) -> int:
+    """One of middle size."""
+    return sorted(viewed.objects(), key=lambda record: record.gaussians)[len(viewed.objects()) // 2].id
+
+
+def test_splats_come_by_object(viewed: ViewedRun) -> None:
+    groups = viewed.splats("colour", 0)
+    listed = {record.id: record.gaussians for record in viewed.objects()}
+    assert set(groups) - {0} <= set(listed)
+    assert sum(map(len, groups.values())) <= len(viewed.folder.gaussians())
+    one = some_object(viewed)
+    colors = viewed.splats("objects", 0)[one].colors
+    assert (colors == next(r.color for r in viewed.objects() if r.id == one)).all()
+    assert len(np.unique(viewed.splats("depth", 0)[one].colors, axis=0)) > 1
+    limited = ViewedRun(viewed.folder, max_splats=1000)
+    assert sum(map(len, limited.splats("identity", 0).values())) == 1000
+
+
+def test_the_object_under_a_pixel_is_the_rendered_one(viewed: ViewedRun) -> None:
+    """A small patch that is rendered around a pixel's ray gives what the whole image has there."""
+    gaussians, camera = viewed.folder.segmented_map().gaussians, viewed.camera
+    T = viewed.frame_poses[0]
+    rasterizer = CpuRasterizer()
+    view = rasterizer.forward(gaussians, camera, inverse(T), features=False)
+    expected = vote_label_image(rasterizer, view, gaussians.object_id.numpy().astype(np.uint16))
+    pixels = np.random.default_rng(1).integers([10, 10], [camera.width - 10, camera.height - 10], (60, 2))
+    same = []
+    for u, v in pixels:
+        ray = T[:3, :3] @ [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]
+        # The patch faces the ray: there is less than a cosine between its pixels and those of the image.
+        focal = camera.fx * np.linalg.norm([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
+        same.append(viewed.object_at(T[:3, 3], ray, focal, set()) == expected[v, u])
+    assert np.mean(same) > 0.9
+    u, v = camera.width // 2, camera.height // 2
+    hidden = viewed.object_at(T[:3, 3], T[:3, 2], camera.fx, {0, *(r.id for r in viewed.objects())})
+    assert hidden == 0 and 0 <= u < camera.width and 0 <= v < camera.height
+
+
+def test_edits_are_saved_as_the_command_would(viewed: ViewedRun, tmp_path: Path) -> None:
+    before = (viewed.folder.path / "map.ply").read_bytes()
+    ids = [record.id for record in viewed.objects()]
+    record = viewed.objects()[1]
+    T = np.eye(4)
+    T[:3, :3] = quaternion_to_matrix(np.array([0.9, 0.1, -0.3, 0.2]))
+    T[:3, 3] = record.centroid - T[:3, :3] @ record.centroid + [0.1, -0.05, 0.2]
+    viewed.remove(ids[0])
+    viewed.move(ids[1], T)
+    viewed.rename(ids[2], "thing")
+    assert len(viewed.edits()) == 3 and ids[0] not in [r.id for r in viewed.objects()]
+    moved = next(r for r in viewed.objects() if r.id == ids[1])
+    assert np.allclose(moved.centroid, record.centroid + [0.1, -0.05, 0.2], atol=0.02)
+    viewed.save(str(tmp_path / "saved"), inpaint=False)
+    edits = [*viewed._edits]
+    assert edits[0] == Edit("remove", str(ids[0])) and edits[1].rotation
+    expected = edit_run(viewed.folder, edits, tmp_path / "expected").folder
+    saved = RunFolder.open(tmp_path / "saved")
+    assert (saved.path / "map.ply").read_bytes() == (expected.path / "map.ply").read_bytes()
+    assert saved.object_table().record(ids[2]).name == "thing"
+    assert (viewed.folder.path / "map.ply").read_bytes() == before
+
+
+def test_a_move_is_that_of_the_gizmo(viewed: ViewedRun) -> None:
+    one = some_object(viewed)
+    record = next(r for r in viewed.objects() if r.id == one)
+    before = viewed.splats("colour", 0)[one].centers
+    T = np.eye(4)
+    T[:3, :3] = quaternion_to_matrix(np.array([0.8, 0.3, 0.4, -0.2]))
+    T[:3, 3] = record.centroid - T[:3, :3] @ record.centroid + [0.3, 0.0, -0.1]
+    viewed.move(one, T)
+    after = viewed.splats("colour", 0)[one].centers
+    expected = before @ T[:3, :3].T + T[:3, 3]
+    distance = np.linalg.norm(expected[:, None] - after[None], axis=2).min(axis=1)
+    assert np.mean(distance < 0.02) > 0.9  # floaters stay where they are
+
+
+def test_edits_can_be_taken_back(viewed: ViewedRun) -> None:
+    count = len(viewed.objects())
+    with pytest.raises(ConfigError, match="no edit"):
+        viewed.undo()
+    with pytest.raises(ConfigError, match="nothing was edited"):
+        viewed.save("anywhere", inpaint=False)
+    viewed.rename(viewed.objects()[0].id, "first")
+    viewed.remove(some_object(viewed))
+    viewed.undo()
+    assert len(viewed.objects()) == count and viewed.objects()[0].name == "first" and len(viewed.edits()) == 1
+    with pytest.raises(ConfigError):
+        viewed.rename(viewed.objects()[0].id, "all")
+    assert len(viewed.edits()) == 1
+
+
+def test_an_exported_object_is_a_splat_file(viewed: ViewedRun, tmp_path: Path) -> None:
+    record = viewed.objects()[0]
+    name, content = viewed.exported(record.id)
+    (tmp_path / name).write_bytes(content)
+    found = read_gaussian_ply(tmp_path / name, with_moments=False)
+    assert len(found) == record.gaussians and (found.object_id == record.id).all()
+
+
+def test_pictures(viewed: ViewedRun) -> None:
+    picture, recorded = viewed.frame_picture(3)
+    assert picture.dtype == np.uint8 and recorded.shape == (viewed.camera.height, viewed.camera.width, 3)
+    T = viewed.frame_poses[0]
+    everything = {0, *(r.id for r in viewed.objects())}
+    assert viewed.picture(viewed.camera, T, set()).std() > 10
+    assert viewed.picture(viewed.camera, T, everything).max() == 0
