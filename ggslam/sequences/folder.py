@@ -100,11 +100,11 @@ def _depth_files(folder: Path, colors: list[Path]) -> list[Path]:
     if not candidates:
         raise SequenceError(f"{folder / 'depth'}: no PNG images")
     by_name = {path.stem: path for path in candidates}
-    by_number = {lastnumber_entry(path.stem): path for path in candidates}
+    by_number = {last_number(path.stem): path for path in candidates}
     by_number.pop(None, None)
     if any(color.stem in by_name for color in colors):
         return [by_name.get(c.stem, folder / "depth" / f"{c.stem}.png") for c in colors]
-    found = [by_number.get(lastnumber_entry(color.stem)) for color in colors]
+    found = [by_number.get(last_number(color.stem)) for color in colors]
     if not any(found):
         raise SequenceError(
             f"{folder}: colour and depth images have neither names nor numbers in common ({colors[0].name}, "

@@ -22,7 +22,7 @@ COLOR: dict[str, tuple[int, int | None]] = {
     "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB), "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
 }  # fmt: skip
 """Encoding -> bytes a pixel and OpenCV's conversion to RGB."""
-DEPTH = {"16uc1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32fc1": np.dtype(np.float32)}
+DEPTH: dict[str, Any] = {"16uc1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32fc1": np.dtype(np.float32)}
 """Encoding -> numbers; uint16 are millimetres, float32 metres (REP 118)."""
 
 
