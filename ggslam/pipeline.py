@@ -17,11 +17,12 @@ from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.formats.staging import new_staging
 from ggslam.progress import Observer, SilentObserver
 from ggslam.realtime import RealtimeSlam
-from ggslam.recordings import SequenceRequest, describe
+from ggslam.recordings import SequenceRequest, describe, open_recording_of
 from ggslam.run_folder import RunFolder
 from ggslam.scene.frame import Frame
 from ggslam.scoring import score_run
 from ggslam.sequences import Sequence
+from ggslam.sequences.live import LiveSequence
 from ggslam.slam import Slam
 from ggslam.slam_result import SlamResult, StepReport
 from ggslam.starting import ancestors, start_in_map
@@ -127,8 +128,17 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
             result.close()
     outcome = RunOutcome(folder, result, error=error)
     if request.evaluate and error is None:
-        outcome.metrics = score_run(folder, sequence, observer)
+        kept = sequence if isinstance(sequence, Sequence) else _kept(folder, sequence)
+        if kept is None:
+            observer.note("not scored: the frames of a live camera are kept with --record FOLDER only")
+        else:
+            outcome.metrics = score_run(folder, kept, observer)
     return outcome
+
+
+def _kept(folder: RunFolder, sequence: LiveSequence) -> Sequence | None:
+    """What a live run recorded, if it did."""
+    return None if sequence.record is None else open_recording_of(folder)
 
 
 def tracking_notes(result: SlamResult) -> list[str]:
@@ -170,7 +180,7 @@ def _names(earlier: RunFolder | None) -> dict[int, str]:
 
 
 def run_slam(
-    sequence: Sequence, config: Config, observer: Observer, earlier: RunFolder | None = None, growing: bool = True,
+    sequence: Sequence | LiveSequence, config: Config, observer: Observer, earlier: RunFolder | None = None, growing: bool = True,
     follower: Follower | None = None, paging: Path | None = None,
 ) -> tuple[SlamResult, BaseException | None]:  # fmt: skip
     """The loop over a recording, synchronous or in real time as the settings say; with `earlier` in that run's map,

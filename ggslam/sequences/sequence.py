@@ -50,6 +50,8 @@ class Sequence:
         camera: intrinsics of the delivered images.
         native_camera: the same before `scale`.
         depth_scale: units per metre of the stored depth images.
+        color_size, depth_size: (width, height) of the stored images.
+        lens: distortion that is undone and intrinsics that change, for people; "" for a pinhole camera that stays one.
         min_confidence: depth less sure than this is dropped; None: the recording has no confidence images.
         registered: whether depth images of another camera are registered to the colour images.
         timestamps: float64 [n], seconds.
@@ -80,6 +82,7 @@ class Sequence:
         self.min_confidence: int | None = None
         if any(entry.confidence is not None for entry in recording.files):
             self.min_confidence = recording.min_confidence
+        self.lens: str = _lens(recording)
         self.registered: bool = recording.depth_camera is not None
         self._recording, self._selection, self._on_bad_frame = recording, selection, on_bad_frame
         self.path: Path = recording.path
@@ -105,6 +108,8 @@ class Sequence:
             more = f" (and {len(known) - 1} more damaged frames)" if len(known) > 1 else ""
             raise SequenceError(recording.problems[known[0]] + more)
         self._geometry = self._measure(scale)
+        self.color_size: tuple[int, int] = self._geometry.color_size
+        self.depth_size: tuple[int, int] = self._geometry.depth_size
         self.camera: Camera = self._geometry.camera
         self.native_camera: Camera = self._geometry.native_camera
 
@@ -238,3 +243,12 @@ class Sequence:
             return ImageGeometry(self._recording, files, image_size(color), image_size(depth), scale)
         reason = first_error or self._recording.problems[self._selection[0]]
         raise SequenceError(f"{self.path}: none of {len(self)} frames can be read; the first: {reason}")
+
+
+def _lens(recording: Recording) -> str:
+    words = []
+    if recording.distortion is not None and np.any(recording.distortion):
+        words.append("fisheye undone" if recording.fisheye else f"{len(recording.distortion)} distortion coefficients undone")
+    if len({entry.camera for entry in recording.files if entry.camera is not None}) > 1:
+        words.append("intrinsics of each frame brought to the first one's")
+    return ", ".join(words)
