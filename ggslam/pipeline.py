@@ -180,8 +180,8 @@ def _names(earlier: RunFolder | None) -> dict[int, str]:
 
 
 def run_slam(
-    sequence: Sequence | LiveSequence, config: Config, observer: Observer, earlier: RunFolder | None = None, growing: bool = True,
-    follower: Follower | None = None, paging: Path | None = None,
+    sequence: Sequence | LiveSequence, config: Config, observer: Observer, earlier: RunFolder | None = None,
+    growing: bool = True, follower: Follower | None = None, paging: Path | None = None,
 ) -> tuple[SlamResult, BaseException | None]:  # fmt: skip
     """The loop over a recording, synchronous or in real time as the settings say; with `earlier` in that run's map,
     which grows or stays as it is. What does not fit into a limit of memory goes to the folder `paging`, see `Slam`.

@@ -27,7 +27,8 @@ Format = Annotated[str | None, typer.Option("--format", help="Recording format, 
 DepthScale = Annotated[float | None, typer.Option(help="Raw depth units per metre, to override the recording's.")]
 Masks = Annotated[Path | None, typer.Option(help="Folder with instance masks, if not the recording's own.")]
 DepthCamera = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="YAML with the calibration of a depth camera beside the colour camera.")
+    Path | None,
+    typer.Option(metavar="FILE", help="YAML with the calibration of a depth camera beside the colour camera."),
 ]
 MinConfidence = Annotated[
     int | None, typer.Option(help="Drop depth less sure than 0, 1 or 2, where the recording tells (default 1).")

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether depth lies on colour: outlines of near things in the depth images are laid over the edges of the colour images,
-shifted and scaled, to see where they fit best."""
+"""Whether depth lies on colour: outlines of near things in the depth images are laid over the edges of the colour
+images, shifted and scaled, to see where they fit best."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FEWEST_OUTLINES, FEWEST_FRAMES = 0.002, 3
 SCALES = (0.86, 0.9, 0.93, 0.96, 0.98, 1.0, 1.02, 1.04, 1.07, 1.1, 1.14)
 
 
-LEAST_OFF, LEAST_GAIN, LEAST_RATIO = 0.012, 0.3, 0.3
+LEAST_OFF, LEAST_GAIN, LEAST_RATIO = 0.012, 0.4, 0.3
 """From so much displacement (share of the width) and gain (absolute, and to the strength as it is) on it is told."""
 
 
@@ -56,24 +56,24 @@ class Alignment:
 
 def measure_alignment(frames: list[Frame]) -> Alignment | None:
     """Compares colour and depth of some frames; None if too few of them show enough outlines."""
-    surfaces, weight = np.zeros(0), 0
+    width = _small_size(frames[0].depth)[0] if frames else WIDTH
+    reach = max(2, round(LARGEST_SHIFT * width))
+    surfaces, weight = np.zeros((len(SCALES), 2 * reach + 1, 2 * reach + 1)), 0
     for frame in frames:
         outlines, edges = _outlines(frame.depth), _edges(frame.color)
         if outlines.sum() < FEWEST_OUTLINES * outlines.size:
             continue
         # Each frame counts alike: one with a picture on the wall has many edges.
-        found = np.stack([_correlation(outlines, edges, scale) for scale in SCALES]) / outlines.sum()
-        surfaces = found + (surfaces if weight else 0)
+        found = np.stack([_correlation(outlines, edges, scale, reach) for scale in SCALES])
+        surfaces += found / outlines.sum()
         weight += 1
     if weight < FEWEST_FRAMES:
         return None
     surfaces /= weight
-    reach = surfaces.shape[1] // 2
     at_rest = float(surfaces[SCALES.index(1.0), reach, reach])
-    best = np.unravel_index(int(surfaces.argmax()), surfaces.shape)
-    width = _small_size(frames[0].depth)[0]
-    shift = ((int(best[2]) - reach) / width, (int(best[1]) - reach) / width)
-    return Alignment(shift, SCALES[int(best[0])], float(surfaces[best]) - at_rest, at_rest)
+    scale, row, column = (int(i) for i in np.unravel_index(int(surfaces.argmax()), surfaces.shape))
+    shift = ((column - reach) / width, (row - reach) / width)
+    return Alignment(shift, SCALES[scale], float(surfaces[scale, row, column]) - at_rest, at_rest)
 
 
 def _small_size(image: np.ndarray) -> tuple[int, int]:
@@ -106,10 +106,9 @@ def _edges(color: np.ndarray) -> np.ndarray:
     return (strength - strength.mean()) / (strength.std() + np.float32(1e-6))
 
 
-def _correlation(outlines: np.ndarray, edges: np.ndarray, scale: float) -> np.ndarray:
-    """Edges under the outlines enlarged by `scale` and shifted by up to `LARGEST_SHIFT`: float [2 r + 1, 2 r + 1]."""
+def _correlation(outlines: np.ndarray, edges: np.ndarray, scale: float, reach: int) -> np.ndarray:
+    """Edges under the outlines enlarged by `scale` and shifted by up to `reach`: float [2 reach + 1, 2 reach + 1]."""
     height, width = edges.shape
-    reach = max(2, round(LARGEST_SHIFT * width))
     rows, columns = np.nonzero(outlines)
     v = np.rint((rows - (height - 1) / 2) * scale + (height - 1) / 2).astype(int)
     u = np.rint((columns - (width - 1) / 2) * scale + (width - 1) / 2).astype(int)

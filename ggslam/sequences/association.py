@@ -61,8 +61,8 @@ def pair_images(
     if not wide:
         gap = min((np.abs(depth - t).min() for t in color), default=np.inf) if len(depth) else np.inf
         raise SequenceError(
-            f"{place}: no image of {names[0]} is within {WIDE_TOLERANCE} s of one in {names[1]} (closest: {gap:.3f} s); "
-            f"colour spans {span(color)}, depth {span(depth)}"
+            f"{place}: no image of {names[0]} is within {WIDE_TOLERANCE} s of one in {names[1]} (closest: {gap:.3f} "
+            f"s); colour spans {span(color)}, depth {span(depth)}"
         )
     warning = (
         f"only {len(pairs)} of {len(color)} colour images have depth within {TOLERANCE} s; {len(wide)} paired within "

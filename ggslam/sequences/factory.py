@@ -79,8 +79,8 @@ def open_sequence(
             `skipped`; a frame whose mask alone is damaged comes without it and is listed in `mask_problems`.
         depth_camera: YAML file with the calibration of a depth camera beside the colour camera (see `calibration`); its
             depth images are registered to the colour images.
-        min_confidence: depth less sure than this (0 low, 1 medium, 2 high) is dropped where the recording tells how sure
-            it is; None: `DEFAULT_CONFIDENCE`.
+        min_confidence: depth less sure than this (0 low, 1 medium, 2 high) is dropped where the recording tells how
+            sure it is; None: `DEFAULT_CONFIDENCE`.
         topics: of a ROS bag, "role=topic" each, where they are not found by themselves; see `ros_topics`.
 
     Raises:

@@ -40,7 +40,8 @@ class FolderFormat:
 
     camera.yaml holds width, height, fx, fy, cx, cy, depth_scale and optionally distortion [k1, k2, p1, p2, k3, ...],
     distortion_model (opencv or fisheye), frame_rate, instances {id: name}, and depth_camera (width, height, fx, fy, cx,
-    cy, T_color_depth, distortion) where the depth images are to be registered to the colour images. A depth image belongs to the colour image of the same name or number.
+    cy, T_color_depth, distortion) where the depth images are to be registered to the colour images. A
+    depth image belongs to the colour image of the same name or number.
     poses.txt holds TUM lines or 4x4 matrices as rows.
     """
 

@@ -168,16 +168,17 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None) -> None:
     add = report.warnings.append
     if doubt.wrong_convention:
         add(
-            f"the true poses look like {doubt.convention}: read so, neighbouring depth images agree to {doubt.best:.2%}, "
-            f"as {AS_READ} only to {doubt.error:.2%}; convert them"
+            f"the true poses look like {doubt.convention}: read so, neighbouring depth images agree to "
+            f"{doubt.best:.2%}, as {AS_READ} only to {doubt.error:.2%}; convert them"
         )
     elif doubt.wrong_scale:
         found = report.depth_scale / doubt.ratio
         usual = min(USUAL_SCALES, key=lambda scale: abs(np.log(scale / found)))
         scale = usual if abs(np.log(usual / found)) < 0.1 else found
         add(
-            f"depth scale {report.depth_scale:g} is suspicious: with about {scale:g} units a metre neighbouring depth images "
-            f"agree with the poses to {doubt.best:.2%}, so only to {doubt.error:.2%}; try --depth-scale {scale:g}"
+            f"depth scale {report.depth_scale:g} is suspicious: with about {scale:g} units a metre neighbouring "
+            f"depth images agree with the poses to {doubt.best:.2%}, so only to {doubt.error:.2%}; "
+            f"try --depth-scale {scale:g}"
         )
     elif doubt.error > 0.05:
         add(f"true poses and depth disagree by {doubt.error:.0%}: wrong depth scale or poses, or little seen twice")
@@ -191,8 +192,9 @@ def _check_alignment(report: SequenceReport) -> None:
     parts = [f"{axis} {share * width:+.0f} pixels" for axis, share in zip(("right", "down"), found.shift, strict=True)]
     size = "" if found.scale == 1 else f" and enlarged by {found.scale:g}"
     report.warnings.append(
-        f"depth does not lie on colour: its outlines fit the edges of the colour images better when moved {', '.join(parts)}"
-        f"{size}; wrong intrinsics, depth that is not registered (--depth-camera FILE), or images of different times"
+        "depth does not lie on colour: its outlines fit the edges of the colour images better when moved "
+        f"{', '.join(parts)}{size}; wrong intrinsics, depth that is not registered (--depth-camera FILE), or images of "
+        "different times"
     )
 
 

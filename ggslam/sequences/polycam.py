@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Polycam's raw data: keyframes/images, cameras, depth, confidence; corrected_* where Polycam optimised the poses.
 
-A camera file holds fx fy cx cy width height and the rows t_00 ... t_23 of camera to world with ARKit's camera axes. Depth are
-millimetres, confidence 0, about 54 and 255 for low, medium and high.
+A camera file holds fx fy cx cy width height and the rows t_00 ... t_23 of camera to world with ARKit's camera axes.
+Depth are millimetres, confidence 0, about 54 and 255 for low, medium and high.
 """
 
 from __future__ import annotations

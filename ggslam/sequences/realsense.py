@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """RealSense cameras, live and recorded by their own tools (.bag), through pyrealsense2.
 
-Depth is registered to colour and distortion is undone here, not by librealsense, so that live frames, recordings and all other
-formats go through the same code.
+Depth is registered to colour and distortion is undone here, not by librealsense, so that live frames, recordings and
+all other formats go through the same code.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ class Device:
         calibration: of the two cameras, as a recording without frames.
     """
 
-    def __init__(self, path: Path | None = None, serial: str = "", size: tuple[int, int] = (640, 480), rate: int = 30) -> None:
+    def __init__(
+        self, path: Path | None = None, serial: str = "", size: tuple[int, int] = (640, 480), rate: int = 30
+    ) -> None:
         """Starts the recording `path`, or else the camera with this serial number (empty: the first one found).
 
         Raises:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Record3D's .r3d: a zip archive with `metadata` (JSON), rgbd/0.jpg, rgbd/0.depth, rgbd/0.conf.
 
-Depth are float32 metres and confidence uint8 (0 low to 2 high), row by row, each compressed with LZFSE. `K` is written column by
-column and belongs to the size w x h; perFrameIntrinsicCoeffs are fx fy cx cy of each frame. `poses` are qx qy qz qw tx
-ty tz, camera to world with ARKit's camera axes (y up, z backwards).
+Depth are float32 metres and confidence uint8 (0 low to 2 high), row by row, each compressed with LZFSE. `K` is written
+column by column and belongs to the size w x h; perFrameIntrinsicCoeffs are fx fy cx cy of each frame. `poses` are qx qy
+qz qw tx ty tz, camera to world with ARKit's camera axes (y up, z backwards).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS 1 bags (one file) and ROS 2 bags (a folder with metadata.yaml, or one .db3 or .mcap): colour, depth, camera_info.
 
-Needs the package rosbags, no ROS. The bag is read through once for the times of its images; images are decoded when their
-frame comes. Depth of a camera beside the colour camera is registered by /tf_static.
+Needs the package rosbags, no ROS. The bag is read through once for the times of its images; images are decoded when
+their frame comes. Depth of a camera beside the colour camera is registered by /tf_static.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def _value(info: Any, name: str) -> Any:
 
 
 def _camera(place: str, info: Any, rectified: bool) -> Camera:
-    K = np.asarray(_value(info, "p"), float).reshape(3, 4) if rectified else np.asarray(_value(info, "k"), float).reshape(3, 3)
+    K = np.asarray(_value(info, "p" if rectified else "k"), float).reshape(3, -1)
     numbers = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
     return camera_of(place, int(info.width), int(info.height), *numbers)
 
@@ -108,7 +108,7 @@ def _distortion(place: str, info: Any) -> tuple[np.ndarray | None, bool]:
     if not values.size or not np.any(values):
         return None, False
     if not np.isfinite(values).all() or len(values) not in ((4,) if fisheye else (4, 5, 8, 12, 14)):
-        raise SequenceError(f"{place}: {len(values)} distortion coefficients of '{info.distortion_model}' make no sense")
+        raise SequenceError(f"{place}: {len(values)} distortion coefficients of '{info.distortion_model}' are unknown")
     return values, fisheye
 
 
@@ -131,8 +131,8 @@ def _place_depth(recording: Recording, bag: Bag, topics: Topics, camera: Camera)
         recording.depth_camera = DepthCamera(depth_camera, T, distortion, fisheye)
         return
     recording.warnings.append(
-        f"depth ({depth_frame}) is of another camera than colour ({color_frame}), and /tf_static does not tell where it is: "
-        "taken as if both stood at one place (--depth-camera FILE tells it)"
+        f"depth ({depth_frame}) is of another camera than colour ({color_frame}), and /tf_static does not tell where "
+        "it is: taken as if both stood at one place (--depth-camera FILE tells it)"
     )
     recording.depth_camera = DepthCamera(depth_camera, np.eye(4))
 

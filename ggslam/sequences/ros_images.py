@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images in ROS messages: sensor_msgs/Image, CompressedImage and the depth images of compressed_depth_image_transport."""
+"""Images in ROS messages: sensor_msgs/Image, CompressedImage, and depth by compressed_depth_image_transport."""
 
 from __future__ import annotations
 
@@ -83,7 +83,8 @@ def _rows(place: str, message: Any, dtype: np.dtype, channels: int) -> np.ndarra
     used = width * channels * dtype.itemsize
     if height < 1 or width < 1 or step < used or data.size < height * step:
         raise SequenceError(
-            f"{place}: expected {width}x{height} pixels of {message.encoding} in rows of {step} bytes, found {data.size} bytes"
+            f"{place}: expected {width}x{height} pixels of {message.encoding} in rows of {step} bytes, found "
+            f"{data.size} bytes"
         )
     rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :used])
     return rows.view(dtype).reshape(height, width, channels)

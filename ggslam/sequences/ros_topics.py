@@ -46,8 +46,10 @@ def find_topics(bag: Bag, given: Mapping[str, str]) -> Topics:
     kinds = {}
     if not {"color", "depth"} <= set(given):
         kinds = {topic: _kind(bag, topic) for topic, name in bag.types.items() if name in IMAGE_TYPES}
-    color = given.get("color") or _best(bag, "color", {t: _color_score(t) for t, depth in kinds.items() if depth is False})
-    depth = given.get("depth") or _best(bag, "depth", {t: _depth_score(t) for t, depth in kinds.items() if depth})
+    colors = {topic: _color_score(topic) for topic, holds_depth in kinds.items() if holds_depth is False}
+    depths = {topic: _depth_score(topic) for topic, holds_depth in kinds.items() if holds_depth}
+    color = given.get("color") or _best(bag, "color", colors)
+    depth = given.get("depth") or _best(bag, "depth", depths)
     color_info = given.get("color_info") or _info(bag, color)
     if color_info is None:
         raise SequenceError(f"{bag.path}: no camera_info belongs to {color}; give it with --topic color_info=TOPIC")
@@ -75,9 +77,8 @@ def _depth_score(topic: str) -> float:
 
 def _best(bag: Bag, role: str, scores: dict[str, float]) -> str:
     if not scores:
-        raise SequenceError(
-            f"{bag.path}: no topic of {role} images; it holds {', '.join(f'{t} ({n})' for t, n in sorted(bag.types.items()))}"
-        )
+        held = ", ".join(f"{topic} ({name})" for topic, name in sorted(bag.types.items()))
+        raise SequenceError(f"{bag.path}: no topic of {role} images; it holds {held}")
     ranked = sorted(scores, key=lambda topic: (-scores[topic], topic))
     if len(ranked) > 1 and scores[ranked[0]] == scores[ranked[1]]:
         raise SequenceError(
@@ -136,7 +137,8 @@ def static_transform(bag: Bag, to_frame: str, from_frame: str) -> np.ndarray | N
     steps: dict[str, list[tuple[str, np.ndarray]]] = {}
     for message in bag.messages(STATIC_FRAMES):
         for link in message.transforms:
-            parent, child, T = link.header.frame_id.lstrip("/"), link.child_frame_id.lstrip("/"), pose_of(link.transform)
+            parent, child = link.header.frame_id.lstrip("/"), link.child_frame_id.lstrip("/")
+            T = pose_of(link.transform)
             steps.setdefault(child, []).append((parent, T))
             steps.setdefault(parent, []).append((child, inverse(T)))
     reached = {from_frame.lstrip("/"): np.eye(4)}

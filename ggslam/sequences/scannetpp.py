@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """ScanNet++: the undistorted DSLR images with rendered depth, or the iPhone's colour and LiDAR depth.
 
-Both parts may be in one scene: the given folder is the scene (then the DSLR part is read when its depth is there, else the
-iPhone's), or its `dslr` or `iphone`. The iPhone's images are those that the data set's own tools extract (rgb/, depth/), or its
-video rgb.mkv together with an extracted depth/. Poses: OpenGL axes in the DSLR part; `aligned_pose` with OpenCV axes of
-the iPhone.
+Both parts may be in one scene: the given folder is the scene (then the DSLR part is read when its depth is there, else
+the iPhone's), or its `dslr` or `iphone`. The iPhone's images are those that the data set's own tools extract (rgb/,
+depth/), or its video rgb.mkv together with an extracted depth/. Poses: OpenGL axes in the DSLR part; `aligned_pose`
+with OpenCV axes of the iPhone.
 """
 
 from __future__ import annotations

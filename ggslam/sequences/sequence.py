@@ -248,7 +248,8 @@ class Sequence:
 def _lens(recording: Recording) -> str:
     words = []
     if recording.distortion is not None and np.any(recording.distortion):
-        words.append("fisheye undone" if recording.fisheye else f"{len(recording.distortion)} distortion coefficients undone")
+        count = len(recording.distortion)
+        words.append("fisheye undone" if recording.fisheye else f"{count} distortion coefficients undone")
     if len({entry.camera for entry in recording.files if entry.camera is not None}) > 1:
         words.append("intrinsics of each frame brought to the first one's")
     return ", ".join(words)

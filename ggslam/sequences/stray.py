@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """StrayScanner: rgb.mp4, depth/, confidence/, odometry.csv, camera_matrix.csv.
 
-Depth are millimetres (PNG, in older recordings .npy) with levels of confidence 0 to 2 beside. odometry.csv tells timestamp, frame, x y z
-qx qy qz qw of every frame of the video, camera to world with OpenCV's axes, in newer recordings fx fy cx cy too.
+Depth are millimetres (PNG, in older recordings .npy) with levels of confidence 0 to 2 beside. odometry.csv tells
+timestamp, frame, x y z qx qy qz qw of every frame of the video, camera to world with OpenCV's axes, in newer recordings
+fx fy cx cy too.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
     {"fl_x": ..., "fl_y": ..., "cx": ..., "cy": ..., "w": ..., "h": ..., "camera_model": "OPENCV", "k1": ...,
      "frames": [{"file_path": "images/0.png", "depth_file_path": "depth/0.png", "transform_matrix": 4x4}, ...]}
 
-Intrinsics may stand in each frame instead. Poses map camera to world with OpenGL's camera axes. The principal point counts
-from the corner of the image, half a pixel further than ours.
+Intrinsics may stand in each frame instead. Poses map camera to world with OpenGL's camera axes. The principal point
+counts from the corner of the image, half a pixel further than ours.
 """
 
 from __future__ import annotations
@@ -62,11 +62,13 @@ def frames_of(path: Path, content: dict[str, Any], key: str = "frames") -> list[
         SequenceError: there is no such list.
     """
     frames = content.get(key)
-    if not isinstance(frames, list) or not all(isinstance(f, dict) and isinstance(f.get("file_path"), str) for f in frames):
+    listed: list[dict[str, Any]] = frames if isinstance(frames, list) else []
+    described = all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in listed)
+    if not isinstance(frames, list) or not described:
         raise SequenceError(f"{path}: expected '{key}' to list objects with file_path and transform_matrix")
-    if all(isinstance(f.get("timestamp"), (int, float)) for f in frames):
-        return sorted(frames, key=lambda f: f["timestamp"])
-    return sorted(frames, key=lambda f: natural_key(f["file_path"]))
+    if all(isinstance(f.get("timestamp"), (int, float)) for f in listed):
+        return sorted(listed, key=lambda f: f["timestamp"])
+    return sorted(listed, key=lambda f: natural_key(f["file_path"]))
 
 
 def read_transforms(
@@ -114,7 +116,10 @@ def read_transforms(
 
 def _image(path: Path) -> Path:
     """NeRFCapture leaves the suffix out."""
-    return path if path.suffix else path.with_name(path.name + ".png")
+    if path.suffix:
+        return path
+    named = [path.with_name(path.name + suffix) for suffix in (".png", ".jpg")]
+    return next((candidate for candidate in named if candidate.is_file()), named[0])
 
 
 def _depth(path: Path, frame: dict[str, Any], images: Path, depths: Path | None) -> Path:
@@ -123,7 +128,8 @@ def _depth(path: Path, frame: dict[str, Any], images: Path, depths: Path | None)
     told = next((frame[key] for key in DEPTH_KEYS if isinstance(frame.get(key), str)), None)
     if told is None:
         raise SequenceError(
-            f"{path}: frame {frame['file_path']} has no {' or '.join(DEPTH_KEYS)}: a recording without depth cannot be used"
+            f"{path}: frame {frame['file_path']} has no {' or '.join(DEPTH_KEYS)}: a recording without depth cannot be "
+            "used"
         )
     return _image(images / told)
 

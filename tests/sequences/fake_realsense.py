@@ -7,6 +7,7 @@ Colour sees depth shifted by 30 * 0.05 / z pixels; depth comes in tenths of a mi
 from __future__ import annotations
 
 import types
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,7 @@ class Pipeline:
         self.next = 0
 
     def start(self, config: Config) -> Any:
-        if config.file is not None and b"/device_0/sensor_" not in open(config.file, "rb").read():  # noqa: SIM115
+        if config.file is not None and b"/device_0/sensor_" not in Path(config.file).read_bytes():
             raise RuntimeError("Failed to resolve request.\n  No device connected")
         Pipeline.started += 1
         streams = {"color": Stream(intrinsics(config.lens)), "depth": Stream(intrinsics())}

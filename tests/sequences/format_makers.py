@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small recordings in the true format of phones' apps, data sets with JSON, and ROS. Each is written without the reader's
-code; depth of frame i is 1 + i/10 m, its colour (10 i, 100, 200), its pose `pose(i)`."""
+"""Small recordings in the true format of phones' apps, data sets with JSON, and ROS. Each is written without the
+reader's code; depth of frame i is 1 + i/10 m, its colour (10 i, 100, 200), its pose `pose(i)`."""
 
 from __future__ import annotations
 
@@ -192,8 +192,8 @@ def make_stray(folder: Path) -> Path:
 
 
 def write_bag(
-    path: Path, ros2: bool, compressed: bool = False, metres: bool = False, registered: bool = True, count: int = FRAMES,
-    d: tuple[float, ...] = (), model: str = "plumb_bob",
+    path: Path, ros2: bool, compressed: bool = False, metres: bool = False, registered: bool = True,
+    count: int = FRAMES, d: tuple[float, ...] = (), model: str = "plumb_bob",
 ) -> Path:  # fmt: skip
     """A bag in the layout of realsense-ros: colour, depth 5 ms later, camera_info, poses on a topic of their own."""
     writer_module = pytest.importorskip("rosbags.rosbag2" if ros2 else "rosbags.rosbag1")
@@ -216,8 +216,8 @@ def write_bag(
             data = np.frombuffer(head + cv2.imencode(".png", pixels)[1].tobytes(), np.uint8)
             return types["CompressedImage"](header=header(time, frame), format=form, data=data)
         return types["Image"](
-            header=header(time, frame), height=pixels.shape[0], width=pixels.shape[1], encoding=encoding, is_bigendian=0,
-            step=pixels.strides[0], data=np.frombuffer(pixels.tobytes(), np.uint8),
+            header=header(time, frame), height=pixels.shape[0], width=pixels.shape[1], encoding=encoding,
+            is_bigendian=0, step=pixels.strides[0], data=np.frombuffer(pixels.tobytes(), np.uint8),
         )  # fmt: skip
 
     def depth(i: int, time: float) -> Any:
@@ -261,7 +261,8 @@ def write_bag(
         link = types["TransformStamped"](
             header=header(999.9, "depth_optical"), child_frame_id="color_optical",
             transform=types["Transform"](
-                translation=types["Vector3"](x=0.05, y=0.0, z=0.0), rotation=types["Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+                translation=types["Vector3"](x=0.05, y=0.0, z=0.0),
+                rotation=types["Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
             ),
         )  # fmt: skip
         sent.append(("/tf_static", "tf2_msgs/msg/TFMessage", 999.9, types["TFMessage"](transforms=[link])))

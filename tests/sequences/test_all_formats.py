@@ -134,7 +134,8 @@ def test_transforms_with_distortion_and_units(make_more: Callable[[str], Path]) 
         assert len(open_sequence(folder)) == FRAMES
     for change, message in (
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not supported"),
-        ({"fl_x": -1}, "impossible camera"), ({"cx": "wide"}, "expected a number for 'cx'"), ({"frames": 3}, "'frames'"),
+        ({"fl_x": -1}, "impossible camera"), ({"frames": 3}, "'frames'"),
+        ({"cx": "wide"}, "expected a number for 'cx'"),
     ):  # fmt: skip
         path.write_text(json.dumps({**content, **change}))
         with pytest.raises(SequenceError, match=rf"transforms\.json.*{message}"):
