@@ -61,12 +61,13 @@ class FolderFormat:
             masks = find_masks(folder / "masks", colors)
         files = [FrameFiles(*pair) for pair in zip(colors, _depth_files(folder, colors), masks, strict=True)]
         path = folder / "camera.yaml"
+        camera = camera_entry(path, settings)
         distortion, fisheye = distortion_entry(path, settings)
         depth_camera = depth_camera_entry(path, settings["depth_camera"]) if "depth_camera" in settings else None
         timestamps, time_source = _timestamps(folder, colors, settings)
         recording = Recording(
             self.name, folder, files, timestamps, number_entry(path, settings, "depth_scale"),
-            camera_entry(path, settings), distortion=distortion, fisheye=fisheye, depth_camera=depth_camera,
+            camera, distortion=distortion, fisheye=fisheye, depth_camera=depth_camera,
             time_source=time_source, instance_names=_instances(path, settings), problems=missing_depth_problems(files),
         )  # fmt: skip
         if (folder / "poses.txt").is_file():

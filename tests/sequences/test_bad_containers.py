@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 from format_makers import MORE_MAKERS, make_record3d, make_stray, write_bag
 
-from ggslam.errors import SequenceError
+from ggslam.errors import MissingDependency, SequenceError
 from ggslam.sequences import open_sequence
 
 
@@ -121,3 +122,19 @@ def test_missing_files(tmp_path: Path, name: str, file: str, message: str) -> No
     folder = MORE_MAKERS[name](tmp_path)
     (folder / file).unlink()
     assert re.search(message, message_of(folder))
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "make"),
+    [
+        ("liblzfse", "phone", make_record3d), ("rosbags.highlevel", "ros", lambda p: write_bag(p / "a.bag", False)),
+        ("rosbags.highlevel", "ros", lambda p: write_bag(p / "a", True)),
+    ],
+)  # fmt: skip
+def test_missing_packages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, extra: str, make: Callable[[Path], Path]
+) -> None:
+    path = make(tmp_path)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingDependency, match=rf"pip install 'ggslam\[{extra}\]'"):
+        open_sequence(path)
