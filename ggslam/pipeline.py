@@ -15,12 +15,13 @@ from ggslam.formats.staging import new_staging
 from ggslam.interrupts import uninterrupted
 from ggslam.progress import Observer, SilentObserver
 from ggslam.realtime import RealtimeSlam
-from ggslam.recordings import SequenceRequest, describe
+from ggslam.recordings import SequenceRequest, describe, open_recording_of
 from ggslam.report_jobs import write_report
 from ggslam.run_folder import RunFolder
 from ggslam.scene.frame import Frame
 from ggslam.scoring import score_run
 from ggslam.sequences import Sequence
+from ggslam.sequences.live import LiveSequence
 from ggslam.slam import Slam
 from ggslam.slam_result import SlamResult, StepReport
 from ggslam.starting import ancestors, start_in_map
@@ -104,18 +105,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
         folder.discard()
         reason = result.frames[0].reason if result.frames else "no frame could be read"
         raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
-    for text in tracking_notes(result):
-        observer.note(text)
-    for skipped in sequence.skipped:
-        observer.note(f"skipped: {skipped.reason}")
-    for problem in sequence.mask_problems.values():
-        observer.note(f"mask not used: {problem}")
-    if sequence.has_masks and config.identity.enabled and config.masks.source != "none" and result.objects is None:
-        reason = "the masks of the keyframes label nothing"
-        if earlier is not None and not earlier.has_objects():
-            reason = f"the map of {earlier.path} has none"
-        observer.note(f"no objects were learned: {reason}")
-    for text in result.notes:
+    for text in [*tracking_notes(result), *_notes(sequence, result, config, earlier)]:
         observer.note(text)
     with uninterrupted():
         names = {**_names(earlier), **sequence.instance_names}
@@ -125,10 +115,33 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
         finally:
             result.close()
     outcome = RunOutcome(folder, result, error=error)
+    kept = sequence if isinstance(sequence, Sequence) else None if error else _kept(folder, sequence)
     if request.evaluate and error is None:
-        outcome.metrics = score_run(folder, sequence, observer)
-    write_report(folder, sequence)
+        if kept is None:
+            observer.note("not scored: the frames of a live camera are kept with --record FOLDER only")
+        else:
+            outcome.metrics = score_run(folder, kept, observer)
+    write_report(folder, kept)
     return outcome
+
+
+def _notes(
+    sequence: Sequence | LiveSequence, result: SlamResult, config: Config, earlier: RunFolder | None
+) -> list[str]:
+    """What a user should know of frames, masks and objects, a line each."""
+    notes = [f"skipped: {skipped.reason}" for skipped in sequence.skipped]
+    notes += [f"mask not used: {problem}" for problem in sequence.mask_problems.values()]
+    if sequence.has_masks and config.identity.enabled and config.masks.source != "none" and result.objects is None:
+        reason = "the masks of the keyframes label nothing"
+        if earlier is not None and not earlier.has_objects():
+            reason = f"the map of {earlier.path} has none"
+        notes.append(f"no objects were learned: {reason}")
+    return notes + result.notes
+
+
+def _kept(folder: RunFolder, sequence: LiveSequence) -> Sequence | None:
+    """What a live run recorded, if it did."""
+    return None if sequence.record is None else open_recording_of(folder)
 
 
 def tracking_notes(result: SlamResult) -> list[str]:
@@ -154,8 +167,8 @@ def _names(earlier: RunFolder | None) -> dict[int, str]:
 
 
 def run_slam(
-    sequence: Sequence, config: Config, observer: Observer, earlier: RunFolder | None = None, growing: bool = True,
-    follower: Follower | None = None, paging: Path | None = None,
+    sequence: Sequence | LiveSequence, config: Config, observer: Observer, earlier: RunFolder | None = None,
+    growing: bool = True, follower: Follower | None = None, paging: Path | None = None,
 ) -> tuple[SlamResult, BaseException | None]:  # fmt: skip
     """The loop over a recording, synchronous or in real time as the settings say; with `earlier` in that run's map,
     which grows or stays as it is. What does not fit into a limit of memory goes to the folder `paging`, see `Slam`.

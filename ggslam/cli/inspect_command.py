@@ -21,15 +21,21 @@ EPILOG = """
 
   ggslam inspect data/rgbd_dataset_freiburg3_cabinet
 
+  ggslam inspect walk.r3d
+
+  ggslam inspect walk.bag --topic pose=/vicon/camera
+
+  ggslam inspect --formats
+
   ggslam inspect kitchen.bin
 """
 
 
 def inspect(
     sequence: Annotated[
-        Path,
-        typer.Argument(metavar="SEQUENCE|STREAM", help="Folder of a recording, or file that `ggslam encode` wrote."),
-    ],
+        Path | None,
+        typer.Argument(metavar="SEQUENCE|STREAM", help="A recording, or a file that `ggslam encode` wrote."),
+    ] = None,
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
@@ -37,18 +43,29 @@ def inspect(
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     masks: options.Masks = None,
+    depth_camera: options.DepthCamera = None,
+    min_confidence: options.MinConfidence = None,
+    topics: options.Topics = None,
+    formats: Annotated[bool, typer.Option("--formats", help="Print the formats of recordings that are read.")] = False,
     samples: int = typer.Option(8, help="Frames to read and look at.", min=1),
 ) -> None:
     """Print what was recognised in a recording, and likely mistakes; of a G-PCC stream, print every unit."""
-    if sequence.is_file() or (sequence.suffix and not sequence.exists()):
+    from ggslam.sequences import open_sequence, recognise_format
+
+    if formats:
+        _print_formats()
+        return
+    if sequence is None:
+        raise typer.BadParameter("give a recording or a stream, or --formats")
+    is_stream = sequence.is_file() and format_name is None and recognise_format(sequence) is None
+    if is_stream or (sequence.suffix and not sequence.exists()):
         _print_stream(sequence)
         return
-    from ggslam.sequences import open_sequence
     from ggslam.sequences.inspection import inspect_sequence
 
     recording = open_sequence(
         sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, masks=masks,
-        depth_scale=depth_scale,
+        depth_scale=depth_scale, depth_camera=depth_camera, min_confidence=min_confidence, topics=topics or (),
     )  # fmt: skip
     report = inspect_sequence(recording, samples=samples)
     for name, value in _lines(report):
@@ -57,6 +74,13 @@ def inspect(
         console.print(f"[red]damaged:[/] {escape(reason)}", highlight=False)
     for warning in report.warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}", highlight=False)
+
+
+def _print_formats() -> None:
+    from ggslam.sequences import FORMATS
+
+    for known in FORMATS:
+        console.print(f"[bold]{known.name:<13}[/] {escape(known.layout)}", highlight=False, soft_wrap=True)
 
 
 def _print_stream(path: Path) -> None:
@@ -81,6 +105,16 @@ def _camera(c: Camera) -> str:
     return f"{c.width}x{c.height}, fx {c.fx:.2f} fy {c.fy:.2f} cx {c.cx:.2f} cy {c.cy:.2f}"
 
 
+def _images(r: SequenceReport) -> str:
+    """How the stored images become those of `camera`."""
+    color, depth = (f"{size[0]}x{size[1]}" for size in (r.color_size, r.depth_size))
+    words = [f"colour {color}, depth {depth}"]
+    words += ["depth registered to colour"] if r.registered else []
+    words += [r.lens] if r.lens else []
+    words += [f"depth of confidence below {r.min_confidence} dropped"] if r.min_confidence is not None else []
+    return "; ".join(words)
+
+
 def _lines(r: SequenceReport) -> list[tuple[str, str]]:
     lines = [
         ("recording", f"{r.name} ({r.format})"),
@@ -88,6 +122,7 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
         ("camera", _camera(r.camera)),
         ("depth", f"{r.depth_m[0]:.2f} to {r.depth_m[2]:.2f} m, median {r.depth_m[1]:.2f} m; {r.valid_share:.0%} of "
                   f"pixels; {r.depth_scale:g} units a metre"),
+        ("images", _images(r)),
         ("poses", f"{r.posed_frames} frames ({r.pose_source})" if r.posed_frames else "none"),
     ]  # fmt: skip
     if r.native_camera != r.camera:
@@ -98,6 +133,9 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
                                 f"(median), {step[2] * 100:.1f} cm and {turn[2]:.1f} deg (most)"))  # fmt: skip
     if r.pose_depth_error is not None:
         lines.append(("consistency", f"depth agrees with the poses to {r.pose_depth_error:.1%}"))
+    if r.alignment is not None:
+        best = "where it is" if r.alignment.off == 0 else f"{r.alignment.off * r.camera.width:.1f} pixels away"
+        lines.append(("alignment", f"outlines of depth fit the edges of colour best {best}"))
     if r.mask_kinds:
         kinds = ", ".join(f"{count} {kind}" for kind, count in r.mask_kinds.items())
         masks = f"{len(r.mask_ids)} ids, {r.named_ids} named, {r.labelled_share:.0%} of pixels"

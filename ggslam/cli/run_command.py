@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,6 +13,7 @@ from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
 from ggslam.cli.summary import print_scores
+from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
     from ggslam.pipeline import RunOutcome
@@ -32,6 +33,8 @@ EPILOG = """
 
   ggslam run data/redkitchen --scale 0.5 --view
 
+  ggslam run realsense: --stop 900 --record data/desk --out runs/desk
+
   ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
 """
 
@@ -44,7 +47,7 @@ class TrackerName(str, Enum):
 
 
 def run(
-    sequence: options.SequencePath,
+    sequence: options.LivePath,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default runs/NAME.")] = None,
     config: Annotated[str | None, typer.Option(help="Preset name or YAML file with settings.")] = None,
     settings: Annotated[
@@ -57,6 +60,12 @@ def run(
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     masks: options.Masks = None,
+    depth_camera: options.DepthCamera = None,
+    min_confidence: options.MinConfidence = None,
+    topics: options.Topics = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Keep the frames of a live camera here, as a recording.")
+    ] = None,
     iterations: Annotated[int | None, typer.Option(help="Mapping iterations per frame (default 4).")] = None,
     refine: Annotated[int | None, typer.Option(help="Iterations of final refinement after the last frame.")] = None,
     realtime: Annotated[
@@ -88,7 +97,8 @@ def run(
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
     from ggslam.pipeline import RunRequest, execute  # imports torch: only when needed
-    from ggslam.recordings import SequenceRequest
+    from ggslam.recordings import LiveRequest, SequenceRequest
+    from ggslam.sequences.live import is_live
     from ggslam.viewing_jobs import wait_for_interrupt
     from ggslam.watching import watching
 
@@ -99,11 +109,16 @@ def run(
         "tracker": None if tracker is None else tracker.value,
     }  # fmt: skip
     overrides += [f"{name}={value}" for name, value in shortcuts.items() if value is not None]
+    reading: dict[str, Any] = {
+        "path": sequence, "format": format_name, "start": start, "stop": stop, "stride": stride, "scale": scale,
+        "masks": masks, "depth_scale": depth_scale, "on_bad_frame": "skip" if skip_bad_frames else "error",
+        "depth_camera": depth_camera, "min_confidence": min_confidence, "topics": tuple(topics or ()),
+    }  # fmt: skip
+    live = is_live(sequence)
+    if record is not None and not live:
+        raise ConfigError("--record is for live cameras: a recording is kept already")
     request = RunRequest(
-        sequence=SequenceRequest(
-            sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, masks=masks,
-            depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error",
-        ),
+        sequence=LiveRequest(**reading, record=record) if live else SequenceRequest(**reading),
         out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite, map=earlier,
         localize_only=localize_only,
     )  # fmt: skip

@@ -3,9 +3,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from ggslam.errors import SequenceError
 from ggslam.scene.poses import se3_exp, so3_log
+
+TOLERANCE = 0.02
+"""Seconds between colour and depth, as in the TUM benchmark's own tool."""
+WIDE_TOLERANCE = 0.08
+"""Tried when almost nothing pairs up within `TOLERANCE`."""
 
 
 def associate(first: np.ndarray, second: np.ndarray, tolerance: float) -> list[tuple[int, int]]:
@@ -31,6 +39,41 @@ def associate(first: np.ndarray, second: np.ndarray, tolerance: float) -> list[t
             pairs[i] = j
             taken.add(j)
     return sorted(pairs.items())
+
+
+def pair_images(
+    place: Path, color: np.ndarray, depth: np.ndarray, names: tuple[str, str]
+) -> tuple[list[tuple[int, int]], list[str]]:
+    """Pairs (i, j) of colour images and the depth images taken at about the same time, and warnings.
+
+    Args:
+        place: of the recording, for messages.
+        color, depth: times float64 [n], [m], seconds.
+        names: what lists the two, for messages.
+
+    Raises:
+        SequenceError: nothing pairs up.
+    """
+    pairs = associate(color, depth, TOLERANCE)
+    if pairs and 2 * len(pairs) >= min(len(color), len(depth)):
+        return pairs, []
+    wide = associate(color, depth, WIDE_TOLERANCE)
+    if not wide:
+        gap = min((np.abs(depth - t).min() for t in color), default=np.inf) if len(depth) else np.inf
+        raise SequenceError(
+            f"{place}: no image of {names[0]} is within {WIDE_TOLERANCE} s of one in {names[1]} (closest: {gap:.3f} "
+            f"s); colour spans {span(color)}, depth {span(depth)}"
+        )
+    warning = (
+        f"only {len(pairs)} of {len(color)} colour images have depth within {TOLERANCE} s; {len(wide)} paired within "
+        f"{WIDE_TOLERANCE} s instead"
+    )
+    return wide, [warning]
+
+
+def span(times: np.ndarray) -> str:
+    """First and last time, for messages."""
+    return f"{times.min():.3f} to {times.max():.3f} s" if len(times) else "no time at all"
 
 
 def poses_at(

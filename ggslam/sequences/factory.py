@@ -5,25 +5,47 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 from ggslam.errors import SequenceError
+from ggslam.sequences.calibration import use_depth_camera
 from ggslam.sequences.folder import FolderFormat, SyntheticFormat
+from ggslam.sequences.icl_nuim import IclNuimFormat
 from ggslam.sequences.masks import find_masks
-from ggslam.sequences.recording import Recording, RecordingFormat
+from ggslam.sequences.polycam import PolycamFormat
+from ggslam.sequences.realsense import RealSenseFormat
+from ggslam.sequences.record3d import Record3DFormat
+from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat
 from ggslam.sequences.replica import ReplicaFormat
+from ggslam.sequences.ros_bag import Ros1Format, Ros2Format
+from ggslam.sequences.ros_topics import ROLES
 from ggslam.sequences.scannet import ScanNetFormat
+from ggslam.sequences.scannetpp import ScanNetPlusFormat
 from ggslam.sequences.sequence import OnBadFrame, Sequence
 from ggslam.sequences.seven_scenes import SevenScenesFormat
+from ggslam.sequences.stray import StrayFormat
+from ggslam.sequences.transforms_json import TransformsFormat
 from ggslam.sequences.tum import TumFormat
+from ggslam.sequences.vmap import VmapFormat
 
 FORMATS: tuple[RecordingFormat, ...] = (
     SyntheticFormat(),
     FolderFormat(),
     ReplicaFormat(),
+    VmapFormat(),
     TumFormat(),
+    IclNuimFormat(),
     SevenScenesFormat(),
     ScanNetFormat(),
+    ScanNetPlusFormat(),
+    TransformsFormat(),
+    Record3DFormat(),
+    PolycamFormat(),
+    StrayFormat(),
+    RealSenseFormat(),
+    Ros1Format(),
+    Ros2Format(),
 )
 """Known formats in the order in which they are tried."""
 
@@ -39,12 +61,15 @@ def open_sequence(
     masks: str | Path | None = None,
     depth_scale: float | None = None,
     on_bad_frame: OnBadFrame = "error",
+    depth_camera: str | Path | None = None,
+    min_confidence: int | None = None,
+    topics: Iterable[str] = (),
 ) -> Sequence:
     """Opens an RGB-D recording.
 
     Args:
-        path: folder of the recording.
-        format: name of a format in `FORMATS`; None: recognised from the folder.
+        path: folder or file of the recording.
+        format: name of a format in `FORMATS`; None: recognised from the folder or file.
         start, stop, stride: frames start, start + stride, ... below stop (None: to the end). A stop past the end means
             the end.
         scale: size of the delivered images, in (0, 1].
@@ -52,14 +77,25 @@ def open_sequence(
         depth_scale: depth units per metre, instead of the recording's own.
         on_bad_frame: "error": a damaged frame or mask raises; "skip": `stream` passes over the frame and lists it in
             `skipped`; a frame whose mask alone is damaged comes without it and is listed in `mask_problems`.
+        depth_camera: YAML file with the calibration of a depth camera beside the colour camera (see `calibration`); its
+            depth images are registered to the colour images.
+        min_confidence: depth less sure than this (0 low, 1 medium, 2 high) is dropped where the recording tells how
+            sure it is; None: `DEFAULT_CONFIDENCE`.
+        topics: of a ROS bag, "role=topic" each, where they are not found by themselves; see `ros_topics`.
 
     Raises:
+        MissingDependency: a package is needed to read the recording.
         SequenceError: the recording cannot be read; the message names the file, what was expected and what was found.
     """
-    folder = _existing_folder(Path(path).expanduser())
-    recording = _find_format(folder, format).read(folder)
+    folder = _existing(Path(path).expanduser())
+    options = _options(depth_camera, min_confidence, topics)
+    recording = _find_format(folder, format).read(folder, options)
     if not recording.files:
         raise SequenceError(f"{folder}: holds no frames")
+    if options.depth_camera is not None:
+        use_depth_camera(recording, options.depth_camera)
+    if options.min_confidence is not None:
+        recording.min_confidence = options.min_confidence
     if masks is not None:
         _use_masks(recording, Path(masks).expanduser())
     if depth_scale is not None:
@@ -78,18 +114,28 @@ def _use_masks(recording: Recording, folder: Path) -> None:
     recording.files = [dataclasses.replace(entry, mask=mask) for entry, mask in pairs]
 
 
+def _options(depth_camera: str | Path | None, min_confidence: int | None, topics: Iterable[str]) -> ReadOptions:
+    if min_confidence is not None and min_confidence not in (0, 1, 2):
+        raise SequenceError(f"min_confidence: expected 0, 1 or 2, found {min_confidence}")
+    by_role = {}
+    for text in topics:
+        role, _, topic = text.partition("=")
+        if role not in ROLES or not topic:
+            raise SequenceError(f"topic: expected ROLE=TOPIC with a role of {', '.join(ROLES)}, found '{text}'")
+        by_role[role] = topic
+    return ReadOptions(None if depth_camera is None else Path(depth_camera).expanduser(), by_role, min_confidence)
+
+
 def recognise_format(path: str | Path) -> str | None:
-    """Name of the format of a folder, None when it is none of the known ones (or no folder)."""
-    folder = Path(path)
-    return next((f.name for f in FORMATS if folder.is_dir() and f.matches(folder)), None)
+    """Name of the format of a folder or file, None when it is none of the known ones."""
+    place = Path(path)
+    return next((f.name for f in FORMATS if place.exists() and f.matches(place)), None)
 
 
-def _existing_folder(folder: Path) -> Path:
-    if not folder.exists():
-        raise SequenceError(f"{folder}: no such folder")
-    if not folder.is_dir():
-        raise SequenceError(f"{folder}: expected the folder of a recording, found a file")
-    return folder
+def _existing(path: Path) -> Path:
+    if not path.exists():
+        raise SequenceError(f"{path}: no such folder or file")
+    return path
 
 
 def _find_format(folder: Path, name: str | None) -> RecordingFormat:
@@ -101,6 +147,8 @@ def _find_format(folder: Path, name: str | None) -> RecordingFormat:
     recognised = next((f for f in FORMATS if f.matches(folder)), None)
     if recognised is None:
         looked_for = "\n".join(f"  {f.name}: {f.layout}" for f in FORMATS)
+        if folder.is_file():
+            raise SequenceError(f"{folder}: expected a recording, found a file that is none. Looked for:\n{looked_for}")
         raise SequenceError(f"{folder}: not a known recording; it holds {_contents(folder)}. Looked for:\n{looked_for}")
     return recognised
 

@@ -7,22 +7,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ggslam.errors import SequenceError
-from ggslam.scene.camera import Camera
 from ggslam.sequences.association import poses_at
+from ggslam.sequences.calibration import (
+    camera_entry,
+    depth_camera_entry,
+    distortion_entry,
+    number_entry,
+    read_calibration,
+)
 from ggslam.sequences.masks import find_masks
 from ggslam.sequences.pose_files import data_lines, read_matrix_rows, read_tum_poses
 from ggslam.sequences.recording import (
+    NO_OPTIONS,
     NOMINAL_RATE,
     FrameFiles,
+    ReadOptions,
     Recording,
     image_files,
     last_number,
     missing_depth_problems,
     nominal_timestamps,
-    read_text,
 )
 
 GENERATOR_KEY = "generator"
@@ -32,8 +38,10 @@ GENERATOR_KEY = "generator"
 class FolderFormat:
     """The simplest layout for one's own data.
 
-    camera.yaml holds width, height, fx, fy, cx, cy, depth_scale and optionally distortion [k1, k2, p1, p2, k3],
-    frame_rate, and instances {id: name}. A depth image belongs to the colour image of the same name or number.
+    camera.yaml holds width, height, fx, fy, cx, cy, depth_scale and optionally distortion [k1, k2, p1, p2, k3, ...],
+    distortion_model (opencv or fisheye), frame_rate, instances {id: name}, and depth_camera (width, height, fx, fy, cx,
+    cy, T_color_depth, distortion) where the depth images are to be registered to the colour images. A
+    depth image belongs to the colour image of the same name or number.
     poses.txt holds TUM lines or 4x4 matrices as rows.
     """
 
@@ -43,8 +51,8 @@ class FolderFormat:
     def matches(self, folder: Path) -> bool:
         return (folder / "camera.yaml").is_file()
 
-    def read(self, folder: Path) -> Recording:
-        settings = _read_settings(folder / "camera.yaml")
+    def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
+        settings = read_calibration(folder / "camera.yaml")
         colors = image_files(folder / "rgb")
         if not colors:
             raise SequenceError(f"{folder / 'rgb'}: no images")
@@ -52,11 +60,15 @@ class FolderFormat:
         if (folder / "masks").is_dir():
             masks = find_masks(folder / "masks", colors)
         files = [FrameFiles(*pair) for pair in zip(colors, _depth_files(folder, colors), masks, strict=True)]
-        camera, depth_scale, distortion = _camera(folder / "camera.yaml", settings)
+        path = folder / "camera.yaml"
+        camera = camera_entry(path, settings)
+        distortion, fisheye = distortion_entry(path, settings)
+        depth_camera = depth_camera_entry(path, settings["depth_camera"]) if "depth_camera" in settings else None
         timestamps, time_source = _timestamps(folder, colors, settings)
         recording = Recording(
-            self.name, folder, files, timestamps, depth_scale, camera, distortion=distortion, time_source=time_source,
-            instance_names=_instances(folder / "camera.yaml", settings), problems=missing_depth_problems(files),
+            self.name, folder, files, timestamps, number_entry(path, settings, "depth_scale"),
+            camera, distortion=distortion, fisheye=fisheye, depth_camera=depth_camera,
+            time_source=time_source, instance_names=_instances(path, settings), problems=missing_depth_problems(files),
         )  # fmt: skip
         if (folder / "poses.txt").is_file():
             _add_poses(recording, folder / "poses.txt")
@@ -71,45 +83,9 @@ class SyntheticFormat(FolderFormat):
 
     def matches(self, folder: Path) -> bool:
         try:
-            return super().matches(folder) and GENERATOR_KEY in _read_settings(folder / "camera.yaml")
+            return super().matches(folder) and GENERATOR_KEY in read_calibration(folder / "camera.yaml")
         except SequenceError:
             return False  # the plain folder's reader will tell what is wrong
-
-
-def _read_settings(path: Path) -> dict[str, Any]:
-    try:
-        settings = yaml.safe_load(read_text(path))
-    except yaml.YAMLError as error:
-        raise SequenceError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(settings, dict):
-        raise SequenceError(f"{path}: expected entries width, height, fx, fy, cx, cy, depth_scale, found none")
-    return settings
-
-
-def _number(path: Path, settings: dict[str, Any], key: str) -> float:
-    if key not in settings:
-        raise SequenceError(f"{path}: entry '{key}' is missing")
-    value = settings[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise SequenceError(f"{path}: expected a number for '{key}', found '{value}'")
-    return float(value)
-
-
-def _camera(path: Path, settings: dict[str, Any]) -> tuple[Camera, float, np.ndarray | None]:
-    width, height, fx, fy, cx, cy = (
-        _number(path, settings, key) for key in ("width", "height", "fx", "fy", "cx", "cy")
-    )
-    try:
-        camera = Camera(int(width), int(height), fx, fy, cx, cy)
-    except ValueError as error:
-        raise SequenceError(f"{path}: {error}") from None
-    distortion = settings.get("distortion")
-    if distortion is None:
-        return camera, _number(path, settings, "depth_scale"), None
-    values = distortion if isinstance(distortion, list) else []
-    if len(values) not in (4, 5, 8) or not all(isinstance(v, (int, float)) and np.isfinite(v) for v in values):
-        raise SequenceError(f"{path}: expected 4, 5 or 8 numbers for 'distortion', found '{distortion}'")
-    return camera, _number(path, settings, "depth_scale"), np.array(values, float)
 
 
 def _instances(path: Path, settings: dict[str, Any]) -> dict[int, str]:
@@ -154,7 +130,7 @@ def _timestamps(folder: Path, colors: list[Path], settings: dict[str, Any]) -> t
             return np.array([float(color.stem) for color in colors]), "names of the images"
     except ValueError:
         pass
-    rate = _number(folder / "camera.yaml", settings, "frame_rate") if "frame_rate" in settings else NOMINAL_RATE
+    rate = number_entry(folder / "camera.yaml", settings, "frame_rate") if "frame_rate" in settings else NOMINAL_RATE
     if rate <= 0:
         raise SequenceError(f"{folder / 'camera.yaml'}: expected a positive 'frame_rate', found {rate:g}")
     return nominal_timestamps(len(colors), rate), f"{rate:g} frames/s of camera.yaml" if "frame_rate" in settings else (

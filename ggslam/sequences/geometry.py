@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
-from ggslam.sequences.recording import FrameFiles, Recording
+from ggslam.sequences.recording import FrameFiles, ImageFile, Recording
+from ggslam.sequences.registration import DepthRegistration
 from ggslam.sequences.resampling import resize_color, resize_depth, resize_mask
 
 ASPECT_TOLERANCE = 0.01
@@ -38,7 +37,8 @@ class ImageGeometry:
     """Turns the images of one recording, as stored, into images of `camera`.
 
     Colour and depth of different resolution are brought to the smaller one (to the depth image's when it has its own
-    intrinsics), lens distortion is undone, and the result is scaled down.
+    intrinsics); depth of another camera is registered to the colour image, at about its own resolution; lens distortion
+    is undone, frames with intrinsics of their own are brought to those of the recording, and the result is scaled down.
 
     Attributes:
         camera: intrinsics of the images that come out.
@@ -49,23 +49,40 @@ class ImageGeometry:
     def __init__(
         self, recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size, scale: float
     ) -> None:
-        if not same_aspect(color_size, depth_size):
+        if recording.depth_camera is None and not same_aspect(color_size, depth_size):
             raise SequenceError(
                 f"{files.depth}: depth is {_text(depth_size)}, but colour {files.color.name} is {_text(color_size)}: "
-                "not the same view at another resolution"
+                "not the same view at another resolution (the calibration of a depth camera beside the colour camera "
+                "would tell how they belong together)"
             )
         self.color_size, self.depth_size = color_size, depth_size
-        color_camera = _color_camera(recording, color_size, files.color)
+        self._common = color_camera = _color_camera(recording, color_size, files.color)
         self._warp: np.ndarray | None = None
         self._seen: np.ndarray | None = None
-        if recording.depth_calibration is not None:
+        self._registration: DepthRegistration | None = None
+        if recording.depth_camera is not None:
+            self.native_camera = self._register(recording, depth_size, files)
+        elif recording.depth_calibration is not None:
             self.native_camera = Camera(*depth_size, *recording.depth_calibration)
             self._align_color(color_camera.resized(*depth_size))
         else:
             size = min(color_size, depth_size, key=lambda s: s[0] * s[1])
             self.native_camera = color_camera.resized(*size)
-        self._maps = _undistortion(self.native_camera, recording.distortion)
+        self._maps = _undistortion(self.native_camera, recording.distortion, recording.fisheye)
         self.camera = self.native_camera.scaled(scale)
+
+    def _register(self, recording: Recording, depth_size: Size, files: FrameFiles) -> Camera:
+        """Prepares registration of depth; returns the colour camera at about the depth image's resolution."""
+        assert recording.depth_camera is not None
+        stated = recording.depth_camera.camera
+        if not same_aspect((stated.width, stated.height), depth_size):
+            raise SequenceError(
+                f"{files.depth}: depth is {_text(depth_size)}, but the calibration of the depth camera is for "
+                f"{stated.width}x{stated.height}"
+            )
+        native = self._common.scaled(min(1.0, stated.resized(*depth_size).fx / self._common.fx))
+        self._registration = DepthRegistration(recording.depth_camera, depth_size, native)
+        return native
 
     def _align_color(self, color_camera: Camera) -> None:
         """Prepares the affine map from depth pixels to colour pixels of the same size; none if it moves nothing."""
@@ -91,6 +108,25 @@ class ImageGeometry:
                     f"{path}: expected {kind} of {_text(expected)} as in the first frame, found {_text(found)}"
                 )
 
+    def steady(self, image: np.ndarray, files: FrameFiles, flags: int) -> np.ndarray:
+        """Image as stored -> the same with the recording's intrinsics, if the frame has its own.
+
+        Args:
+            image: [H, W, ...] colour, depth or ids.
+            files: the frame.
+            flags: OpenCV's interpolation.
+        """
+        if files.camera is None:
+            return image
+        size = image_size(image)
+        own, common = files.camera.resized(*size), self._common.resized(*size)
+        ax, ay = own.fx / common.fx, own.fy / common.fy
+        warp = np.array([[ax, 0.0, own.cx - ax * common.cx], [0.0, ay, own.cy - ay * common.cy]])
+        corner = warp @ (size[0] - 1, size[1] - 1, 1)
+        if max(np.abs(warp[:, 2]).max(), np.abs(corner - (size[0] - 1, size[1] - 1)).max()) < 0.25:
+            return image
+        return cv2.warpAffine(image, warp, size, flags=flags | cv2.WARP_INVERSE_MAP)
+
     def color(self, color: np.ndarray) -> np.ndarray:
         """Colour uint8 [H, W, 3] as stored -> image of `camera`."""
         native, size = (self.native_camera.width, self.native_camera.height), (self.camera.width, self.camera.height)
@@ -105,6 +141,8 @@ class ImageGeometry:
 
     def depth(self, depth: np.ndarray) -> np.ndarray:
         """Depth float32 [H, W] metres as stored -> image of `camera`."""
+        if self._registration is not None:
+            return resize_depth(self._registration(depth), self.camera.width, self.camera.height)
         depth = resize_depth(depth, self.native_camera.width, self.native_camera.height)
         if self._seen is not None:
             depth = np.where(self._seen, depth, np.float32(0))  # no colour there
@@ -123,7 +161,7 @@ class ImageGeometry:
         return resize_mask(mask, self.camera.width, self.camera.height)
 
 
-def _color_camera(recording: Recording, color_size: Size, color_file: Path) -> Camera:
+def _color_camera(recording: Recording, color_size: Size, color_file: ImageFile) -> Camera:
     if recording.camera is None:
         if recording.calibration is None:
             raise SequenceError(f"{recording.path}: no intrinsics")
@@ -136,9 +174,12 @@ def _color_camera(recording: Recording, color_size: Size, color_file: Path) -> C
     return recording.camera.resized(*color_size)
 
 
-def _undistortion(camera: Camera, distortion: np.ndarray | None) -> tuple[np.ndarray, np.ndarray] | None:
+def _undistortion(
+    camera: Camera, distortion: np.ndarray | None, fisheye: bool
+) -> tuple[np.ndarray, np.ndarray] | None:
     if distortion is None or not np.any(distortion):
         return None
-    K, size = camera.matrix(), (camera.width, camera.height)
-    maps = cv2.initUndistortRectifyMap(K, np.asarray(distortion, float), np.eye(3), K, size, cv2.CV_32FC1)
+    K, size, coefficients = camera.matrix(), (camera.width, camera.height), np.asarray(distortion, float)
+    make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+    maps = make(K, coefficients, np.eye(3), K, size, cv2.CV_32FC1)
     return maps[0], maps[1]

@@ -14,39 +14,76 @@ import cv2
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.sequences.recording import ImageFile
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
-def read_color(path: Path) -> np.ndarray:
+def read_color(file: ImageFile) -> np.ndarray:
     """Colour image, uint8 [H, W, 3] RGB (grey images are spread over the three channels).
 
     Raises:
         SequenceError: missing, truncated, or not an image.
     """
+    return decode_color(file, read_content(file)) if isinstance(file, Path) else file.read()
+
+
+def decode_color(name: object, content: bytes) -> np.ndarray:
+    """Colour image uint8 [H, W, 3] RGB of the bytes of a PNG or JPEG file (`name` is for errors)."""
     # The orientation tag is ignored: depth and calibration refer to the pixels as stored.
-    image = decode(path, read_content(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decode(name, content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def read_depth(path: Path, depth_scale: float, invalid: int | None = None) -> np.ndarray:
+def read_depth(file: ImageFile, depth_scale: float, invalid: int | None = None) -> np.ndarray:
     """Depth image, float32 [H, W], metres, 0 where nothing was measured.
 
     Args:
-        path: single-channel 16-bit PNG.
+        file: single-channel 16-bit PNG, or .npy of uint16 or floating-point numbers, or a source of either.
         depth_scale: units per metre.
-        invalid: raw value that means "nothing measured" beside 0.
+        invalid: raw value that means "nothing measured" beside 0; negative numbers and NaN do so always.
 
     Raises:
-        SequenceError: missing, truncated, not an image, or not 16-bit with one channel.
+        SequenceError: missing, truncated, not an image, or not 16-bit or floating-point with one channel.
     """
-    raw = decode(path, read_content(path), cv2.IMREAD_UNCHANGED)
-    if raw.ndim != 2 or raw.dtype != np.uint16:
-        raise SequenceError(f"{path}: expected a 16-bit depth image with one channel, found {describe_channels(raw)}")
+    if not isinstance(file, Path):
+        raw = file.read()
+    elif file.suffix.lower() == ".npy":
+        raw = _read_array(file)
+    else:
+        raw = decode(file, read_content(file), cv2.IMREAD_UNCHANGED)
+    if raw.ndim != 2 or (raw.dtype != np.uint16 and raw.dtype.kind != "f"):
+        raise SequenceError(f"{file}: expected a 16-bit depth image with one channel, found {describe_channels(raw)}")
     depth = raw.astype(np.float32) / np.float32(depth_scale)
+    if raw.dtype.kind == "f":
+        depth[~((depth > 0) & np.isfinite(depth))] = 0
     if invalid is not None:
         depth[raw == invalid] = 0
     return depth
+
+
+def read_confidence(file: ImageFile) -> np.ndarray:
+    """Confidence levels uint8 [H, W]: 0 low, 1 medium, 2 high.
+
+    Raises:
+        SequenceError: missing, damaged, or not 8-bit with one channel.
+    """
+    image = decode(file, read_content(file), cv2.IMREAD_UNCHANGED) if isinstance(file, Path) else file.read()
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise SequenceError(f"{file}: expected an 8-bit confidence image, found {describe_channels(image)}")
+    return image
+
+
+def _read_array(path: Path) -> np.ndarray:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        raise SequenceError(f"{path}: image file is missing") from None
+    except (OSError, ValueError, EOFError) as error:
+        raise SequenceError(f"{path}: cannot be read: {error}") from None
+    if not isinstance(array, np.ndarray) or array.ndim not in (2, 3):
+        raise SequenceError(f"{path}: expected an array of an image, found shape {list(np.shape(array))}")
+    return array
 
 
 def describe_channels(image: np.ndarray) -> str:
@@ -73,8 +110,8 @@ def read_content(path: Path) -> bytes:
     return content
 
 
-def decode(path: Path, content: bytes, flags: int) -> np.ndarray:
-    """Image of the bytes of `path` (named in errors), as OpenCV decodes it with `flags`.
+def decode(path: object, content: bytes, flags: int) -> np.ndarray:
+    """Image of the bytes `content`, as OpenCV decodes it with `flags`; `path` is for errors.
 
     Raises:
         SequenceError: OpenCV cannot decode it.

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,11 +10,13 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, transformed
+from ggslam.scene.poses import inverse
+from ggslam.sequences.alignment import Alignment, measure_alignment
+from ggslam.sequences.pose_doubts import AS_READ, PoseDoubt, doubt_poses, pairs_apart
 from ggslam.sequences.sequence import Sequence
 
-SMALLEST_MEDIAN_DEPTH, LARGEST_MEDIAN_DEPTH = 0.1, 20.0
-"""Metres; a median depth outside suggests a wrong depth scale."""
+SMALLEST_MEDIAN_DEPTH, LARGEST_MEDIAN_DEPTH = 0.1, 6.0
+"""Metres; a median depth outside suggests a wrong depth scale: RGB-D cameras see rooms."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +37,18 @@ class SequenceReport:
         duration_s, rate_hz: by the timestamps; rate is the median one (NaN for a single frame).
         time_source, pose_source: what told them.
         camera, native_camera: delivered and stored intrinsics.
+        color_size, depth_size: (width, height) of the stored images.
+        lens: what is undone, for people; "" for a pinhole camera.
+        registered: whether depth of another camera is registered to colour.
+        min_confidence: depth less sure is dropped; None: the recording does not tell.
         depth_scale: units per metre.
         depth_m: 1st percentile, median, 99th percentile of the valid depths of the sampled frames (NaN: none valid).
         valid_share: share of sampled pixels with depth.
         posed_frames: frames with a true pose.
         motion: None without two successive true poses.
-        pose_depth_error: median relative difference between the depth seen in a frame and the depth predicted from the
-            frame before by the true poses; None when it cannot be told.
+        pose_depth_error: median relative difference between the depth seen in a frame and the depth predicted from an
+            earlier frame by the true poses; None when it cannot be told.
+        alignment: where depth fits colour best; None when too few outlines are seen.
         mask_kinds: how the masks of all frames are stored ("grey", "palette", "RGB-coded", ...) -> number of frames.
         masked_frames: share of sampled frames with a mask; mask_ids: ids seen in them; labelled_share: of their pixels.
         named_ids: how many ids have names.
@@ -60,11 +66,17 @@ class SequenceReport:
     camera: Camera
     native_camera: Camera
     depth_scale: float
+    color_size: tuple[int, int] = (0, 0)
+    depth_size: tuple[int, int] = (0, 0)
+    lens: str = ""
+    registered: bool = False
+    min_confidence: int | None = None
     depth_m: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     valid_share: float = 0.0
     posed_frames: int = 0
     motion: Motion | None = None
     pose_depth_error: float | None = None
+    alignment: Alignment | None = None
     mask_kinds: dict[str, int] = field(default_factory=dict)
     masked_frames: float = 0.0
     mask_ids: list[int] = field(default_factory=list)
@@ -81,6 +93,7 @@ def inspect_sequence(sequence: Sequence, samples: int = 8) -> SequenceReport:
     report = SequenceReport(
         sequence.name, sequence.format, len(sequence), float(times[-1] - times[0]), _rate(intervals),
         sequence.time_source, sequence.pose_source, sequence.camera, sequence.native_camera, sequence.depth_scale,
+        sequence.color_size, sequence.depth_size, sequence.lens, sequence.registered, sequence.min_confidence,
         named_ids=len(sequence.instance_names), warnings=list(sequence.warnings),
     )  # fmt: skip
     chosen = np.unique(np.linspace(0, len(sequence) - 1, max(1, min(samples, len(sequence)))).round().astype(int))
@@ -93,7 +106,9 @@ def inspect_sequence(sequence: Sequence, samples: int = 8) -> SequenceReport:
     if sequence.ground_truth is not None:
         report.posed_frames = int(np.isfinite(sequence.ground_truth).all((1, 2)).sum())
         report.motion = _motion(sequence.ground_truth)
-        _check_poses(report, _neighbours(sequence, frames))
+        _check_poses(report, doubt_poses(pairs_apart(sequence, frames)))
+    report.alignment = measure_alignment(frames)
+    _check_alignment(report)
     _warn(report, intervals, frames)
     return report
 
@@ -141,68 +156,46 @@ def _motion(poses: np.ndarray) -> Motion | None:
     return Motion(summary(distance), summary(turn), float(distance.sum()))
 
 
-def _neighbours(sequence: Sequence, frames: list[Frame]) -> list[tuple[Frame, Frame]]:
-    """Pairs of a frame and the next one where both have a true pose."""
-    pairs = []
-    for frame in frames:
-        if frame.T_world_camera is None or frame.index + 1 >= len(sequence):
-            continue
-        try:
-            after = sequence.frame(frame.index + 1)
-        except SequenceError:
-            continue
-        if after.T_world_camera is not None:
-            pairs.append((frame, after))
-    return pairs
+USUAL_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10000.0, 512.0, 256.0, 1.0)
+"""Depth units per metre that cameras and data sets use."""
 
 
-_CONVENTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "world to camera": inverse,
-    "OpenGL camera axes (y up, z back)": lambda T: T @ np.diag([1.0, -1.0, -1.0, 1.0]),
-}
-"""Ways in which poses are often written; each function turns such a pose into ours."""
-
-
-def _check_poses(report: SequenceReport, pairs: list[tuple[Frame, Frame]]) -> None:
-    """Compares neighbouring depth images by the true poses, read as they should be and as they are often written."""
-    error = report.pose_depth_error = _pose_depth_error(pairs, lambda T: T)
-    if error is None:
+def _check_poses(report: SequenceReport, doubt: PoseDoubt | None) -> None:
+    """Tells what depth images of neighbouring frames say about poses and depth scale."""
+    if doubt is None:
         return
-    for name, convert in _CONVENTIONS.items():
-        other = _pose_depth_error(pairs, convert)
-        if other is not None and other < 0.4 * error and error > 0.004:
-            report.warnings.append(
-                f"the true poses look like {name}: read so, neighbouring depth images agree to {other:.2%}, as "
-                f"camera to world with OpenCV axes only to {error:.2%}"
-            )
-            return
-    if error > 0.05:
-        report.warnings.append(
-            f"true poses and depth disagree by {error:.0%}: wrong depth scale or poses, or little seen twice"
+    report.pose_depth_error = doubt.error
+    add = report.warnings.append
+    if doubt.wrong_convention:
+        add(
+            f"the true poses look like {doubt.convention}: read so, neighbouring depth images agree to "
+            f"{doubt.best:.2%}, as {AS_READ} only to {doubt.error:.2%}; convert them"
         )
+    elif doubt.wrong_scale:
+        found = report.depth_scale / doubt.ratio
+        usual = min(USUAL_SCALES, key=lambda scale: abs(np.log(scale / found)))
+        scale = usual if abs(np.log(usual / found)) < 0.1 else found
+        add(
+            f"depth scale {report.depth_scale:g} is suspicious: with about {scale:g} units a metre neighbouring "
+            f"depth images agree with the poses to {doubt.best:.2%}, so only to {doubt.error:.2%}; "
+            f"try --depth-scale {scale:g}"
+        )
+    elif doubt.error > 0.05:
+        add(f"true poses and depth disagree by {doubt.error:.0%}: wrong depth scale or poses, or little seen twice")
 
 
-def _pose_depth_error(pairs: list[tuple[Frame, Frame]], convert: Callable[[np.ndarray], np.ndarray]) -> float | None:
-    """Median relative depth difference of neighbouring frames by converted poses; None when too little overlaps."""
-    errors = [_relative_depth_error(a, b, convert) for a, b in pairs]
-    known = np.concatenate(errors) if errors else np.zeros(0)
-    return float(np.median(known)) if len(known) >= 100 else None
-
-
-def _relative_depth_error(frame: Frame, other: Frame, convert: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """|seen - predicted| / predicted for pixels of `frame` (every 8th row and column) that fall into `other`."""
-    assert frame.T_world_camera is not None and other.T_world_camera is not None
-    points = frame.camera.back_project(frame.depth)[::8, ::8].reshape(-1, 3)
-    points = points[points[:, 2] > 0]
-    T = inverse(convert(other.T_world_camera)) @ convert(frame.T_world_camera)
-    points = transformed(points, T)
-    points = points[points[:, 2] > 0.05]
-    c = other.camera
-    u = np.rint(c.fx * points[:, 0] / points[:, 2] + c.cx).astype(int)
-    v = np.rint(c.fy * points[:, 1] / points[:, 2] + c.cy).astype(int)
-    inside = (u >= 0) & (u < c.width) & (v >= 0) & (v < c.height)
-    predicted, seen = points[inside, 2], other.depth[v[inside], u[inside]]
-    return np.abs(seen - predicted)[seen > 0] / predicted[seen > 0]
+def _check_alignment(report: SequenceReport) -> None:
+    found = report.alignment
+    if found is None or not found.doubtful:
+        return
+    width = report.camera.width
+    parts = [f"{axis} {share * width:+.0f} pixels" for axis, share in zip(("right", "down"), found.shift, strict=True)]
+    size = "" if found.scale == 1 else f" and enlarged by {found.scale:g}"
+    report.warnings.append(
+        "depth does not lie on colour: its outlines fit the edges of the colour images better when moved "
+        f"{', '.join(parts)}{size}; wrong intrinsics, depth that is not registered (--depth-camera FILE), or images of "
+        "different times"
+    )
 
 
 def _warn(report: SequenceReport, intervals: np.ndarray, frames: list[Frame]) -> None:
@@ -213,7 +206,9 @@ def _warn(report: SequenceReport, intervals: np.ndarray, frames: list[Frame]) ->
     if frames and not report.valid_share:
         add("no depth at all in the sampled frames")
     elif median < SMALLEST_MEDIAN_DEPTH or median > LARGEST_MEDIAN_DEPTH:
-        add(f"depth scale {report.depth_scale:g} is suspicious: the median depth is {median:.3g} m")
+        told = any(f"depth scale {report.depth_scale:g} is suspicious" in warning for warning in report.warnings)
+        if not told:  # the poses tell more
+            add(f"depth scale {report.depth_scale:g} is suspicious: the median depth is {median:.3g} m")
     elif frames and report.valid_share < 0.2:
         add(f"only {report.valid_share:.0%} of the pixels have depth")
     if len(intervals) and intervals.min() <= 0:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from ggslam.errors import SequenceError
 from ggslam.sequences.geometry import Size, same_aspect
 from ggslam.sequences.mask_ids import IdTable, read_id_table
 from ggslam.sequences.mask_images import mask_kind, read_mask_image
-from ggslam.sequences.recording import image_files, last_number
+from ggslam.sequences.recording import ImageFile, image_files, last_number
 
 USUAL_FOLDERS = ("semantic_instance", "Annotations", "instance-filt", "instance", "masks", "object_mask")
 """Where masks lie in a folder that is laid out like a recording, or that a segmenter wrote."""
@@ -23,7 +23,7 @@ USUAL_FOLDERS = ("semantic_instance", "Annotations", "instance-filt", "instance"
 _log = logging.getLogger(__name__)
 
 
-def find_masks(folder: Path, color_files: list[Path]) -> list[Path | None]:
+def find_masks(folder: Path, color_files: Sequence[ImageFile]) -> list[Path | None]:
     """The mask of each colour image in `folder`: of the same name, else of the same last number in the name.
 
     If `folder` itself holds no mask of these, the folders that usually hold masks are looked into (`USUAL_FOLDERS`, and
@@ -57,7 +57,7 @@ def _candidates(folder: Path) -> list[Path]:
     return [path for path in images if path.stem.endswith(".segm")] or images
 
 
-def _match(candidates: list[Path], color_files: list[Path]) -> list[Path | None]:
+def _match(candidates: list[Path], color_files: Sequence[ImageFile]) -> list[Path | None]:
     by_name = {path.stem.removesuffix(".segm"): path for path in candidates}
     found = [by_name.get(path.stem) or by_name.get(path.stem.removesuffix(".color")) for path in color_files]
     if any(found):

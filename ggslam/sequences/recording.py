@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording format hands over: where the files of each frame are and how to read them."""
+"""What a recording format hands over: where the images of each frame are and how to read them."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -22,13 +23,86 @@ Calibration = tuple[float, float, float, float]
 COLOR_SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
+class ImageSource(Protocol):
+    """One image that is no file of its own: it lies in an archive, a video or a bag. `str()` of it tells the container
+    and the place in it, for messages. May be read in any order and from several threads."""
+
+    @property
+    def name(self) -> str:
+        """Name with a suffix, as a file of its own would have it."""
+        ...
+
+    @property
+    def stem(self) -> str:
+        """Name without suffix."""
+        ...
+
+    def read(self) -> np.ndarray:
+        """Colour uint8 [H, W, 3] RGB; depth uint16 [H, W] or float32 [H, W], in depth units; confidence uint8 [H, W].
+
+        Raises:
+            SequenceError: damaged; the message names container and reason.
+        """
+        ...
+
+
+ImageFile = Path | ImageSource
+"""An image of a recording, wherever it lies."""
+
+
 @dataclass(frozen=True)
 class FrameFiles:
-    """The files of one frame. A path may name a file that is missing; reading it then gives the error."""
+    """The images of one frame. A path may name a file that is missing; reading it then gives the error.
 
-    color: Path
-    depth: Path
+    Attributes:
+        color, depth: the images.
+        mask: instance ids.
+        confidence: how sure the depth is: 0 low, 1 medium, 2 high.
+        camera: intrinsics of this frame's colour image where they change from frame to frame (autofocus, stabilised
+            lens); the image is brought to the recording's intrinsics.
+    """
+
+    color: ImageFile
+    depth: ImageFile
     mask: Path | None = None
+    confidence: ImageFile | None = None
+    camera: Camera | None = None
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A depth camera beside the colour camera; its images are registered to the colour image.
+
+    Attributes:
+        camera: intrinsics at the size they were calibrated for.
+        T_color_depth: float64 [4, 4], from the depth camera's frame to the colour camera's, OpenCV axes, metres.
+        distortion, fisheye: of its lens, as in `Recording`.
+    """
+
+    camera: Camera
+    T_color_depth: np.ndarray
+    distortion: np.ndarray | None = None
+    fisheye: bool = False
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What a user says about a recording that it does not say itself.
+
+    Attributes:
+        depth_camera: YAML file with intrinsics of a depth camera that is not the colour camera, see `calibration`.
+        topics: of a bag: role (color, depth, color_info, depth_info, pose) -> topic.
+        min_confidence: depth less sure than this (0 to 2) is dropped; None: `DEFAULT_CONFIDENCE`.
+    """
+
+    depth_camera: Path | None = None
+    topics: Mapping[str, str] = field(default_factory=dict)
+    min_confidence: int | None = None
+
+
+NO_OPTIONS = ReadOptions()
+DEFAULT_CONFIDENCE = 1
+"""Medium: of a phone's LiDAR this drops the fringes around objects and keeps the walls."""
 
 
 @dataclass
@@ -37,7 +111,7 @@ class Recording:
 
     Attributes:
         format: name of the format.
-        path: folder of the recording.
+        path: folder or file of the recording.
         files: one entry per frame, in order of time.
         timestamps: float64 [n], seconds.
         camera: intrinsics of the colour image at the size they were calibrated for; None: the format does not tell the
@@ -46,7 +120,11 @@ class Recording:
         depth_calibration: (fx, fy, cx, cy) for the size of the depth image when it is another camera's.
         depth_scale: depth units per metre.
         invalid_depth: raw depth value that means "nothing measured" beside 0, or None.
-        distortion: OpenCV coefficients (k1, k2, p1, p2, k3) of both images, or None.
+        depth_camera: of depth images that are to be registered to the colour images, or None.
+        distortion: OpenCV coefficients (k1, k2, p1, p2, k3[, k4, k5, k6]) of both images (of the colour image alone
+            when there is a `depth_camera`), or None.
+        fisheye: whether `distortion` are the four coefficients of OpenCV's fisheye model instead.
+        min_confidence: depth less sure than this is dropped in frames that have a confidence image.
         poses: float64 [n, 4, 4] T_world_camera with rows of NaN where unknown, or None.
         pose_source: file or folder that told the poses, for reports.
         time_source: what told the time, for reports.
@@ -64,7 +142,10 @@ class Recording:
     calibration: Calibration | None = None
     depth_calibration: Calibration | None = None
     invalid_depth: int | None = None
+    depth_camera: DepthCamera | None = None
     distortion: np.ndarray | None = None
+    fisheye: bool = False
+    min_confidence: int = DEFAULT_CONFIDENCE
     poses: np.ndarray | None = None
     pose_source: str = "none"
     time_source: str = f"nominal {NOMINAL_RATE:g} frames/s"
@@ -74,22 +155,23 @@ class Recording:
 
 
 class RecordingFormat(Protocol):
-    """One way of laying a recording out on disk. Implementations hold no state."""
+    """One way of laying a recording out on disk, in a folder or in one file. Implementations hold no state."""
 
     name: str
     """Name for `open_sequence(format=...)`."""
     layout: str
-    """What the folder must hold, in one line, for messages."""
+    """What the folder or file must hold, in one line, for messages."""
 
-    def matches(self, folder: Path) -> bool:
-        """Whether the folder looks like this format (only names of files are looked at)."""
+    def matches(self, path: Path, /) -> bool:
+        """Whether the folder or file looks like this format (names, or the first bytes of one file)."""
         ...
 
-    def read(self, folder: Path) -> Recording:
+    def read(self, path: Path, options: ReadOptions = NO_OPTIONS, /) -> Recording:
         """Reads the description of the recording, no images.
 
         Raises:
             SequenceError: a file is missing or does not follow the format.
+            MissingDependency: a package is needed to read it.
         """
         ...
 
@@ -113,12 +195,12 @@ def image_files(folder: Path, suffixes: tuple[str, ...] = COLOR_SUFFIXES) -> lis
     return sorted(found, key=lambda p: natural_key(p.name))
 
 
-def missing_depth_problems(files: list[FrameFiles]) -> dict[int, str]:
+def missing_depth_problems(files: Iterable[FrameFiles]) -> dict[int, str]:
     """Frames whose depth or colour file does not exist: frame number -> reason."""
     problems = {}
     for i, entry in enumerate(files):
         for kind, path in (("colour", entry.color), ("depth", entry.depth)):
-            if not path.is_file():
+            if isinstance(path, Path) and not path.is_file():
                 problems[i] = f"frame {i}: {kind} file {path} is missing"
     return problems
 

@@ -11,7 +11,9 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.pose_files import read_matrix_rows
 from ggslam.sequences.recording import (
+    NO_OPTIONS,
     FrameFiles,
+    ReadOptions,
     Recording,
     image_files,
     last_number,
@@ -33,7 +35,7 @@ class ReplicaFormat:
     def matches(self, folder: Path) -> bool:
         return any((folder / "results").glob("frame*.*"))
 
-    def read(self, folder: Path) -> Recording:
+    def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
         colors = [p for p in image_files(folder / "results") if p.stem.startswith("frame")]
         if not colors:
             raise SequenceError(f"{folder / 'results'}: no frame*.jpg or frame*.png")

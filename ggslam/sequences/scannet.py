@@ -11,8 +11,10 @@ from ggslam.errors import SequenceError
 from ggslam.sequences.masks import find_masks
 from ggslam.sequences.pose_files import invalid_pose_reason, read_intrinsics, read_matrix
 from ggslam.sequences.recording import (
+    NO_OPTIONS,
     Calibration,
     FrameFiles,
+    ReadOptions,
     Recording,
     image_files,
     missing_depth_problems,
@@ -30,7 +32,7 @@ class ScanNetFormat:
     def matches(self, folder: Path) -> bool:
         return _root(folder) is not None
 
-    def read(self, folder: Path) -> Recording:
+    def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
         root = _root(folder)
         if root is None:
             raise SequenceError(f"{folder}: expected {self.layout}")

@@ -12,13 +12,14 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.geometry import ImageGeometry, image_size
-from ggslam.sequences.images import read_color, read_depth
+from ggslam.sequences.images import read_color, read_confidence, read_depth
 from ggslam.sequences.masks import MaskReader
 from ggslam.sequences.recording import FrameFiles, Recording
 from ggslam.sequences.stream import ReadAhead
@@ -43,12 +44,16 @@ class Sequence:
     """A recording read as a stream. Made by `open_sequence`; holds no images.
 
     Attributes:
-        name: name of the folder.
+        name: name of the folder, or of the file without suffix.
         format: name of the format.
-        path: folder of the recording.
+        path: folder or file of the recording.
         camera: intrinsics of the delivered images.
         native_camera: the same before `scale`.
         depth_scale: units per metre of the stored depth images.
+        color_size, depth_size: (width, height) of the stored images.
+        lens: distortion that is undone and intrinsics that change, for people; "" for a pinhole camera that stays one.
+        min_confidence: depth less sure than this is dropped; None: the recording has no confidence images.
+        registered: whether depth images of another camera are registered to the colour images.
         timestamps: float64 [n], seconds.
         ground_truth: float64 [n, 4, 4] T_world_camera, rows of NaN where the recording tells none; None when it
             never does.
@@ -74,9 +79,14 @@ class Sequence:
             raise SequenceError(f"on_bad_frame: expected 'error' or 'skip', found '{on_bad_frame}'")
         if not (math.isfinite(scale) and 0 < scale <= 1):
             raise SequenceError(f"scale: expected a number above 0 and at most 1, found {scale}")
+        self.min_confidence: int | None = None
+        if any(entry.confidence is not None for entry in recording.files):
+            self.min_confidence = recording.min_confidence
+        self.lens: str = _lens(recording)
+        self.registered: bool = recording.depth_camera is not None
         self._recording, self._selection, self._on_bad_frame = recording, selection, on_bad_frame
         self.path: Path = recording.path
-        self.name: str = recording.path.name
+        self.name: str = recording.path.stem if recording.path.is_file() else recording.path.name
         self.format: str = recording.format
         self.depth_scale: float = recording.depth_scale
         self.instance_names: dict[int, str] = dict(recording.instance_names)
@@ -98,6 +108,8 @@ class Sequence:
             more = f" (and {len(known) - 1} more damaged frames)" if len(known) > 1 else ""
             raise SequenceError(recording.problems[known[0]] + more)
         self._geometry = self._measure(scale)
+        self.color_size: tuple[int, int] = self._geometry.color_size
+        self.depth_size: tuple[int, int] = self._geometry.depth_size
         self.camera: Camera = self._geometry.camera
         self.native_camera: Camera = self._geometry.native_camera
 
@@ -146,8 +158,8 @@ class Sequence:
             index=index,
             source_index=source,
             timestamp=float(self.timestamps[index]),
-            color=self._geometry.color(color),
-            depth=self._geometry.depth(depth),
+            color=self._geometry.color(self._geometry.steady(color, files, cv2.INTER_LINEAR)),
+            depth=self._geometry.depth(self._geometry.steady(depth, files, cv2.INTER_NEAREST)),
             camera=self.camera,
             mask=self._mask(index) if masks is True else None,
             T_world_camera=pose.copy() if pose is not None and np.isfinite(pose).all() else None,
@@ -201,11 +213,17 @@ class Sequence:
                 _log.warning("frame %d goes without its mask: %s", index, error)
             self.mask_problems[index] = str(error)
             return None
-        return self._geometry.mask(ids)
+        return self._geometry.mask(self._geometry.steady(ids, self.files(index), cv2.INTER_NEAREST))
 
     def _read(self, source: int) -> tuple[np.ndarray, np.ndarray]:
         files = self._recording.files[source]
         depth = read_depth(files.depth, self._recording.depth_scale, self._recording.invalid_depth)
+        if files.confidence is not None:
+            confidence = read_confidence(files.confidence)
+            if confidence.shape != depth.shape:
+                found, expected = (f"{a.shape[1]}x{a.shape[0]}" for a in (confidence, depth))
+                raise SequenceError(f"{files.confidence}: expected confidence of {expected} like depth, found {found}")
+            depth[confidence < self._recording.min_confidence] = 0
         return read_color(files.color), depth
 
     def _measure(self, scale: float) -> ImageGeometry:
@@ -225,3 +243,13 @@ class Sequence:
             return ImageGeometry(self._recording, files, image_size(color), image_size(depth), scale)
         reason = first_error or self._recording.problems[self._selection[0]]
         raise SequenceError(f"{self.path}: none of {len(self)} frames can be read; the first: {reason}")
+
+
+def _lens(recording: Recording) -> str:
+    words = []
+    if recording.distortion is not None and np.any(recording.distortion):
+        count = len(recording.distortion)
+        words.append("fisheye undone" if recording.fisheye else f"{count} distortion coefficients undone")
+    if len({entry.camera for entry in recording.files if entry.camera is not None}) > 1:
+        words.append("intrinsics of each frame brought to the first one's")
+    return ", ".join(words)

@@ -10,8 +10,10 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.sequences.pose_files import invalid_pose_reason, read_intrinsics, read_matrix
 from ggslam.sequences.recording import (
+    NO_OPTIONS,
     Calibration,
     FrameFiles,
+    ReadOptions,
     Recording,
     image_files,
     missing_depth_problems,
@@ -33,14 +35,15 @@ class SevenScenesFormat:
     def matches(self, folder: Path) -> bool:
         return any(folder.glob("frame-*.color.*")) or any(folder.glob("seq-*/frame-*.color.*"))
 
-    def read(self, folder: Path) -> Recording:
+    def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
         frames = self._frames_folder(folder)
         colors = [p for p in image_files(frames) if p.stem.startswith("frame-") and p.stem.endswith(".color")]
         bases = [frames / color.stem.removesuffix(".color") for color in colors]
-        registered = bool(bases) and all(Path(f"{base}.depth.proj.png").is_file() for base in bases)
+        raw = options.depth_camera is not None  # its calibration is for the images as recorded
+        registered = bool(bases) and not raw and all(Path(f"{base}.depth.proj.png").is_file() for base in bases)
         suffix = ".depth.proj.png" if registered else ".depth.png"
         files = [self._files(color, base, suffix) for color, base in zip(colors, bases, strict=True)]
-        calibration, warnings = self._calibration(folder, frames, registered)
+        calibration, warnings = self._calibration(folder, frames, registered or raw)
         recording = Recording(
             self.name, folder, files, nominal_timestamps(len(files)), 1000.0, calibration=calibration,
             invalid_depth=65535, problems=missing_depth_problems(files), warnings=warnings,
@@ -69,7 +72,8 @@ class SevenScenesFormat:
             return COLOR_CALIBRATION, []
         warning = (
             "plain 7-Scenes depth is not registered to the colour image (two cameras, several centimetres apart): "
-            "colours are off by some pixels; intrinsics 585 585 320 240 of the depth camera are used"
+            "colours are off by some pixels; intrinsics 585 585 320 240 of the depth camera are used "
+            "(--depth-camera FILE registers it)"
         )
         return DEPTH_CALIBRATION, [warning]
 

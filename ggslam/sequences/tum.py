@@ -9,15 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.association import associate, poses_at
+from ggslam.sequences.association import TOLERANCE, pair_images, poses_at, span
 from ggslam.sequences.pose_files import data_lines, read_tum_poses
-from ggslam.sequences.recording import Calibration, FrameFiles, Recording, missing_depth_problems
+from ggslam.sequences.recording import (
+    NO_OPTIONS,
+    Calibration,
+    FrameFiles,
+    ReadOptions,
+    Recording,
+    missing_depth_problems,
+)
 
 DEPTH_SCALE = 5000.0
-TOLERANCE = 0.02
-"""Seconds between colour and depth, as in the benchmark's own tool."""
-WIDE_TOLERANCE = 0.08
-"""Tried when almost nothing pairs up within `TOLERANCE`."""
 
 CALIBRATIONS = {
     "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -37,10 +40,10 @@ class TumFormat:
     def matches(self, folder: Path) -> bool:
         return (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file()
 
-    def read(self, folder: Path) -> Recording:
+    def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
         color_times, color_files = read_image_list(folder / "rgb.txt")
         depth_times, depth_files = read_image_list(folder / "depth.txt")
-        pairs, warnings = _pair(folder, color_times, depth_times)
+        pairs, warnings = pair_images(folder, color_times, depth_times, ("rgb.txt", "depth.txt"))
         files = [FrameFiles(folder / color_files[i], folder / depth_files[j]) for i, j in pairs]
         times = color_times[[i for i, _ in pairs]]
         calibration, distortion = self._calibration(folder, warnings)
@@ -74,8 +77,8 @@ class TumFormat:
         without = int(np.isnan(recording.poses[:, 0, 0]).sum())
         if without == len(recording.files):
             raise SequenceError(
-                f"{path}: no pose within {TOLERANCE} s of any image; poses span {_span(pose_times)}, images "
-                f"{_span(recording.timestamps)}"
+                f"{path}: no pose within {TOLERANCE} s of any image; poses span {span(pose_times)}, images "
+                f"{span(recording.timestamps)}"
             )
         if without:
             recording.warnings.append(f"{without} of {len(recording.files)} frames have no true pose near in time")
@@ -101,25 +104,3 @@ def read_image_list(path: Path) -> tuple[np.ndarray, list[str]]:
         raise SequenceError(f"{path}: lists no images")
     entries.sort()
     return np.array([time for time, _ in entries]), [name for _, name in entries]
-
-
-def _pair(folder: Path, color: np.ndarray, depth: np.ndarray) -> tuple[list[tuple[int, int]], list[str]]:
-    pairs = associate(color, depth, TOLERANCE)
-    if 2 * len(pairs) >= min(len(color), len(depth)):
-        return pairs, []
-    wide = associate(color, depth, WIDE_TOLERANCE)
-    if not wide:
-        gap = min(np.abs(depth - t).min() for t in color)
-        raise SequenceError(
-            f"{folder}: no image of rgb.txt is within {WIDE_TOLERANCE} s of one in depth.txt (closest: {gap:.3f} s); "
-            f"colour spans {_span(color)}, depth {_span(depth)}"
-        )
-    warning = (
-        f"only {len(pairs)} of {len(color)} colour images have depth within {TOLERANCE} s; {len(wide)} paired within "
-        f"{WIDE_TOLERANCE} s instead"
-    )
-    return wide, [warning]
-
-
-def _span(times: np.ndarray) -> str:
-    return f"{times.min():.3f} to {times.max():.3f} s" if len(times) else "no time at all"

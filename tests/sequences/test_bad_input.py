@@ -112,7 +112,7 @@ def test_first_frame_damaged(make: Make) -> None:
 
 
 def test_no_recording(tmp_path: Path) -> None:
-    with pytest.raises(SequenceError, match="no such folder"):
+    with pytest.raises(SequenceError, match="no such folder or file"):
         open_sequence(tmp_path / "nowhere")
     (tmp_path / "file").write_text("x")
     with pytest.raises(SequenceError, match="found a file"):

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images inside a zip archive, read where they are asked for."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+
+
+class Archive:
+    """A zip archive; members are read by name. May be used from several threads.
+
+    Attributes:
+        path: the file.
+        names: of its members.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises SequenceError if the file is no whole zip archive."""
+        self.path = path
+        try:
+            self._zip = zipfile.ZipFile(path)
+        except (OSError, zipfile.BadZipFile) as error:
+            raise SequenceError(f"{path}: not a whole zip archive (truncated?): {error}") from None
+        self.names = frozenset(self._zip.namelist())
+
+    def read(self, name: str) -> bytes:
+        """Content of a member. Raises SequenceError if it is missing or damaged."""
+        try:
+            return self._zip.read(name)
+        except KeyError:
+            raise SequenceError(f"{self.path}: holds no {name}") from None
+        except (OSError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
+            raise SequenceError(f"{self.path}, {name}: cannot be read: {error}") from None
+
+
+@dataclass(frozen=True)
+class ArchiveImage:
+    """A member of an archive as an image of a recording; see `ImageSource`.
+
+    Attributes:
+        archive, member: where it is.
+        decode: makes the image of (place for messages, bytes).
+    """
+
+    archive: Archive
+    member: str
+    decode: Callable[[str, bytes], np.ndarray]
+
+    @property
+    def name(self) -> str:
+        return Path(self.member).name
+
+    @property
+    def stem(self) -> str:
+        return Path(self.member).stem
+
+    def __str__(self) -> str:
+        return f"{self.archive.path}, {self.member}"
+
+    def read(self) -> np.ndarray:
+        return self.decode(str(self), self.archive.read(self.member))

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrations written as YAML: camera.yaml of a plain folder, and files for `--depth-camera`.
+
+    width: 640            size, focal lengths and principal point in pixels, as in `scene.camera.Camera`
+    height: 480
+    fx: 585.0
+    fy: 585.0
+    cx: 319.5
+    cy: 239.5
+    distortion: [...]     4, 5 or 8 coefficients in OpenCV's order; optional
+    distortion_model: opencv | fisheye
+
+A depth camera's calibration holds also
+
+    T_color_depth: [16 numbers, row by row]   from its frame to the colour camera's, OpenCV axes, metres
+    color: {width: ..., fx: ..., ...}         of the colour camera, if not as the recording says; optional
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ggslam.errors import SequenceError
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import is_valid_pose
+from ggslam.sequences.recording import DepthCamera, Recording, read_text
+
+MODELS = ("opencv", "fisheye")
+
+
+def read_calibration(path: Path) -> dict[str, Any]:
+    """Entries of a YAML file.
+
+    Raises:
+        SequenceError: missing, not YAML, or without entries.
+    """
+    try:
+        settings = yaml.safe_load(read_text(path))
+    except yaml.YAMLError as error:
+        raise SequenceError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(settings, dict):
+        raise SequenceError(f"{path}: expected entries width, height, fx, fy, cx, cy, depth_scale, found none")
+    return settings
+
+
+def number_entry(path: Path, settings: dict[str, Any], key: str) -> float:
+    """A finite number. Raises SequenceError if it is none or missing."""
+    if key not in settings:
+        raise SequenceError(f"{path}: entry '{key}' is missing")
+    value = settings[key]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise SequenceError(f"{path}: expected a number for '{key}', found '{value}'")
+    return float(value)
+
+
+def camera_entry(path: Path, settings: dict[str, Any]) -> Camera:
+    """Entries width, height, fx, fy, cx, cy as a camera. Raises SequenceError if they are none."""
+    width, height, fx, fy, cx, cy = (
+        number_entry(path, settings, key) for key in ("width", "height", "fx", "fy", "cx", "cy")
+    )
+    try:
+        return Camera(int(width), int(height), fx, fy, cx, cy)
+    except ValueError as error:
+        raise SequenceError(f"{path}: {error}") from None
+
+
+def distortion_entry(path: Path, settings: dict[str, Any]) -> tuple[np.ndarray | None, bool]:
+    """Coefficients float64 [4, 5 or 8] or None, and whether they are of the fisheye model.
+
+    Raises:
+        SequenceError: another number of them, or another model.
+    """
+    model, distortion = settings.get("distortion_model", "opencv"), settings.get("distortion")
+    if model not in MODELS:
+        raise SequenceError(f"{path}: expected 'distortion_model' to be {' or '.join(MODELS)}, found '{model}'")
+    if distortion is None:
+        return None, False
+    fisheye = model == "fisheye"
+    counts = (4,) if fisheye else (4, 5, 8)
+    values = distortion if isinstance(distortion, list) else []
+    if len(values) not in counts or not all(isinstance(v, (int, float)) and np.isfinite(v) for v in values):
+        wanted = "4" if fisheye else "4, 5 or 8"
+        raise SequenceError(f"{path}: expected {wanted} numbers for 'distortion', found '{distortion}'")
+    return np.array(values, float), fisheye
+
+
+def depth_camera_entry(path: Path, settings: Any) -> DepthCamera:
+    """A depth camera of its entries.
+
+    Raises:
+        SequenceError: an entry is missing, or T_color_depth is no rigid transform.
+    """
+    if not isinstance(settings, dict):
+        raise SequenceError(f"{path}: expected entries width, height, fx, fy, cx, cy, T_color_depth of a depth camera")
+    if "T_color_depth" not in settings:
+        raise SequenceError(f"{path}: entry 'T_color_depth' is missing")
+    try:
+        T = np.array(settings["T_color_depth"], float).reshape(-1)
+    except (TypeError, ValueError):
+        T = np.zeros(0)
+    if T.size != 16 or not np.isfinite(T).all() or not is_valid_pose(T.reshape(4, 4)):
+        raise SequenceError(f"{path}: expected 'T_color_depth' to be the 16 numbers of a rigid transform, row by row")
+    distortion, fisheye = distortion_entry(path, settings)
+    return DepthCamera(camera_entry(path, settings), T.reshape(4, 4), distortion, fisheye)
+
+
+def use_depth_camera(recording: Recording, path: Path) -> None:
+    """Lets the depth images of a recording be registered by the calibration in a file.
+
+    Raises:
+        SequenceError: the file is missing or does not follow the format above.
+    """
+    settings = read_calibration(path)
+    recording.depth_camera, recording.depth_calibration = depth_camera_entry(path, settings), None
+    color = settings.get("color")
+    if color is not None:
+        if not isinstance(color, dict):
+            raise SequenceError(f"{path}: expected 'color' to hold width, height, fx, fy, cx, cy")
+        recording.camera, recording.calibration = camera_entry(path, color), None
+        recording.distortion, recording.fisheye = distortion_entry(path, color)

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Polycam's raw data: keyframes/images, cameras, depth, confidence; corrected_* where Polycam optimised the poses.
+
+A camera file holds fx fy cx cy width height and the rows t_00 ... t_23 of camera to world with ARKit's camera axes.
+Depth are millimetres, confidence 0, about 54 and 255 for low, medium and high.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.images import read_confidence
+from ggslam.sequences.json_files import OPENCV_FROM_OPENGL, camera_of, number_of, read_object
+from ggslam.sequences.pose_files import invalid_pose_reason
+from ggslam.sequences.recording import (
+    NO_OPTIONS,
+    FrameFiles,
+    ReadOptions,
+    Recording,
+    image_files,
+    missing_depth_problems,
+    nominal_timestamps,
+)
+
+MEDIUM, HIGH = 27, 155
+"""Grey values from which confidence counts as medium and high: half-way between the values that are written."""
+
+
+@dataclass(frozen=True)
+class PolycamConfidence:
+    """A confidence image whose grey values are turned into levels; see `ImageSource`."""
+
+    path: Path
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def stem(self) -> str:
+        return self.path.stem
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def read(self) -> np.ndarray:
+        grey = read_confidence(self.path)
+        return (grey >= MEDIUM).astype(np.uint8) + (grey >= HIGH)
+
+
+class PolycamFormat:
+    """Optimised poses and images are taken where they are there. Every frame has its own intrinsics."""
+
+    name = "polycam"
+    layout = "keyframes/ with images/, cameras/, depth/[, confidence/, corrected_images/, corrected_cameras/]"
+
+    def matches(self, folder: Path) -> bool:
+        return any((folder / "keyframes" / name).is_dir() for name in ("cameras", "corrected_cameras"))
+
+    def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
+        root = folder / "keyframes"
+        corrected = all((root / f"corrected_{name}").is_dir() for name in ("images", "cameras"))
+        prefix = "corrected_" if corrected else ""
+        colors = image_files(root / f"{prefix}images")
+        if not colors:
+            raise SequenceError(f"{root / f'{prefix}images'}: no images")
+        if not (root / "depth").is_dir():
+            raise SequenceError(f"{root / 'depth'}: folder is missing; export the raw data of a LiDAR capture")
+        paths = [root / f"{prefix}cameras" / f"{color.stem}.json" for color in colors]
+        described = [read_object(path) for path in paths]
+        cameras = [
+            camera_of(path, *(number_of(path, values, key) for key in ("width", "height", "fx", "fy", "cx", "cy")))
+            for path, values in zip(paths, described, strict=True)
+        ]
+        files = [
+            FrameFiles(color, root / "depth" / f"{color.stem}.png", None, _confidence(root, color), camera)
+            for color, camera in zip(colors, cameras, strict=True)
+        ]
+        recording = Recording(
+            self.name, folder, files, nominal_timestamps(len(files)), 1000.0, cameras[0],
+            problems=missing_depth_problems(files), pose_source=f"{prefix}cameras/*.json (ARKit axes)",
+        )  # fmt: skip
+        _add_poses(recording, paths, described)
+        return recording
+
+
+def _confidence(root: Path, color: Path) -> PolycamConfidence | None:
+    path = root / "confidence" / f"{color.stem}.png"
+    return PolycamConfidence(path) if path.is_file() else None
+
+
+def _add_poses(recording: Recording, paths: list[Path], described: list[dict[str, Any]]) -> None:
+    poses = np.full((len(paths), 4, 4), np.nan)
+    for i, (path, values) in enumerate(zip(paths, described, strict=True)):
+        T = np.eye(4)
+        T[:3] = [[number_of(path, values, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+        reason = invalid_pose_reason(T)
+        if reason is None:
+            poses[i] = T @ OPENCV_FROM_OPENGL
+        else:
+            recording.problems.setdefault(i, f"{path}: {reason}")
+    recording.poses = poses

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Record3D's .r3d: a zip archive with `metadata` (JSON), rgbd/0.jpg, rgbd/0.depth, rgbd/0.conf.
+
+Depth are float32 metres and confidence uint8 (0 low to 2 high), row by row, each compressed with LZFSE. `K` is written
+column by column and belongs to the size w x h; perFrameIntrinsicCoeffs are fx fy cx cy of each frame. `poses` are qx qy
+qz qw tx ty tz, camera to world with ARKit's camera axes (y up, z backwards).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import MissingDependency, SequenceError
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.sequences.archive import Archive, ArchiveImage
+from ggslam.sequences.images import decode_color, find_damage
+from ggslam.sequences.json_files import OPENCV_FROM_OPENGL, camera_of, number_of, numbers_of, parse_object
+from ggslam.sequences.pose_files import invalid_pose_reason
+from ggslam.sequences.recording import (
+    NO_OPTIONS,
+    NOMINAL_RATE,
+    FrameFiles,
+    ReadOptions,
+    Recording,
+    natural_key,
+    nominal_timestamps,
+)
+
+LARGEST_IMAGE = 64_000_000
+"""Bytes; what a damaged file may claim is not believed beyond."""
+
+
+class Record3DFormat:
+    """Nothing is unpacked to disk."""
+
+    name = "record3d"
+    layout = "one file .r3d of the app Record3D"
+
+    def matches(self, path: Path) -> bool:
+        return path.suffix.lower() == ".r3d" and path.is_file()
+
+    def read(self, path: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
+        archive = Archive(path)
+        place = f"{path}, metadata"
+        metadata = parse_object(place, archive.read("metadata"))
+        colors = sorted((n for n in archive.names if n.startswith("rgbd/") and n.endswith(".jpg")), key=natural_key)
+        if not colors:
+            raise SequenceError(f"{path}: holds no rgbd/*.jpg")
+        if not any(name.endswith(".depth") for name in archive.names):
+            raise SequenceError(f"{path}: holds no rgbd/*.depth: a recording without depth cannot be used")
+        lzfse_decompress()
+        cameras = _cameras(place, metadata, len(colors))
+        files = [_frame(archive, metadata, place, name, camera) for name, camera in zip(colors, cameras, strict=True)]
+        times, source = _times(place, metadata, len(colors))
+        recording = Recording(self.name, path, files, times, 1.0, cameras[0], time_source=source)
+        recording.problems = {
+            i: f"frame {i}: {files[i].depth} is missing"
+            for i, name in enumerate(colors)
+            if name.removesuffix(".jpg") + ".depth" not in archive.names
+        }
+        _add_poses(recording, place, metadata)
+        return recording
+
+
+def _frame(archive: Archive, metadata: dict[str, Any], place: str, color: str, camera: Camera) -> FrameFiles:
+    size = (int(number_of(place, metadata, "dh")), int(number_of(place, metadata, "dw")))
+    base = color.removesuffix(".jpg")
+    confidence = f"{base}.conf"
+    return FrameFiles(
+        ArchiveImage(archive, color, _decode_color),
+        ArchiveImage(archive, f"{base}.depth", partial(_decode_array, size=size, dtype=np.dtype(np.float32))),
+        None,
+        ArchiveImage(archive, confidence, partial(_decode_array, size=size, dtype=np.dtype(np.uint8)))
+        if confidence in archive.names else None,
+        camera,
+    )  # fmt: skip
+
+
+def _decode_color(place: str, content: bytes) -> np.ndarray:
+    damage = find_damage(content)
+    if damage:
+        raise SequenceError(f"{place}: {damage}")
+    return decode_color(place, content)
+
+
+def _decode_array(place: str, content: bytes, *, size: tuple[int, int], dtype: np.dtype) -> np.ndarray:
+    """Image [H, W] of LZFSE bytes; bytes of the full length count as not compressed."""
+    expected = size[0] * size[1] * dtype.itemsize
+    if not 0 < expected <= LARGEST_IMAGE:
+        raise SequenceError(f"{place}: impossible size {size[1]}x{size[0]}")
+    raw = content if len(content) == expected else _decompress(place, content)
+    if len(raw) != expected:
+        raise SequenceError(f"{place}: expected {expected} bytes for {size[1]}x{size[0]} pixels, found {len(raw)}")
+    return np.frombuffer(raw, dtype).reshape(size)
+
+
+def lzfse_decompress() -> Any:
+    """The decompressor. Raises MissingDependency without it."""
+    try:
+        import liblzfse
+    except ImportError:
+        raise MissingDependency("reading .r3d needs LZFSE: pip install 'ggslam[phone]' (or pyliblzfse)") from None
+    return liblzfse.decompress
+
+
+def _decompress(place: str, content: bytes) -> bytes:
+    decompress = lzfse_decompress()
+    # The decompressor grows its memory without end for streams that do not end: the end marker is looked for first.
+    if not content.endswith(b"bvx$"):
+        raise SequenceError(f"{place}: LZFSE stream is truncated or none ({len(content)} bytes)")
+    try:
+        return decompress(content)
+    except Exception as error:  # the package has an exception type of its own beside MemoryError
+        raise SequenceError(f"{place}: LZFSE stream is damaged: {error}") from None
+
+
+def _cameras(place: str, metadata: dict[str, Any], count: int) -> list[Camera]:
+    width, height = number_of(place, metadata, "w"), number_of(place, metadata, "h")
+    own = metadata.get("perFrameIntrinsicCoeffs")
+    if isinstance(own, list) and len(own) >= count:
+        values = [numbers_of(place, {"perFrameIntrinsicCoeffs": row}, "perFrameIntrinsicCoeffs", 4) for row in own]
+        return [camera_of(place, width, height, *map(float, row)) for row in values[:count]]
+    K = numbers_of(place, metadata, "K", 9).reshape(3, 3).T
+    camera = camera_of(place, width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    return [camera] * count
+
+
+def _times(place: str, metadata: dict[str, Any], count: int) -> tuple[np.ndarray, str]:
+    if isinstance(metadata.get("frameTimestamps"), list) and len(metadata["frameTimestamps"]) >= count:
+        return numbers_of(place, metadata, "frameTimestamps")[:count], "metadata, frameTimestamps"
+    rate = number_of(place, metadata, "fps") if "fps" in metadata else NOMINAL_RATE
+    if rate <= 0:
+        raise SequenceError(f"{place}: expected a positive 'fps', found {rate:g}")
+    return nominal_timestamps(count, rate), f"{rate:g} frames/s of metadata"
+
+
+def _add_poses(recording: Recording, place: str, metadata: dict[str, Any]) -> None:
+    if not isinstance(metadata.get("poses"), list) or not metadata["poses"]:
+        return
+    count = len(recording.files)
+    rows = numbers_of(place, metadata, "poses")
+    if rows.size != 7 * len(metadata["poses"]) or len(metadata["poses"]) < count:
+        raise SequenceError(f"{place}: expected {count} poses of 7 numbers, found {len(metadata['poses'])}")
+    poses = np.full((count, 4, 4), np.nan)
+    for i, row in enumerate(rows.reshape(-1, 7)[:count]):
+        if not np.isfinite(row).all() or np.linalg.norm(row[:4]) < 0.5:
+            continue
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = quaternion_to_matrix(row[[3, 0, 1, 2]]), row[4:]
+        if invalid_pose_reason(T) is None:
+            poses[i] = T @ OPENCV_FROM_OPENGL
+    recording.poses, recording.pose_source = poses, "metadata, poses (ARKit axes)"

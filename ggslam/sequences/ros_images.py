@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images in ROS messages: sensor_msgs/Image, CompressedImage, and depth by compressed_depth_image_transport."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.images import decode, decode_color, find_damage
+
+COLOR: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None), "8uc3": (3, cv2.COLOR_BGR2RGB), "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB), "bgra8": (4, cv2.COLOR_BGRA2RGB), "8uc4": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB), "8uc1": (1, cv2.COLOR_GRAY2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY), "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2), "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB), "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB), "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
+}  # fmt: skip
+"""Encoding -> bytes a pixel and OpenCV's conversion to RGB."""
+DEPTH: dict[str, Any] = {"16uc1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32fc1": np.dtype(np.float32)}
+"""Encoding -> numbers; uint16 are millimetres, float32 metres (REP 118)."""
+
+
+def is_depth(message: Any) -> bool | None:
+    """Whether an image message holds depth; None: neither depth nor colour that is known."""
+    if hasattr(message, "encoding"):
+        encoding = message.encoding.lower()
+        return True if encoding in DEPTH else False if encoding in COLOR else None
+    form = message.format.lower()
+    if "compresseddepth" in form:
+        return True
+    return None if any(encoding in form for encoding in DEPTH) else False
+
+
+def in_metres(message: Any) -> bool:
+    """Whether a depth message holds metres (else millimetres)."""
+    name = message.encoding if hasattr(message, "encoding") else message.format
+    return "32fc1" in name.lower()
+
+
+def color_image(place: str, message: Any) -> np.ndarray:
+    """Colour uint8 [H, W, 3] RGB of an image message. Raises SequenceError if it is damaged or not colour."""
+    if not hasattr(message, "encoding"):
+        content = bytes(message.data)
+        damage = find_damage(content)
+        if damage:
+            raise SequenceError(f"{place}: {damage}")
+        return decode_color(place, content)
+    encoding = message.encoding.lower()
+    if encoding not in COLOR:
+        raise SequenceError(f"{place}: encoding {message.encoding} is no colour that is known ({', '.join(COLOR)})")
+    channels, conversion = COLOR[encoding]
+    image = _rows(place, message, np.dtype(np.uint8), channels)
+    if conversion is None:
+        return np.ascontiguousarray(image)
+    return cv2.cvtColor(np.ascontiguousarray(image if channels > 1 else image[..., 0]), conversion)
+
+
+def depth_image(place: str, message: Any) -> np.ndarray:
+    """Depth of an image message, uint16 (millimetres) or float32 (metres) [H, W].
+
+    Raises:
+        SequenceError: it is damaged or not depth.
+    """
+    if not hasattr(message, "encoding"):
+        return _compressed_depth(place, message)
+    encoding = message.encoding.lower()
+    if encoding not in DEPTH:
+        raise SequenceError(f"{place}: encoding {message.encoding} is no depth that is known ({', '.join(DEPTH)})")
+    dtype = DEPTH[encoding].newbyteorder(">" if message.is_bigendian else "<")
+    return np.ascontiguousarray(_rows(place, message, dtype, 1)[..., 0]).astype(dtype.newbyteorder("="), copy=False)
+
+
+def _rows(place: str, message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
+    """Pixels [H, W, channels] without the padding at the end of each row."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    used = width * channels * dtype.itemsize
+    if height < 1 or width < 1 or step < used or data.size < height * step:
+        raise SequenceError(
+            f"{place}: expected {width}x{height} pixels of {message.encoding} in rows of {step} bytes, found "
+            f"{data.size} bytes"
+        )
+    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :used])
+    return rows.view(dtype).reshape(height, width, channels)
+
+
+def _compressed_depth(place: str, message: Any) -> np.ndarray:
+    """The 12 bytes before the PNG tell how float32 depth was turned into 16 bits: A / depth + B."""
+    form, content = message.format.lower(), bytes(message.data)
+    if "rvl" in form:
+        raise SequenceError(f"{place}: depth compressed with RVL is not supported; republish it as PNG")
+    if len(content) <= 12:
+        raise SequenceError(f"{place}: compressed depth of {len(content)} bytes is truncated")
+    damage = find_damage(content[12:])
+    if damage:
+        raise SequenceError(f"{place}: {damage}")
+    raw = decode(place, content[12:], cv2.IMREAD_UNCHANGED)
+    if raw.ndim != 2 or raw.dtype != np.uint16:
+        raise SequenceError(f"{place}: expected a 16-bit image in compressed depth")
+    if "32fc1" not in form:
+        return raw
+    a, b = struct.unpack("<ff", content[4:12])
+    depth = np.zeros(raw.shape, np.float32)
+    np.divide(np.float32(a), raw.astype(np.float32) - np.float32(b), out=depth, where=raw > 0)
+    return depth

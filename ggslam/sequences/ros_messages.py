@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of a ROS 1 or ROS 2 bag, read one at a time where they are asked for."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import GgslamError, MissingDependency, SequenceError
+
+
+class Bag:
+    """A bag, open for as long as this object lives. May be used from several threads.
+
+    Attributes:
+        path: the file, or the folder of a ROS 2 bag.
+        types: topic -> name of its messages' type, without /msg/.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises MissingDependency without the package rosbags, SequenceError if the bag is damaged."""
+        try:
+            from rosbags.highlevel import AnyReader
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError as error:
+            raise MissingDependency(f"reading ROS bags needs rosbags: pip install 'ggslam[ros]' ({error})") from None
+        self.path = path
+        self._lock = threading.RLock()
+        self._cursors: dict[str, tuple[int, Iterator[Any]]] = {}
+        self._logged: dict[str, list[int]] = {}
+        try:
+            # Old ROS 2 bags do not carry the definitions of their messages.
+            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            self._reader.open()
+        except Exception as error:  # the package raises many types for files that are no whole bag
+            raise SequenceError(f"{path}: not a whole bag (truncated, or not indexed?): {_text(error)}") from None
+        self.types = {c.topic: c.msgtype.replace("/msg/", "/") for c in self._reader.connections}
+
+    def stamps(self, topic: str) -> np.ndarray:
+        """Times in the headers of a topic's messages, float64 [n], seconds, in the order of the bag.
+
+        Raises:
+            SequenceError: the bag is damaged.
+        """
+        stamps, logged = [], []
+        with self._lock, _told(f"{self.path}, {topic}"):
+            for _, time, raw in self._read(topic):
+                stamps.append(self._stamp(raw))
+                logged.append(time)
+        self._logged[topic] = logged
+        return np.array(stamps)
+
+    def message(self, topic: str, number: int) -> Any:
+        """Message `number` of a topic, in the order of the bag. Reading them in order is quick.
+
+        Raises:
+            SequenceError: there is none, or the bag is damaged.
+        """
+        place = f"{self.path}, {topic}, message {number}"
+        with self._lock, _told(place):
+            at, cursor = self._cursors.pop(topic, (-1, iter(())))
+            if at != number:
+                at, cursor = self._seek(topic, number)
+            for _, _, raw in cursor:
+                at += 1
+                if at > number:
+                    self._cursors[topic] = (at, cursor)
+                    return self._reader.deserialize(raw, self._type(topic))
+        raise SequenceError(f"{place}: there is none")
+
+    def messages(self, topic: str) -> list[Any]:
+        """All messages of a topic of small ones. Raises SequenceError if the bag is damaged."""
+        with self._lock, _told(f"{self.path}, {topic}"):
+            return [self._reader.deserialize(raw, self._type(topic)) for _, _, raw in self._read(topic)]
+
+    def _seek(self, topic: str, number: int) -> tuple[int, Iterator[Any]]:
+        """Number of the first message that a new cursor will give, and the cursor, at or before `number`."""
+        logged = self._logged.get(topic, [])
+        if number >= len(logged) or logged != sorted(logged):
+            return 0, self._read(topic)
+        return logged.index(logged[number]), self._read(topic, logged[number])
+
+    def _read(self, topic: str, start: int | None = None) -> Iterator[Any]:
+        chosen = [c for c in self._reader.connections if c.topic == topic]
+        return iter(self._reader.messages(connections=chosen, start=start))
+
+    def _type(self, topic: str) -> str:
+        return next(c.msgtype for c in self._reader.connections if c.topic == topic)
+
+    def _stamp(self, raw: Any) -> float:
+        """Only the header is looked at: images are large."""
+        head = bytes(raw[:12])
+        if self._reader.is2:
+            seconds, nanoseconds = struct.unpack("<iI" if head[1] & 1 else ">iI", head[4:12])
+        else:
+            _, seconds, nanoseconds = struct.unpack("<III", head)
+        return float(seconds + 1e-9 * nanoseconds)
+
+
+class _told:
+    """Turns whatever goes wrong inside a damaged bag into one SequenceError."""
+
+    def __init__(self, place: str) -> None:
+        self._place = place
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, Exception) and not isinstance(error, GgslamError):
+            raise SequenceError(f"{self._place}: bag is damaged: {_text(error)}") from None
+
+
+def _text(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+@dataclass(frozen=True)
+class BagImage:
+    """An image message as an image of a recording; see `ImageSource`.
+
+    Attributes:
+        bag, topic, number: where it is.
+        stamp: seconds.
+        decode: makes the image of (place for messages, message).
+    """
+
+    bag: Bag
+    topic: str
+    number: int
+    stamp: float
+    decode: Callable[[str, Any], np.ndarray]
+
+    @property
+    def stem(self) -> str:
+        return f"{self.stamp:.6f}"
+
+    @property
+    def name(self) -> str:
+        return f"{self.stem}.png"
+
+    def __str__(self) -> str:
+        return f"{self.bag.path}, {self.topic}, message {self.number}"
+
+    def read(self) -> np.ndarray:
+        return self.decode(str(self), self.bag.message(self.topic, self.number))

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames inside a video file, decoded where they are asked for: the next one is quick, jumps seek."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ggslam.errors import SequenceError
+
+FORWARD = 90
+"""So many frames are decoded and dropped rather than sought past: seeking starts at a key frame anyway."""
+
+
+class Video:
+    """A video file; frames are read by their number. May be used from several threads.
+
+    Attributes:
+        path: the file.
+        count: frames, as the container tells.
+        rate: frames per second.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises SequenceError if the file is missing or is no video that can be decoded."""
+        self.path = path
+        self._lock = threading.Lock()
+        self._capture = self._open()
+        self._next = 0
+        self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.rate = float(self._capture.get(cv2.CAP_PROP_FPS)) or 30.0
+
+    def _open(self) -> cv2.VideoCapture:
+        if not self.path.is_file():
+            raise SequenceError(f"{self.path}: file is missing")
+        # The orientation tag is ignored: depth and calibration refer to the pixels as stored.
+        capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        if not capture.isOpened() or capture.get(cv2.CAP_PROP_FRAME_COUNT) < 1:
+            raise SequenceError(f"{self.path}: cannot be opened as a video (truncated, or a codec that is not known)")
+        return capture
+
+    def frame(self, index: int) -> np.ndarray:
+        """Colour image uint8 [H, W, 3] RGB of frame `index`.
+
+        Raises:
+            SequenceError: it cannot be decoded.
+        """
+        with self._lock:
+            if not 0 <= index - self._next <= FORWARD:
+                self._seek(index)
+            while self._next < index and self._capture.grab():
+                self._next += 1
+            read, image = self._capture.read() if self._next == index else (False, None)
+            if not read or image is None:
+                self._next = -1 - FORWARD  # nothing is known about the place now: the next one seeks
+                raise SequenceError(f"{self.path}: frame {index} cannot be decoded (the video is truncated or damaged)")
+            self._next = index + 1
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+    def _seek(self, index: int) -> None:
+        """Puts the capture before frame `index`, or at the start where containers do not seek exactly."""
+        if index > FORWARD and self._capture.set(cv2.CAP_PROP_POS_FRAMES, index):
+            at = self._capture.get(cv2.CAP_PROP_POS_FRAMES)
+            if round(at) == index:
+                self._next = index
+                return
+        self._capture.release()
+        self._capture = self._open()
+        self._next = 0
+
+
+@dataclass(frozen=True)
+class VideoFrame:
+    """A frame of a video as the colour image of a recording; see `ImageSource`."""
+
+    video: Video
+    index: int
+
+    @property
+    def stem(self) -> str:
+        return f"{self.index:06d}"
+
+    @property
+    def name(self) -> str:
+        return f"{self.stem}.png"
+
+    def __str__(self) -> str:
+        return f"{self.video.path}, frame {self.index}"
+
+    def read(self) -> np.ndarray:
+        return self.video.frame(self.index)

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Faults planted in a generated recording are told by `inspect_sequence`; healthy recordings are not doubted."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ggslam.scene.poses import inverse
+from ggslam.sequences import inspect_sequence, open_sequence
+from ggslam.sequences.alignment import measure_alignment
+
+FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.fixture
+def copy(room: Path, tmp_path: Path) -> Path:
+    """The room with files of its own for everything but the images."""
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    for path in room.iterdir():
+        if path.is_dir():
+            (folder / path.name).symlink_to(path)
+        else:
+            shutil.copy(path, folder / path.name)
+    return folder
+
+
+def warnings_of(folder: Path, **options: float) -> list[str]:
+    return inspect_sequence(open_sequence(folder, **options)).warnings  # type: ignore[arg-type]
+
+
+def test_healthy(room: Path) -> None:
+    report = inspect_sequence(open_sequence(room))
+    assert report.warnings == []
+    assert report.pose_depth_error is not None and report.pose_depth_error < 0.01
+    assert report.alignment is not None and report.alignment.strength > 0.4
+
+
+def test_healthy_shared_recordings(shared_data: Path) -> None:
+    for name in ("livingroom", "redkitchen", "rgbd_dataset_freiburg3_cabinet", "shelf"):
+        assert warnings_of(shared_data / name, scale=0.5) == [], name
+
+
+@pytest.mark.parametrize("factor", [5.0, 0.2, 6.5535])
+def test_depth_scale(room: Path, factor: float) -> None:
+    true = open_sequence(room).depth_scale
+    told = [text for text in warnings_of(room, depth_scale=true * factor) if "is suspicious" in text]
+    assert len(told) == 1 and f"depth scale {true * factor:g} is suspicious" in told[0]
+    assert f"try --depth-scale {true:g}" in told[0]
+
+
+def test_depth_scale_without_poses(copy: Path) -> None:
+    """Only what no room looks like can be told."""
+    (copy / "poses.txt").unlink()
+    true = open_sequence(copy).depth_scale
+    assert warnings_of(copy) == []
+    assert any("is suspicious: the median depth is" in text for text in warnings_of(copy, depth_scale=true / 5))
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("world to camera", inverse), ("OpenGL camera axes", lambda T: T @ FLIP_YZ),
+        ("world to camera with OpenGL axes", lambda T: inverse(T @ FLIP_YZ)),
+    ],
+)  # fmt: skip
+def test_pose_convention(copy: Path, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    poses = open_sequence(copy).ground_truth
+    assert poses is not None
+    (copy / "poses.txt").write_text("".join(" ".join(map(str, change(T).ravel())) + "\n" for T in poses))
+    (text,) = warnings_of(copy)
+    assert f"the true poses look like {name}" in text
+
+
+def test_quaternion_order(copy: Path) -> None:
+    from scipy.spatial.transform import Rotation
+
+    poses = open_sequence(copy).ground_truth
+    assert poses is not None
+    lines = []
+    for i, T in enumerate(poses):
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+        lines.append(" ".join(map(str, (i / 30, *T[:3, 3], w, x, y, z))))
+    (copy / "poses.txt").write_text("\n".join(lines))
+    (text,) = warnings_of(copy)
+    assert "the true poses look like quaternions in the order wxyz" in text
+
+
+def misplaced(depth: np.ndarray, shift: tuple[float, float], scale: float) -> np.ndarray:
+    """A depth image moved, and enlarged about its centre."""
+    height, width = depth.shape
+    centre = np.array([(width - 1) / 2, (height - 1) / 2])
+    warp = np.column_stack([scale * np.eye(2), shift + (1 - scale) * centre])
+    return cv2.warpAffine(depth, warp, (width, height), flags=cv2.INTER_NEAREST)
+
+
+@pytest.mark.parametrize("name", ["livingroom", "redkitchen", "rgbd_dataset_freiburg3_cabinet"])
+def test_misaligned_real_images(shared_data: Path, name: str) -> None:
+    sequence = open_sequence(shared_data / name, scale=0.5)
+    frames = [sequence.frame(i) for i in np.linspace(0, len(sequence) - 1, 5).astype(int)]
+    for shift, scale in (((9, 0), 1.0), ((-7, 7), 1.0), ((0, 0), 1.08), ((0, 0), 0.92)):
+        moved = [dataclasses.replace(frame, depth=misplaced(frame.depth, shift, scale)) for frame in frames]
+        found = measure_alignment(moved)
+        assert found is not None and found.doubtful
+        assert np.abs(np.array(found.shift) * 320 + shift).max() <= 3
+        assert found.scale == pytest.approx(1 / scale, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("shift", "scale"), [((6, 0), 1.0), ((0, -5), 1.0), ((-5, 4), 1.0), ((0, 0), 0.88)]
+)
+def test_misaligned(copy: Path, shift: tuple[int, int], scale: float) -> None:
+    source = (copy / "depth").resolve()
+    (copy / "depth").unlink()
+    (copy / "depth").mkdir()
+    for path in source.iterdir():
+        moved = misplaced(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), shift, scale)
+        assert cv2.imwrite(str(copy / "depth" / path.name), moved)
+    report = inspect_sequence(open_sequence(copy))
+    assert sum("depth does not lie on colour" in text for text in report.warnings) == 1
+    assert report.alignment is not None
+    found = np.array(report.alignment.shift) * 160
+    assert np.abs(found + shift).max() <= 2 and report.alignment.scale == pytest.approx(1 / scale, abs=0.04)
