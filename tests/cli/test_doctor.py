@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -57,7 +58,8 @@ def test_a_core_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_core_that_computes_nonsense(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(self_test, "_STEP", self_test._STEP * 0 + 5.0)  # out of the box: nothing fits
+    still = self_test._frame(0)
+    monkeypatch.setattr(self_test, "_frame", lambda index: replace(still, index=index))
     works, found = findings()
     assert not works and found["self-test/track two frames"]["state"] == "broken"
 
