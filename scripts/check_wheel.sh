@@ -44,12 +44,12 @@ CHECK
 "$python" -m venv "$work/empty"
 "$work/empty/bin/pip" install -q "${TORCH:-torch==2.13.0}"
 "$work/empty/bin/pip" install -q "$work"/dist/*.whl
-mkdir -p "$work/away" && cd "$work/away"
+rm -rf "$work/away" && mkdir "$work/away" && cd "$work/away"
 ggslam="$work/empty/bin/ggslam"
 "$ggslam" doctor
-"$ggslam" synth room --frames 12 --width 160 --height 120 --overwrite
-"$ggslam" run room --out run --overwrite
+"$ggslam" synth room --frames 12 --width 160 --height 120
+"$ggslam" run room --out run
 for format in ply splat pcd; do "$ggslam" export run --format "$format" --out "map.$format"; done
-rm -rf colmap && "$ggslam" export run --format colmap --voxel 0.03 --out colmap
+"$ggslam" export run --format colmap --voxel 0.03 --out colmap
 "$ggslam" volumes run --voxel 0.05
 echo "the wheel works"
