@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -158,6 +159,22 @@ def test_splats_by_the_command_line(run: RunFolder, tmp_path: Path, kind: str) -
     assert f"{opaque} Gaussians" in result.output.replace("\n", " ") and f"{len(run.gaussians())} Gaussians" in faint
     if kind == "splat":
         assert out.stat().st_size == 32 * opaque
+
+
+def test_a_map_on_disk_is_written_cell_by_cell(
+    run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, first = tmp_path / "whole.splat", len(run.gaussians()) // 3
+    export_packed(run, whole, "splat")
+    copy = tmp_path / "run"
+    shutil.copytree(run.path, copy)
+    box = {"low": [-9, -9, -9], "high": [9, 9, 9]}
+    cells = [{"cell": [0, 0, 0], "start": 0, "count": first, **box},
+             {"cell": [1, 0, 0], "start": first, "count": len(run.gaussians()) - first, **box}]  # fmt: skip
+    (copy / "map_cells.json").write_text(json.dumps({"version": 1, "cells": cells}))
+    monkeypatch.setattr(RunFolder, "gaussians", None)  # the whole map is not asked for
+    export_packed(RunFolder.open(copy), tmp_path / "parts.splat", "splat")
+    assert (tmp_path / "parts.splat").read_bytes() == whole.read_bytes()
 
 
 def refused(*arguments: str) -> GgslamError:
