@@ -14,6 +14,7 @@ from ggslam import __version__
 from ggslam.cli import (
     compare_command,
     decode_command,
+    doctor_command,
     edit_command,
     encode_command,
     eval_command,
@@ -58,7 +59,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "render": (render_command.render, render_command.EPILOG), "export": (export_command.export, export_command.EPILOG),
     "report": (report_command.report, report_command.EPILOG),
     "compare": (compare_command.compare, compare_command.EPILOG),
-    "edit": (edit_command.edit, edit_command.EPILOG),
+    "doctor": (doctor_command.doctor, doctor_command.EPILOG), "edit": (edit_command.edit, edit_command.EPILOG),
     "encode": (encode_command.encode, encode_command.EPILOG), "decode": (decode_command.decode, decode_command.EPILOG),
     "localize": (localize_command.localize, localize_command.EPILOG),
     "submaps": (submaps_command.submaps, submaps_command.EPILOG),
@@ -68,7 +69,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
 }  # fmt: skip
 for _name, (_function, _epilog) in _COMMANDS.items():
     _class = edit_command.EditCommand if _name == "edit" else None
-    app.command(_name, cls=_class, epilog=_epilog, no_args_is_help=True)(_function)
+    app.command(_name, cls=_class, epilog=_epilog, no_args_is_help=_name != "doctor")(_function)
 
 
 def main() -> None:

@@ -24,6 +24,7 @@ class FeatureSettings:
     reprojection: float = 2.0
     """RANSAC's inlier distance in pixels of a 320-pixel-wide image."""
     min_inliers: int = 12
+    """Matches that agree on a pose at least; else there is none."""
 
     def __post_init__(self) -> None:
         check_ranges(

@@ -22,6 +22,7 @@ class NeighbourSettings:
     samples: int = 400
     """Gaussians drawn each time."""
     neighbours: int = 5
+    """Nearest Gaussians that each is compared with."""
     growth: float = 0.2
     """The index of neighbours is built anew when the map has grown by this share, or when Gaussians were removed."""
 

@@ -52,15 +52,18 @@ class LearningRates:
     """Adam step sizes of each group of parameters."""
 
     means: float = 6e-4
+    """Of the means, metres."""
     quaternions: float = 4e-3
     log_scales: float = 5e-2
     opacity_logits: float = 5e-2
     sh_dc: float = 1.8e-2
     sh_rest: float = 5e-4
     features: float = 1e-2
+    """Of the other parameters, by the names that they have in the map; `sh_dc` is the coefficient of degree 0."""
     beta1: float = 0.9
     beta2: float = 0.99
     epsilon: float = 1e-15
+    """Adam's decay rates of the two moments, and what is added to the root of the second."""
     young_factor: float = 3.0
     """A Gaussian's first step is this much longer..."""
     young_updates: int = 8
@@ -78,7 +81,9 @@ class PruningSettings:
     """Which Gaussians are dropped, and how often one looks."""
 
     every_keyframes: int = 5
+    """One looks after every n-th keyframe."""
     min_opacity: float = 0.05
+    """Fainter Gaussians are dropped."""
     max_scale_m: float = 0.25
     """Larger Gaussians are dropped."""
 
@@ -109,8 +114,11 @@ class ExposureSettings:
     """Per-keyframe affine colour (gain and offset per channel), pulled towards the identity."""
 
     enabled: bool = False
+    """Whether keyframes get an exposure of their own; scores are those of renders without it."""
     rate: float = 2e-3
+    """Learning rate of gains and offsets."""
     regularization: float = 1e-2
+    """Weight of half the squared distance from the identity in the loss."""
 
     def __post_init__(self) -> None:
         check_ranges(self, {"rate": (0, 1), "regularization": (0, 1e6)})

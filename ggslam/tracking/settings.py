@@ -21,7 +21,9 @@ class DepthNoise:
     """
 
     constant: float = 0.0012
+    """Metres."""
     square: float = 0.0019
+    """Metres per square metre of depth."""
 
     def sigma(self, z: float) -> float:
         """Standard deviation in metres at depth `z`."""

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sparse models of COLMAP in its binary form: `cameras.bin`, `images.bin`, `points3D.bin`.
+
+Format: "Output Format" in COLMAP's documentation. Little endian. Poses are world to camera (quaternion wxyz,
+translation), axes x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5) there and (0, 0) here.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.formats.atomic import write_bytes
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse, matrix_to_quaternion
+
+_PINHOLE = 1
+_CAMERA_ID = 1
+_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track_length", "<u8")])
+
+
+def write_colmap_model(
+    folder: str | Path, camera: Camera, names: Sequence[str], T_world_camera: Sequence[np.ndarray],
+    points: np.ndarray, colors: np.ndarray,
+) -> None:  # fmt: skip
+    """Writes a model of images that share a pinhole camera; each file whole or not at all.
+
+    Args:
+        folder: exists; customarily `sparse/0`.
+        camera: of all images.
+        names: of the image files, relative to the folder of images; images are numbered from 1 in this order.
+        T_world_camera: a float64 [4, 4] for each.
+        points: [N, 3] metres; they have no tracks: no image is said to have seen them.
+        colors: uint8 [N, 3].
+
+    Raises:
+        RunFolderError: a file cannot be written.
+    """
+    folder = Path(folder)
+    write_bytes(folder / "cameras.bin", _cameras(camera))
+    write_bytes(folder / "images.bin", _images(names, T_world_camera))
+    write_bytes(folder / "points3D.bin", _points(points, colors))
+
+
+def _cameras(camera: Camera) -> bytes:
+    numbers = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)
+    return struct.pack("<QIiQQ4d", 1, _CAMERA_ID, _PINHOLE, camera.width, camera.height, *numbers)
+
+
+def _images(names: Sequence[str], T_world_camera: Sequence[np.ndarray]) -> bytes:
+    parts = [struct.pack("<Q", len(names))]
+    for number, (name, T) in enumerate(zip(names, T_world_camera, strict=True), start=1):
+        T_camera_world = inverse(np.asarray(T, float))
+        pose = (*matrix_to_quaternion(T_camera_world[:3, :3]), *T_camera_world[:3, 3])
+        parts.append(struct.pack("<I7dI", number, *pose, _CAMERA_ID) + name.encode() + b"\0" + struct.pack("<Q", 0))
+    return b"".join(parts)
+
+
+def _points(points: np.ndarray, colors: np.ndarray) -> bytes:
+    rows = np.zeros(len(points), _POINT)
+    rows["id"] = np.arange(1, len(points) + 1)
+    rows["xyz"], rows["rgb"] = points, colors
+    rows["error"] = -1  # COLMAP's word for unknown
+    return struct.pack("<Q", len(rows)) + rows.tobytes()

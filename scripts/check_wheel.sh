@@ -1,0 +1,55 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+# Builds sdist and wheel (the wheel from the sdist), looks into both, installs the wheel into an empty environment and
+# runs there: doctor, the generated room, a short run, exports. Needs no checkout on the path. Leaves dist/.
+#   FOLDER=...   where to work (default: a temporary folder that is removed)
+#   TORCH=...    what to install first (default: torch==2.13.0), so that nothing else chooses another build of it
+set -eu
+cd "$(dirname "$0")/.."
+root=$PWD
+unset PYTHONPATH
+work=${FOLDER:-$(mktemp -d)}
+mkdir -p "$work"
+[ -n "${FOLDER:-}" ] || trap 'rm -rf "$work"' EXIT
+python=${PYTHON:-python3}
+
+"$python" -m venv "$work/build"
+"$work/build/bin/pip" install -q build
+rm -rf "$work/dist"
+"$work/build/bin/python" -m build -o "$work/dist" "$root" >"$work/build.log" 2>&1 || { tail -30 "$work/build.log"; exit 1; }
+mkdir -p dist && cp "$work"/dist/* dist/
+
+"$python" - "$work"/dist/*.whl "$work"/dist/*.tar.gz <<'CHECK'
+import sys, tarfile, zipfile
+from pathlib import Path
+
+wheel, sdist = sys.argv[1:]
+packed = set(zipfile.ZipFile(wheel).namelist())
+source = {"/".join(name.split("/")[1:]) for name in tarfile.open(sdist).getnames()}
+needed = {"ggslam/py.typed", "ggslam/native/_lib/libggslam_core.so", "ggslam/configs/default.yaml"}
+junk = [n for n in packed if n.startswith(("tests/", "scripts/", "docs/")) or "/src/" in n or n.endswith(".pyc")]
+assert needed <= packed, f"{wheel} lacks {needed - packed}"
+assert not junk, f"{wheel} holds {junk[:5]}"
+assert any(n.endswith("licenses/LICENSE") for n in packed), f"{wheel} lacks the licence"
+needed = {"LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "CMakeLists.txt", "pyproject.toml", "ggslam/py.typed",
+          "configs/default.yaml", "tests/conftest.py", "ggslam/native/src/dispatch.hpp"}
+ends = (".so", ".pyc", ".whl", ".o")
+junk = [n for n in source if n.endswith(ends) or n.split("/")[0] in (".git", "build", "dist", "runs", "demo", ".ci")]
+assert needed <= source, f"{sdist} lacks {needed - source}"
+assert not junk, f"{sdist} holds {junk[:5]}"
+for name, count in ((wheel, len(packed)), (sdist, len(source))):
+    print(f"{Path(name).name}: {count} files, {Path(name).stat().st_size / 1e6:.1f} MB")
+CHECK
+
+"$python" -m venv "$work/empty"
+"$work/empty/bin/pip" install -q "${TORCH:-torch==2.13.0}"
+"$work/empty/bin/pip" install -q "$work"/dist/*.whl
+rm -rf "$work/away" && mkdir "$work/away" && cd "$work/away"
+ggslam="$work/empty/bin/ggslam"
+"$ggslam" doctor
+"$ggslam" synth room --frames 12 --width 160 --height 120
+"$ggslam" run room --out run
+for format in ply splat pcd; do "$ggslam" export run --format "$format" --out "map.$format"; done
+"$ggslam" export run --format colmap --voxel 0.03 --out colmap
+"$ggslam" volumes run --voxel 0.05
+echo "the wheel works"
