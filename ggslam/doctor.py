@@ -54,7 +54,7 @@ EXTRAS = {
     "bench": Extra(("pyoctomap", "open3d", "edt"), "what the benchmarks of volumes compare with"),
     "gsplat": Extra(("gsplat",), "the renderer on an NVIDIA GPU"),
     "viewer": Extra(("viser",), "maps in the browser: ggslam view, ggslam run --view"),
-    "browser": Extra(("viser", "selenium"), "tests of the viewer in a browser (and Debian's chromium, chromium-driver)"),
+    "browser": Extra(("viser", "selenium"), "tests of the viewer in a browser (with chromium-driver)"),
     "rerun": Extra(("rerun",), "ggslam run --log: a run streamed to rerun"),
     "phone": Extra(("liblzfse",), "recordings of Record3D (.r3d)"),
     "ros": Extra(("rosbags",), "ROS 1 and ROS 2 bags"),
