@@ -20,6 +20,7 @@ from ggslam.errors import FormatError
 from ggslam.formats.atomic import write_text
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_sampling import MapPart
+from ggslam.process_memory import release_early
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.submaps.frustums import Frustums
@@ -101,6 +102,8 @@ class MapInParts:
         self.rows = GaussianRows(ply)
         """For going through all of the map."""
         self.in_cells = index is not None
+        if index is not None:
+            release_early()  # of a map that may not fit into memory
         """Whether there is an index."""
         self.index = MapIndex.of_whole(len(self.rows)) if index is None else index
         if len(self.rows) != int(self.index.counts.sum()):

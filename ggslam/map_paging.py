@@ -47,7 +47,7 @@ _GROWTH = 0.1
 _INSERTIONS = 8
 """As much room is kept as the largest of so many last keyframes took (the first, for which all is new, aside)."""
 _AT_ONCE = 64
-"""Keyframes that are asked together which of them saw something last, from the newest to the oldest."""
+"""Keyframes that are asked together what they see."""
 _TILES = (6, 8)
 """Rows and columns of parts of a view: each is as deep as what was measured in it, cells behind that are hidden."""
 
@@ -158,8 +158,11 @@ class MapPager:
         """Those of some keyframes of whose view nothing is on disk."""
         if self.cells is None or not self.cells.sorted_keys() or not len(numbers):
             return numbers
-        lacking = self.cells.needed(self._frustums(self._views(numbers)))
-        found = [number for number, keys in zip(numbers, lacking, strict=True) if not keys]
+        found = []
+        for begin in range(0, len(numbers), _AT_ONCE):
+            asked = numbers[begin : begin + _AT_ONCE]
+            lacking = self.cells.needed(self._frustums(self._views(asked)))
+            found += [number for number, keys in zip(asked, lacking, strict=True) if not keys]
         return found or [numbers[-1]]  # the budget is less than one view: the newest is trained on what there is
 
     def stages(self) -> Iterator[Sequence[int]]:

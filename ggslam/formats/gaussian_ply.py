@@ -126,6 +126,7 @@ def gaussians_of_vertices(
     if degree is None:
         raise FormatError(f"{path}: {len(rest)} properties f_rest_*, expected 0, 9, 24 or 45 (SH degree 0 to 3)")
     out = GaussianMap(degree, len(features), torch.device(device), with_moments)
+    growth, out.growth = out.growth, 0.0  # at first no more room than for what is there: of small cells many are kept
     out.insert(
         means=_floats(path, first, vertex, _MEANS),
         quaternions=_floats(path, first, vertex, _ROTATIONS),
@@ -138,6 +139,7 @@ def gaussians_of_vertices(
     out.sh[:, 0] = _floats(path, first, vertex, _COLORS).to(out.sh)
     channel_major = _floats(path, first, vertex, rest).reshape(len(vertex), 3, len(rest) // 3)
     out.sh[:, 1:] = channel_major.transpose(1, 2).to(out.sh)
+    out.growth = growth
     norms = out.quaternions.norm(dim=1)
     if (norms < 1e-6).any():
         raise FormatError(f"{path}: the quaternion of vertex {first + int(norms.argmin())} is zero")

@@ -11,8 +11,10 @@ import numpy as np
 
 from ggslam.scene.camera import Camera
 
-_AT_ONCE = 1 << 20
-"""Pairs of a camera and a box that are tested at a time."""
+_AT_ONCE = 1 << 18
+"""Pairs of a camera and a box that are tested at a time: with few, the test itself takes little memory."""
+_TILES_AT_ONCE = 1 << 13
+"""As many pairs of a tile and a box."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Frustums:
     ) -> None:
         """Of the boxes that whole views reach those stay in `seen` that one of their tiles does."""
         cameras, boxes = np.nonzero(seen)
-        step = max(1, _AT_ONCE // (6 * tiles[0].shape[1]))
+        step = max(1, _TILES_AT_ONCE // tiles[0].shape[1])
         for begin in range(0, len(cameras), step):
             k, m = cameras[begin : begin + step], boxes[begin : begin + step]
             normals = tiles[0][k]
