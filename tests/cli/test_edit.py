@@ -67,7 +67,7 @@ def test_several_edits_at_once_leave_a_whole_run(finished: Path, tmp_path: Path)
     assert {"carpet", "sideboard copy"} <= names and not {"vase", "rug", "west wall"} & names
     expected = {"trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "timing.json", "run.json",
                 "map.ply", "objects.json", "classifier.npz", "votes.npz", "points.ply", "points_grid.ply", "loops.json",
-                "renders"}  # fmt: skip
+                "renders", "steps.csv", "ground_truth.txt"}  # fmt: skip
     assert {path.name for path in out.iterdir()} == expected
     marker = json.loads((out / "run.json").read_text())
     assert marker["complete"] is True and len(marker["edits"]) == 6

@@ -115,6 +115,7 @@ def test_poses_images_map_and_numbers_are_sent() -> None:
         trajectory=lambda: np.stack([_moved(1), np.full((4, 4), np.nan), _moved(2)]), gaussians=[]
     )
     live.finish(refined)
+    live.close()
     assert stream.closed
     np.testing.assert_array_equal(stream.entities("world/path")[-1].values[0][0], [[1, 0, 0], [2, 0, 0], [2, 0, 0]])
 
