@@ -141,6 +141,7 @@ class Slam:
         tracking = self.track(frame)
         is_keyframe = self.wants_keyframe(frame, tracking)
         if is_keyframe:
+            self.tracker.target = None  # the surface may be made anew; the next frame gets what it is then
             self.insert(frame, tracking, self.moves_followed)
             self.anchor_to(tracking.T_world_camera)
         self.remember(frame, tracking)

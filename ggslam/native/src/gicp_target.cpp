@@ -83,6 +83,9 @@ struct BaseRange {
 
 // The voxels of the blocks: those of the base keep their moments, new ones start empty.
 void make_moments(const BaseRange& base, float size, Partition& out) {
+  std::size_t voxels = 0;
+  for (const VoxelBlock& b : out.blocks) voxels += __builtin_popcountll(b.occupied);
+  out.moments.reserve(voxels);
   for (std::size_t b = 0; b < out.blocks.size(); ++b) {
     VoxelBlock before{0, 0, 0};
     if (base.begin + b < base.end) before = base.level->blocks[base.begin + b];
@@ -130,9 +133,13 @@ void fill_partition(const Sorted& s, int p, const BaseRange& base, const TargetI
   accumulate(input, settings, s.order.data() + begin, out.voxels.data(), n, out.moments.data());
 }
 
-void concatenate(const std::vector<Partition>& partitions, VoxelLevel& level) {
+// Partitions are freed as they are taken over: a map's moments are not there twice.
+void concatenate(std::vector<Partition>& partitions, VoxelLevel& level) {
   level.blocks.clear(), level.block_keys.clear(), level.moments.clear();
-  for (const Partition& p : partitions) {
+  std::size_t blocks = 0, moments = 0;
+  for (const Partition& p : partitions) blocks += p.blocks.size(), moments += p.moments.size();
+  level.blocks.reserve(blocks), level.block_keys.reserve(blocks), level.moments.reserve(moments);
+  for (Partition& p : partitions) {
     const uint32_t base = static_cast<uint32_t>(level.moments.size());
     for (VoxelBlock b : p.blocks) {
       b.first += base;
@@ -140,6 +147,7 @@ void concatenate(const std::vector<Partition>& partitions, VoxelLevel& level) {
     }
     level.block_keys.insert(level.block_keys.end(), p.keys.begin(), p.keys.end());
     level.moments.insert(level.moments.end(), p.moments.begin(), p.moments.end());
+    p = Partition{};
   }
 }
 
