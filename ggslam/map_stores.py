@@ -88,10 +88,11 @@ def store_of_run(run: Path, store: GridStore, visit: str | None = None, at: floa
     if camera is not None:
         others += _place_parts(store, views, camera)
     due = _Due(store, time)
-    others = [write for write in others if due[write.key]]  # before the points make the cells new
-    store_cloud(store, points[kept := due.of(points)], {n: v[kept] for n, v in attributes.items()}, time)
+    others, kept = [write for write in others if due[write.key]], due.of(points)
+    # The points come last: they make a cell new, and one that was cut off before is written again by the next attempt.
     for begin in range(0, len(others), _CELLS_AT_ONCE):
         _put(store, others[begin : begin + _CELLS_AT_ONCE])
+    store_cloud(store, points[kept], {name: values[kept] for name, values in attributes.items()}, time)
 
 
 def visit_of(folder: RunFolder) -> str:

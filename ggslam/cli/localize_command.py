@@ -62,7 +62,7 @@ def localize(
     depth_scale: options.DepthScale = None,
     columns: Annotated[int, typer.Option(help="Numbers of a point in .bin scans.", min=3)] = 4,
     skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
-    threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.", min=1)] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.", min=1, max=1024)] = None,
 ) -> None:  # fmt: skip
     """Locate each frame or scan of a recording in a map, of which only the surroundings are in memory."""
     from ggslam.localization_jobs import LocalizeRequest

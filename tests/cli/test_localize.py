@@ -144,3 +144,24 @@ def test_what_cannot_be_done_is_one_error(run: Path, room: Path, scans: Path, tm
     (scans.parent / "damaged.grid").mkdir()
     (scans.parent / "damaged.grid" / "index.sqlite").write_bytes(b"nothing of the kind" * 100)
     one_error(ggslam("localize", scans.parent / "damaged.grid", room), "damaged.grid")
+
+
+def test_a_run_whose_adding_was_cut_off_is_added_whole(
+    run: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, puts = tmp_path / "room.grid", []
+    put_cells = GridStore.put_cells
+
+    def cut_off(self: GridStore, writes: Any) -> None:
+        puts.append(1)
+        if len(puts) == 2:
+            raise OSError("disk full")
+        put_cells(self, writes)
+
+    monkeypatch.setattr(GridStore, "put_cells", cut_off)
+    assert ggslam("submaps", run, "--out", store).exit_code != 0 and len(puts) == 2
+    monkeypatch.undo()
+    done("submaps", run, "--out", store)
+    listed = done("submaps", store)
+    assert all(part in listed for part in ("points.pcd", "gaussians.npz", "places.npz"))
+    done("localize", store, room, "--stop", 2, "--out", tmp_path / "out")
