@@ -39,7 +39,7 @@ def write_report(folder: RunFolder, sequence: Sequence | None = None, plots: Pat
         save_truth(folder, sequence)
     recording = sequence if sequence is not None else _recording(folder)
     views = saved_views(folder)
-    if not views and not folder.config().memory_limit_mb:  # a view may see far more than a run with a limit holds
+    if not views and not _has_limit(folder):  # a view may see far more than a run with a limit holds
         views = rendered_views(folder, recording, spread(frame_poses(folder.read_json("keyframes.json"))))
     run = load_run(folder, recording, views)
     path = folder.path / REPORT_FILE
@@ -48,6 +48,10 @@ def write_report(folder: RunFolder, sequence: Sequence | None = None, plots: Pat
         make_folder(plots)
         write_plots(plots, all_plots([run]))
     return path
+
+
+def _has_limit(folder: RunFolder) -> bool:
+    return (folder.path / "config.yaml").is_file() and folder.config().memory_limit_mb > 0
 
 
 def _recording(folder: RunFolder) -> Sequence | None:

@@ -16,18 +16,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
-import subprocess
 import sys
-import time
-from dataclasses import dataclass
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 import torch
+from commands import Usage, usage
 
 from ggslam.formats.gaussian_ply import write_gaussian_parts
 from ggslam.map_index import MAP_INDEX, write_map_index
@@ -38,19 +35,10 @@ from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 
-ROOT = Path(__file__).parents[1]
 COPIED = ("run.json", "trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "loops.json", "timing.json",
           "classifier.npz")  # fmt: skip
 GAP_M = 1.0
 """Between storeys."""
-
-
-@dataclass(frozen=True)
-class Usage:
-    """Peak resident memory, 10^6 bytes, and seconds."""
-
-    peak_mb: float
-    seconds: float
 
 
 def main() -> None:
@@ -142,21 +130,6 @@ def commands(run: Path, out: Path, arguments: argparse.Namespace, times: int) ->
         found["render, whole map"] = ["render", whole, "--what", "color,ids", "--out", out / "pictures", *views]
         found["eval, whole map"] = ["eval", whole, "--no-lpips", *views]
     return {name: [str(word) for word in words] for name, words in found.items()}
-
-
-def usage(words: list[str]) -> Usage:
-    """Runs `ggslam` with these words."""
-    start = time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "ggslam.cli.main", *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        text=True,
-    )  # fmt: skip
-    assert process.stdout is not None
-    said = process.stdout.read()
-    _, status, used = os.wait4(process.pid, 0)
-    if status:
-        sys.exit(f"ggslam {' '.join(words)}\n{said}")
-    return Usage(used.ru_maxrss * 1024 / 1e6, time.perf_counter() - start)
 
 
 def report(used: dict[str, dict[int, Usage]], sizes: dict[int, float]) -> None:

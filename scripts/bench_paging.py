@@ -17,8 +17,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,7 +24,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-ROOT = Path(__file__).parents[1]
+from commands import usage
 
 
 def main() -> None:
@@ -87,20 +85,12 @@ def run(recording: Path, out: Path, settings: list[str], more: list[str], scored
 
 
 def command(*words: str) -> float:
-    """Runs `ggslam` with these words; its largest resident memory, MB."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "ggslam.cli.main", *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        text=True,
-    )  # fmt: skip
-    assert process.stdout is not None
-    said = process.stdout.read()
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        sys.exit(f"ggslam {' '.join(words)}\n{said}")
-    for line in said.splitlines():
+    """Runs `ggslam` with these words and prints what it says of the limit; its largest resident memory, MB."""
+    used = usage(words)
+    for line in used.said.splitlines():
         if "limit" in line:
             print(f"  {line.strip()}")
-    return usage.ru_maxrss * 1024 / 1e6
+    return used.peak_mb
 
 
 def report(runs: dict[str, dict[str, Any]], limit: float) -> None:

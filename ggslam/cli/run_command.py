@@ -16,7 +16,7 @@ from ggslam.cli.summary import print_scores
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
-    from ggslam.pipeline import RunOutcome
+    from ggslam.pipeline import RunOutcome, RunRequest
 
 EPILOG = """
 [bold]Examples[/]
@@ -96,19 +96,16 @@ def run(
     overwrite: Annotated[bool, typer.Option(help="Replace a finished run in the output folder.")] = False,
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
-    from ggslam.pipeline import RunRequest, execute  # imports torch: only when needed
+    from ggslam.pipeline import RunRequest  # imports torch: only when needed
     from ggslam.recordings import LiveRequest, SequenceRequest
     from ggslam.sequences.live import is_live
-    from ggslam.viewing_jobs import wait_for_interrupt
-    from ggslam.watching import watching
 
-    overrides = [*(settings or [])]
     shortcuts = {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
         "threads": threads, "seed": seed, "loops.enabled": loops,
         "tracker": None if tracker is None else tracker.value,
     }  # fmt: skip
-    overrides += [f"{name}={value}" for name, value in shortcuts.items() if value is not None]
+    overrides = [*(settings or []), *(f"{name}={value}" for name, value in shortcuts.items() if value is not None)]
     reading: dict[str, Any] = {
         "path": sequence, "format": format_name, "start": start, "stop": stop, "stride": stride, "scale": scale,
         "masks": masks, "depth_scale": depth_scale, "on_bad_frame": "skip" if skip_bad_frames else "error",
@@ -122,7 +119,16 @@ def run(
         out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite, map=earlier,
         localize_only=localize_only,
     )  # fmt: skip
-    with watching(log, (host, port) if view else None, sequence.resolve().name) as watchers:
+    _run_and_show(request, log, (host, port) if view else None)
+
+
+def _run_and_show(request: RunRequest, log: str | None, address: tuple[str, int] | None) -> None:
+    """Runs, logged and shown on a page as asked; the page stays until Ctrl-C."""
+    from ggslam.pipeline import execute
+    from ggslam.viewing_jobs import wait_for_interrupt
+    from ggslam.watching import watching
+
+    with watching(log, address, request.sequence.path.resolve().name) as watchers:
         page = watchers.page
         if page is not None:
             console.print(f"the map as it grows: {page.address}", highlight=False, markup=False)

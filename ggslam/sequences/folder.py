@@ -159,6 +159,4 @@ def _add_poses(recording: Recording, path: Path) -> None:
         poses, problems = read_matrix_rows(path)
         if len(poses) != count:
             raise SequenceError(f"{path}: expected {count} poses, one a frame, found {len(poses)}")
-    recording.poses, recording.pose_source = poses, path.name
-    for i, reason in problems.items():
-        recording.problems.setdefault(i, reason)
+    recording.take_poses(poses, path.name, problems)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.poses import is_valid_pose, quaternion_to_matrix
-from ggslam.sequences.recording import Calibration, read_text
+from ggslam.sequences.recording import Calibration, Recording, read_text
 
 
 def data_lines(path: Path) -> list[tuple[int, str]]:
@@ -67,6 +67,22 @@ def read_matrix_rows(path: Path) -> tuple[np.ndarray, dict[int, str]]:
         poses.append(T)
         places.append(f"{path}, line {number}")
     return _checked(poses, places)
+
+
+def add_row_poses(recording: Recording, path: Path) -> None:
+    """Sets a recording's poses from a file with one row a frame (see `read_matrix_rows`), if there is that file. Rows
+    beyond the last frame are left out.
+
+    Raises:
+        SequenceError: a row does not hold 12 or 16 numbers, or there are fewer rows than frames.
+    """
+    if not path.is_file():
+        return
+    poses, problems = read_matrix_rows(path)
+    count = len(recording.files)
+    if len(poses) < count:
+        raise SequenceError(f"{path}: expected {count} poses, one a frame, found {len(poses)}")
+    recording.take_poses(poses[:count], path.name, problems)
 
 
 def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:

@@ -20,7 +20,7 @@ from ggslam.errors import MissingDependency, SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.geometry import ImageGeometry, image_size
-from ggslam.sequences.recording import NO_OPTIONS, DepthCamera, FrameFiles, ReadOptions, Recording
+from ggslam.sequences.recording import NO_OPTIONS, DepthCamera, FrameFiles, NumberedImage, ReadOptions, Recording
 
 TIMEOUT_MS = 5000
 SNIFFED = 1 << 20
@@ -178,20 +178,12 @@ class Playback:
 
 
 @dataclass(frozen=True)
-class PlaybackImage:
+class PlaybackImage(NumberedImage):
     """Colour or depth of a played frame; see `ImageSource`."""
 
     playback: Playback
     index: int
     part: int
-
-    @property
-    def stem(self) -> str:
-        return f"{self.index:06d}"
-
-    @property
-    def name(self) -> str:
-        return f"{self.stem}.png"
 
     def __str__(self) -> str:
         return f"{self.playback.path}, frame {self.index}"

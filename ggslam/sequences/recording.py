@@ -46,6 +46,22 @@ class ImageSource(Protocol):
         ...
 
 
+class NumberedImage:
+    """Name and stem of an `ImageSource` that is one of the frames 0, 1, 2, ... of its container, by `index`."""
+
+    index: int
+
+    @property
+    def stem(self) -> str:
+        """The number, six digits."""
+        return f"{self.index:06d}"
+
+    @property
+    def name(self) -> str:
+        """The number as the name of a PNG file."""
+        return f"{self.stem}.png"
+
+
 ImageFile = Path | ImageSource
 """An image of a recording, wherever it lies."""
 
@@ -152,6 +168,12 @@ class Recording:
     instance_names: dict[int, str] = field(default_factory=dict)
     problems: dict[int, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+
+    def take_poses(self, poses: np.ndarray, source: str, problems: Mapping[int, str]) -> None:
+        """Sets the poses, float64 [n, 4, 4]; `problems` tells why frames have none, if nothing else is wrong there."""
+        self.poses, self.pose_source = poses, source
+        for number, reason in problems.items():
+            self.problems.setdefault(number, reason)
 
 
 class RecordingFormat(Protocol):

@@ -9,7 +9,7 @@ from typing import Any
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
-from ggslam.sequences.pose_files import read_matrix_rows
+from ggslam.sequences.pose_files import add_row_poses
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     FrameFiles,
@@ -45,15 +45,7 @@ class ReplicaFormat:
             self.name, folder, files, nominal_timestamps(len(files)), depth_scale, camera,
             instance_names=names, problems=missing_depth_problems(files),
         )  # fmt: skip
-        trajectory = folder / "traj.txt"
-        if trajectory.is_file():
-            poses, problems = read_matrix_rows(trajectory)
-            if len(poses) < len(files):
-                raise SequenceError(f"{trajectory}: expected {len(files)} poses, one a frame, found {len(poses)}")
-            recording.poses = poses[: len(files)]
-            recording.pose_source = trajectory.name
-            for i, reason in problems.items():
-                recording.problems.setdefault(i, reason)
+        add_row_poses(recording, folder / "traj.txt")
         return recording
 
     def _files(self, folder: Path, color: Path) -> FrameFiles:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.sequences.recording import NumberedImage
 
 FORWARD = 90
 """So many frames are decoded and dropped rather than sought past: seeking starts at a key frame anyway."""
@@ -75,19 +76,11 @@ class Video:
 
 
 @dataclass(frozen=True)
-class VideoFrame:
+class VideoFrame(NumberedImage):
     """A frame of a video as the colour image of a recording; see `ImageSource`."""
 
     video: Video
     index: int
-
-    @property
-    def stem(self) -> str:
-        return f"{self.index:06d}"
-
-    @property
-    def name(self) -> str:
-        return f"{self.stem}.png"
 
     def __str__(self) -> str:
         return f"{self.video.path}, frame {self.index}"

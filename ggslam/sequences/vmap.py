@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
-from ggslam.sequences.pose_files import read_matrix_rows
+from ggslam.sequences.pose_files import add_row_poses
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     FrameFiles,
@@ -48,14 +48,7 @@ class VmapFormat:
             self.name, folder, files, nominal_timestamps(len(files)), DEPTH_SCALE, CAMERA,
             problems=missing_depth_problems(files), warnings=warnings,
         )  # fmt: skip
-        trajectory = root / "traj_w_c.txt"
-        if trajectory.is_file():
-            poses, problems = read_matrix_rows(trajectory)
-            if len(poses) < len(files):
-                raise SequenceError(f"{trajectory}: expected {len(files)} poses, one a frame, found {len(poses)}")
-            recording.poses, recording.pose_source = poses[: len(files)], trajectory.name
-            for i, reason in problems.items():
-                recording.problems.setdefault(i, reason)
+        add_row_poses(recording, root / "traj_w_c.txt")
         return recording
 
 

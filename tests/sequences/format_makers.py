@@ -191,95 +191,108 @@ def make_stray(folder: Path) -> Path:
     return folder
 
 
+class BagMessages:
+    """Messages in the layout of realsense-ros; colour and depth compressed or raw, depth in millimetres or metres."""
+
+    def __init__(self, ros2: bool, compressed: bool, metres: bool) -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self.ros2, self.compressed, self.metres = ros2, compressed, metres
+        self.store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
+        self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+        self.types: Any = {name.split("/")[-1]: kind for name, kind in self.store.types.items()}
+        self.types["Time"] = self.store.types["builtin_interfaces/msg/Time"]  # there is a std_msgs/Time too
+
+    def header(self, time: float, frame: str) -> Any:
+        stamp = self.types["Time"](sec=int(time), nanosec=round(time % 1 * 1e9))
+        return self.types["Header"](**({} if self.ros2 else {"seq": 0}), stamp=stamp, frame_id=frame)
+
+    def image(self, time: float, frame: str, encoding: str, pixels: np.ndarray, form: str, head: bytes = b"") -> Any:
+        if self.compressed:
+            data = np.frombuffer(head + cv2.imencode(".png", pixels)[1].tobytes(), np.uint8)
+            return self.types["CompressedImage"](header=self.header(time, frame), format=form, data=data)
+        return self.types["Image"](
+            header=self.header(time, frame), height=pixels.shape[0], width=pixels.shape[1], encoding=encoding,
+            is_bigendian=0, step=pixels.strides[0], data=np.frombuffer(pixels.tobytes(), np.uint8),
+        )  # fmt: skip
+
+    def depth(self, i: int, time: float, frame: str) -> Any:
+        raw: np.ndarray = depth_mm(i)
+        head = b"\0" * 12
+        if self.metres and self.compressed:  # A / depth + B, as compressed_depth_image_transport writes it
+            a, b = 101.0 * 100, 1 - 101.0 * 100 / 10
+            with np.errstate(divide="ignore"):
+                raw = np.where(raw > 0, a / (raw / 1000) + b, 0).astype(np.uint16)
+            head = struct.pack("<iff", 1, a, b)
+        elif self.metres:
+            raw = np.where(raw > 0, raw / 1000, np.nan).astype(np.float32)
+        kind = "32FC1" if self.metres else "16UC1"
+        return self.image(time, frame, kind, raw, f"{kind}; compressedDepth png", head)
+
+    def info(self, frame: str, d: tuple[float, ...], model: str) -> Any:
+        names = ("d", "k", "r", "p") if self.ros2 else ("D", "K", "R", "P")
+        K = np.array([30.0, 0, 15, 0, 31, 11, 0, 0, 1])
+        matrices = (np.array(d, float), K, np.eye(3).ravel(), np.insert(K, [3, 6, 9], 0))
+        roi = self.types["RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        return self.types["CameraInfo"](
+            header=self.header(1, frame), height=HEIGHT, width=WIDTH, distortion_model=model,
+            **dict(zip(names, matrices, strict=True)), binning_x=0, binning_y=0, roi=roi,
+        )  # fmt: skip
+
+    def posed(self, i: int, time: float) -> Any:
+        T, q = pose(i), quaternion_xyzw(pose(i))
+        at = self.types["Pose"](
+            position=self.types["Point"](x=T[0, 3], y=T[1, 3], z=T[2, 3]),
+            orientation=self.types["Quaternion"](x=q[0], y=q[1], z=q[2], w=q[3]),
+        )
+        return self.types["PoseStamped"](header=self.header(time, "map"), pose=at)
+
+    def link(self, frame: str, child: str) -> Any:
+        """The child's place in the frame: 5 cm along x."""
+        transform = self.types["Transform"](
+            translation=self.types["Vector3"](x=0.05, y=0.0, z=0.0),
+            rotation=self.types["Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+        )
+        stamped = self.types["TransformStamped"]
+        link = stamped(header=self.header(999.9, frame), child_frame_id=child, transform=transform)
+        return self.types["TFMessage"](transforms=[link])
+
+    def raw(self, kind: str, message: Any) -> Any:
+        return self.store.serialize_cdr(message, kind) if self.ros2 else self.store.serialize_ros1(message, kind)
+
+
 def write_bag(
     path: Path, ros2: bool, compressed: bool = False, metres: bool = False, registered: bool = True,
     count: int = FRAMES, d: tuple[float, ...] = (), model: str = "plumb_bob",
 ) -> Path:  # fmt: skip
     """A bag in the layout of realsense-ros: colour, depth 5 ms later, camera_info, poses on a topic of their own."""
     writer_module = pytest.importorskip("rosbags.rosbag2" if ros2 else "rosbags.rosbag1")
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-    types: Any = {name.split("/")[-1]: kind for name, kind in store.types.items()}
-    types["Time"] = store.types["builtin_interfaces/msg/Time"]  # there is a std_msgs/Time too
+    messages = BagMessages(ros2, compressed, metres)
     writer = writer_module.Writer(path, version=9) if ros2 else writer_module.Writer(path)
     base = "/camera/aligned_depth_to_color" if registered else "/camera/depth"
     frame_of_depth = "color_optical" if registered else "depth_optical"
-
-    def header(time: float, frame: str) -> Any:
-        stamp = types["Time"](sec=int(time), nanosec=round(time % 1 * 1e9))
-        return types["Header"](**({} if ros2 else {"seq": 0}), stamp=stamp, frame_id=frame)
-
-    def image(time: float, frame: str, encoding: str, pixels: np.ndarray, form: str, head: bytes = b"") -> Any:
-        if compressed:
-            data = np.frombuffer(head + cv2.imencode(".png", pixels)[1].tobytes(), np.uint8)
-            return types["CompressedImage"](header=header(time, frame), format=form, data=data)
-        return types["Image"](
-            header=header(time, frame), height=pixels.shape[0], width=pixels.shape[1], encoding=encoding,
-            is_bigendian=0, step=pixels.strides[0], data=np.frombuffer(pixels.tobytes(), np.uint8),
-        )  # fmt: skip
-
-    def depth(i: int, time: float) -> Any:
-        raw: np.ndarray = depth_mm(i)
-        head = b"\0" * 12
-        if metres and compressed:  # A / depth + B, as compressed_depth_image_transport writes it
-            a, b = 101.0 * 100, 1 - 101.0 * 100 / 10
-            with np.errstate(divide="ignore"):
-                raw = np.where(raw > 0, a / (raw / 1000) + b, 0).astype(np.uint16)
-            head = struct.pack("<iff", 1, a, b)
-        elif metres:
-            raw = np.where(raw > 0, raw / 1000, np.nan).astype(np.float32)
-        kind = "32FC1" if metres else "16UC1"
-        return image(time, frame_of_depth, kind, raw, f"{kind}; compressedDepth png", head)
-
-    def info(frame: str) -> Any:
-        names = ("d", "k", "r", "p") if ros2 else ("D", "K", "R", "P")
-        K = np.array([30.0, 0, 15, 0, 31, 11, 0, 0, 1])
-        matrices = (np.array(d, float), K, np.eye(3).ravel(), np.insert(K, [3, 6, 9], 0))
-        roi = types["RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-        return types["CameraInfo"](
-            header=header(1, frame), height=HEIGHT, width=WIDTH, distortion_model=model,
-            **dict(zip(names, matrices, strict=True)), binning_x=0, binning_y=0, roi=roi,
-        )  # fmt: skip
-
-    def posed(i: int, time: float) -> Any:
-        T, q = pose(i), quaternion_xyzw(pose(i))
-        at = types["Pose"](
-            position=types["Point"](x=T[0, 3], y=T[1, 3], z=T[2, 3]),
-            orientation=types["Quaternion"](x=q[0], y=q[1], z=q[2], w=q[3]),
-        )
-        return types["PoseStamped"](header=header(time, "map"), pose=at)
-
     images, suffix = ("CompressedImage", "/compressed") if compressed else ("Image", "")
     depth_topic = f"{base}/image_raw" + ("/compressedDepth" if compressed else "")
     sent: list[tuple[str, str, float, Any]] = [
-        ("/camera/color/camera_info", "sensor_msgs/msg/CameraInfo", 999.9, info("color_optical")),
-        (f"{base}/camera_info", "sensor_msgs/msg/CameraInfo", 999.9, info(frame_of_depth)),
+        ("/camera/color/camera_info", "sensor_msgs/msg/CameraInfo", 999.9, messages.info("color_optical", d, model)),
+        (f"{base}/camera_info", "sensor_msgs/msg/CameraInfo", 999.9, messages.info(frame_of_depth, d, model)),
     ]
     if not registered:
-        link = types["TransformStamped"](
-            header=header(999.9, "depth_optical"), child_frame_id="color_optical",
-            transform=types["Transform"](
-                translation=types["Vector3"](x=0.05, y=0.0, z=0.0),
-                rotation=types["Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
-            ),
-        )  # fmt: skip
-        sent.append(("/tf_static", "tf2_msgs/msg/TFMessage", 999.9, types["TFMessage"](transforms=[link])))
+        sent.append(("/tf_static", "tf2_msgs/msg/TFMessage", 999.9, messages.link("depth_optical", "color_optical")))
     for i in range(count):
         time = 1000 + i / 30
-        picture = image(time, "color_optical", "bgr8", color_bgr(i), "bgr8; png compressed bgr8")
+        picture = messages.image(time, "color_optical", "bgr8", color_bgr(i), "bgr8; png compressed bgr8")
+        depth = messages.depth(i, time + 0.005, frame_of_depth)
         sent.append((f"/camera/color/image_raw{suffix}", f"sensor_msgs/msg/{images}", time, picture))
-        sent.append((depth_topic, f"sensor_msgs/msg/{images}", time + 0.005, depth(i, time + 0.005)))
-        sent.append(("/poses", "geometry_msgs/msg/PoseStamped", time, posed(i, time)))
+        sent.append((depth_topic, f"sensor_msgs/msg/{images}", time + 0.005, depth))
+        sent.append(("/poses", "geometry_msgs/msg/PoseStamped", time, messages.posed(i, time)))
     with writer:
         connections = {
-            topic: writer.add_connection(topic, kind, typestore=store) for topic, kind, _, _ in sent
+            topic: writer.add_connection(topic, kind, typestore=messages.store) for topic, kind, _, _ in sent
             if not any(topic == other.topic for other in writer.connections)
         }  # fmt: skip
         for topic, kind, time, message in sent:
-            raw = store.serialize_cdr(message, kind) if ros2 else store.serialize_ros1(message, kind)
-            writer.write(connections[topic], round((time + 0.2) * 1e9), raw)
+            writer.write(connections[topic], round((time + 0.2) * 1e9), messages.raw(kind, message))
     return path
 
 
