@@ -34,6 +34,8 @@ from ggslam.tracking.settings import TargetSettings, TrackerSettings
 GIVEN = "given"
 """As a start pose: the recording's own first pose."""
 _CELLS = "cells"
+_FARTHEST = 1e7
+"""Metres from the origin of the map that a start pose may be."""
 _FINEST = 1.5
 """A target's voxels are at least this many times as wide as those that the map was thinned with."""
 
@@ -96,11 +98,13 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
             FullSurface(store, target, context) if request.full else PartialSurface(store, target, context, submaps)
         )
         opened.callback(surface.close)
-        localizer = _localizer(request, recording, store, surface, context, start)
+        places = None if isinstance(recording, ScanSequence) else _places(request, recording, store, start, observer)
+        localizer = _localizer(request, recording, places, surface, context, start)
         results = _run(localizer, recording, observer)
+        damaged = sorted([*surface.damaged, *(places.damaged if places is not None else [])])
         report = LocalizationReport(
             str(request.map), str(request.sequence.path), request.full, recording.timestamps, results,
-            recording.ground_truth, sorted(surface.damaged),
+            recording.ground_truth, damaged,
         )  # fmt: skip
     write_report(report, out, observer)
     return report
@@ -152,8 +156,9 @@ def parsed_pose(text: str) -> np.ndarray:
     except ValueError:
         numbers = np.zeros(0)
     norm = float(np.linalg.norm(numbers[3:]))
-    if len(numbers) != 7 or not np.isfinite(numbers).all() or not 0.9 < norm < 1.1:
-        raise ConfigError(f'--start: expected "x y z qx qy qz qw" with a unit quaternion, or "{GIVEN}", found {text!r}')
+    if len(numbers) != 7 or not (np.abs(numbers) <= _FARTHEST).all() or not 0.9 < norm < 1.1:
+        expected = f'"x y z qx qy qz qw", metres and a unit quaternion, or "{GIVEN}"'
+        raise ConfigError(f"--start: expected {expected}, found {text!r}")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = quaternion_to_matrix(numbers[[6, 3, 4, 5]] / norm), numbers[:3]
     return T
@@ -183,16 +188,30 @@ def _target(request: LocalizeRequest, submaps: SubmapSettings, scans: bool) -> T
     return replace(own, voxel=voxel if request.voxel is None else request.voxel)
 
 
+def _places(
+    request: LocalizeRequest, recording: Sequence, store: GridStore, start: np.ndarray | None, observer: Observer
+) -> StoredPlaces | None:
+    """The places of the map; None if they cannot be used and are not needed for the start."""
+    try:
+        places = StoredPlaces(store, recording.camera)
+    except ConfigError as error:
+        if start is None:
+            raise
+        observer.note(f"lost frames are not looked up: {error}")
+        return None
+    if start is None and not len(places):
+        reason = f"; left out: {places.damaged[0]}" if places.damaged else ""
+        raise ConfigError(f"{request.map}: has no places to look up: --start is needed{reason}")
+    return places
+
+
 def _localizer(
-    request: LocalizeRequest, recording: Sequence | ScanSequence, store: GridStore, surface: Surface,
+    request: LocalizeRequest, recording: Sequence | ScanSequence, places: StoredPlaces | None, surface: Surface,
     context: NativeContext, start: np.ndarray | None,
 ) -> Localizer[Any]:  # fmt: skip
     if isinstance(recording, ScanSequence):
         assert start is not None
         return Localizer(surface, ScanTracker(request.scans, context, start), start)
-    places = StoredPlaces(store, recording.camera)
-    if start is None and not len(places):
-        raise ConfigError(f"{request.map}: has no places to look up: --start is needed")
     front_end = FrameTracker(recording.camera, request.tracker, context, start, places)
     return Localizer(surface, front_end, start)
 

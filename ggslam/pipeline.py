@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ggslam.config import Config, load_config
 from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.formats.staging import new_staging
@@ -23,7 +25,7 @@ from ggslam.scoring import score_run
 from ggslam.sequences import Sequence
 from ggslam.sequences.live import LiveSequence
 from ggslam.slam import Slam
-from ggslam.slam_result import SlamResult, StepReport
+from ggslam.slam_result import SlamResult, StepReport, tracked_poses
 from ggslam.starting import ancestors, start_in_map
 
 
@@ -95,9 +97,8 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     folder = RunFolder.create(out, overwrite=request.overwrite)
     for warning in sequence.warnings:
         observer.note(warning)
-    paging = new_staging(folder.path) if config.memory_limit_mb else None
     try:
-        result, error = run_slam(sequence, config, observer, earlier, not request.localize_only, follower, paging)
+        result, error = run_slam(sequence, config, observer, earlier, not request.localize_only, follower, folder)
     except GgslamError:  # before the first frame: settings that do not fit the recording, a model that is none
         folder.discard()
         raise
@@ -168,15 +169,17 @@ def _names(earlier: RunFolder | None) -> dict[int, str]:
 
 def run_slam(
     sequence: Sequence | LiveSequence, config: Config, observer: Observer, earlier: RunFolder | None = None,
-    growing: bool = True, follower: Follower | None = None, paging: Path | None = None,
+    growing: bool = True, follower: Follower | None = None, folder: RunFolder | None = None,
 ) -> tuple[SlamResult, BaseException | None]:  # fmt: skip
     """The loop over a recording, synchronous or in real time as the settings say; with `earlier` in that run's map,
-    which grows or stays as it is. What does not fit into a limit of memory goes to the folder `paging`, see `Slam`.
+    which grows or stays as it is. What does not fit into a limit of memory goes to a hidden folder in `folder`.
 
     Raises:
-        GgslamError: settings or map do not fit the recording.
+        GgslamError: settings or map do not fit the recording; or the disk is full of what does not fit into memory:
+            then the trajectory is in `folder`, and the map is lost.
     """
     error: BaseException | None = None
+    paging = new_staging(folder.path) if config.memory_limit_mb and folder is not None else None
     slam = Slam(sequence.camera, config, sequence.has_masks, paging)
     if earlier is not None:
         start_in_map(slam, earlier, growing)
@@ -204,7 +207,11 @@ def run_slam(
             result = slam.result()
     except KeyboardInterrupt as again:  # by now there is the result
         error = again
-    except Exception:  # the disk is full, and what is there goes to make room
+    except Exception as failure:  # the disk is full, and what is there goes to make room
         slam.close()
+        if folder is not None and slam.frames:
+            stamps = np.array([frame.timestamp for frame in slam.frames])
+            folder.save_trajectory(stamps, tracked_poses(slam.frames, slam.mapper.keyframes), repr(failure))
+            observer.note(f"the map is lost; the trajectory of {len(stamps)} frames is in {folder.path}")
         raise
     return result, error

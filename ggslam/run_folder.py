@@ -175,6 +175,19 @@ class RunFolder:
             save_points_in_parts(self.path, result.cells, with_object_id)
         self.write_json("timing.json", timing(result))  # once more: peak memory is that of the whole run
 
+    def save_trajectory(self, timestamps: np.ndarray, poses: np.ndarray, error: str) -> None:
+        """Writes what is left of a run whose map is lost: trajectory.txt, and why it stopped.
+
+        Args:
+            timestamps: seconds, [n].
+            poses: T_world_camera [n, 4, 4], NaN where lost.
+            error: why it stopped.
+        """
+        for name in (*OBJECT_FILES, "map.ply", "metrics.json", REPORT_FILE):  # of a run that this one replaces
+            (self.path / name).unlink(missing_ok=True)
+        write_tum(self.path / "trajectory.txt", timestamps, poses)
+        self.write_json(MARKER, {"ggslam": __version__, "complete": False, "stopped_by": error})
+
     def save_objects(self, segmented: SegmentedMap) -> None:
         """Writes a map with its objects: map.ply with object ids and identity vectors, and the files beside it."""
         for stale in OBJECT_FILES:

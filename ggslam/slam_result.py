@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -177,12 +177,7 @@ class SlamResult:
     def trajectory(self) -> np.ndarray:
         """T_world_camera of every frame, float64 [n, 4, 4], NaN for lost ones; the world is the first keyframe's
         camera."""
-        poses = np.full((len(self.frames), 4, 4), np.nan)
-        for pose, f in zip(poses, self.frames, strict=True):
-            # A keyframe may be missing if a real-time run stopped before its mapper had taken it in.
-            if f.status != TrackingStatus.LOST.value and f.keyframe < len(self.keyframes):
-                pose[:] = self.keyframes[f.keyframe].T_world_camera @ f.T_keyframe_camera
-        return poses
+        return tracked_poses(self.frames, self.keyframes)
 
     def lost_stretches(self) -> list[LostStretch]:
         """When the camera was lost."""
@@ -205,3 +200,13 @@ class SlamResult:
     def frames_per_second(self) -> float:
         """Frames by wall time, reading the recording included, final refinement and scoring not."""
         return len(self.frames) / self.times.wall if self.times.wall > 0 else float("nan")
+
+
+def tracked_poses(frames: Sequence[TrackedFrame], keyframes: Sequence[Keyframe]) -> np.ndarray:
+    """See `SlamResult.trajectory`."""
+    poses = np.full((len(frames), 4, 4), np.nan)
+    for pose, f in zip(poses, frames, strict=True):
+        # A keyframe may be missing if a real-time run stopped before its mapper had taken it in.
+        if f.status != TrackingStatus.LOST.value and f.keyframe < len(keyframes):
+            pose[:] = keyframes[f.keyframe].T_world_camera @ f.T_keyframe_camera
+    return poses

@@ -61,12 +61,19 @@ class StoredPlaces:
         camera: of the views that are looked up.
 
     Raises:
-        FormatError: a part is damaged.
         ConfigError: the places were seen by another camera.
     """
 
     def __init__(self, store: GridStore, camera: Camera, settings: PlaceSettings | None = None) -> None:
-        parts = [(key, _arrays(store, key)) for key in store.cells() if PLACES in store.cell(key).parts]
+        self.damaged: list[str] = []
+        """What is wrong with parts that were left out."""
+        parts = []
+        for key in store.cells():
+            if PLACES in store.cell(key).parts:
+                try:
+                    parts.append((key, _arrays(store, key)))
+                except FormatError as error:
+                    self.damaged.append(str(error))
         for key, arrays in parts:
             _check_camera(store, key, arrays["camera"], camera)
         merged = {name: np.concatenate([arrays[name] for _, arrays in parts]) for name in _NAMES[:5]} if parts else {}

@@ -83,6 +83,8 @@ class StoreListing:
     visits: Sequence[VisitTotal]
     since: str | None
     changes: Sequence[CellChange] | None
+    problems: Sequence[str] = ()
+    """What is wrong with files of it; the rest can be used."""
 
 
 def make_store(request: SubmapsRequest, observer: Observer) -> None:
@@ -130,8 +132,9 @@ def list_store(path: Path, since: str | None = None) -> StoreListing:
         changes = None if since is None else store.changed_since(since)
         size = sum(record.bytes for record in records)
         return StoreListing(
-            Path(path), store.settings, len(records), size, dict(sorted(parts.items())), visits, since, changes
-        )
+            Path(path), store.settings, len(records), size, dict(sorted(parts.items())), visits, since, changes,
+            list(store.problems()),
+        )  # fmt: skip
 
 
 def _with_next(names: list[str]) -> Iterator[tuple[str, str | None]]:

@@ -16,6 +16,7 @@ from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.point_ply import read_points
 from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.trajectory import read_tum
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.pipeline import RunOutcome, RunRequest, execute
 from ggslam.progress import SilentObserver
@@ -191,7 +192,7 @@ def test_an_interrupt_keeps_what_was_done(
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]
 
 
-def test_a_full_disk_is_named_and_nothing_is_left(
+def test_a_full_disk_is_named_and_the_trajectory_kept(
     turning: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def put(store: GridStore, writes) -> None:
@@ -200,7 +201,10 @@ def test_a_full_disk_is_named_and_nothing_is_left(
     monkeypatch.setattr(GridStore, "put_cells", put)
     with pytest.raises(RunFolderError, match="No space left on device"):
         executed(turning, tmp_path / "full", *SMALL)
-    assert not (tmp_path / "full").exists()
+    left = sorted(path.name for path in (tmp_path / "full").iterdir())
+    assert left == ["run.json", "trajectory.txt"]  # the map is lost, where the camera was is not
+    assert len(read_tum(tmp_path / "full" / "trajectory.txt")) > 5
+    assert "No space left" in json.loads((tmp_path / "full" / "run.json").read_text())["stopped_by"]
 
 
 def test_what_a_killed_run_left_goes_with_the_next_one(turning: Path, tmp_path: Path) -> None:

@@ -49,12 +49,14 @@ def localize(
     full_map: Annotated[bool, typer.Option("--full-map", help="Align to the whole map, for comparison.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default localized/NAME.")] = None,
     radius: Annotated[
-        float | None, typer.Option(help="R': cells with centres so near are aligned to, metres; default: the map's.")
+        float | None, typer.Option(help="R': cells with centres so near are aligned to, metres; default: the map's.",
+                                   min=0, max=1e7)
     ] = None,
     voxel: Annotated[
-        float | None, typer.Option(help="Edge of the voxels that are aligned to, metres; default 0.03, of scans 0.15.")
+        float | None, typer.Option(help="Edge of the voxels that are aligned to, metres; default 0.03, of scans 0.15.",
+                                   min=1e-3, max=10)
     ] = None,
-    first: Annotated[int, typer.Option("--first", help="First frame to use.")] = 0,
+    first: Annotated[int, typer.Option("--first", help="First frame to use.", min=0)] = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
     scale: options.Scale = 1.0,

@@ -25,6 +25,9 @@ EPILOG = """
   ggslam submaps kitchen.grid --since tuesday
 """
 
+_PROBLEMS = 5
+"""Damaged files that are named."""
+
 SourcePath = Annotated[
     Path,
     typer.Argument(metavar="SOURCE", help="A grid store, to list it; with --out: a run, a cloud, or a recording (RGB-D "
@@ -43,15 +46,23 @@ def submaps(
     at: Annotated[
         float | None, typer.Option(help="Seconds on the clock of all visits at which this one began; T counts by it.")
     ] = None,
-    spacing: Annotated[float | None, typer.Option(help="S of a new store: edge of a cell, metres (2).")] = None,
-    axes: Annotated[str | None, typer.Option(help="World axes of a new store's grid: xyz, xz, xy (xyz).")] = None,
-    voxel: Annotated[float | None, typer.Option(help="One point a cube of this edge is kept, metres; 0: all.")] = None,
-    radius: Annotated[
-        float | None, typer.Option(help="R: a cell is recorded from so near its centre, metres (1).")
+    spacing: Annotated[
+        float | None, typer.Option(help="S of a new store: edge of a cell, metres (2).", min=1e-3, max=1e6)
     ] = None,
-    refresh: Annotated[float | None, typer.Option(help="T: seconds before a cell is recorded again (300).")] = None,
-    sensor_range: Annotated[float | None, typer.Option(help="Farther points are not recorded, metres (10).")] = None,
-    first: Annotated[int, typer.Option("--first", help="First frame to use.")] = 0,
+    axes: Annotated[str | None, typer.Option(help="World axes of a new store's grid: xyz, xz, xy (xyz).")] = None,
+    voxel: Annotated[
+        float | None, typer.Option(help="One point a cube of this edge is kept, metres; 0: all.", min=0)
+    ] = None,
+    radius: Annotated[
+        float | None, typer.Option(help="R: a cell is recorded from so near its centre, metres (1).", min=0)
+    ] = None,
+    refresh: Annotated[
+        float | None, typer.Option(help="T: seconds before a cell is recorded again (300).", min=0)
+    ] = None,
+    sensor_range: Annotated[
+        float | None, typer.Option(help="Farther points are not recorded, metres (10).", min=1e-3)
+    ] = None,
+    first: Annotated[int, typer.Option("--first", help="First frame to use.", min=0)] = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
     scale: options.Scale = 1.0,
@@ -91,3 +102,7 @@ def _print(listing: StoreListing) -> None:
             for c in listing.changes
         ]
         console.print(table(f"{len(rows)} cells since {listing.since}", ["cell", "new", "changed"], rows))
+    for problem in listing.problems[:_PROBLEMS]:
+        console.print(problem, highlight=False, markup=False, soft_wrap=True)
+    if len(listing.problems) > _PROBLEMS:
+        console.print(f"and {len(listing.problems) - _PROBLEMS} more files like these", highlight=False)

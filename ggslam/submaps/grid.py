@@ -19,7 +19,7 @@ import os
 import secrets
 import threading
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
@@ -181,6 +181,19 @@ class GridStore:
 
     def __contains__(self, key: CellKey) -> bool:
         return self._index.record(key) is not None
+
+    def problems(self) -> Iterator[str]:
+        """What is wrong with the files of parts as far as their sizes tell, each in a line with the file's name."""
+        for key in self.cells():
+            for name, part in self.cell(key).parts.items():
+                path = self._files.path(key, part.version, name)
+                try:
+                    size = path.stat().st_size
+                except OSError as error:
+                    yield f"cannot read {path}: {error.strerror or error}"
+                else:
+                    if size != part.bytes:
+                        yield f"{path}: damaged: {size} bytes, the index says {part.bytes}"
 
     def get(self, key: CellKey, part: str) -> bytes:
         """The content of a part.

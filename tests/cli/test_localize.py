@@ -130,6 +130,7 @@ def test_what_cannot_be_done_is_one_error(run: Path, room: Path, scans: Path, tm
     one_error(ggslam("localize", cloud, room), "no places")
     one_error(ggslam("localize", run, room, "--scale", 0.5), "camera", "--scale")
     one_error(ggslam("localize", run, room, "--start", "1 2 3"), "--start", "'1 2 3'")
+    one_error(ggslam("localize", run, room, "--start", "1e300 0 0 0 0 0 1"), "--start")
     one_error(ggslam("localize", run, room, "--start", ORIGIN, "--no-start"), "one of them")
     one_error(ggslam("submaps", room), "no grid store")
     one_error(ggslam("submaps", tmp_path / "none"), "none")
@@ -144,6 +145,35 @@ def test_what_cannot_be_done_is_one_error(run: Path, room: Path, scans: Path, tm
     (scans.parent / "damaged.grid").mkdir()
     (scans.parent / "damaged.grid" / "index.sqlite").write_bytes(b"nothing of the kind" * 100)
     one_error(ggslam("localize", scans.parent / "damaged.grid", room), "damaged.grid")
+
+
+def test_damaged_places_are_left_out(run: Path, room: Path, tmp_path: Path) -> None:
+    store = tmp_path / "room.grid"
+    done("submaps", run, "--out", store)
+    parts = sorted((store / "cells").rglob("places.npz"))
+    parts[0].write_bytes(parts[0].read_bytes()[:-1])
+    output = done("localize", store, room, "--stop", 3, "--start", ORIGIN, "--out", tmp_path / "torn")
+    assert summary(tmp_path / "torn")["located_share"] == 1 and "left out" in output and "places.npz" in output
+    assert "places.npz" in done("submaps", store)
+    for part in parts[1:]:
+        part.unlink()
+    one_error(ggslam("localize", store, room), "--start is needed", "places.npz")
+
+
+def test_another_camera_is_located_from_a_start_pose(run: Path, room: Path, tmp_path: Path) -> None:
+    output = done("localize", run, room, "--scale", 0.5, "--stop", 3, "--start", ORIGIN, "--out", tmp_path / "out")
+    assert summary(tmp_path / "out")["located_share"] == 1 and "lost frames are not looked up" in output
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "value"),
+    [("localize", "--radius", -1), ("localize", "--voxel", 0), ("localize", "--first", -1), ("submaps", "--radius", -1)]
+)
+def test_numbers_out_of_range_are_named_as_they_were_given(
+    run: Path, room: Path, tmp_path: Path, command: str, option: str, value: int
+) -> None:
+    result = ggslam(command, run, *([room] if command == "localize" else []), "--out", tmp_path / "o", option, value)
+    assert result.exit_code == 2 and f"'{option}'" in result.output
 
 
 def test_a_run_whose_adding_was_cut_off_is_added_whole(
