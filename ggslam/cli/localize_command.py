@@ -25,6 +25,9 @@ EPILOG = """
   ggslam localize campus.pcd scans/tuesday --start given --full-map --out localized/full
 """
 
+_OTHER_WORLD = 4.0
+"""Times the RMSE after alignment from which on the RMSE tells of another world."""
+
 MapPath = Annotated[
     Path,
     typer.Argument(metavar="MAP", help="Folder of a grid store (`ggslam submaps`) or of a run, or a cloud: .ply, .pcd, "
@@ -104,6 +107,12 @@ def _print(report: LocalizationReport) -> None:
         ["frames located", f"{100 * s['located_share']:.1f} % of {s['frames']}"],
     ]
     console.print(table("full map" if report.full else "partial map", ["", ""], rows))
+    rmse, aligned = s["rmse_m"], s["rmse_aligned_m"]
+    if rmse is not None and aligned is not None and rmse > _OTHER_WORLD * aligned:
+        console.print(
+            "the given poses are not in the world of this map (of a run: its first camera), so the RMSE after rigid "
+            "alignment is the one to read", highlight=False,
+        )  # fmt: skip
     lost = {name: count for name, count in s["statuses"].items() if name not in ("ok", "degenerate")}
     if lost:
         console.print("frames " + ", ".join(f"{name}: {count}" for name, count in lost.items()), highlight=False)

@@ -168,7 +168,8 @@ class CellIndex:
         """
         with self._transaction() as connection:
             for write, version, sizes in writes:
-                known = connection.execute("SELECT 1 FROM cells WHERE x = ? AND y = ? AND z = ?", write.key).fetchone()
+                query = "SELECT recorded_at FROM cells WHERE x = ? AND y = ? AND z = ?"
+                known = connection.execute(query, write.key).fetchone()
                 connection.execute(
                     "INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET version = excluded.version, "
                     "recorded_at = COALESCE(excluded.recorded_at, recorded_at), "
@@ -181,7 +182,7 @@ class CellIndex:
                     connection.execute(
                         "INSERT INTO changes VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET "
                         "changed = MAX(COALESCE(changed, excluded.changed), COALESCE(excluded.changed, changed))",
-                        (visit, *write.key, known is None, write.changed),
+                        (visit, *write.key, known is None or known[0] is None, write.changed),
                     )
             connection.execute("UPDATE store SET last_version = MAX(last_version, ?)", (max(w[1] for w in writes),))
 

@@ -148,6 +148,7 @@ def test_visits_list_what_they_changed(folder: Path) -> None:
     with GridStore.create(folder, SETTINGS) as store:
         store.put(c, {"points.pcd": b"0"}, 0.0)
         store.begin_visit("monday")
+        store.put(a, {"gaussians.npz": b"no recording: the next one is the first"})
         store.put(a, {"points.pcd": b"1"}, 1.0)
         store.put(b, {"points.pcd": b"1"}, 1.0)
         store.put(c, {"gaussians.npz": b"no recording"})
