@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import os
+import sys
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,6 +17,9 @@ INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 _LIBRARY_NAMES = ("libggslam_core.so", "libggslam_core.dylib")
 
 
+_HERE = Path(__file__).parent
+
+
 @lru_cache(maxsize=1)
 def load_library() -> ctypes.CDLL:
     """The compiled core. `GGSLAM_CORE` in the environment names another file than the installed one.
@@ -22,23 +27,44 @@ def load_library() -> ctypes.CDLL:
     Raises:
         NativeCoreError: no library, or one of another version.
     """
-    folder = Path(__file__).parent / "_lib"
     candidates = [Path(os.environ["GGSLAM_CORE"])] if "GGSLAM_CORE" in os.environ else []
-    candidates += [folder / name for name in _LIBRARY_NAMES]
+    candidates += [_HERE / "_lib" / name for name in _LIBRARY_NAMES]
     found = next((path for path in candidates if path.exists()), None)
-    if found is None:
+    library = _installed_library() if found is None else ctypes.CDLL(str(found))
+    if library is None:
         raise NativeCoreError(
-            f"the compiled core is missing (looked for {', '.join(map(str, candidates))}): "
-            "run `pip install .` or, in a checkout, `bash scripts/build_native.sh`"
+            f"the compiled core is missing (looked for {', '.join(map(str, candidates))}, and for an installed package "
+            "of these sources): run `pip install .` or, in a checkout, `bash scripts/build_native.sh`"
         )
-    library = ctypes.CDLL(str(found))
     version = library.ggslam_abi_version()
     if version != ABI_VERSION:
-        raise NativeCoreError(f"{found}: compiled core has interface version {version}, expected {ABI_VERSION}")
+        raise NativeCoreError(f"{library._name}: compiled core has interface version {version}, expected {ABI_VERSION}")
     library.ggslam_context_create.restype = ctypes.c_void_p
     library.ggslam_context_create.argtypes = [ctypes.c_int, ctypes.c_int]
     library.ggslam_context_destroy.argtypes = [ctypes.c_void_p]
     return library
+
+
+def _installed_library() -> ctypes.CDLL | None:
+    """The core of an installed ggslam, for a checkout that has none of its own, if it was compiled from the checkout's
+    sources."""
+    for folder in map(Path, sys.path):
+        for name in _LIBRARY_NAMES:
+            path = folder / "ggslam" / "native" / "_lib" / name
+            if path.is_file():
+                library = ctypes.CDLL(str(path))
+                tell = getattr(library, "ggslam_source_hash", None)
+                if tell is not None:
+                    tell.restype = ctypes.c_char_p
+                    return library if tell().decode() == source_hash(_HERE / "src") else None
+    return None
+
+
+def source_hash(folder: Path) -> str:
+    """SHA-256 of C++ sources as CMakeLists.txt computes it: of lines of path and SHA-256, sorted by path."""
+    paths = {p.relative_to(folder).as_posix(): p for kind in ("*.cpp", "*.hpp") for p in folder.rglob(kind)}
+    lines = [f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n" for name, path in sorted(paths.items())]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def available_instruction_sets() -> list[str]:

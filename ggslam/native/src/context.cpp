@@ -31,6 +31,9 @@ Isa best_isa() {
 // Version of the C interface: the loader refuses a library whose number differs from its own.
 GGSLAM_EXPORT int ggslam_abi_version() { return 1; }
 
+// SHA-256 of the sources, see CMakeLists.txt.
+GGSLAM_EXPORT const char* ggslam_source_hash() { return GGSLAM_SOURCE_HASH; }
+
 GGSLAM_EXPORT int ggslam_isa_available(int isa) {
   return isa >= 0 && isa <= 2 && ggslam::isa_available(static_cast<ggslam::Isa>(isa)) ? 1 : 0;
 }
