@@ -12,8 +12,8 @@ import numpy as np
 
 from ggslam.errors import RunFolderError
 from ggslam.formats.atomic import make_folder
-from ggslam.formats.point_ply import write_points
-from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.point_ply import write_points_in_parts
+from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.formats.staging import new_staging, publish
 from ggslam.map_index import MAP_INDEX
 from ggslam.objects.segmented_map import SegmentedMap
@@ -94,5 +94,6 @@ def _stage(
     for name, picture in pictures.items():
         write_picture(staged.path / "renders" / name, picture)
     if not named_only:
-        write_points(staged.path, sample_points(scene.gaussians, with_object_id=True))
+        parts = [MapPart.of(scene.gaussians)]
+        write_points_in_parts(staged.path, sample_parts(parts, with_object_id=True))
     staged.save_objects(scene)

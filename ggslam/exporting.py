@@ -16,8 +16,8 @@ from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.atomic import make_folder, write_bytes
 from ggslam.formats.gaussian_ply import write_gaussian_parts
 from ggslam.formats.gaussian_rows import GaussianRows
-from ggslam.formats.point_ply import write_points, write_points_in_parts
-from ggslam.formats.point_sampling import sample_parts, sample_points
+from ggslam.formats.point_ply import write_points_in_parts
+from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.formats.trajectory import write_tum
 from ggslam.map_index import MapInParts
 from ggslam.objects.table import ObjectRecord
@@ -130,13 +130,10 @@ def export_points(folder: RunFolder, path: Path, voxel_size: float, min_opacity:
 def _sample(folder: RunFolder, parts: MapInParts, path: Path, voxel_size: float, opacity: float) -> int:
     """Writes the points of a map, cell by cell if it has cells; returns how many."""
     with_object_id = folder.has_objects()
-    if parts.in_cells:
-        clouds = sample_parts(parts.parts(), voxel_size, opacity, with_object_id)
-        if (first := next(clouds, None)) is not None:
-            return write_points_in_parts(path, chain([first], clouds))
-    elif len(cloud := sample_points(folder.gaussians(), voxel_size, opacity, with_object_id)):
-        write_points(path, cloud)
-        return len(cloud)
+    pieces = parts.parts() if parts.in_cells else [MapPart.of(folder.gaussians())]
+    clouds = sample_parts(pieces, voxel_size, opacity, with_object_id)
+    if (first := next(clouds, None)) is not None:
+        return write_points_in_parts(path, chain([first], clouds))
     raise RunFolderError(f"{folder.path}: the map has no points to export")
 
 

@@ -36,8 +36,6 @@ from ggslam.environment import environment
 from ggslam.errors import RunFolderError
 from ggslam.formats.atomic import write_bytes, write_text
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from ggslam.formats.point_ply import write_points
-from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.staging import finish_saving, leftovers
 from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
 from ggslam.map_index import MAP_INDEX, MapIndex, MapInParts
@@ -45,7 +43,7 @@ from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.process_memory import peak_memory_bytes
 from ggslam.saved_places import PLACES_FILE
-from ggslam.saving_parts import save_map_in_parts, save_points_in_parts
+from ggslam.saving_parts import save_map_in_parts, save_points
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam_result import SlamResult
@@ -168,11 +166,7 @@ class RunFolder:
             write_bytes(self.path / PLACES_FILE, result.places)
         self.write_json(MARKER, {**mark, "complete": error is None, "stopped_by": error})
         # Last and largest; `ggslam export --format points` makes them again from the map.
-        with_object_id = result.objects is not None
-        if result.cells is None:
-            write_points(self.path, sample_points(result.gaussians, with_object_id=with_object_id))
-        else:
-            save_points_in_parts(self.path, result.cells, with_object_id)
+        save_points(self.path, result)
         self.write_json("timing.json", timing(result))  # once more: peak memory is that of the whole run
 
     def save_trajectory(self, timestamps: np.ndarray, poses: np.ndarray, error: str) -> None:

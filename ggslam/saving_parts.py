@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a run whose map is on disk: written cell by cell, so that memory is as bounded as it was during the run."""
+"""Files of a run that are written in parts: of a map on disk cell by cell, so that memory is as bounded as it was
+during the run."""
 
 from __future__ import annotations
 
@@ -17,7 +18,6 @@ from ggslam.map_index import MAP_INDEX, write_map_index
 from ggslam.objects.segmented_map import ObjectVotes
 from ggslam.objects.table import ObjectTable
 from ggslam.slam_result import SlamResult
-from ggslam.submaps.gaussian_cells import GaussianCells
 
 
 def save_map_in_parts(folder: Path, result: SlamResult, names: Mapping[int, str] | None = None) -> None:
@@ -42,7 +42,11 @@ def save_map_in_parts(folder: Path, result: SlamResult, names: Mapping[int, str]
     table.save(folder / "objects.json")
 
 
-def save_points_in_parts(folder: Path, cells: GaussianCells, with_object_id: bool) -> None:
-    """Writes points.ply and points_grid.ply."""
-    parts = [MapPart(*cells.box(key), partial(cells.read, key)) for key in cells.sorted_keys()]
-    write_points_in_parts(folder, sample_parts(parts, with_object_id=with_object_id))
+def save_points(folder: Path, result: SlamResult) -> None:
+    """Writes points.ply and points_grid.ply; of the cloud, which may be many times the map, a part at a time."""
+    cells = result.cells
+    if cells is None:
+        parts = [MapPart.of(result.gaussians)]
+    else:
+        parts = [MapPart(*cells.box(key), partial(cells.read, key)) for key in cells.sorted_keys()]
+    write_points_in_parts(folder, sample_parts(parts, with_object_id=result.objects is not None))

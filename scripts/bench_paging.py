@@ -4,7 +4,7 @@
 
     python scripts/bench_paging.py --folder /tmp/paging
     python scripts/bench_paging.py --folder /tmp/paging --recording corridor --limit 520
-    python scripts/bench_paging.py --folder /tmp/paging --frames 1440 --width 160 --budget 8
+    python scripts/bench_paging.py --folder /tmp/paging --frames 1440 --width 160 --budget 80
 
 Prints for each run: peak resident memory (and against the limit), held-out PSNR, trajectory error, frames per second,
 Gaussians in all and the most that were in memory, sizes on disk, and how many times the map's budget the map is. The
@@ -118,10 +118,13 @@ def report(runs: dict[str, dict[str, Any]], limit: float) -> None:
         f"peak RSS / limit: {bound['peak_mb'] / limit:.3f}, scoring {bound['scoring_mb'] / limit:.3f}; Gaussians / the "
         f"most in memory: {bound['timing']['gaussians'] / max(1, paging['most_resident']):.1f}"
     )
+    if room <= 0:
+        print(f"the limit is below the program's own {paging['program_mb']:.0f} MB: choose a larger --budget")
+        return
     print(
         f"state (Gaussians with optimizer state {paging['map_mb']:.0f} MB, images and points of keyframes "
         f"{paging['images_on_disk_mb']:.0f} MB) / what the limit leaves beside the program's own "
-        f"{paging['program_mb']:.0f} MB: {state / max(room, 1e-9):.1f}; Gaussians / their part of it: "
+        f"{paging['program_mb']:.0f} MB: {state / room:.1f}; Gaussians / their part of it: "
         f"{paging['map_mb'] / max(1e-9, paging['gaussian_budget_mb']):.1f}; state / limit: {state / limit:.2f}"
     )
 

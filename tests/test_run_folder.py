@@ -29,7 +29,7 @@ def fail(*_: object, **__: object) -> None:
     raise RunFolderError("cannot write: No space left on device")
 
 
-@pytest.mark.parametrize(("broken", "complete"), [("write_gaussian_ply", False), ("write_points", True)])
+@pytest.mark.parametrize(("broken", "complete"), [("write_gaussian_ply", False), ("save_points", True)])
 def test_a_disk_that_fills_up(
     result: SlamResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, complete: bool
 ) -> None:

@@ -92,6 +92,14 @@ class MapPart:
     high: np.ndarray
     load: Callable[[], GaussianMap]
 
+    @staticmethod
+    def of(gaussians: GaussianMap) -> MapPart:
+        """A map in memory as one part."""
+        means = gaussians.means.detach().cpu().numpy().astype(np.float64)
+        if not len(means):
+            means = np.zeros((1, 3))
+        return MapPart(means.min(0), means.max(0), lambda: gaussians)
+
 
 def sample_parts(
     parts: Sequence[MapPart], voxel_size: float = 0.01, minimum_opacity: float = 0.3, with_object_id: bool = False
