@@ -22,6 +22,7 @@ from ggslam.slam_result import StepReport
 from ggslam.viewed_pictures import CELL_WIDTH, table_of
 from ggslam.viewer.cameras import vertical_fov, view_of_pose
 from ggslam.viewer.scene_nodes import SceneNodes
+from ggslam.viewer.server import keep_fitting
 from ggslam.viewer.splats import most_visible, splats_of
 
 if TYPE_CHECKING:
@@ -123,6 +124,7 @@ class LiveView:
                 client.camera.position, client.camera.look_at = start.position, start.look_at
             first = self._server.initial_camera
             first.position, first.look_at, first.fov = start.position, start.look_at, vertical_fov(camera)
+            keep_fitting(self._server, camera)
         rows = most_visible(snapshot.gaussians, self._max_splats)
         picture = self._compared(snapshot, camera)
         with self._server.atomic():

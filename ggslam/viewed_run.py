@@ -124,12 +124,15 @@ class ViewedRun:
         """See `ViewedMap`."""
         with self._lock:
             if self._shown is None:
-                rows = most_visible(self._gaussians, self._max_splats)
+                rows = self._most_visible()
                 self._shown = rows, splats_of(self._gaussians, rows)
             rows, splats = self._shown
             splats = replace(splats, colors=self._colors(coloring, frame, rows, splats))
             owner = self._gaussians.object_id.numpy()[rows]
             return {int(i): splats.rows(owner == i) for i in np.unique(owner)}
+
+    def _most_visible(self) -> np.ndarray:
+        return most_visible(self._gaussians, self._max_splats, self._gaussians.object_id.numpy())
 
     def _colors(self, coloring: Coloring, frame: int, rows: np.ndarray, splats: Splats) -> np.ndarray:
         """uint8 [N, 3]."""
@@ -168,7 +171,7 @@ class ViewedRun:
     def static_page(self, title: str) -> str:
         """The map, up to the limit of splats, as one HTML file that needs neither server nor network."""
         with self._lock:
-            rows = most_visible(self._gaussians, self._max_splats)
+            rows = self._most_visible()
             owners = self._gaussians.object_id.numpy()[rows].astype(np.uint16)
             identity = self._identity_colors(rows)
             return static_page(self, title, self._gaussians, rows, identity, owners)
