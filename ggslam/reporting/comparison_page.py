@@ -25,20 +25,32 @@ from ggslam.reporting.run_plots import (
 _ABSENT = "not there"
 
 
-def comparison_page(runs: Sequence[RunData], views: Sequence[FrameView]) -> str:
+def by_recording(runs: Sequence[RunData]) -> list[list[int]]:
+    """Numbers of the runs of each recording, recordings and runs in the order given."""
+    groups: dict[str, list[int]] = {}
+    for number, run in enumerate(runs):
+        groups.setdefault(_recording(run), []).append(number)
+    return list(groups.values())
+
+
+def comparison_page(groups: Sequence[Sequence[RunData]], views: Sequence[Sequence[FrameView]]) -> str:
     """The whole page as text.
 
     Args:
-        runs: two or more.
-        views: frames as each run shows them.
+        groups: the runs of each recording, two or more in all; paths of one recording are in one world. Curves and
+            pictures of different recordings are shown one recording after the other: their frames and places have
+            nothing to do with each other.
+        views: for each recording, frames as each of its runs shows them.
     """
+    runs = [run for group in groups for run in group]
     parts = [
         ("scores", "Scores", _scores(runs)), ("settings", "Settings that differ", _settings(runs)),
-        ("views", "The same views", _views(views, len(runs))),
-        ("trajectory", "Trajectory", _curves([*trajectory_plots(runs), error_plot(runs)])),
-        ("quality", "Image quality", _curves(score_plots(runs))),
-        ("tracking", "Tracking", _curves(tracking_plots(runs))),
-        ("course", "Time, map and memory", _curves([*time_plots(runs), *map_plots(runs), *loss_plots(runs)])),
+        ("views", "The same views", _each(groups, [_views(v, len(g)) for g, v in zip(groups, views, strict=True)])),
+        ("trajectory", "Trajectory", _each(groups, [_curves([*trajectory_plots(g), error_plot(g)]) for g in groups])),
+        ("quality", "Image quality", _each(groups, [_curves(score_plots(g)) for g in groups])),
+        ("tracking", "Tracking", _each(groups, [_curves(tracking_plots(g)) for g in groups])),
+        ("course", "Time, map and memory",
+         _each(groups, [_curves([*time_plots(g), *map_plots(g), *loss_plots(g)]) for g in groups])),
         ("meaning", "What the numbers mean", p.definitions(MEANINGS)), ("runs", "Runs", _folders(runs)),
     ]  # fmt: skip
     content = [p.section(title, anchor, body) for anchor, title, body in parts]
@@ -51,8 +63,23 @@ def _lead(runs: Sequence[RunData]) -> str:
     return f"{len(runs)} runs of {'one recording' if count == 1 else f'{count} recordings'}"
 
 
+def _recording(run: RunData) -> str:
+    return str(run.recording.get("open", {}).get("path", "an unknown recording"))
+
+
 def _recordings(runs: Sequence[RunData]) -> set[str]:
-    return {str(run.recording.get("open", {}).get("path")) for run in runs}
+    return {_recording(run) for run in runs}
+
+
+def _each(groups: Sequence[Sequence[RunData]], contents: Sequence[Html]) -> Html:
+    """What is shown of each recording, under its name if there are several."""
+    if len(groups) == 1:
+        return contents[0]
+    return p.joined(
+        p.tag("div", p.tag("h3", f"{', '.join(run.name for run in group)}: {_recording(group[0])}"), content,
+              class_="recording")
+        for group, content in zip(groups, contents, strict=True)
+    )  # fmt: skip
 
 
 def _scores(runs: Sequence[RunData]) -> Html:
