@@ -25,8 +25,8 @@ def upright_of(gaussians: Gaussians, poses: np.ndarray) -> Upright:
     step = max(1, len(gaussians.means) // _SAMPLED)
     points, normals = gaussians.means.numpy()[::step].astype(np.float64), _thinnest_axes(gaussians, step)
     # A Gaussian has no front; a camera saw it from the side where the cameras are.
-    normals = normals * np.where((normals * (poses[:, :3, 3].mean(axis=0) - points)).sum(axis=1) < 0, -1.0, 1.0)[:, None]
-    return estimate_up(poses, points, normals)
+    behind = (normals * (poses[:, :3, 3].mean(axis=0) - points)).sum(axis=1) < 0
+    return estimate_up(poses, points, np.where(behind[:, None], -normals, normals))
 
 
 def _thinnest_axes(gaussians: Gaussians, step: int) -> np.ndarray:

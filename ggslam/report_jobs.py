@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError
+from ggslam.evaluation.trajectory import FEWEST_POSES, align_points
 from ggslam.formats.atomic import make_folder, write_text
 from ggslam.recordings import open_recording_of
 from ggslam.rendering_jobs import frame_poses
-from ggslam.evaluation.trajectory import FEWEST_POSES, align_points
 from ggslam.report_data import has_limit, load_run, save_truth
 from ggslam.report_views import RENDER, TRUTH, rendered_views, saved_views, spread
 from ggslam.reporting.comparison_page import by_recording, comparison_page

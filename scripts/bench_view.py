@@ -30,6 +30,7 @@ import viser
 from commands import ROOT
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
 
 KINDS = ("without --view", "nobody looks", "a page is open")
 _CAMERA = {
@@ -51,8 +52,9 @@ class Looker(threading.Thread):
     def __init__(self, port: int) -> None:
         super().__init__(daemon=True)
         self._socket: ClientConnection = connect(
-            f"ws://localhost:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, compression=None
-        )  # type: ignore[list-item]
+            f"ws://localhost:{port}", subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], max_size=None,
+            compression=None,
+        )  # fmt: skip
         self._socket.send(msgspec.msgpack.encode(_CAMERA))
         self.ended = threading.Event()
         self.megabytes, self.maps = 0.0, 0

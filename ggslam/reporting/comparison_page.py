@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from ggslam.reporting import page as p
 from ggslam.reporting.metric_words import MEANINGS, METRICS, Metric
@@ -46,11 +47,11 @@ def comparison_page(groups: Sequence[Sequence[RunData]], views: Sequence[Sequenc
     parts = [
         ("scores", "Scores", _scores(runs)), ("settings", "Settings that differ", _settings(runs)),
         ("views", "The same views", _each(groups, [_views(v, len(g)) for g, v in zip(groups, views, strict=True)])),
-        ("trajectory", "Trajectory", _each(groups, [_curves([*trajectory_plots(g), error_plot(g)]) for g in groups])),
-        ("quality", "Image quality", _each(groups, [_curves(score_plots(g)) for g in groups])),
-        ("tracking", "Tracking", _each(groups, [_curves(tracking_plots(g)) for g in groups])),
+        ("trajectory", "Trajectory", _curves(groups, lambda group: [*trajectory_plots(group), error_plot(group)])),
+        ("quality", "Image quality", _curves(groups, score_plots)),
+        ("tracking", "Tracking", _curves(groups, tracking_plots)),
         ("course", "Time, map and memory",
-         _each(groups, [_curves([*time_plots(g), *map_plots(g), *loss_plots(g)]) for g in groups])),
+         _curves(groups, lambda group: [*time_plots(group), *map_plots(group), *loss_plots(group)])),
         ("meaning", "What the numbers mean", p.definitions(MEANINGS)), ("runs", "Runs", _folders(runs)),
     ]  # fmt: skip
     content = [p.section(title, anchor, body) for anchor, title, body in parts]
@@ -83,22 +84,24 @@ def _each(groups: Sequence[Sequence[RunData]], contents: Sequence[Html]) -> Html
 
 
 def _scores(runs: Sequence[RunData]) -> Html:
-    rows = []
+    one, rows = len(_recordings(runs)) == 1, []
     for metric in METRICS:
         values = [metric.of(run) for run in runs]
         if any(value is not None for value in values):
             unit = f", {metric.unit}" if metric.unit else ""
-            rows.append([f"{metric.name}{unit}", *_marked(metric, values)])
+            texts = [metric.text(value) for value in values]
+            rows.append([f"{metric.name}{unit}", *(_marked(metric, values) if one else texts)])
     if not rows:
         return p.tag("p", "None of these runs was scored; ggslam eval does that.")
     unscored = [run.name for run in runs if not run.metrics]
     note = [p.tag("p", f"Not scored: {', '.join(unscored)}.")] if unscored else []
-    if len(_recordings(runs)) > 1:
+    if not one:
         note.append(p.tag("p", "The runs are of different recordings: their scores cannot be held against each other."))
     elif len({tuple(run.tracked.get("frame", ())) for run in runs}) > 1:
         note.append(p.tag("p", "The runs are of different frames of the recording; so are their scores."))
-    words = p.tag("p", "The best of each row is marked, unless all are equal as printed.", class_="note")
-    return p.joined([p.table(["", *(run.name for run in runs)], rows), words, *note])
+    if one:
+        note.insert(0, p.tag("p", "The best of each row is marked, unless all are equal as printed.", class_="note"))
+    return p.joined([p.table(["", *(run.name for run in runs)], rows), *note])
 
 
 def _marked(metric: Metric, values: Sequence[float | None]) -> list[str]:
@@ -139,9 +142,14 @@ def _views(views: Sequence[FrameView], runs: int) -> Html:
     )
 
 
-def _curves(plots: Sequence[Plot]) -> Html:
-    shown = [plot for plot in plots if plot.has_data()]
-    return p.figures(shown) if shown else p.tag("p", "None of these runs has what would be shown here.")
+def _curves(groups: Sequence[Sequence[RunData]], plots_of: Callable[[Sequence[RunData]], Sequence[Plot]]) -> Html:
+    return _each(groups, [_figures(plots_of(group), len(group) > 1) for group in groups])
+
+
+def _figures(plots: Sequence[Plot], several: bool) -> Html:
+    shown = [replace(plot, named=several) for plot in plots if plot.has_data()]
+    words = "None of these runs has" if several else "This run does not have"
+    return p.figures(shown) if shown else p.tag("p", f"{words} what would be shown here.")
 
 
 def _folders(runs: Sequence[RunData]) -> Html:

@@ -123,8 +123,9 @@ def test_names_are_words_not_markup(name: str) -> None:
 
 
 def test_a_comparison_marks_the_best_and_lists_what_differs() -> None:
-    runs = [some_run("a", 30.0), replace(some_run("b", 31.5), settings={"seed": 2, "mapping.rate": 0.5}), bare_run("c")]
-    page = comparison_page([runs[:2], runs[2:]], [[FrameView(3, {"a": np.zeros((6, 8, 3), np.uint8)})], []])
+    runs = [some_run("a", 30.0), replace(some_run("b", 31.5), settings={"seed": 2, "mapping.rate": 0.5}),
+            replace(bare_run("c"), recording=some_run().recording)]  # fmt: skip
+    page = comparison_page([runs], [[FrameView(3, {"a": np.zeros((6, 8, 3), np.uint8)})]])
     found = checked(page)
     assert re.search(r'<td class="best"><span>31\.50</span></td>', page)
     assert not re.search(r'<td class="best"><span>30\.00', page)
@@ -144,6 +145,7 @@ def test_runs_of_different_recordings_are_not_laid_over_each_other() -> None:
     assert "3 runs of 2 recordings" in page and "a, b: /data/kitchen" in page and "c: /data/office" in page
     assert checked(page).counts["svg"] == checked(together).counts["svg"] + len(all_plots([other]))
     assert "a, b: /data/kitchen" not in together
+    assert 'class="best"' not in page and "cannot be held against each other" in page
 
 
 def test_paths_are_shown_level() -> None:

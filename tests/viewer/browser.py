@@ -54,9 +54,11 @@ def screenshot(browser: Any) -> np.ndarray:
 
     for _ in range(8):
         try:
-            return cv2.imdecode(np.frombuffer(browser.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
+            picture = cv2.imdecode(np.frombuffer(browser.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
         except TimeoutException:
             continue
+        assert picture is not None
+        return picture
     raise AssertionError("the browser draws nothing")
 
 

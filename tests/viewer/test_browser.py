@@ -140,7 +140,7 @@ def test_the_recording_is_gone_through(browser: Any, page: tuple[Any, ViewedRun]
     b.wait_for(lambda: np.abs(b.screenshot(browser)[:, :500].astype(float) - before[:, :500]).mean() > 1)
     b.press(browser, "button", "Save picture")
     picture = cv2.imread(str(b.downloaded(tmp_path, ".png")))
-    assert max(picture.shape) == 1920 and picture.std() > 5
+    assert picture is not None and max(picture.shape) == 1920 and picture.std() > 5
 
 
 def test_the_static_page_shows_splats_and_objects_from_disk(browser: Any, run: RunFolder, tmp_path: Path) -> None:
