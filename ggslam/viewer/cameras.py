@@ -32,6 +32,14 @@ def view_of_pose(T_world_camera: np.ndarray, distance: float) -> Viewpoint:
     return Viewpoint(position, position + distance * forward, -T_world_camera[:3, 1])
 
 
+def view_from_behind(T_world_camera: np.ndarray, distance: float) -> Viewpoint:
+    """A recorded camera from behind and above, so that what is drawn of it is seen before what it saw `distance`
+    metres before it."""
+    ahead = view_of_pose(T_world_camera, distance)
+    back, raised = -0.4 * distance * T_world_camera[:3, 2], 0.25 * distance * ahead.up
+    return Viewpoint(ahead.position + back + raised, ahead.look_at, ahead.up)
+
+
 def top_view(centers: np.ndarray, positions: np.ndarray, forward: np.ndarray, up: np.ndarray, fov: float) -> Viewpoint:
     """Straight down on a map.
 
