@@ -20,8 +20,9 @@ from ggslam.scene.poses import inverse
 from ggslam.slam import Slam
 from ggslam.slam_result import StepReport
 from ggslam.viewed_pictures import CELL_WIDTH, table_of
-from ggslam.viewer.cameras import vertical_fov, view_of_pose
+from ggslam.viewer.cameras import vertical_fov, view_from_behind
 from ggslam.viewer.scene_nodes import SceneNodes
+from ggslam.viewer.server import keep_fitting
 from ggslam.viewer.splats import most_visible, splats_of
 
 if TYPE_CHECKING:
@@ -117,12 +118,13 @@ class LiveView:
         camera = self._camera
         assert camera is not None
         if not self.updates:
-            start = view_of_pose(snapshot.poses[0], 2.0)
+            start = view_from_behind(snapshot.poses[0], 2.0)
             self._server.scene.set_up_direction("-y")
             for client in self._server.get_clients().values():
                 client.camera.position, client.camera.look_at = start.position, start.look_at
             first = self._server.initial_camera
             first.position, first.look_at, first.fov = start.position, start.look_at, vertical_fov(camera)
+            keep_fitting(self._server, camera)
         rows = most_visible(snapshot.gaussians, self._max_splats)
         picture = self._compared(snapshot, camera)
         with self._server.atomic():

@@ -12,12 +12,14 @@ from ggslam.config import Config, config_to_dict
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points, associate
 from ggslam.formats.trajectory import read_tum, write_tum
+from ggslam.map_upright import upright_of
 from ggslam.recordings import open_recording_of
 from ggslam.rendering_jobs import frame_poses
-from ggslam.reporting.run_data import FrameView, Path3D, RunData
+from ggslam.reporting.run_data import FrameView, LevelAxes, Path3D, RunData
 from ggslam.run_folder import MARKER, TRUTH_FILE, RunFolder
 from ggslam.sequences import Sequence
 from ggslam.step_log import STEPS_FILE, read_table
+from ggslam.volumes.upright import estimate_up
 
 
 def load_run(folder: RunFolder, sequence: Sequence | None = None, views: list[FrameView] | None = None) -> RunData:
@@ -102,6 +104,26 @@ def _tracked(record: dict[str, Any]) -> dict[str, np.ndarray]:
 # --- where the camera was --------------------------------------------------------------------------------------------
 
 
+def has_limit(folder: RunFolder) -> bool:
+    """Whether the run had a limit of memory: its map may be larger than should be read as a whole."""
+    return (folder.path / "config.yaml").is_file() and folder.config().memory_limit_mb > 0
+
+
+def level_axes(folder: RunFolder, record: dict[str, Any]) -> LevelAxes:
+    """Level directions: up from the surfaces of the map, or, if it is too large to be read as a whole or has no level
+    surfaces, from how the cameras were held; right and forward those of the first camera."""
+    poses = np.array([T for _, T in sorted(frame_poses(record).items())]).reshape(-1, 4, 4)
+    if not len(poses):
+        return LevelAxes()
+    none = np.zeros((0, 3))
+    found = estimate_up(poses, none, none) if has_limit(folder) else upright_of(folder.gaussians(), poses)
+    start = poses[0, :3, 2] if abs(poses[0, :3, 2] @ found.up) < 0.95 else -poses[0, :3, 1]  # it looked down, or up
+    forward = start - (start @ found.up) * found.up
+    forward /= np.linalg.norm(forward)
+    source = "the map's floor, tops and ceilings" if found.support else "the cameras on average"
+    return LevelAxes(np.stack([np.cross(forward, found.up), forward, found.up]), source, found.floor)
+
+
 def camera_path(folder: RunFolder, record: dict[str, Any], sequence: Sequence | None = None) -> Path3D:
     """The camera's path from keyframes.json, with the truth laid upon it if it is known.
 
@@ -117,14 +139,15 @@ def camera_path(folder: RunFolder, record: dict[str, Any], sequence: Sequence | 
     seconds = np.array([times[f] for f in frames], float)
     start = seconds[0] if len(seconds) else 0.0
     truth, reason = _truth(folder, frames, seconds, sequence)
-    known = np.isfinite(truth).all(1)
+    known, level = np.isfinite(truth).all(1), level_axes(folder, record)
     if not reason and known.sum() < FEWEST_POSES:
         reason = f"fewer than {FEWEST_POSES} frames have both poses"
     if reason:
-        return Path3D(frames, seconds - start, positions, reason=reason)
+        return Path3D(frames, seconds - start, positions, reason=reason, level=level)
     T, _ = align_points(truth[known], positions[known])
     moved = truth @ T[:3, :3].T + T[:3, 3]
-    return Path3D(frames, seconds - start, positions, moved, np.linalg.norm(moved - positions, axis=1))
+    error = np.linalg.norm(moved - positions, axis=1)
+    return Path3D(frames, seconds - start, positions, moved, error, level=level)
 
 
 def _truth(

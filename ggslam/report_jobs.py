@@ -6,13 +6,16 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ggslam.errors import ConfigError, GgslamError
+from ggslam.evaluation.trajectory import FEWEST_POSES, align_points
 from ggslam.formats.atomic import make_folder, write_text
 from ggslam.recordings import open_recording_of
 from ggslam.rendering_jobs import frame_poses
-from ggslam.report_data import load_run, save_truth
+from ggslam.report_data import has_limit, load_run, save_truth
 from ggslam.report_views import RENDER, TRUTH, rendered_views, saved_views, spread
-from ggslam.reporting.comparison_page import comparison_page
+from ggslam.reporting.comparison_page import by_recording, comparison_page
 from ggslam.reporting.plot_files import write_plots
 from ggslam.reporting.run_data import FrameView, RunData
 from ggslam.reporting.run_page import run_page
@@ -39,7 +42,7 @@ def write_report(folder: RunFolder, sequence: Sequence | None = None, plots: Pat
         save_truth(folder, sequence)
     recording = sequence if sequence is not None else _recording(folder)
     views = saved_views(folder)
-    if not views and not _has_limit(folder):  # a view may see far more than a run with a limit holds
+    if not views and not has_limit(folder):  # a view may see far more than a run with a limit holds
         views = rendered_views(folder, recording, spread(frame_poses(folder.read_json("keyframes.json"))))
     run = load_run(folder, recording, views)
     path = folder.path / REPORT_FILE
@@ -48,10 +51,6 @@ def write_report(folder: RunFolder, sequence: Sequence | None = None, plots: Pat
         make_folder(plots)
         write_plots(plots, all_plots([run]))
     return path
-
-
-def _has_limit(folder: RunFolder) -> bool:
-    return (folder.path / "config.yaml").is_file() and folder.config().memory_limit_mb > 0
 
 
 def _recording(folder: RunFolder) -> Sequence | None:
@@ -76,19 +75,44 @@ def write_comparison(folders: list[RunFolder], out: Path, plots: Path | None = N
     """
     if len(folders) < 2:
         raise ConfigError(f"expected at least two runs to compare, found {len(folders)}")
-    known = [set(frame_poses(folder.read_json("keyframes.json"))) for folder in folders]
-    frames = spread(set.intersection(*known), COMPARED_VIEWS)
-    runs = []
-    for folder in folders:
-        recording = _recording(folder)
-        runs.append(load_run(folder, recording, rendered_views(folder, recording, frames)))
-    runs = _named_apart(runs)
+    recordings = [_recording(folder) for folder in folders]
+    runs = _named_apart([load_run(f, recording) for f, recording in zip(folders, recordings, strict=True)])
+    groups, views = [], []
+    for numbers in by_recording(runs):
+        frames = spread(set.intersection(*({*runs[i].camera_path.frames.tolist()} for i in numbers)), COMPARED_VIEWS)
+        group = [replace(runs[i], views=rendered_views(folders[i], recordings[i], frames)) for i in numbers]
+        groups.append(_in_one_world(group))
+        views.append(_same_views(group, frames))
     make_folder(out.parent)
-    write_text(out, comparison_page(runs, _same_views(runs, frames)))
+    write_text(out, comparison_page(groups, views))
     if plots is not None:
         make_folder(plots)
-        write_plots(plots, all_plots(runs))
+        for number, group in enumerate(groups, start=1):
+            prefix = f"{number}_" if len(groups) > 1 else ""
+            write_plots(plots, [replace(plot, name=prefix + plot.name) for plot in all_plots(group)])
     return out
+
+
+def _in_one_world(runs: list[RunData]) -> list[RunData]:
+    """Runs of one recording whose paths can be laid over each other: each world is that of the run's first camera,
+    and runs may begin at different frames. Paths are laid upon the first one's by the truth of the frames that both
+    have, where it is known, else by their own positions."""
+    first = runs[0].camera_path
+    moved = runs[:1]
+    for run in runs[1:]:
+        path = run.camera_path
+        _, ours, theirs = np.intersect1d(path.frames, first.frames, return_indices=True)
+        source, target = path.positions[ours], first.positions[theirs]
+        if path.truth is not None and first.truth is not None:
+            both = np.isfinite(path.truth[ours]).all(1) & np.isfinite(first.truth[theirs]).all(1)
+            if both.sum() >= FEWEST_POSES:
+                source, target = path.truth[ours][both], first.truth[theirs][both]
+        if len(source) >= FEWEST_POSES:
+            T, _ = align_points(source, target)
+            truth = None if path.truth is None else path.truth @ T[:3, :3].T + T[:3, 3]
+            path = replace(path, positions=path.positions @ T[:3, :3].T + T[:3, 3], truth=truth)
+        moved.append(replace(run, camera_path=path))
+    return moved
 
 
 def _same_views(runs: list[RunData], frames: list[int]) -> list[FrameView]:

@@ -16,6 +16,7 @@ from ggslam.editing_jobs import Edit, apply_edit, edit_run
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.exporting import OBJECT_EXTRAS, object_file_name
 from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.map_upright import upright_of
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.table import ObjectRecord
 from ggslam.recordings import open_recording_of
@@ -25,13 +26,11 @@ from ggslam.run_folder import RunFolder
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.sequences import Sequence
 from ggslam.viewed_pictures import ViewPictures
 from ggslam.viewer.model import Coloring, ListedObject
 from ggslam.viewer.splats import Splats, most_visible, splats_of
 from ggslam.viewer.static_page import static_page
-from ggslam.volumes.upright import estimate_up
 
 DEFAULT_SPLATS = 400_000
 """As many are shown, at most, unless asked otherwise."""
@@ -67,7 +66,7 @@ class ViewedRun:
         self.notes: list[str] = []
         self._recording = self._open_recording(sequence)
         self._read_map()
-        self.up = _up(self._gaussians, np.stack(list(self.frame_poses.values())))
+        self.up = upright_of(self._gaussians, np.stack(list(self.frame_poses.values()))).up
 
     def _open_recording(self, path: Path | None) -> Sequence | None:
         try:
@@ -124,12 +123,15 @@ class ViewedRun:
         """See `ViewedMap`."""
         with self._lock:
             if self._shown is None:
-                rows = most_visible(self._gaussians, self._max_splats)
+                rows = self._most_visible()
                 self._shown = rows, splats_of(self._gaussians, rows)
             rows, splats = self._shown
             splats = replace(splats, colors=self._colors(coloring, frame, rows, splats))
             owner = self._gaussians.object_id.numpy()[rows]
             return {int(i): splats.rows(owner == i) for i in np.unique(owner)}
+
+    def _most_visible(self) -> np.ndarray:
+        return most_visible(self._gaussians, self._max_splats, self._gaussians.object_id.numpy())
 
     def _colors(self, coloring: Coloring, frame: int, rows: np.ndarray, splats: Splats) -> np.ndarray:
         """uint8 [N, 3]."""
@@ -168,7 +170,7 @@ class ViewedRun:
     def static_page(self, title: str) -> str:
         """The map, up to the limit of splats, as one HTML file that needs neither server nor network."""
         with self._lock:
-            rows = most_visible(self._gaussians, self._max_splats)
+            rows = self._most_visible()
             owners = self._gaussians.object_id.numpy()[rows].astype(np.uint16)
             identity = self._identity_colors(rows)
             return static_page(self, title, self._gaussians, rows, identity, owners)
@@ -269,19 +271,3 @@ def _listed(record: ObjectRecord) -> ListedObject:
 
 def _numbers(values: np.ndarray) -> str:
     return " ".join(f"{value:.{_DIGITS}f}" for value in values)
-
-
-def _up(gaussians: GaussianMap, poses: np.ndarray) -> np.ndarray:
-    """The up direction of the map's surfaces: flat Gaussians are thinnest along their normals."""
-    step = max(1, len(gaussians) // 20_000)
-    axes = _thinnest_axes(gaussians, step)
-    return estimate_up(poses, gaussians.means.numpy()[::step], axes).up
-
-
-def _thinnest_axes(gaussians: GaussianMap, step: int) -> np.ndarray:
-    """Direction [M, 3] in which every `step`-th Gaussian is thinnest; zero where it is nearly as thick as wide."""
-    scales = gaussians.log_scales.numpy()[::step]
-    thinnest, order = scales.argmin(axis=1), np.sort(scales, axis=1)
-    rotations = quaternion_to_matrix(gaussians.quaternions.numpy()[::step])
-    normals = np.take_along_axis(rotations, thinnest[:, None, None], axis=2)[:, :, 0]
-    return np.where((order[:, 1] - order[:, 0] > 0.7)[:, None], normals, 0.0)

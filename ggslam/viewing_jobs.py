@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -100,9 +100,10 @@ def live_page(host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, title: str = "
         close_server(server)
 
 
-def wait_for_interrupt() -> None:
-    """Returns at Ctrl-C."""
+def wait_for_interrupt(announce: Callable[[], None]) -> None:
+    """Says what is waited for, and returns at Ctrl-C, also if it comes while that is said."""
     try:
+        announce()
         while True:
             time.sleep(3600)
     except KeyboardInterrupt:

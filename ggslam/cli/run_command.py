@@ -137,8 +137,8 @@ def _run_and_show(request: RunRequest, log: str | None, address: tuple[str, int]
         _print(outcome)
         watchers.finish(outcome)
         if page is not None and outcome.error is None:
-            console.print(f"{page.address} shows the run (Ctrl-C ends)", highlight=False, markup=False)
-            wait_for_interrupt()
+            text = f"{page.address} shows the run (Ctrl-C ends)"
+            wait_for_interrupt(lambda: console.print(text, highlight=False, markup=False))
     if outcome.error is not None:
         raise outcome.error
 

@@ -47,8 +47,7 @@ def view(
         return
     server, model = serve_run(folder, host, port, max_splats, sequence)
     try:
-        _say(model, f"{address(server)} (Ctrl-C ends)")
-        wait_for_interrupt()
+        wait_for_interrupt(lambda: _say(model, f"{address(server)} (Ctrl-C ends)"))
     finally:
         close_server(server)
 

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from ggslam.reporting import page as p
 from ggslam.reporting.metric_words import MEANINGS, METRICS, Metric
@@ -25,20 +26,32 @@ from ggslam.reporting.run_plots import (
 _ABSENT = "not there"
 
 
-def comparison_page(runs: Sequence[RunData], views: Sequence[FrameView]) -> str:
+def by_recording(runs: Sequence[RunData]) -> list[list[int]]:
+    """Numbers of the runs of each recording, recordings and runs in the order given."""
+    groups: dict[str, list[int]] = {}
+    for number, run in enumerate(runs):
+        groups.setdefault(_recording(run), []).append(number)
+    return list(groups.values())
+
+
+def comparison_page(groups: Sequence[Sequence[RunData]], views: Sequence[Sequence[FrameView]]) -> str:
     """The whole page as text.
 
     Args:
-        runs: two or more.
-        views: frames as each run shows them.
+        groups: the runs of each recording, two or more in all; paths of one recording are in one world. Curves and
+            pictures of different recordings are shown one recording after the other: their frames and places have
+            nothing to do with each other.
+        views: for each recording, frames as each of its runs shows them.
     """
+    runs = [run for group in groups for run in group]
     parts = [
         ("scores", "Scores", _scores(runs)), ("settings", "Settings that differ", _settings(runs)),
-        ("views", "The same views", _views(views, len(runs))),
-        ("trajectory", "Trajectory", _curves([*trajectory_plots(runs), error_plot(runs)])),
-        ("quality", "Image quality", _curves(score_plots(runs))),
-        ("tracking", "Tracking", _curves(tracking_plots(runs))),
-        ("course", "Time, map and memory", _curves([*time_plots(runs), *map_plots(runs), *loss_plots(runs)])),
+        ("views", "The same views", _each(groups, [_views(v, len(g)) for g, v in zip(groups, views, strict=True)])),
+        ("trajectory", "Trajectory", _curves(groups, lambda group: [*trajectory_plots(group), error_plot(group)])),
+        ("quality", "Image quality", _curves(groups, score_plots)),
+        ("tracking", "Tracking", _curves(groups, tracking_plots)),
+        ("course", "Time, map and memory",
+         _curves(groups, lambda group: [*time_plots(group), *map_plots(group), *loss_plots(group)])),
         ("meaning", "What the numbers mean", p.definitions(MEANINGS)), ("runs", "Runs", _folders(runs)),
     ]  # fmt: skip
     content = [p.section(title, anchor, body) for anchor, title, body in parts]
@@ -51,27 +64,44 @@ def _lead(runs: Sequence[RunData]) -> str:
     return f"{len(runs)} runs of {'one recording' if count == 1 else f'{count} recordings'}"
 
 
+def _recording(run: RunData) -> str:
+    return str(run.recording.get("open", {}).get("path", "an unknown recording"))
+
+
 def _recordings(runs: Sequence[RunData]) -> set[str]:
-    return {str(run.recording.get("open", {}).get("path")) for run in runs}
+    return {_recording(run) for run in runs}
+
+
+def _each(groups: Sequence[Sequence[RunData]], contents: Sequence[Html]) -> Html:
+    """What is shown of each recording, under its name if there are several."""
+    if len(groups) == 1:
+        return contents[0]
+    return p.joined(
+        p.tag("div", p.tag("h3", f"{', '.join(run.name for run in group)}: {_recording(group[0])}"), content,
+              class_="recording")
+        for group, content in zip(groups, contents, strict=True)
+    )  # fmt: skip
 
 
 def _scores(runs: Sequence[RunData]) -> Html:
-    rows = []
+    one, rows = len(_recordings(runs)) == 1, []
     for metric in METRICS:
         values = [metric.of(run) for run in runs]
         if any(value is not None for value in values):
             unit = f", {metric.unit}" if metric.unit else ""
-            rows.append([f"{metric.name}{unit}", *_marked(metric, values)])
+            texts = [metric.text(value) for value in values]
+            rows.append([f"{metric.name}{unit}", *(_marked(metric, values) if one else texts)])
     if not rows:
         return p.tag("p", "None of these runs was scored; ggslam eval does that.")
     unscored = [run.name for run in runs if not run.metrics]
     note = [p.tag("p", f"Not scored: {', '.join(unscored)}.")] if unscored else []
-    if len(_recordings(runs)) > 1:
+    if not one:
         note.append(p.tag("p", "The runs are of different recordings: their scores cannot be held against each other."))
     elif len({tuple(run.tracked.get("frame", ())) for run in runs}) > 1:
         note.append(p.tag("p", "The runs are of different frames of the recording; so are their scores."))
-    words = p.tag("p", "The best of each row is marked, unless all are equal as printed.", class_="note")
-    return p.joined([p.table(["", *(run.name for run in runs)], rows), words, *note])
+    if one:
+        note.insert(0, p.tag("p", "The best of each row is marked, unless all are equal as printed.", class_="note"))
+    return p.joined([p.table(["", *(run.name for run in runs)], rows), *note])
 
 
 def _marked(metric: Metric, values: Sequence[float | None]) -> list[str]:
@@ -112,9 +142,14 @@ def _views(views: Sequence[FrameView], runs: int) -> Html:
     )
 
 
-def _curves(plots: Sequence[Plot]) -> Html:
-    shown = [plot for plot in plots if plot.has_data()]
-    return p.figures(shown) if shown else p.tag("p", "None of these runs has what would be shown here.")
+def _curves(groups: Sequence[Sequence[RunData]], plots_of: Callable[[Sequence[RunData]], Sequence[Plot]]) -> Html:
+    return _each(groups, [_figures(plots_of(group), len(group) > 1) for group in groups])
+
+
+def _figures(plots: Sequence[Plot], several: bool) -> Html:
+    shown = [replace(plot, named=several) for plot in plots if plot.has_data()]
+    words = "None of these runs has" if several else "This run does not have"
+    return p.figures(shown) if shown else p.tag("p", f"{words} what would be shown here.")
 
 
 def _folders(runs: Sequence[RunData]) -> Html:

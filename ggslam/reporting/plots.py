@@ -64,6 +64,7 @@ class Plot:
         from_zero: y begins at 0.
         equal: one unit is as long along x as along y (maps).
         note: a sentence for below the plot.
+        named: the legend names a curve even if it is alone.
     """
 
     name: str
@@ -75,6 +76,7 @@ class Plot:
     from_zero: bool = False
     equal: bool = False
     note: str = ""
+    named: bool = False
 
     def has_data(self) -> bool:
         """Whether anything would be seen."""
@@ -258,11 +260,12 @@ def _step(values: list[float]) -> float:
 
 def _entries(plot: Plot) -> list[tuple[str, Series | None]]:
     series: list[tuple[str, Series | None]] = [(s.label, s) for s in plot.series]
-    return (series if len(series) > 1 else []) + [(label, None) for label in dict.fromkeys(b.label for b in plot.bands)]
+    bands: list[tuple[str, Series | None]] = [(label, None) for label in dict.fromkeys(b.label for b in plot.bands)]
+    return (series if len(series) > 1 or plot.named else []) + bands
 
 
 def _legend_rows(plot: Plot, width: int) -> list[list[tuple[str, Series | None]]]:
-    """Entries of the legend in rows that fit; one curve alone needs none, its axis names it."""
+    """Entries of the legend in rows that fit; one curve alone needs none where its axis names it."""
     rows: list[list[tuple[str, Series | None]]] = []
     used = math.inf
     for entry in _entries(plot):

@@ -10,6 +10,21 @@ import numpy as np
 
 
 @dataclass(frozen=True)
+class LevelAxes:
+    """Directions in which a path is shown.
+
+    Attributes:
+        axes: float [3, 3], rows right, forward and up, unit vectors in the run's world; the first two are level.
+        source: what `up` was taken from, some words.
+        floor: height of the floor over the world's origin along up, metres; None: no floor was found.
+    """
+
+    axes: np.ndarray = field(default_factory=lambda: np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
+    source: str = "the first camera"
+    floor: float | None = None
+
+
+@dataclass(frozen=True)
 class Path3D:
     """Where the camera was.
 
@@ -21,6 +36,7 @@ class Path3D:
             is no ground truth.
         error_m: float [N], distance to the truth so laid, metres.
         reason: why there is no truth.
+        level: the directions in which it is shown.
     """
 
     frames: np.ndarray
@@ -29,6 +45,7 @@ class Path3D:
     truth: np.ndarray | None = None
     error_m: np.ndarray | None = None
     reason: str = ""
+    level: LevelAxes = field(default_factory=LevelAxes)
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,10 @@ def _views(run: RunData) -> Html:
 
 
 def _path(run: RunData) -> Html:
-    words = "The world is the first camera: x to its right, z where it looked, up against its y axis."
+    words = (
+        "Forward is where the first camera looked, right is to its right, both level; 0 is where it was. Up is that of "
+        f"{run.camera_path.level.source}. One metre is as long along both axes."
+    )
     missing = []
     if run.camera_path.truth is None:
         missing = [p.tag("p", f"No comparison with true poses: {run.camera_path.reason}.")]

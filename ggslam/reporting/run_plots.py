@@ -17,10 +17,14 @@ _SMOOTH = 9
 
 
 def trajectory_plots(runs: Sequence[RunData]) -> list[Plot]:
-    """The camera's path from above and from the side, with the truth if it is known."""
+    """The camera's path from above and from the side, with the truth if it is known; of several runs, which are in
+    one world, in the directions of the first."""
+    level = runs[0].camera_path.level
+    right, forward, up = level.axes
+    height, ground = ("height above the floor (m)", level.floor) if level.floor is not None else ("height (m)", 0.0)
     views = (
-        ("trajectory_top", "From above", "x, right (m)", "z, forward (m)", lambda p: (p[:, 0], p[:, 2])),
-        ("trajectory_side", "From the side", "z, forward (m)", "up (m)", lambda p: (p[:, 2], -p[:, 1])),
+        ("trajectory_top", "From above", "right (m)", "forward (m)", lambda p: (p @ right, p @ forward)),
+        ("trajectory_side", "From the side", "forward (m)", height, lambda p: (p @ forward, p @ up - ground)),
     )
     return [Plot(name, title, x, y, _paths(runs, project), equal=True) for name, title, x, y, project in views]
 

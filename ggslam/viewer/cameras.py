@@ -32,6 +32,14 @@ def view_of_pose(T_world_camera: np.ndarray, distance: float) -> Viewpoint:
     return Viewpoint(position, position + distance * forward, -T_world_camera[:3, 1])
 
 
+def view_from_behind(T_world_camera: np.ndarray, distance: float) -> Viewpoint:
+    """A recorded camera from behind and above, so that what is drawn of it is seen before what it saw `distance`
+    metres before it."""
+    ahead = view_of_pose(T_world_camera, distance)
+    back, raised = -0.4 * distance * T_world_camera[:3, 2], 0.25 * distance * ahead.up
+    return Viewpoint(ahead.position + back + raised, ahead.look_at, ahead.up)
+
+
 def top_view(centers: np.ndarray, positions: np.ndarray, forward: np.ndarray, up: np.ndarray, fov: float) -> Viewpoint:
     """Straight down on a map.
 
@@ -55,6 +63,14 @@ def top_view(centers: np.ndarray, positions: np.ndarray, forward: np.ndarray, up
     return Viewpoint(position, middle, level / np.linalg.norm(level), near=max(0.01, height))
 
 
+def upright_axes(up: np.ndarray) -> np.ndarray:
+    """A rotation [3, 3] whose third column is `up` [3], a unit vector; the first is as near to the x axis as can be."""
+    near = np.eye(3)[int(abs(up[0]) > 0.9)]
+    level = near - (near @ up) * up
+    level /= np.linalg.norm(level)
+    return np.column_stack([level, np.cross(up, level), up])
+
+
 def vertical_fov(camera: Camera) -> float:
     """Vertical field of view in radians."""
     return 2 * math.atan(camera.height / 2 / camera.fy)
@@ -64,6 +80,11 @@ def fitting_fov(camera: Camera, aspect: float) -> float:
     """Vertical field of view in radians of a canvas, width by height `aspect`, that shows all that a camera sees."""
     across = 2 * math.atan(camera.width / 2 / camera.fx / max(aspect, 1e-3))
     return max(vertical_fov(camera), across)
+
+
+def shorter_fov(fov: float, aspect: float) -> float:
+    """Field of view in radians along the shorter side of a canvas, width by height `aspect`, with vertical `fov`."""
+    return 2 * math.atan(math.tan(fov / 2) * min(1.0, aspect))
 
 
 def canvas_camera(width: int, height: int, fov: float, longest: int | None = None) -> Camera:

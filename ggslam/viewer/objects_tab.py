@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix
+from ggslam.viewer.cameras import upright_axes
 from ggslam.viewer.model import EditableMap, ListedObject
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 NOTHING = "(none)"
 _LIST_HEIGHT = 260
+_GIZMO_PIXELS = 110.0
 
 
 class ObjectsTab:
@@ -88,7 +90,7 @@ class ObjectsTab:
         if record is None:
             self._page.nodes.drop_box()
         else:
-            self._page.nodes.set_box(record.center, record.axes, record.size, record.label)
+            self._page.nodes.set_box(record.center, record.axes, record.size, self._model.up, record.label)
         self._list.content = object_list(list(self._records.values()), self._page.hidden, self.selected)
 
     def _one(self) -> int:
@@ -162,15 +164,16 @@ class ObjectsTab:
             self._put_back()
             return
         record = self._records[self._one()]
-        scale = float(np.clip(0.9 * record.size.max(), 0.1, 1.5))
+        upright = upright_axes(self._model.up)
         gizmo = self._page.server.scene.add_transform_controls(
-            "/selected/gizmo", scale=scale, depth_test=False, position=record.centroid
-        )
+            "/selected/gizmo", scale=_GIZMO_PIXELS, fixed=True, position=record.centroid,
+            wxyz=matrix_to_quaternion(upright),
+        )  # fmt: skip
         self._gizmo = gizmo
 
         @gizmo.on_update
         def _dragged(event: Any) -> None:
-            R = quaternion_to_matrix(np.array(gizmo.wxyz))
+            R = quaternion_to_matrix(np.array(gizmo.wxyz)) @ upright.T
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = R, np.array(gizmo.position) - R @ record.centroid
             self._motion = T

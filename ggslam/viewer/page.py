@@ -7,15 +7,17 @@ import functools
 import threading
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ggslam.errors import GgslamError
-from ggslam.viewer.cameras import Viewpoint, fitting_fov, top_view, vertical_fov, view_of_pose
+from ggslam.viewer.cameras import Viewpoint, top_view, vertical_fov, view_of_pose
 from ggslam.viewer.model import Coloring, EditableMap, ViewedMap
 from ggslam.viewer.objects_tab import ObjectsTab
 from ggslam.viewer.scene_nodes import SceneNodes
+from ggslam.viewer.server import keep_fitting
 from ggslam.viewer.time_tab import TimeTab
 from ggslam.viewer.view_tab import ViewTab
 
@@ -63,11 +65,7 @@ class Page:
         first = server.initial_camera
         first.position, first.look_at, first.up = start.position, start.look_at, model.up
         first.fov, first.near = vertical_fov(model.camera), start.near
-        server.on_client_connect(self._fit)
-
-    def _fit(self, client: viser.ClientHandle) -> None:
-        """Narrow windows see as wide as the recording's camera."""
-        client.camera.fov = fitting_fov(self.model.camera, client.camera.aspect)
+        keep_fitting(server, model.camera)
 
     # --- space -------------------------------------------------------------------------------------------------------
 
@@ -94,17 +92,20 @@ class Page:
 
     def start_view(self) -> Viewpoint:
         """As the first frame saw it."""
-        return view_of_pose(next(iter(self.model.frame_poses.values())), LOOK_AHEAD_M)
+        return self._view_of(next(iter(self.model.frame_poses.values())))
 
-    def top_view(self) -> Viewpoint:
-        """From above."""
+    def top_view(self, fov: float) -> Viewpoint:
+        """From above; `fov` of the window along its shorter side, radians."""
         poses = np.stack(list(self.model.frame_poses.values()))
-        fov = vertical_fov(self.model.camera)
         return top_view(self.centers, poses[:, :3, 3], poses[0, :3, 2], self.model.up, fov)
 
     def frame_view(self) -> Viewpoint:
         """What the frame that is looked at saw."""
-        return view_of_pose(self.model.frame_poses[self.frame], LOOK_AHEAD_M)
+        return self._view_of(self.model.frame_poses[self.frame])
+
+    def _view_of(self, T_world_camera: np.ndarray) -> Viewpoint:
+        """From a recorded camera, without the lines and the picture that are drawn right before it."""
+        return replace(view_of_pose(T_world_camera, LOOK_AHEAD_M), near=2.5 * self.depth)
 
     def go(self, client: viser.ClientHandle, view: Viewpoint) -> None:
         """Takes a page's camera to a place."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
-from ggslam.viewer.cameras import box_lines, frustum_lines
+from ggslam.viewer.cameras import box_lines, frustum_lines, vertical_fov
 from ggslam.viewer.splats import Splats
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 UNIT_M = 0.01
 """Splats are sent in centimetres and drawn at this scale: covariances travel in half precision, which in square metres
 would round splats of a millimetre to nothing."""
+_LABEL_GAP_M = 0.01
 _PATH, _KEYFRAMES, _SELECTED = (255, 176, 32), (110, 190, 255), (255, 235, 60)
 
 
@@ -33,6 +34,7 @@ class SceneNodes:
         self._server = server
         self._groups: dict[int, viser.GaussianSplatHandle] = {}
         self._marks: dict[str, viser.SceneNodeHandle] = {}
+        self._hidden: set[str] = set()
 
     # --- splats ------------------------------------------------------------------------------------------------------
 
@@ -65,10 +67,14 @@ class SceneNodes:
             self._groups[object_id].visible = visible
 
     def displace(self, object_id: int, T: np.ndarray) -> None:
-        """Draws an object moved by T [4, 4] from where its splats are."""
-        if object_id in self._groups:
-            group = self._groups[object_id]
-            group.wxyz, group.position = matrix_to_quaternion(T[:3, :3]), T[:3, 3]
+        """Draws the selected object, its box and its label moved by T [4, 4] from where they belong."""
+        moved = [self._groups.get(object_id), self._marks.get("/selected/box")]
+        with self._server.atomic():
+            for node in moved:
+                if node is not None:
+                    node.wxyz, node.position = matrix_to_quaternion(T[:3, :3]), T[:3, 3]
+            if "/selected/label" in self._marks:
+                self._marks["/selected/label"].position = T[:3, :3] @ self._label_at + T[:3, 3]
 
     # --- lines -------------------------------------------------------------------------------------------------------
 
@@ -80,12 +86,14 @@ class SceneNodes:
         """Pyramids at the keyframes, [K, 4, 4]."""
         self._lines("/camera/keyframes", frustum_lines(T_world_camera, camera, depth), _KEYFRAMES, 1.0)
 
-    def set_box(self, center: np.ndarray, axes: np.ndarray, size: np.ndarray, text: str) -> None:
-        """Frames the selected object and labels it."""
-        lines = box_lines(center, axes, size)
-        self._lines("/selected/box", lines, _SELECTED, 2.0)
+    def set_box(self, center: np.ndarray, axes: np.ndarray, size: np.ndarray, up: np.ndarray, text: str) -> None:
+        """Frames the selected object and writes a label above it."""
+        self._lines("/selected/box", box_lines(center, axes, size), _SELECTED, 2.0)
+        self._label_at = center + up * (np.abs(axes @ up) @ size / 2 + _LABEL_GAP_M)
         self._drop("/selected/label")
-        self._marks["/selected/label"] = self._server.scene.add_label("/selected/label", text, position=center)
+        self._marks["/selected/label"] = self._server.scene.add_label(
+            "/selected/label", text, position=self._label_at, anchor="bottom-center"
+        )
 
     def drop_box(self) -> None:
         """Nothing is selected any more."""
@@ -93,26 +101,31 @@ class SceneNodes:
             self._drop(name)
 
     def set_frame(self, T_world_camera: np.ndarray, camera: Camera, depth: float, picture: np.ndarray) -> None:
-        """The camera of one frame with its picture, uint8 [H, W, 3]."""
-        fov = 2 * float(np.arctan(camera.height / 2 / camera.fy))
-        self._marks["/camera/now"] = self._server.scene.add_camera_frustum(
-            "/camera/now", fov=fov, aspect=camera.width / camera.height, scale=depth, color=_PATH, image=picture,
+        """The camera of one frame with its picture, uint8 [H, W, 3], `depth` metres before it."""
+        fov, aspect = vertical_fov(camera), camera.width / camera.height
+        # viser's `scale` is that of the volume: the cube root of a third of height by width by depth.
+        scale = depth * float(np.cbrt(np.tan(fov / 2) ** 2 * aspect / 3))
+        name = "/camera/now"
+        self._marks[name] = self._server.scene.add_camera_frustum(
+            name, fov=fov, aspect=aspect, scale=scale, color=_PATH, image=picture,
             thickness=2.5, thickness_units="screen", wxyz=matrix_to_quaternion(T_world_camera[:3, :3]),
-            position=T_world_camera[:3, 3],
+            position=T_world_camera[:3, 3], visible=name not in self._hidden,
         )  # fmt: skip
 
     def show_lines(self, name: str, visible: bool) -> None:
-        """Shows or hides "path", "keyframes" or "now"."""
-        if f"/camera/{name}" in self._marks:
-            self._marks[f"/camera/{name}"].visible = visible
+        """Shows or hides "path", "keyframes" or "now", also those that come later."""
+        node = f"/camera/{name}"
+        (self._hidden.discard if visible else self._hidden.add)(node)
+        if node in self._marks:
+            self._marks[node].visible = visible
 
     def _lines(self, name: str, segments: np.ndarray, color: tuple[int, int, int], width: float) -> None:
-        visible = name not in self._marks or self._marks[name].visible
         self._drop(name)
         if len(segments):
             self._marks[name] = self._server.scene.add_line_segments(
-                name, segments.astype(np.float32), color, thickness=width, thickness_units="screen", visible=visible
-            )
+                name, segments.astype(np.float32), color, thickness=width, thickness_units="screen",
+                visible=name not in self._hidden,
+            )  # fmt: skip
 
     def _drop(self, name: str) -> None:
         if name in self._marks:

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from ggslam.errors import ConfigError, MissingDependency
+from ggslam.scene.camera import Camera
+from ggslam.viewer.cameras import fitting_fov
 
 if TYPE_CHECKING:
     import viser
@@ -59,6 +61,18 @@ def clear_page(server: viser.ViserServer, title: str = "ggslam") -> None:
     server.gui.main_panel.dock_right()
     server.gui.main_panel.set_width(PANEL_WIDTH)
     server.scene.world_axes.visible = False
+
+
+def keep_fitting(server: viser.ViserServer, camera: Camera) -> None:
+    """Pages of any shape show all that a camera sees, also after a window changed its size."""
+
+    def fit(view: viser.CameraHandle) -> None:
+        view.fov = fitting_fov(camera, view.aspect)
+
+    @server.on_client_connect
+    def connected(client: viser.ClientHandle) -> None:
+        client.camera.on_update(fit)
+        fit(client.camera)
 
 
 def close_server(server: viser.ViserServer) -> None:

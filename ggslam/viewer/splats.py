@@ -65,13 +65,26 @@ def opacities_of(gaussians: Gaussians) -> np.ndarray:
     return (1 / (1 + np.exp(-logits))).astype(np.float32)
 
 
-def most_visible(gaussians: Gaussians, limit: int) -> np.ndarray:
+def most_visible(gaussians: Gaussians, limit: int, owners: np.ndarray | None = None) -> np.ndarray:
     """Rows, rising, of the `limit` Gaussians that cover most: by opacity times the area of their two widest axes.
-    Gaussians that are too faint to be seen are left out in any case."""
+    Gaussians that are too faint to be seen are left out in any case.
+
+    Args:
+        gaussians: the map.
+        limit: no more rows than this.
+        owners: object ids int [N]. A quarter of the rows is shared among the objects evenly before the others are
+            chosen: the largest Gaussians are those of walls, and small objects would be left out.
+    """
     opacities = opacities_of(gaussians)
     seen = np.flatnonzero(opacities >= FAINT)
     if len(seen) <= limit:
         return seen
     widths = np.sort(gaussians.log_scales.numpy()[seen], axis=1)[:, 1:].sum(axis=1)
     weight = np.log(opacities[seen]) + np.minimum(widths, 2 * np.log(LARGEST_M))
+    if owners is not None:
+        ids = owners[seen]
+        share = limit // (4 * len(np.unique(ids)))
+        order = np.lexsort((-weight, ids))
+        rank = np.arange(len(order)) - np.searchsorted(ids[order], ids[order])
+        weight[order[rank < share]] = np.inf
     return np.sort(seen[np.argpartition(-weight, limit)[:limit]])

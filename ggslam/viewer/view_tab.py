@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ggslam.scene.poses import quaternion_to_matrix
-from ggslam.viewer.cameras import canvas_camera
+from ggslam.viewer.cameras import canvas_camera, shorter_fov
 from ggslam.viewer.model import COLORINGS
 
 if TYPE_CHECKING:
@@ -44,7 +44,9 @@ class ViewTab:
         @places.on_click
         @page.guarded
         def _go(event: Any) -> None:
-            views = {"Start": page.start_view, "Frame": page.frame_view, "Top": page.top_view}
+            seen = event.client.camera
+            views = {"Start": page.start_view, "Frame": page.frame_view,
+                     "Top": lambda: page.top_view(shorter_fov(seen.fov, seen.aspect))}  # fmt: skip
             page.go(event.client, views[places.value]())
 
         @save.on_click

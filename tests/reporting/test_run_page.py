@@ -10,10 +10,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from ggslam.reporting.comparison_page import comparison_page
-from ggslam.reporting.run_data import FrameView, Path3D, RunData, stage_seconds
+from ggslam.reporting.comparison_page import by_recording, comparison_page
+from ggslam.reporting.run_data import FrameView, LevelAxes, Path3D, RunData, stage_seconds
 from ggslam.reporting.run_page import run_page
-from ggslam.reporting.run_plots import all_plots
+from ggslam.reporting.run_plots import all_plots, trajectory_plots
 
 VOID = {"meta", "img", "br", "link", "input"}
 ADDRESSES = ("src", "href", "xlink:href", "srcset", "data", "action")
@@ -116,15 +116,16 @@ def test_what_is_missing_is_said_in_a_sentence() -> None:
 @pytest.mark.parametrize("name", ["<script>alert(1)</script>", 'a" onload="b', "a & b", "Küche"])
 def test_names_are_words_not_markup(name: str) -> None:
     run = replace(some_run(name), warnings=[name], settings={name: name}, path=name)
-    for page in (run_page(run), comparison_page([run, some_run("b")], [FrameView(0, run.views[0].pictures)])):
+    for page in (run_page(run), comparison_page([[run, some_run("b")]], [[FrameView(0, run.views[0].pictures)]])):
         found = checked(page)
         assert found.counts["script"] == 1  # the page's own
         assert name in "".join(found.words)
 
 
 def test_a_comparison_marks_the_best_and_lists_what_differs() -> None:
-    runs = [some_run("a", 30.0), replace(some_run("b", 31.5), settings={"seed": 2, "mapping.rate": 0.5}), bare_run("c")]
-    page = comparison_page(runs, [FrameView(3, {"a": np.zeros((6, 8, 3), np.uint8)})])
+    runs = [some_run("a", 30.0), replace(some_run("b", 31.5), settings={"seed": 2, "mapping.rate": 0.5}),
+            replace(bare_run("c"), recording=some_run().recording)]  # fmt: skip
+    page = comparison_page([runs], [[FrameView(3, {"a": np.zeros((6, 8, 3), np.uint8)})]])
     found = checked(page)
     assert re.search(r'<td class="best"><span>31\.50</span></td>', page)
     assert not re.search(r'<td class="best"><span>30\.00', page)
@@ -133,6 +134,28 @@ def test_a_comparison_marks_the_best_and_lists_what_differs() -> None:
     assert "Not scored: c." in " ".join(found.words)
     # 0.900 in both is no best one; frames/s and memory are known without scores
     assert 'class="best"><span>0.900' not in page and "frames/s" in " ".join(found.words)
+
+
+def test_runs_of_different_recordings_are_not_laid_over_each_other() -> None:
+    other = replace(some_run("c"), recording={"open": {"path": "/data/office"}})
+    runs = [some_run("a"), other, some_run("b")]
+    assert by_recording(runs) == [[0, 2], [1]]
+    page = comparison_page([[runs[0], runs[2]], [other]], [[], []])
+    together = comparison_page([[runs[0], runs[2]]], [[]])
+    assert "3 runs of 2 recordings" in page and "a, b: /data/kitchen" in page and "c: /data/office" in page
+    assert checked(page).counts["svg"] == checked(together).counts["svg"] + len(all_plots([other]))
+    assert "a, b: /data/kitchen" not in together
+    assert 'class="best"' not in page and "cannot be held against each other" in page
+
+
+def test_paths_are_shown_level() -> None:
+    tilt = np.array([[1.0, 0, 0], [0, 0.6, 0.8], [0, -0.8, 0.6]])  # rows right, forward, up: 37 degrees off
+    run = some_run()
+    path = replace(run.camera_path, positions=np.array([[0.0, 0, 0], [1, 1.2, 1.6]]), truth=None, frames=np.arange(2),
+                   level=LevelAxes(tilt, "surfaces", -1.5))  # fmt: skip
+    top, side = trajectory_plots([replace(run, camera_path=path)])
+    assert np.allclose(top.series[0].x, [0, 1]) and np.allclose(top.series[0].y, [0, 2])
+    assert np.allclose(side.series[0].y, [1.5, 1.5]) and "floor" in side.y_label and top.equal and side.equal
 
 
 def test_stages_add_up_to_the_wall_time() -> None:

@@ -14,8 +14,11 @@ from ggslam.viewer.cameras import (
     fitting_fov,
     frustum_lines,
     pose_along,
+    shorter_fov,
     top_view,
+    upright_axes,
     vertical_fov,
+    view_from_behind,
     view_of_pose,
 )
 
@@ -69,3 +72,23 @@ def test_lines_of_frustums_and_boxes() -> None:
     lengths = np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1)
     assert sorted(lengths.round(5).tolist()) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
     assert np.allclose(edges.reshape(-1, 3).mean(axis=0), [1, 0, 0])
+
+
+def test_a_camera_is_seen_from_behind_and_above() -> None:
+    T = se3_exp(np.array([0.3, -0.2, 1.0, 0.4, 0.1, -0.3]))
+    view = view_from_behind(T, 2.0)
+    seen = np.linalg.inv(T) @ np.append(view.position, 1)
+    assert seen[2] < 0 and seen[1] < 0 and np.isclose(seen[0], 0)
+    assert np.allclose(np.linalg.inv(T) @ np.append(view.look_at, 1), [0, 0, 2, 1])
+
+
+def test_upright_axes_are_a_rotation_about_up() -> None:
+    for up in (np.array([0.0, -1, 0]), np.array([1.0, 0, 0]), np.array([0.6, 0, 0.8])):
+        axes = upright_axes(up)
+        assert np.allclose(axes @ axes.T, np.eye(3)) and np.isclose(np.linalg.det(axes), 1)
+        assert np.allclose(axes[:, 2], up)
+
+
+def test_the_shorter_side_of_a_window() -> None:
+    assert math.isclose(shorter_fov(1.0, 1.5), 1.0)
+    assert math.isclose(math.tan(shorter_fov(1.0, 0.5) / 2), math.tan(0.5) / 2)

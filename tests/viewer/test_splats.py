@@ -46,3 +46,14 @@ def test_the_most_visible_are_kept() -> None:
     assert most_visible(gaussians, 10).tolist() == [0, 2, 3]
     assert most_visible(gaussians, 1).tolist() == [0]
     assert most_visible(gaussians, 2).tolist() == [0, 2]
+
+
+def test_small_objects_keep_a_share() -> None:
+    gaussians = some(40)
+    gaussians.log_scales[:] = -2
+    gaussians.log_scales[30:] = -6  # one object of ten small ones
+    gaussians.opacity_logits[:] = 2
+    owners = np.repeat([0, 7], [30, 10])
+    assert (most_visible(gaussians, 16) < 30).all()
+    kept = most_visible(gaussians, 16, owners)
+    assert len(kept) == 16 and (owners[kept] == 7).sum() == 2
