@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import ConfigError, SequenceError
+from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.frame_localization import FrameTracker
+from ggslam.interrupts import uninterrupted
 from ggslam.localization import Localization, Localizer, ScanTracker, ScanTrackerSettings
 from ggslam.localization_report import LocalizationReport, write_report
 from ggslam.map_stores import INDOORS, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
@@ -76,7 +77,8 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     """Locates a recording in a map and writes trajectory.txt, localization.json and plots.
 
     Raises:
-        GgslamError: map or recording cannot be read, or nothing says where to begin.
+        GgslamError: map or recording cannot be read, or nothing says where to begin. If that happens in the middle, or
+            on Ctrl-C, what was located is written all the same.
     """
     if request.start is not None and request.no_start:
         raise ConfigError("--start and --no-start: one of them")
@@ -100,13 +102,19 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         opened.callback(surface.close)
         places = None if isinstance(recording, ScanSequence) else _places(request, recording, store, start, observer)
         localizer = _localizer(request, recording, places, surface, context, start)
-        results = _run(localizer, recording, observer)
+        results, error = _run(localizer, recording, observer)
+        if error is not None and not results:
+            raise error
         damaged = sorted([*surface.damaged, *(places.damaged if places is not None else [])])
         report = LocalizationReport(
-            str(request.map), str(request.sequence.path), request.full, recording.timestamps, results,
-            recording.ground_truth, damaged,
+            str(request.map), str(request.sequence.path), request.full, recording.timestamps[: len(results)], results,
+            None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
         )  # fmt: skip
-    write_report(report, out, observer)
+    with uninterrupted():
+        write_report(report, out, observer)
+    if error is not None:
+        observer.note(f"stopped after {len(results)} of {len(recording)} frames, which are in {out}")
+        raise error
     return report
 
 
@@ -216,7 +224,10 @@ def _localizer(
     return Localizer(surface, front_end, start)
 
 
-def _run(localizer: Localizer[Any], recording: Sequence | ScanSequence, observer: Observer) -> list[Localization]:
+def _run(
+    localizer: Localizer[Any], recording: Sequence | ScanSequence, observer: Observer
+) -> tuple[list[Localization], BaseException | None]:
+    """What was located, and what stopped it before the end."""
     results: list[Localization] = []
     observer.begin("localize", len(recording))
     items: Iterable[Any]
@@ -224,7 +235,10 @@ def _run(localizer: Localizer[Any], recording: Sequence | ScanSequence, observer
         items = (scan.points for scan in recording.stream())
     else:
         items = recording.stream(masks=False)
-    for item in items:
-        results.append(localizer.locate(item))
-        observer.advance(len(results), len(recording))
-    return results
+    try:
+        for item in items:
+            results.append(localizer.locate(item))
+            observer.advance(len(results), len(recording))
+    except (GgslamError, KeyboardInterrupt) as stopped:  # what was located is written first
+        return results, stopped
+    return results, None

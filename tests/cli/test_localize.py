@@ -176,6 +176,14 @@ def test_numbers_out_of_range_are_named_as_they_were_given(
     assert result.exit_code == 2 and f"'{option}'" in result.output
 
 
+def test_a_damaged_scan_in_the_middle_loses_nothing(scans: Path, tmp_path: Path) -> None:
+    torn = shutil.copytree(scans, tmp_path / "torn")
+    (torn / "scans" / "000007.npy").write_bytes(b"?")
+    result = ggslam("localize", scans.parent / "cloud.npy", torn, "--start", "given", "--out", tmp_path / "out")
+    one_error(result, "000007.npy")
+    assert summary(tmp_path / "out")["frames"] == 7 and len(read_tum(tmp_path / "out" / "trajectory.txt")) == 7
+
+
 def test_a_run_whose_adding_was_cut_off_is_added_whole(
     run: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
