@@ -5,7 +5,10 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import torch
+
 from ggslam.errors import MissingDependency
+from ggslam.rendering.cuda.compiler import find_nvcc, library_path
 from ggslam.rendering.cuda.library import library_for_device
 
 
@@ -18,3 +21,19 @@ def cuda_backend_problem() -> str | None:
     except MissingDependency as error:
         return str(error)
     return None
+
+
+def describe_cuda_backend() -> tuple[bool, str]:
+    """Whether the backend "cuda" looks usable, and why; compiles nothing."""
+    nvcc = find_nvcc()
+    if nvcc is None:
+        return False, "no nvcc to compile it with"
+    if not torch.cuda.is_available():
+        return False, f"no GPU in use; {nvcc} could compile it"
+    major, minor = torch.cuda.get_device_capability()
+    try:
+        path = library_path(nvcc, f"{major}{minor}")
+    except MissingDependency as error:
+        return False, str(error)
+    state = "compiled" if path.exists() else "will be compiled at first use"
+    return True, f"sm_{major}{minor}, {state}: {path}"
