@@ -59,7 +59,7 @@ def test_lower_active_degree_leaves_the_other_coefficients_alone(rasterizer: Cud
 
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 5), (64, 33)])
 def test_image_sizes(rasterizer: CudaRasterizer, size: tuple[int, int]) -> None:
-    camera = Camera(*size, 30.0, 31.0, size[0] / 2 - 0.7, size[1] / 2 - 0.2)
+    camera = Camera(*size, 30.0, 31.0, size[0] / 2 - 0.6, size[1] / 2 - 0.2)
     check_against_cpu(rasterizer, make_scene(features=3), camera)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from ggslam.errors import RenderError
-from ggslam.rendering.autograd import rigid_inverse, twist_to_matrix_gradient
+from ggslam.rendering.autograd import rigid_inverse
 from ggslam.rendering.cuda.memory import GrowingMemory
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import PARAMETERS, Gaussians, GaussianTensors, RenderBuffers
@@ -57,10 +57,18 @@ class _Render(torch.autograd.Function):
         result = ctx.rasterizer.differentiate(ctx.rendering, given, ctx.memory)
         pose = None
         if ctx.needs_input_grad[len(PARAMETERS)]:
-            twist = result.twist.cpu().numpy()
-            pose = twist_to_matrix_gradient(twist, T_world_camera.detach().cpu().numpy())
-            pose = torch.as_tensor(pose).to(T_world_camera)
+            pose = _pose_gradient(result.twist.to(T_world_camera), T_world_camera)
         return (*(getattr(result, name) for name in PARAMETERS), pose, None, None, None)
+
+
+def _pose_gradient(twist: torch.Tensor, T_world_camera: torch.Tensor) -> torch.Tensor:
+    """`ggslam.rendering.autograd.twist_to_matrix_gradient` where the pose is, without waiting for the device."""
+    R = T_world_camera[:3, :3]
+    gradient = torch.zeros_like(T_world_camera)
+    # Columns of [omega]x R^T are omega x (rows of R): R [omega]x is minus its transpose.
+    gradient[:3, :3] = 0.5 * torch.linalg.cross(twist[3:].expand(3, 3), R)
+    gradient[:3, 3] = -R @ twist[:3]
+    return gradient
 
 
 def render_cuda(

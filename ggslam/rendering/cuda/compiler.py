@@ -16,7 +16,7 @@ from ggslam.errors import MissingDependency
 KERNELS = Path(__file__).parent / "kernels"
 """Folder of the CUDA sources."""
 
-_FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC,-fvisibility=hidden", "--threads", "0")
+_FLAGS = ("-O3", "-std=c++17", "-ftz=true", "-shared", "-Xcompiler", "-fPIC,-fvisibility=hidden", "--threads", "0")
 _ERROR_LINES = 12
 
 

@@ -9,8 +9,8 @@ namespace ggslam::cuda {
 
 std::size_t sorting_bytes(std::int64_t) { return 1; }
 
-void sort_pairs(void*, std::size_t, const std::uint32_t* keys, std::uint32_t* sorted_keys, const std::uint32_t* values,
-                std::uint32_t* sorted_values, std::int64_t count, int bits, cudaStream_t) {
+cudaError_t sort_pairs(void*, std::size_t, const std::uint32_t* keys, std::uint32_t* sorted_keys, const std::uint32_t* values,
+                       std::uint32_t* sorted_values, std::int64_t count, int bits, cudaStream_t) {
   const std::uint32_t mask = bits == 32 ? ~0u : (1u << bits) - 1;
   std::vector<std::int64_t> order(static_cast<std::size_t>(count));
   std::iota(order.begin(), order.end(), 0);
@@ -20,11 +20,13 @@ void sort_pairs(void*, std::size_t, const std::uint32_t* keys, std::uint32_t* so
     sorted_keys[i] = keys[order[static_cast<std::size_t>(i)]];
     sorted_values[i] = values[order[static_cast<std::size_t>(i)]];
   }
+  return cudaSuccess;
 }
 
-void running_sum(void*, std::size_t, const std::uint32_t* numbers, std::uint32_t* sums, std::int64_t count,
-                 cudaStream_t) {
+cudaError_t running_sum(void*, std::size_t, const std::uint32_t* numbers, std::uint32_t* sums, std::int64_t count,
+                        cudaStream_t) {
   std::partial_sum(numbers, numbers + count, sums);
+  return cudaSuccess;
 }
 
 }  // namespace ggslam::cuda

@@ -59,7 +59,7 @@ void for_each_group(const GaussianArrays& arrays, const Run& run) {
   } while (first < channels);
 }
 
-void project_all(const Rendering& r, const Counter& counter) {
+cudaError_t project_all(const Rendering& r, const Counter& counter) {
   const GaussianWorkspace w = gaussians_of(r);
   const cudaStream_t stream = stream_of(r);
   const std::uint32_t hidden = hidden_key(r.view);
@@ -69,35 +69,38 @@ void project_all(const Rendering& r, const Counter& counter) {
          make_grid(r.view), float_bits(r.view.near_plane), hidden, w);
   cudaMemcpyAsync(counter.totals, w.totals, sizeof(Totals), cudaMemcpyDeviceToHost, stream);
   cudaEventRecord(counter.ready, stream);
-  if (n == 0) return;
-  sort_pairs(w.sorting, w.sorting_bytes, w.depth_keys, w.sorted_depth_keys, w.rows, w.rows_by_depth, n,
-             bits_of(hidden), stream);
+  if (n == 0) return cudaSuccess;
+  const cudaError_t sorted = sort_pairs(w.sorting, w.sorting_bytes, w.depth_keys, w.sorted_depth_keys, w.rows,
+                                        w.rows_by_depth, n, bits_of(hidden), stream);
+  if (sorted != cudaSuccess) return sorted;
   launch(gather_counts_kernel, blocks_for(n, kBinThreads), kBinThreads, stream, n, w);
-  running_sum(w.sorting, w.sorting_bytes, w.counts_by_depth, w.pair_ends, n, stream);
+  return running_sum(w.sorting, w.sorting_bytes, w.counts_by_depth, w.pair_ends, n, stream);
 }
 
-void list_pairs(const Rendering& r, const Grid& grid, const GaussianWorkspace& w, const PairWorkspace& pairs,
-                const PixelWorkspace& pixels) {
+cudaError_t list_pairs(const Rendering& r, const Grid& grid, const GaussianWorkspace& w, const PairWorkspace& pairs,
+                       const PixelWorkspace& pixels) {
   const cudaStream_t stream = stream_of(r);
   const std::uint32_t capacity = static_cast<std::uint32_t>(r.pair_capacity);
   const std::int64_t n = r.gaussians.count;
   // Places that stay unwritten: all ones is beyond every tile, also in the lowest bits by which it is sorted.
   cudaMemsetAsync(pairs.tiles, 0xff, sizeof(std::uint32_t) * capacity, stream);
-  cudaMemsetAsync(pairs.rows, 0, sizeof(std::uint32_t) * capacity, stream);
   launch(write_pairs_kernel, blocks_for(n, kBinThreads), kBinThreads, stream, n, grid, w, pairs, capacity);
+  cudaError_t status = cudaSuccess;
   if (capacity > 0)
-    sort_pairs(pairs.sorting, pairs.sorting_bytes, pairs.tiles, pairs.sorted_tiles, pairs.rows, pairs.sorted_rows,
-               capacity, bits_of(static_cast<std::uint32_t>(grid.tiles())), stream);
+    status = sort_pairs(pairs.sorting, pairs.sorting_bytes, pairs.tiles, pairs.sorted_tiles, pairs.rows,
+                        pairs.sorted_rows, capacity, bits_of(static_cast<std::uint32_t>(grid.tiles())), stream);
   launch(tile_starts_kernel, blocks_for(r.pair_capacity + 1, kBinThreads), kBinThreads, stream, capacity,
          pairs.sorted_tiles, grid.tiles(), pixels.tile_start);
+  return status;
 }
 
-void composite_all(const Rendering& r) {
+cudaError_t composite_all(const Rendering& r) {
   const Grid grid = make_grid(r.view);
   const GaussianWorkspace w = gaussians_of(r);
   const PairWorkspace pairs = pairs_of(r);
   const PixelWorkspace pixels = pixel_workspace(r.pixel_workspace, grid);
-  list_pairs(r, grid, w, pairs, pixels);
+  const cudaError_t listed = list_pairs(r, grid, w, pairs, pixels);
+  if (listed != cudaSuccess) return listed;
   for_each_group(r.gaussians, [&](const FeatureGroup& group, int compiled) {
     const auto run = [&](auto kernel) {
       launch(kernel, grid.tiles(), kTileThreads, stream_of(r), r.gaussians, grid, w, pairs, pixels, r.targets, group);
@@ -108,6 +111,7 @@ void composite_all(const Rendering& r) {
     if (compiled == 12) run(composite_kernel<12>);
     if (compiled == 16) run(composite_kernel<16>);
   });
+  return cudaSuccess;
 }
 
 void differentiate_images(const Rendering& r, const ImageGradients& in, const GradientRows& rows) {
@@ -128,22 +132,24 @@ void differentiate_images(const Rendering& r, const ImageGradients& in, const Gr
   });
 }
 
-void differentiate_all(const Rendering& r, const ImageGradients& in, const GaussianGradients& out, float* row_memory) {
+cudaError_t differentiate_all(const Rendering& r, const ImageGradients& in, const GaussianGradients& out,
+                              float* row_memory) {
   const cudaStream_t stream = stream_of(r);
   const std::int64_t n = r.gaussians.count;
   const GradientRows rows{row_memory, gradient_stride(r.gaussians), out.touched};
   cudaMemsetAsync(out.twist, 0, 6 * sizeof(double), stream);
-  if (n == 0) return;
+  if (n == 0) return cudaSuccess;
   cudaMemsetAsync(out.touched, 0, static_cast<std::size_t>(n), stream);
-  launch(clear_rows_kernel, blocks_for(n * rows.stride / 4, kGatherThreads), kGatherThreads, stream, n,
+  launch(clear_rows_kernel, blocks_for(n, kGatherThreads), kGatherThreads, stream, n,
          gaussians_of(r).tile_counts, rows);
   differentiate_images(r, in, rows);
   launch(gather_kernel, std::min<std::int64_t>(blocks_for(n, kGatherThreads), kGatherBlocks), kGatherThreads, stream,
          r.gaussians, view_constants(r.view), rows, out);
   const int channels = r.gaussians.render_features ? r.gaussians.feature_channels : 0;
   if (out.features != nullptr && channels > 0)
-    launch(gather_features_kernel, blocks_for(n * channels, kGatherThreads), kGatherThreads, stream, n, channels, rows,
+    launch(gather_features_kernel, blocks_for(n, kGatherThreads), kGatherThreads, stream, n, channels, rows,
            out.features);
+  return cudaSuccess;
 }
 
 // Runs work on the rendering's device and reports what went wrong.
@@ -151,8 +157,8 @@ template <class Work>
 int on_device(int device, const Work& work) {
   const cudaError_t chosen = cudaSetDevice(device);
   if (chosen != cudaSuccess) return chosen;
-  work();
-  return cudaGetLastError();
+  const cudaError_t status = work(), launched = cudaGetLastError();
+  return status != cudaSuccess ? status : launched;
 }
 
 }  // namespace
@@ -170,9 +176,8 @@ GGSLAM_EXPORT int ggslam_cuda_counter_create(int device, void** counter) {
   auto* c = new Counter;
   *counter = c;
   return on_device(device, [&] {
-    if (cudaHostAlloc(reinterpret_cast<void**>(&c->totals), sizeof(Totals), cudaHostAllocDefault) == cudaSuccess)
-      *c->totals = Totals{};
-    cudaEventCreateWithFlags(&c->ready, cudaEventDisableTiming);
+    const cudaError_t status = cudaHostAlloc(reinterpret_cast<void**>(&c->totals), sizeof(Totals), cudaHostAllocDefault);
+    return status != cudaSuccess ? status : cudaEventCreateWithFlags(&c->ready, cudaEventDisableTiming);
   });
 }
 
@@ -194,12 +199,13 @@ GGSLAM_EXPORT int ggslam_cuda_plan(Rendering* r, Sizes* sizes) {
         static_cast<std::int64_t>(pair_workspace(nullptr, r->pair_capacity, r->pair_sorting_bytes).bytes);
     sizes->pixel_workspace = static_cast<std::int64_t>(pixel_workspace(nullptr, make_grid(r->view)).bytes);
     sizes->gradient_rows = r->gaussians.count * gradient_stride(r->gaussians) * static_cast<std::int64_t>(sizeof(float));
+    return cudaSuccess;
   });
 }
 
 // Projects, counts and sorts by depth. The totals will be in the counter; needs the Gaussians' workspace only.
 GGSLAM_EXPORT int ggslam_cuda_project(const Rendering* r, void* counter) {
-  return on_device(r->device, [&] { project_all(*r, *static_cast<Counter*>(counter)); });
+  return on_device(r->device, [&] { return project_all(*r, *static_cast<Counter*>(counter)); });
 }
 
 // Waits for the counter's last projection; totals: visible Gaussians, pairs of a Gaussian and a tile.
@@ -213,11 +219,11 @@ GGSLAM_EXPORT int ggslam_cuda_wait(const void* counter, std::int64_t* totals) {
 
 // Lists pairs by tile and composites. May be called again for the same projection, with more room for pairs.
 GGSLAM_EXPORT int ggslam_cuda_composite(const Rendering* r) {
-  return on_device(r->device, [&] { composite_all(*r); });
+  return on_device(r->device, [&] { return composite_all(*r); });
 }
 
 // Differentiates a rendering, whose arrays and memory must still be there and unchanged. row_memory: gradient_rows bytes.
 GGSLAM_EXPORT int ggslam_cuda_backward(const Rendering* r, const ImageGradients* image_gradients,
                                        const GaussianGradients* gradients, float* row_memory) {
-  return on_device(r->device, [&] { differentiate_all(*r, *image_gradients, *gradients, row_memory); });
+  return on_device(r->device, [&] { return differentiate_all(*r, *image_gradients, *gradients, row_memory); });
 }

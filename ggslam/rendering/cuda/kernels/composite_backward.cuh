@@ -119,7 +119,7 @@ __device__ inline int maximum_of_block(int value) {
 }
 
 template <int kFeatures, bool kDetached>
-__global__ void __launch_bounds__(kTileThreads)
+__global__ void __launch_bounds__(kTileThreads, 4)
 differentiate_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussians, PairWorkspace pairs,
                      PixelWorkspace w, ImageGradients in, FeatureGroup group, GradientRows out) {
   GGSLAM_SHARED Batch<kBackwardBatch, kFeatures> batch;

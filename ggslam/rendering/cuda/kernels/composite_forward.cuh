@@ -72,18 +72,21 @@ __device__ inline void load_batch(Batch<kForwardBatch, kFeatures>& batch, std::u
 }
 
 template <int kFeatures>
-__global__ void __launch_bounds__(kTileThreads)
+__global__ void __launch_bounds__(kTileThreads, 4)
 composite_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussians, PairWorkspace pairs, PixelWorkspace w,
                  RenderTargets targets, FeatureGroup group) {
   static_assert(kForwardBatch == kTileThreads, "one thread brings one splat");
   GGSLAM_SHARED Batch<kForwardBatch, kFeatures> batch;
   GGSLAM_SHARED std::uint32_t contributed[kWarps][kForwardBatch / kWarp];  // one bit per splat
   const int tile = static_cast<int>(blockIdx.x), lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  const Pixel pixel = pixel_of_thread(grid, tile);
-  const float x = static_cast<float>(pixel.x), y = static_cast<float>(pixel.y);
-  const std::uint32_t begin = w.tile_start[tile], end = w.tile_start[tile + 1];
+  float x, y;
   PixelSums<kFeatures> sums;
-  sums.transmittance = pixel.inside ? 1.0f : 0.0f;  // pixels outside neither take nor keep alive anything
+  {
+    const Pixel pixel = pixel_of_thread(grid, tile);
+    x = static_cast<float>(pixel.x), y = static_cast<float>(pixel.y);
+    sums.transmittance = pixel.inside ? 1.0f : 0.0f;  // pixels outside neither take nor keep alive anything
+  }
+  const std::uint32_t begin = w.tile_start[tile], end = w.tile_start[tile + 1];
 
   for (std::uint32_t first = begin; first < end; first += kForwardBatch) {
     if (__syncthreads_count(sums.transmittance >= kMinTransmittance) == 0) break;
@@ -95,6 +98,7 @@ composite_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussians, 
       __syncthreads();
     }
     bool alive = __ballot_sync(kAllLanes, sums.transmittance >= kMinTransmittance) != 0;
+#pragma unroll 1
     for (int chunk = 0; chunk < kForwardBatch / kWarp; ++chunk) {
       const int k0 = chunk * kWarp;
       const bool mine = alive && k0 + lane < n && ((batch.warps[k0 + lane] >> warp) & 1) != 0;
@@ -114,7 +118,8 @@ composite_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussians, 
       pairs.contributed[first + threadIdx.x] = static_cast<std::uint8_t>(warps);
     }
   }
-  write_pixel<kFeatures>(targets, w, grid, group, pixel, sums);
+  // The pixel is worked out anew rather than kept in registers all along.
+  write_pixel<kFeatures>(targets, w, grid, group, pixel_of_thread(grid, tile), sums);
 }
 
 }  // namespace ggslam::cuda

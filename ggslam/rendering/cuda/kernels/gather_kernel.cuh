@@ -10,22 +10,28 @@ namespace ggslam::cuda {
 constexpr int kGatherThreads = 256;
 constexpr int kGatherBlocks = 1024;  // at most: each adds to the twist once per warp
 
-// Zeroes the rows of the Gaussians that were rendered, four floats per thread.
+// Zeroes the rows of the Gaussians that were rendered, four floats per thread. A block takes kGatherThreads rows.
 __global__ void __launch_bounds__(kGatherThreads)
 clear_rows_kernel(std::int64_t count, const std::uint32_t* tile_counts, GradientRows out) {
+  const std::int64_t first = static_cast<std::int64_t>(blockIdx.x) * kGatherThreads;
   const int quads = out.stride / 4;
-  const std::int64_t i = static_cast<std::int64_t>(blockIdx.x) * kGatherThreads + threadIdx.x;
-  if (i >= count * quads || tile_counts[i / quads] == 0) return;
-  reinterpret_cast<float4*>(out.rows)[i] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+  for (int k = threadIdx.x; k < kGatherThreads * quads; k += kGatherThreads) {
+    const std::int64_t row = first + k / quads;
+    if (row < count && tile_counts[row] != 0)
+      reinterpret_cast<float4*>(out.rows + row * out.stride)[k % quads] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+  }
 }
 
-// Copies the features' columns; rows of Gaussians that were not touched become zero.
+// Copies the features' columns; rows of Gaussians that were not touched become zero. A block takes kGatherThreads rows.
 __global__ void __launch_bounds__(kGatherThreads)
 gather_features_kernel(std::int64_t count, int channels, GradientRows in, float* features) {
-  const std::int64_t i = static_cast<std::int64_t>(blockIdx.x) * kGatherThreads + threadIdx.x;
-  if (i >= count * channels) return;
-  const std::int64_t row = i / channels;
-  features[i] = in.touched[row] != 0 ? in.rows[row * in.stride + kBaseGradients + i % channels] : 0.0f;
+  const std::int64_t first = static_cast<std::int64_t>(blockIdx.x) * kGatherThreads;
+  for (int k = threadIdx.x; k < kGatherThreads * channels; k += kGatherThreads) {
+    const std::int64_t row = first + k / channels;
+    if (row < count)
+      features[row * channels + k % channels] =
+          in.touched[row] != 0 ? in.rows[row * in.stride + kBaseGradients + k % channels] : 0.0f;
+  }
 }
 
 __device__ inline void write_gradients(const GaussianArrays& arrays, const GaussianGradients& out, std::int64_t row,

@@ -18,16 +18,16 @@ std::size_t sorting_bytes(std::int64_t count) {
   return std::max(sort, sum);
 }
 
-void sort_pairs(void* scratch, std::size_t scratch_bytes, const std::uint32_t* keys, std::uint32_t* sorted_keys,
-                const std::uint32_t* values, std::uint32_t* sorted_values, std::int64_t count, int bits,
-                cudaStream_t stream) {
-  cub::DeviceRadixSort::SortPairs(scratch, scratch_bytes, keys, sorted_keys, values, sorted_values,
-                                  static_cast<int>(count), 0, bits, stream);
+cudaError_t sort_pairs(void* scratch, std::size_t scratch_bytes, const std::uint32_t* keys, std::uint32_t* sorted_keys,
+                       const std::uint32_t* values, std::uint32_t* sorted_values, std::int64_t count, int bits,
+                       cudaStream_t stream) {
+  return cub::DeviceRadixSort::SortPairs(scratch, scratch_bytes, keys, sorted_keys, values, sorted_values,
+                                         static_cast<int>(count), 0, bits, stream);
 }
 
-void running_sum(void* scratch, std::size_t scratch_bytes, const std::uint32_t* numbers, std::uint32_t* sums,
-                 std::int64_t count, cudaStream_t stream) {
-  cub::DeviceScan::InclusiveSum(scratch, scratch_bytes, numbers, sums, static_cast<int>(count), stream);
+cudaError_t running_sum(void* scratch, std::size_t scratch_bytes, const std::uint32_t* numbers, std::uint32_t* sums,
+                        std::int64_t count, cudaStream_t stream) {
+  return cub::DeviceScan::InclusiveSum(scratch, scratch_bytes, numbers, sums, static_cast<int>(count), stream);
 }
 
 }  // namespace ggslam::cuda

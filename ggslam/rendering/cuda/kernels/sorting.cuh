@@ -9,12 +9,12 @@ namespace ggslam::cuda {
 std::size_t sorting_bytes(std::int64_t count);
 
 // Sorts values by the lowest `bits` bits of their keys; values of equal keys keep their order.
-void sort_pairs(void* scratch, std::size_t scratch_bytes, const std::uint32_t* keys, std::uint32_t* sorted_keys,
-                const std::uint32_t* values, std::uint32_t* sorted_values, std::int64_t count, int bits,
-                cudaStream_t stream);
+cudaError_t sort_pairs(void* scratch, std::size_t scratch_bytes, const std::uint32_t* keys, std::uint32_t* sorted_keys,
+                       const std::uint32_t* values, std::uint32_t* sorted_values, std::int64_t count, int bits,
+                       cudaStream_t stream);
 
 // sums[i] = numbers[0] + ... + numbers[i].
-void running_sum(void* scratch, std::size_t scratch_bytes, const std::uint32_t* numbers, std::uint32_t* sums,
-                 std::int64_t count, cudaStream_t stream);
+cudaError_t running_sum(void* scratch, std::size_t scratch_bytes, const std::uint32_t* numbers, std::uint32_t* sums,
+                        std::int64_t count, cudaStream_t stream);
 
 }  // namespace ggslam::cuda

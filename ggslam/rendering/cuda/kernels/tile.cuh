@@ -35,7 +35,7 @@ __device__ inline unsigned reached_warps(const Splat& s, const Grid& grid, int t
   const float x0 = static_cast<float>(tile % grid.tiles_x * kTileSize);
   const float y0 = static_cast<float>(tile / grid.tiles_x * kTileSize);
   unsigned result = 0;
-#pragma unroll
+#pragma unroll 2  // more at a time would cost the compositing loop its registers
   for (int warp = 0; warp < kWarps; ++warp) {
     const float x = x0 + static_cast<float>(warp % 2 * kWarpWidth), y = y0 + static_cast<float>(warp / 2 * kWarpHeight);
     result |= static_cast<unsigned>(reaches(s, x, y, kWarpWidth - 1, kWarpHeight - 1)) << warp;
@@ -58,6 +58,7 @@ __device__ inline void load_features(Batch<kBatch, kFeatures>& batch, int n, con
                                      const FeatureGroup& group) {
   constexpr int kQuads = kFeatures / 4;
   const bool whole = group.count == kFeatures && arrays.feature_channels % 4 == 0;
+#pragma unroll 1
   for (int i = threadIdx.x; i < n * kQuads; i += kTileThreads) {
     const int k = i / kQuads, quad = i % kQuads;
     if (batch.warps[k] == 0) continue;
