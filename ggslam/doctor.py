@@ -214,7 +214,7 @@ def _cuda_rasterizer() -> Finding:
         usable, detail = describe_cuda_backend()
     except ImportError as error:  # a package is missing, and said so above
         usable, detail = False, str(error)
-    advice = "" if usable else "none is needed; to render on a GPU install nvcc (CUDA toolkit) and a CUDA build of torch"
+    advice = "" if usable else "none is needed; to render on a GPU install nvcc (CUDA toolkit) and torch for CUDA"
     return Finding("gpu", "rasterizer", "ok" if usable else "missing", detail, advice)
 
 

@@ -91,7 +91,8 @@ def render_cuda(
     device = gaussians.means.device
     if rasterizer is None:
         if device.type != "cuda":
-            raise RenderError(f"the cuda backend needs float32 on a CUDA device, found {gaussians.means.dtype} on {device}")
+            found = f"{gaussians.means.dtype} on {device}"
+            raise RenderError(f"the cuda backend needs float32 on a CUDA device, found {found}")
         rasterizer = _rasterizer(device)
     parameters = [getattr(gaussians, name).contiguous() for name in PARAMETERS]
     image, depth, alpha, features, median = _Render.apply(*parameters, T_world_camera, camera, rasterizer, options)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiles the CUDA sources into a shared library, once per GPU architecture, and keeps it in the user's cache folder."""
+"""Compiles the CUDA sources to a shared library, once per GPU architecture, and keeps it in the user's cache folder."""
 
 from __future__ import annotations
 

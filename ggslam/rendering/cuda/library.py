@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The C interface of the CUDA rasterizer: structures as laid out in kernels/contract.cuh, functions of kernels/api.cu."""
+"""The C interface of the CUDA rasterizer: structures as in kernels/contract.cuh, functions of kernels/api.cu."""
 
 from __future__ import annotations
 

@@ -97,5 +97,5 @@ class FinishedRendering:
 
 def target_pointers(buffers: RenderBuffers) -> _native.RenderTargets:
     """Addresses of the images."""
-    names = [name for name, _ in _native.RenderTargets._fields_]
+    names = [field_[0] for field_ in _native.RenderTargets._fields_]
     return _native.RenderTargets(**{name: pointer(getattr(buffers, name)) for name in names})

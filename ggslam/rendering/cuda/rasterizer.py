@@ -114,8 +114,10 @@ class CudaRasterizer:
         """Renders. Arguments, results and errors as `CpuRasterizer.forward`, tensors being on the rasterizer's device;
         the images belong to the rasterizer and are overwritten by its next call."""
         self._last = None
-        options = {"features": features, "median_depth": median_depth, "active_sh_degree": active_sh_degree}
-        self._last = self.render(gaussians, camera, T_camera_world, self._memory, self._images, **options)
+        self._last = self.render(
+            gaussians, camera, T_camera_world, self._memory, self._images,
+            features=features, median_depth=median_depth, active_sh_degree=active_sh_degree,
+        )  # fmt: skip
         return self._last.buffers
 
     def render(
