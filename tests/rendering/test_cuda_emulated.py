@@ -105,7 +105,10 @@ def test_only_some_image_gradients(rasterizer: CudaRasterizer) -> None:
     depth_only = rasterizer.backward(None, gradients.depth)
     zero = torch.zeros_like
     spelled_out = rasterizer.backward(
-        zero(gradients.image), gradients.depth, zero(gradients.alpha), zero(gradients.features)  # type: ignore[arg-type]
+        zero(gradients.image),
+        gradients.depth,
+        zero(gradients.alpha),
+        zero(gradients.features),  # type: ignore[arg-type]
     )
     assert depth_only.means.any()
     for name in PARAMETERS:

@@ -33,9 +33,7 @@ class Rendering(ctypes.Structure):
 class Sizes(ctypes.Structure):
     """Bytes of the memory that a rendering works in."""
 
-    _fields_ = [
-        (name, _int64) for name in ("gaussian_workspace", "pair_workspace", "pixel_workspace", "gradient_rows")
-    ]
+    _fields_ = [(name, _int64) for name in ("gaussian_workspace", "pair_workspace", "pixel_workspace", "gradient_rows")]
 
 
 class CudaLibrary:

@@ -57,7 +57,8 @@ template <int kBatch, int kFeatures>
 __device__ inline void load_features(Batch<kBatch, kFeatures>& batch, int n, const GaussianArrays& arrays,
                                      const FeatureGroup& group) {
   constexpr int kQuads = kFeatures / 4;
-  const bool whole = group.count == kFeatures && arrays.feature_channels % 4 == 0;
+  const bool aligned = arrays.feature_channels % 4 == 0 && reinterpret_cast<std::uintptr_t>(arrays.features) % 16 == 0;
+  const bool whole = group.count == kFeatures && aligned;
 #pragma unroll 1
   for (int i = threadIdx.x; i < n * kQuads; i += kTileThreads) {
     const int k = i / kQuads, quad = i % kQuads;
