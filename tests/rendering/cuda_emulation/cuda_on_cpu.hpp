@@ -44,6 +44,8 @@ using std::min;
 inline void __syncthreads() { emulation::meet_block(0); }
 inline int __syncthreads_count(int predicate) { return emulation::meet_block(predicate != 0); }
 
+inline void __syncwarp() { emulation::meet_warp(emulation::kSync, 0); }
+
 inline void require_whole_warp(unsigned mask) {
   if (mask != 0xffffffffu) emulation::fail("a collective of part of a warp");
 }

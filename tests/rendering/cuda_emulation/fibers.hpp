@@ -10,7 +10,7 @@ struct Index {
 };
 extern Index threadIdx, blockIdx, blockDim, gridDim;
 
-enum Operation { kShuffle, kShuffleXor, kBallot, kReduceAdd, kReduceMax };
+enum Operation { kShuffle, kShuffleXor, kBallot, kReduceAdd, kReduceMax, kSync };
 
 [[noreturn]] void fail(const char* what);
 

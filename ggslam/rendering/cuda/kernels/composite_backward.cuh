@@ -6,23 +6,16 @@
 // so one scalar per pixel stands for everything behind. The transmittance is recovered by dividing by 1 - alpha.
 //
 // d loss / d log(alpha) =: G leads to the splat's geometry through its moments sum G (1, dx, dy, dx^2, dx dy, dy^2).
-// A warp sums all values of a splat over its pixels at once (warp_reduction.cuh) and adds them to the Gaussian's row of
-// gradients with one coalesced atomic instruction. Everything is linear in the image gradients, so that groups of
-// feature channels may be handled by launches of their own.
+// Sums over a warp's pixels are the business of gradient_queue.cuh. Everything is linear in the image gradients, so that
+// groups of feature channels may be handled by launches of their own.
 #pragma once
-#include "tile.cuh"
-#include "warp_reduction.cuh"
+#include "gradient_queue.cuh"
 
 namespace ggslam::cuda {
 
-constexpr int kBackwardBatch = 128;
-
-// Where the summed gradients go.
-struct GradientRows {
-  float* rows;  // [N, stride]: base gradients, then features
-  int stride;
-  std::uint8_t* touched;  // [N]
-};
+// Splats brought to shared memory at a time; with many features less, for that memory's sake.
+template <int kFeatures>
+constexpr int kBackwardBatch = kFeatures > 8 ? 64 : 128;
 
 // What a pixel knows while going through the splats from back to front.
 template <int kFeatures>
@@ -58,12 +51,16 @@ __device__ inline PixelState<kFeatures> load_pixel(const ImageGradients& in, con
   return p;
 }
 
-// Takes one splat back out of a pixel; values: its base gradients at this pixel, then those of its features.
+// A splat's weight at a pixel, and its G = d loss / d log(alpha).
+struct Contribution {
+  float weight, log_alpha;
+};
+
+// Takes one splat back out of a pixel.
 template <int kFeatures, bool kDetached>
-__device__ inline void differentiate(const Splat& s, const float4* features, int entry, PixelState<kFeatures>& p,
-                                     float (&values)[kBaseGradients + kFeatures]) {
-  const float dx = p.x - s.mean_x, dy = p.y - s.mean_y;
-  const float exponent = log2_alpha(s, dx, dy);
+__device__ inline Contribution differentiate(const Splat& s, const float4* features, int entry,
+                                             PixelState<kFeatures>& p) {
+  const float exponent = log2_alpha(s, p.x - s.mean_x, p.y - s.mean_y);
   const bool taken = exponent >= kLog2MinAlpha && entry <= p.last;
   const float unlimited = exp2f(exponent);
   const float alpha = taken ? fminf(unlimited, kMaxAlpha) : 0.0f;
@@ -82,18 +79,20 @@ __device__ inline void differentiate(const Splat& s, const float4* features, int
   p.behind += weight * dot;
   p.transmittance = before;
   // At the limit kMaxAlpha, alpha does not depend on the splat's shape.
-  const float G = taken && unlimited <= kMaxAlpha ? alpha * alpha_gradient : 0.0f;
-  const float Gx = G * dx, Gy = G * dy;
-  values[0] = G, values[1] = Gx, values[2] = Gy;
-  values[3] = Gx * dx, values[4] = Gx * dy, values[5] = Gy * dy;
-  values[6] = weight * p.red, values[7] = weight * p.green, values[8] = weight * p.blue, values[9] = weight * p.depth;
+  return {weight, taken && unlimited <= kMaxAlpha ? alpha * alpha_gradient : 0.0f};
+}
+
+// Leaves a pixel's image gradients in shared memory for the sums.
+template <int kFeatures>
+__device__ inline void share_image_gradients(const PixelState<kFeatures>& p, float* out) {
+  out[0] = p.red, out[1] = p.green, out[2] = p.blue, out[3] = p.depth;
 #pragma unroll
-  for (int q = 0; q < kFeatures; ++q) values[kBaseGradients + q] = weight * p.features[q];
+  for (int q = 0; q < kFeatures; ++q) out[kBaseChannels + q] = p.features[q];
 }
 
 // Brings entries [first, first + n) of the tile's list to shared memory and marks the Gaussians that contributed.
-template <int kFeatures>
-__device__ inline void load_contributors(Batch<kBackwardBatch, kFeatures>& batch, std::uint32_t first, int n,
+template <int kBatch, int kFeatures>
+__device__ inline void load_contributors(Batch<kBatch, kFeatures>& batch, std::uint32_t first, int n,
                                          const GaussianWorkspace& gaussians, const PairWorkspace& pairs,
                                          const GradientRows& out) {
   const int k = threadIdx.x;
@@ -122,36 +121,45 @@ template <int kFeatures, bool kDetached>
 __global__ void __launch_bounds__(kTileThreads, 4)
 differentiate_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussians, PairWorkspace pairs,
                      PixelWorkspace w, ImageGradients in, FeatureGroup group, GradientRows out) {
-  GGSLAM_SHARED Batch<kBackwardBatch, kFeatures> batch;
-  constexpr int kValues = kBaseGradients + kFeatures;
+  constexpr int kBatch = kBackwardBatch<kFeatures>;
+  GGSLAM_SHARED Batch<kBatch, kFeatures> batch;
+  GGSLAM_SHARED WarpQueue<kFeatures> queues[kWarps];
   const int tile = static_cast<int>(blockIdx.x), lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
   PixelState<kFeatures> pixel = load_pixel<kFeatures>(in, w, grid, group, pixel_of_thread(grid, tile));
   const std::uint32_t begin = w.tile_start[tile];
-  // Where the lane's sum goes in a Gaussian's row.
-  const int column = lane < kBaseGradients ? lane : lane + group.first;
-  const bool adds = lane < kBaseGradients + group.count;
+  WarpQueue<kFeatures>& queue = queues[warp];
+  share_image_gradients(pixel, queue.pixel(lane));
+  const float left = pixel.x - static_cast<float>(lane % kWarpWidth);
+  const float top = pixel.y - static_cast<float>(lane / kWarpWidth);
+  QueuedSplat mine = {};
+  int queued = 0;
 
-  for (int end = maximum_of_block(pixel.last) + 1; end > 0; end -= kBackwardBatch) {
-    const int first = max(end - kBackwardBatch, 0), n = end - first;
+  for (int end = maximum_of_block(pixel.last) + 1; end > 0; end -= kBatch) {
+    const int first = max(end - kBatch, 0), n = end - first;
     __syncthreads();
-    load_contributors<kFeatures>(batch, begin + static_cast<std::uint32_t>(first), n, gaussians, pairs, out);
+    load_contributors(batch, begin + static_cast<std::uint32_t>(first), n, gaussians, pairs, out);
     __syncthreads();
     if constexpr (kFeatures > 0 && !kDetached) {
       load_features(batch, n, arrays, group);
       __syncthreads();
     }
     for (int k0 = (n - 1) / kWarp * kWarp; k0 >= 0; k0 -= kWarp) {
-      const bool mine = k0 + lane < n && ((batch.warps[k0 + lane] >> warp) & 1) != 0;
-      for (unsigned left = __ballot_sync(kAllLanes, mine); left != 0;) {
-        const int bit = 31 - __clz(static_cast<int>(left)), k = k0 + bit;
-        left ^= 1u << bit;
-        float values[kValues];
-        differentiate<kFeatures, kDetached>(batch.splats[k], batch.features[k], first + k, pixel, values);
-        const float sum = sum_over_warp(values, lane);
-        if (adds) atomicAdd(out.rows + static_cast<std::int64_t>(batch.rows[k]) * out.stride + column, sum);
+      const bool concerned = k0 + lane < n && ((batch.warps[k0 + lane] >> warp) & 1) != 0;
+      for (unsigned open = __ballot_sync(kAllLanes, concerned); open != 0;) {
+        const int bit = 31 - __clz(static_cast<int>(open)), k = k0 + bit;
+        open ^= 1u << bit;
+        const Splat& splat = batch.splats[k];
+        const Contribution c = differentiate<kFeatures, kDetached>(splat, batch.features[k], first + k, pixel);
+        queue.weights[queued * kQueueStride + lane] = c.weight;
+        queue.log_alphas[queued * kQueueStride + lane] = c.log_alpha;
+        if (lane % kQueued == queued) mine = {splat.mean_x, splat.mean_y, batch.rows[k]};
+        if (++queued < kQueued) continue;
+        empty_queue(queue, mine, queued, left, top, group, out);
+        queued = 0;
       }
     }
   }
+  if (queued > 0) empty_queue(queue, mine, queued, left, top, group, out);
 }
 
 }  // namespace ggslam::cuda

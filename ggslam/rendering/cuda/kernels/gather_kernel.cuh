@@ -4,6 +4,7 @@
 #include "composite_backward.cuh"
 #include "projection_backward.cuh"
 #include "view_colour.cuh"
+#include "warp_reduction.cuh"
 
 namespace ggslam::cuda {
 
