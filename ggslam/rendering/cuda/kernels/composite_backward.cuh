@@ -118,7 +118,7 @@ __device__ inline int maximum_of_block(int value) {
 }
 
 template <int kFeatures, bool kDetached>
-__global__ void __launch_bounds__(kTileThreads, 4)
+__global__ void __launch_bounds__(kTileThreads, kFeatures > 0 ? 3 : 4)
 differentiate_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussians, PairWorkspace pairs,
                      PixelWorkspace w, ImageGradients in, FeatureGroup group, GradientRows out) {
   constexpr int kBatch = kBackwardBatch<kFeatures>;
@@ -126,18 +126,16 @@ differentiate_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussia
   GGSLAM_SHARED WarpQueue<kFeatures> queues[kWarps];
   const int tile = static_cast<int>(blockIdx.x), lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
   PixelState<kFeatures> pixel = load_pixel<kFeatures>(in, w, grid, group, pixel_of_thread(grid, tile));
-  const std::uint32_t begin = w.tile_start[tile];
   WarpQueue<kFeatures>& queue = queues[warp];
   share_image_gradients(pixel, queue.pixel(lane));
-  const float left = pixel.x - static_cast<float>(lane % kWarpWidth);
-  const float top = pixel.y - static_cast<float>(lane / kWarpWidth);
   QueuedSplat mine = {};
   int queued = 0;
 
   for (int end = maximum_of_block(pixel.last) + 1; end > 0; end -= kBatch) {
     const int first = max(end - kBatch, 0), n = end - first;
     __syncthreads();
-    load_contributors(batch, begin + static_cast<std::uint32_t>(first), n, gaussians, pairs, out);
+    // The list's start is read anew for each batch rather than kept in a register all along.
+    load_contributors(batch, w.tile_start[tile] + static_cast<std::uint32_t>(first), n, gaussians, pairs, out);
     __syncthreads();
     if constexpr (kFeatures > 0 && !kDetached) {
       load_features(batch, n, arrays, group);
@@ -154,12 +152,12 @@ differentiate_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussia
         queue.log_alphas[queued * kQueueStride + lane] = c.log_alpha;
         if (lane % kQueued == queued) mine = {splat.mean_x, splat.mean_y, batch.rows[k]};
         if (++queued < kQueued) continue;
-        empty_queue(queue, mine, queued, left, top, group, out);
+        empty_queue(queue, mine, queued, pixel.x, pixel.y, group, out);
         queued = 0;
       }
     }
   }
-  if (queued > 0) empty_queue(queue, mine, queued, left, top, group, out);
+  if (queued > 0) empty_queue(queue, mine, queued, pixel.x, pixel.y, group, out);
 }
 
 }  // namespace ggslam::cuda

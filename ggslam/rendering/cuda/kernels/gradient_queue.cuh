@@ -43,41 +43,65 @@ struct QueuedSplat {
   std::uint32_t row;
 };
 
-// Sums along the lane's row of pixels, into the values in the order of a row of gradients. left, y: of that row's first
-// pixel, from the splat's mean.
-template <int kFeatures, int kValues>
-__device__ inline void sum_row(const WarpQueue<kFeatures>& queue, int lane, float left, float y,
-                               float (&values)[kValues]) {
-  constexpr int kQuads = WarpQueue<kFeatures>::kChannels / 4;
-  const int row = lane / kQueued, place = lane % kQueued * kQueueStride + row * kWarpWidth;
-  float4 sums[kQuads];
-#pragma unroll
-  for (float4& sum : sums) sum = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+// Eight numbers of the queue, of one splat and one row of pixels.
+struct RowOfNumbers {
+  float values[kWarpWidth];
+};
+
+__device__ inline RowOfNumbers load_row(const float* numbers, int lane) {
+  const float* row = numbers + lane % kQueued * kQueueStride + lane / kQueued * kWarpWidth;
+  const float4 a = *reinterpret_cast<const float4*>(row), b = *reinterpret_cast<const float4*>(row + 4);
+  return {{a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}};
+}
+
+// values[0..6): moments of G along the lane's row of pixels; left, y: of its first pixel, from the splat's mean.
+__device__ inline void sum_moments(const float* log_alphas, int lane, float left, float y, float* values) {
+  const RowOfNumbers row = load_row(log_alphas, lane);
   float m0 = 0.0f, mx = 0.0f, mxx = 0.0f;
 #pragma unroll
-  for (int half = 0; half < 2; ++half) {
-    const float4 w = *reinterpret_cast<const float4*>(queue.weights + place + 4 * half);
-    const float4 g = *reinterpret_cast<const float4*>(queue.log_alphas + place + 4 * half);
-    const float weights[4] = {w.x, w.y, w.z, w.w}, log_alphas[4] = {g.x, g.y, g.z, g.w};
-#pragma unroll
-    for (int i = 0; i < 4; ++i) {
-      const int column = 4 * half + i;
-      const float* pixel = queue.image_gradients + row * queue.kRowStride + column * queue.kChannels;
-#pragma unroll
-      for (int quad = 0; quad < kQuads; ++quad) {
-        const float4 v = *reinterpret_cast<const float4*>(pixel + 4 * quad);
-        sums[quad].x += weights[i] * v.x, sums[quad].y += weights[i] * v.y;
-        sums[quad].z += weights[i] * v.z, sums[quad].w += weights[i] * v.w;
-      }
-      const float x = left + static_cast<float>(column), moment = log_alphas[i] * x;
-      m0 += log_alphas[i], mx += moment, mxx += moment * x;
-    }
+  for (int column = 0; column < kWarpWidth; ++column) {
+    const float x = left + static_cast<float>(column), moment = row.values[column] * x;
+    m0 += row.values[column], mx += moment, mxx += moment * x;
   }
   values[0] = m0, values[1] = mx, values[2] = m0 * y, values[3] = mxx, values[4] = mx * y, values[5] = m0 * y * y;
+}
+
+// values[0..4 kQuads): weight times image gradient along the lane's row, for channels from 4 kFirst on.
+template <int kFirst, int kQuads, int kFeatures>
+__device__ inline void sum_channels(const WarpQueue<kFeatures>& queue, int lane, float* values) {
+  const RowOfNumbers weights = load_row(queue.weights, lane);
+  const float* pixels = queue.image_gradients + lane / kQueued * queue.kRowStride + 4 * kFirst;
 #pragma unroll
-  for (int quad = 0; quad < kQuads; ++quad) {
-    values[6 + 4 * quad] = sums[quad].x, values[7 + 4 * quad] = sums[quad].y;
-    values[8 + 4 * quad] = sums[quad].z, values[9 + 4 * quad] = sums[quad].w;
+  for (int i = 0; i < 4 * kQuads; ++i) values[i] = 0.0f;
+#pragma unroll
+  for (int column = 0; column < kWarpWidth; ++column) {
+#pragma unroll
+    for (int quad = 0; quad < kQuads; ++quad) {
+      const float4 v = *reinterpret_cast<const float4*>(pixels + column * queue.kChannels + 4 * quad);
+      const float weight = weights.values[column];
+      values[4 * quad] += weight * v.x, values[4 * quad + 1] += weight * v.y;
+      values[4 * quad + 2] += weight * v.z, values[4 * quad + 3] += weight * v.w;
+    }
+  }
+}
+
+// Sums along the lane's row of pixels, in the order of a row of gradients.
+template <int kFeatures>
+__device__ inline void sum_row(const WarpQueue<kFeatures>& queue, int lane, float left, float y,
+                               float (&values)[kBaseGradients + kFeatures]) {
+  constexpr int kQuads = kFeatures / 4, kFirstHalf = (kQuads + 1) / 2;
+  float* features = values + kBaseGradients;
+  // Nothing is moved across __syncwarp: all sums at once would take more registers than there are.
+  sum_moments(queue.log_alphas, lane, left, y, values);
+  sum_channels<0, 1>(queue, lane, values + 6);
+  values[10] = values[11] = 0.0f;
+  if constexpr (kQuads > 0) {
+    if constexpr (kQuads > 2) __syncwarp();
+    sum_channels<1, kFirstHalf>(queue, lane, features);
+  }
+  if constexpr (kQuads > 1) {
+    __syncwarp();
+    sum_channels<1 + kFirstHalf, kQuads - kFirstHalf>(queue, lane, features + 4 * kFirstHalf);
   }
 }
 
@@ -97,28 +121,27 @@ __device__ inline void join_rows(int lane, float (&values)[kValues]) {
   }
 }
 
-// Adds the gradients of the first `count` queued splats to their Gaussians' rows. x, y: first pixel of the warp. All
-// lanes of the warp must call this.
+// Adds the gradients of the first `count` queued splats to their Gaussians' rows. x, y: the lane's pixel. All lanes of
+// the warp must call this.
 template <int kFeatures>
 __device__ inline void empty_queue(const WarpQueue<kFeatures>& queue, const QueuedSplat& mine, int count, float x,
                                    float y, const FeatureGroup& group, const GradientRows& out) {
-  constexpr int kUsed = kBaseGradients + kFeatures, kValues = (kUsed + 3) / 4 * 4;
-  const int lane = threadIdx.x % kWarp, row = lane / kQueued;
-  float values[kValues];
-#pragma unroll
-  for (int i = kUsed; i < kValues; ++i) values[i] = 0.0f;
+  const int lane = threadIdx.x % kWarp;
+  float values[kBaseGradients + kFeatures];
   __syncwarp();  // the queue has been written
-  sum_row<kFeatures>(queue, lane, x - mine.mean_x, y + static_cast<float>(row) - mine.mean_y, values);
+  // The lane's own pixel lies in the row that it sums, as there are as many splats as pixels in a row.
+  static_assert(kQueued == kWarpWidth, "a lane's row of pixels is the row that it sums");
+  const float left = x - static_cast<float>(lane % kWarpWidth);
+  sum_row<kFeatures>(queue, lane, left - mine.mean_x, y - mine.mean_y, values);
   __syncwarp();  // and may be written again
   join_rows(lane, values);
   if (lane % kQueued >= count) return;
-  float* gradients = out.rows + static_cast<std::int64_t>(mine.row) * out.stride;
+  float* gradients = out.rows + static_cast<std::int64_t>(mine.row) * out.stride + lane / kQueued;
 #pragma unroll
-  for (int i = 0; i < kValues / 4; ++i) {
-    const int value = 4 * i + row;
-    if (value < kBaseGradients + group.count)
-      atomicAdd(gradients + (value < kBaseGradients ? value : value + group.first), values[i]);
-  }
+  for (int i = 0; i < kBaseGradients / 4; ++i) atomicAdd(gradients + 4 * i, values[i]);
+  gradients += group.first;
+#pragma unroll
+  for (int i = kBaseGradients / 4; i < (kBaseGradients + kFeatures) / 4; ++i) atomicAdd(gradients + 4 * i, values[i]);
 }
 
 }  // namespace ggslam::cuda

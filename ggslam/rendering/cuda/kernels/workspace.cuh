@@ -6,7 +6,7 @@
 namespace ggslam::cuda {
 
 constexpr int kTileSize = 16;  // pixels; a tile is square
-constexpr int kBaseGradients = 10;  // log-alpha moments 1, dx, dy, dx^2, dx dy, dy^2; colour; depth
+constexpr int kBaseGradients = 12;  // log-alpha moments 1, dx, dy, dx^2, dx dy, dy^2; colour; depth; two not in use
 
 // Tiles that a splat's bounding box covers.
 struct __align__(8) TileRectangle {
@@ -36,8 +36,8 @@ inline int bits_of(std::uint32_t largest) {
 
 // Floats from one Gaussian's row of summed image-space gradients to the next: base gradients, then features.
 inline int gradient_stride(const GaussianArrays& arrays) {
-  const int used = kBaseGradients + (arrays.render_features ? arrays.feature_channels : 0);
-  return (used + 15) / 16 * 16;
+  const int features = arrays.render_features ? (arrays.feature_channels + 3) / 4 * 4 : 0;
+  return (kBaseGradients + features + 15) / 16 * 16;
 }
 
 // Hands out parts of a block of memory, each aligned to 256 bytes. With a null block it only counts.
