@@ -58,7 +58,7 @@ def make_workload(size: tuple[int, int], count: int, features: int) -> tuple[Gau
 
 
 def leaves(scene: GaussianTensors, device: str) -> GaussianTensors:
-    return GaussianTensors(**{name: getattr(scene, name).to(device).requires_grad_() for name in PARAMETERS})
+    return GaussianTensors(**{name: getattr(scene, name).clone().to(device).requires_grad_() for name in PARAMETERS})
 
 
 @dataclass

@@ -37,8 +37,8 @@ machine() {
 }
 
 build() {
-  JOBS=${JOBS:-$(nproc)} bash scripts/build_native.sh
-  test -f ggslam/native/_lib/libggslam_core.so
+  JOBS=${JOBS:-$(nproc)} bash scripts/build_native.sh &&
+    test -f ggslam/native/_lib/libggslam_core.so
 }
 
 # Compiles the rasterizer for this GPU as a user's first call does, then once more to list registers and spills.
@@ -54,7 +54,7 @@ CODE
   local arch
   arch=$("$python" -c 'import torch; print("".join(map(str, torch.cuda.get_device_capability())))')
   nvcc -O3 -std=c++17 -ftz=true -Xptxas -v -gencode "arch=compute_$arch,code=sm_$arch" -c -o /dev/null \
-    ggslam/rendering/cuda/kernels/api.cu 2>&1 | grep -E "Compiling|spill|Used" | c++filt
+    ggslam/rendering/cuda/kernels/api.cu 2>&1 | grep -E "Compiling|spill|Used" | { c++filt 2>/dev/null || cat; }
 }
 
 tests() {

@@ -17,6 +17,7 @@ from test_cpu_rules import bad_rows
 from ggslam.errors import RenderError
 from ggslam.rendering.autograd import render_cpu
 from ggslam.rendering.cuda.autograd import render_cuda
+from ggslam.rendering.cuda.memory import GrowingMemory
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import PARAMETERS, GaussianTensors
 from ggslam.scene.camera import Camera
@@ -166,6 +167,37 @@ def test_too_little_room_for_pairs_is_made_good(rasterizer: CudaRasterizer) -> N
     assert all(torch.equal(found[name], expected[name]) for name in expected)
     again = run(rasterizer, many, CAMERA, POSE, gradients)  # now with more room than there are pairs
     assert all(torch.equal(again[name], expected[name]) for name in expected)
+
+
+class GuardedMemory(GrowingMemory):
+    """Blocks of just the size asked for, filled with one value, between margins that nobody may write to."""
+
+    MARGIN = 4096
+
+    def __init__(self, value: int) -> None:
+        super().__init__(torch.device("cpu"))
+        self._value = value
+        self._buffers: list[torch.Tensor] = []
+
+    def block(self, name: str, size: int) -> torch.Tensor:
+        self._buffers.append(torch.full((size + 2 * self.MARGIN,), self._value, dtype=torch.uint8))
+        return self._buffers[-1][self.MARGIN : self.MARGIN + size]
+
+    def untouched(self) -> bool:
+        margins = [torch.cat([b[: self.MARGIN], b[len(b) - self.MARGIN :]]) for b in self._buffers]
+        return bool(margins) and all(bool((margin == self._value).all()) for margin in margins)
+
+
+@pytest.mark.parametrize("features", [0, 5, 16])
+def test_what_was_in_memory_before_does_not_matter(rasterizer: CudaRasterizer, features: int) -> None:
+    found = []
+    for value in (0, 255):  # 255: NaN, or numbers far out of range
+        rasterizer._memory = memory = GuardedMemory(value)
+        rasterizer._counter.expected_pairs = 2000  # more than there are
+        scene, gradients = make_scene(300, features), make_image_gradients(CAMERA, features)
+        found.append(run(rasterizer, scene, CAMERA, POSE, gradients, median_depth=True))
+        assert memory.untouched()
+    assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
 
 
 def leaves(scene: GaussianTensors) -> GaussianTensors:

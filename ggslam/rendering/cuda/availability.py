@@ -31,6 +31,8 @@ def describe_cuda_backend() -> tuple[bool, str]:
     if not torch.cuda.is_available():
         return False, f"no GPU in use; {nvcc} could compile it"
     major, minor = torch.cuda.get_device_capability()
+    if major < 8:
+        return False, f"the GPU's compute capability is {major}.{minor}; 8.0 is needed"
     try:
         path = library_path(nvcc, f"{major}{minor}")
     except MissingDependency as error:

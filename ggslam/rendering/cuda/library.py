@@ -102,4 +102,6 @@ def library_for_device(device: torch.device | int | None = None) -> CudaLibrary:
     if not torch.cuda.is_available():
         raise MissingDependency("the cuda backend needs an NVIDIA GPU and a CUDA build of torch; torch finds none")
     major, minor = torch.cuda.get_device_capability(device)
+    if major < 8:  # sums over a warp in one instruction
+        raise MissingDependency(f"the cuda backend needs a GPU of compute capability 8.0, found {major}.{minor}")
     return library_for(f"{major}{minor}")
