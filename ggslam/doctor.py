@@ -204,6 +204,18 @@ def _gpu() -> Iterator[Finding]:
     compiler = shutil.which("nvcc")
     if compiler is not None:
         yield Finding("gpu", "nvcc", "ok", _last_line([compiler, "--version"]) or compiler)
+    yield _cuda_rasterizer()
+
+
+def _cuda_rasterizer() -> Finding:
+    try:
+        from ggslam.rendering.cuda.availability import describe_cuda_backend
+
+        usable, detail = describe_cuda_backend()
+    except ImportError as error:  # a package is missing, and said so above
+        usable, detail = False, str(error)
+    advice = "" if usable else "none is needed; to render on a GPU install nvcc (CUDA toolkit) and torch for CUDA"
+    return Finding("gpu", "rasterizer", "ok" if usable else "missing", detail, advice)
 
 
 def _last_line(command: list[str]) -> str:

@@ -26,13 +26,15 @@ from pathlib import Path
 wheel, sdist = sys.argv[1:]
 packed = set(zipfile.ZipFile(wheel).namelist())
 source = {"/".join(name.split("/")[1:]) for name in tarfile.open(sdist).getnames()}
-needed = {"ggslam/py.typed", "ggslam/native/_lib/libggslam_core.so", "ggslam/configs/default.yaml"}
+needed = {"ggslam/py.typed", "ggslam/native/_lib/libggslam_core.so", "ggslam/configs/default.yaml",
+          "ggslam/rendering/cuda/kernels/api.cu", "ggslam/rendering/cuda/kernels/tile.cuh"}
 junk = [n for n in packed if n.startswith(("tests/", "scripts/", "docs/")) or "/src/" in n or n.endswith(".pyc")]
 assert needed <= packed, f"{wheel} lacks {needed - packed}"
 assert not junk, f"{wheel} holds {junk[:5]}"
 assert any(n.endswith("licenses/LICENSE") for n in packed), f"{wheel} lacks the licence"
 needed = {"LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "CMakeLists.txt", "pyproject.toml", "ggslam/py.typed",
-          "configs/default.yaml", "tests/conftest.py", "ggslam/native/src/dispatch.hpp"}
+          "configs/default.yaml", "tests/conftest.py", "ggslam/native/src/dispatch.hpp",
+          "ggslam/rendering/cuda/kernels/api.cu", "ggslam/rendering/cuda/kernels/tile.cuh"}
 ends = (".so", ".pyc", ".whl", ".o")
 junk = [n for n in source if n.endswith(ends) or n.split("/")[0] in (".git", "build", "dist", "runs", "demo", ".ci")]
 assert needed <= source, f"{sdist} lacks {needed - source}"

@@ -1,20 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differentiable rendering of Gaussians: `render` for library users, `CpuRasterizer` for inner loops."""
+"""Differentiable rendering of Gaussians: `render` for library users, `CpuRasterizer` and `CudaRasterizer` for
+inner loops."""
 
 from ggslam.rendering.adam import AdamSettings
-from ggslam.rendering.api import backends, register_backend, render
+from ggslam.rendering.api import backends, choose_backend, register_backend, render
 from ggslam.rendering.cpu import CpuRasterizer, StepResult
+from ggslam.rendering.cuda import CudaGradients, CudaRasterizer
 from ggslam.rendering.types import Gaussians, GaussianTensors, Gradients, RenderBuffers
 
 __all__ = [
     "AdamSettings",
     "CpuRasterizer",
+    "CudaGradients",
+    "CudaRasterizer",
     "GaussianTensors",
     "Gaussians",
     "Gradients",
     "RenderBuffers",
     "StepResult",
     "backends",
+    "choose_backend",
     "register_backend",
     "render",
 ]

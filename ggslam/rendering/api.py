@@ -11,6 +11,8 @@ import torch
 
 from ggslam.errors import RenderError
 from ggslam.rendering.autograd import render_cpu, rigid_inverse
+from ggslam.rendering.cuda.autograd import render_cuda
+from ggslam.rendering.cuda.availability import cuda_backend_problem
 from ggslam.rendering.gsplat_backend import render_gsplat
 from ggslam.rendering.reference import render_reference
 from ggslam.rendering.types import LOW_PASS, Gaussians, RenderBuffers, check_pose
@@ -23,7 +25,9 @@ def _reference(gaussians: Gaussians, camera: Camera, T_world_camera: torch.Tenso
     return render_reference(gaussians, camera, rigid_inverse(T_world_camera).to(gaussians.means), **options)
 
 
-_BACKENDS: dict[str, Backend] = {"cpu": render_cpu, "reference": _reference, "gsplat": render_gsplat}
+_BACKENDS: dict[str, Backend] = {
+    "cpu": render_cpu, "cuda": render_cuda, "gsplat": render_gsplat, "reference": _reference,
+}  # fmt: skip
 
 
 def register_backend(name: str, backend: Backend) -> None:
@@ -33,8 +37,22 @@ def register_backend(name: str, backend: Backend) -> None:
 
 
 def backends() -> list[str]:
-    """Names of the backends. "gsplat" is listed whether or not it is installed."""
+    """Names of the backends, whether or not they can be used here. "auto" stands for `choose_backend`."""
     return list(_BACKENDS)
+
+
+def choose_backend(device: torch.device | None = None) -> str:
+    """The backend that "auto" stands for.
+
+    Args:
+        device: of the Gaussians; None: they can be anywhere.
+
+    Returns:
+        "cuda" if there is a CUDA device, not ruled out by `device`, for which the rasterizer can be compiled;
+        else "cpu".
+    """
+    ruled_out = device is not None and device.type != "cuda"
+    return "cuda" if not ruled_out and torch.cuda.is_available() and cuda_backend_problem() is None else "cpu"
 
 
 def render(
@@ -52,12 +70,12 @@ def render(
     """Renders Gaussians, differentiable with respect to their parameters and to the pose.
 
     Args:
-        gaussians: see `Gaussians`; float32 on the CPU for "cpu", on a CUDA device for "gsplat", any float for
-            "reference".
+        gaussians: see `Gaussians`; float32 on the CPU for "cpu", on a CUDA device for "cuda" and "gsplat", any
+            float for "reference".
         camera: the camera.
         T_world_camera: [4, 4] rigid transform, camera to world; a tensor may require gradients. The gradient of "cpu"
-            is the part along rigid motions.
-        backend: one of `backends()`.
+            and "cuda" is the part along rigid motions.
+        backend: one of `backends()`, or "auto": "cuda" for Gaussians on a CUDA device, else "cpu".
         features: render the feature channels, if there are any.
         median_depth: render the median depth, too.
         active_sh_degree: highest spherical-harmonic degree to evaluate; None: all.
@@ -69,8 +87,10 @@ def render(
 
     Raises:
         RenderError: unknown backend, wrong shapes, dtypes or devices, an impossible pose or degree.
-        MissingDependency: the backend's package is not installed.
+        MissingDependency: the backend's package is not installed, or it cannot be compiled.
     """
+    if backend == "auto":
+        backend = choose_backend(gaussians.means.device)
     if backend not in _BACKENDS:
         raise RenderError(f"unknown rendering backend {backend!r}; available: {', '.join(_BACKENDS)}")
     if not isinstance(T_world_camera, torch.Tensor):

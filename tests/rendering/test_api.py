@@ -68,7 +68,7 @@ def test_images_are_the_callers_own() -> None:
 
 
 def test_backends_by_name() -> None:
-    assert {"cpu", "reference", "gsplat"} <= set(backends())
+    assert {"cpu", "cuda", "reference", "gsplat"} <= set(backends())
     with pytest.raises(RenderError, match="unknown rendering backend 'opengl'; available: cpu"):
         render(make_scene(1), CAMERA, np.eye(4), backend="opengl")
     with pytest.raises(RenderError, match="4x4"):

@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The CUDA rasterizer: the interface of `CpuRasterizer`, for tensors on an NVIDIA GPU.
+
+Work is only started, on torch's current stream. The host waits once per rendering, and only for its projection: the
+number of pairs of a Gaussian and an image tile has to be known to have made room for them. What follows is started
+before that, with the room that the last rendering needed and some more, and repeated in the rare case that it was not
+enough; so the device does not idle while the host waits.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ggslam.errors import RenderError
+from ggslam.rendering import _native
+from ggslam.rendering._native import pointer
+from ggslam.rendering.cuda.library import CudaLibrary, Rendering, library_for_device
+from ggslam.rendering.cuda.memory import Counter, FinishedRendering, GrowingMemory, target_pointers
+from ggslam.rendering.types import (
+    LOW_PASS,
+    PARAMETERS,
+    Gaussians,
+    GaussianTensors,
+    RenderBuffers,
+    active_coefficients,
+    check_gaussians,
+    check_pose,
+)
+from ggslam.scene.camera import Camera
+
+_MAX_PAIRS = 2**31 - 1
+_IMAGES = ("image", "features", "depth", "alpha")
+
+
+@dataclass
+class CudaGradients:
+    """`Gradients` on the device. Sums are formed by atomic additions: the last digits differ from run to run.
+
+    Attributes:
+        means, quaternions, log_scales, opacity_logits, sh, features: as the parameters; features None if not rendered.
+        twist: float64 [6] tensor on the device, d loss / d xi as in `Gradients`.
+        touched: uint8 [N], 1 where the Gaussian contributed to some pixel. All other rows are zero.
+    """
+
+    means: torch.Tensor
+    quaternions: torch.Tensor
+    log_scales: torch.Tensor
+    opacity_logits: torch.Tensor
+    sh: torch.Tensor
+    features: torch.Tensor | None
+    twist: torch.Tensor
+    touched: torch.Tensor
+
+
+class CudaRasterizer:
+    """Renders Gaussians on a GPU and differentiates what it rendered. The rules are those of
+    `ggslam.rendering.reference`.
+
+    One rasterizer serves one caller and one stream at a time and holds the buffers of one rendering. Memory grows to
+    the largest rendering and stays.
+
+    Args:
+        device: CUDA device; None: the current one.
+        near_plane: metres; Gaussians whose mean is nearer are left out.
+        low_pass: pixels^2 added to both variances of a projected Gaussian.
+        library: the compiled rasterizer; None: that of the device, compiled if need be.
+
+    Raises:
+        RenderError: an impossible near plane or low-pass filter.
+        MissingDependency: no CUDA device, or the rasterizer cannot be compiled.
+    """
+
+    def __init__(
+        self,
+        device: torch.device | str | None = None,
+        near_plane: float = 0.05,
+        low_pass: float = LOW_PASS,
+        library: CudaLibrary | None = None,
+    ) -> None:
+        if not near_plane > 0:
+            raise RenderError(f"near_plane must be positive, found {near_plane}")
+        if not 0 < low_pass < 1e3:
+            raise RenderError(f"low_pass must be positive, found {low_pass}")
+        self.near_plane = near_plane
+        self.low_pass = low_pass
+        chosen = None if device is None else torch.device(device)
+        self.library = library or library_for_device(chosen)
+        if chosen is None or (chosen.type == "cuda" and chosen.index is None):
+            on_gpu = self.library.device_type == "cuda"
+            chosen = torch.device("cuda", torch.cuda.current_device()) if on_gpu else torch.device("cpu")
+        self.device = chosen
+        self._counter = Counter(self.library, chosen.index or 0)
+        self._memory = GrowingMemory(chosen)
+        self._images: dict[str, torch.Tensor] = {}
+        self._last: FinishedRendering | None = None
+
+    # --- forward -------------------------------------------------------------------------------------------------
+
+    def forward(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        T_camera_world: np.ndarray,
+        *,
+        features: bool = True,
+        median_depth: bool = False,
+        active_sh_degree: int | None = None,
+    ) -> RenderBuffers:
+        """Renders. Arguments, results and errors as `CpuRasterizer.forward`, tensors being on the rasterizer's device;
+        the images belong to the rasterizer and are overwritten by its next call."""
+        self._last = None
+        self._last = self.render(
+            gaussians, camera, T_camera_world, self._memory, self._images,
+            features=features, median_depth=median_depth, active_sh_degree=active_sh_degree,
+        )  # fmt: skip
+        return self._last.buffers
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        T_camera_world: np.ndarray,
+        memory: GrowingMemory,
+        images: dict[str, torch.Tensor],
+        *,
+        features: bool = True,
+        median_depth: bool = False,
+        active_sh_degree: int | None = None,
+    ) -> FinishedRendering:
+        """Renders in memory and images given by the caller (images are made where they do not fit), so that several
+        renderings can wait to be differentiated."""
+        parameters = self._checked_parameters(gaussians)
+        channels = parameters.features.shape[1] if features else 0
+        arrays = _native.GaussianArrays(
+            count=parameters.means.shape[0],
+            **{name: pointer(getattr(parameters, name)) for name in PARAMETERS},
+            sh_coefficients=parameters.sh.shape[1],
+            active_sh_coefficients=active_coefficients(parameters, active_sh_degree),
+            feature_channels=parameters.features.shape[1],
+            render_features=int(channels > 0),
+        )
+        rows = (ctypes.c_float * 12)(*check_pose(T_camera_world)[:3].ravel().tolist())
+        view = _native.View(
+            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+            self.near_plane, self.low_pass, rows,
+        )  # fmt: skip
+        buffers = self._buffers(images, camera, channels, median_depth)
+        stream, index = self.library.stream(self.device), self.device.index or 0
+        native = Rendering(arrays, view, target_pointers(buffers), stream=stream, device=index)
+        rendering = FinishedRendering(parameters, buffers, native)
+        self._run(rendering, memory)
+        return rendering
+
+    def _run(self, rendering: FinishedRendering, memory: GrowingMemory) -> None:
+        counter = self._counter
+        expected = counter.expected_pairs
+        sizes = rendering.plan(self.library, expected or 0)
+        rendering.use("gaussian_workspace", memory.block("gaussians", sizes.gaussian_workspace))
+        rendering.use("pixel_workspace", memory.block("pixels", sizes.pixel_workspace))
+        self.library.call("project", ctypes.byref(rendering.native), counter.handle)
+        if expected is not None:
+            self._composite(rendering, expected, memory)
+        rendering.visible, rendering.pairs = counter.wait()
+        if rendering.pairs > _MAX_PAIRS:
+            raise RenderError(
+                "rendering failed: too many pairs of a Gaussian and an image tile (2^31): "
+                "the Gaussians are far too large for the image"
+            )
+        if expected is None or rendering.pairs > expected:
+            self._composite(rendering, rendering.pairs, memory)
+        counter.expected_pairs = min(rendering.pairs + rendering.pairs // 16 + 4096, _MAX_PAIRS)
+
+    def _composite(self, rendering: FinishedRendering, pairs: int, memory: GrowingMemory) -> None:
+        sizes = rendering.plan(self.library, pairs)
+        rendering.gradient_bytes = sizes.gradient_rows
+        rendering.use("pair_workspace", memory.block("pairs", sizes.pair_workspace))
+        self.library.call("composite", ctypes.byref(rendering.native))
+
+    def _buffers(
+        self, images: dict[str, torch.Tensor], camera: Camera, channels: int, median_depth: bool
+    ) -> RenderBuffers:
+        size = (camera.height, camera.width)
+
+        def image(name: str, *shape: int) -> torch.Tensor:
+            found = images.get(name)
+            if found is None or found.shape != shape:
+                found = images[name] = torch.empty(shape, dtype=torch.float32, device=self.device)
+            return found
+
+        return RenderBuffers(
+            image=image("image", 3, *size),
+            depth=image("depth", *size),
+            alpha=image("alpha", *size),
+            features=image("features", channels, *size) if channels else None,
+            median_depth=image("median_depth", *size) if median_depth else None,
+        )
+
+    def statistics(self) -> dict[str, int]:
+        """Of the last forward: `visible` Gaussians and `pairs` of a Gaussian and an image tile."""
+        last = self._require_last()
+        return {"visible": last.visible, "pairs": last.pairs}
+
+    # --- backward --------------------------------------------------------------------------------------------------
+
+    def backward(
+        self,
+        grad_image: torch.Tensor | None,
+        grad_depth: torch.Tensor | None = None,
+        grad_alpha: torch.Tensor | None = None,
+        grad_features: torch.Tensor | None = None,
+        *,
+        detach_features: bool = False,
+    ) -> CudaGradients:
+        """Gradients of a loss through the last `forward`; arguments and errors as `CpuRasterizer.backward`."""
+        grads = (grad_image, grad_depth, grad_alpha, grad_features)
+        return self.differentiate(self._require_last(), grads, self._memory, detach_features=detach_features)
+
+    def pose_gradient(
+        self,
+        grad_image: torch.Tensor | None,
+        grad_depth: torch.Tensor | None = None,
+        grad_alpha: torch.Tensor | None = None,
+        grad_features: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Only the `twist` of `backward`; the gradients of the Gaussians are not written."""
+        last = self._require_last()
+        grads = (grad_image, grad_depth, grad_alpha, grad_features)
+        twist, touched = self._twist_and_touched(last)
+        out = _native.GaussianGradients(twist=pointer(twist), touched=pointer(touched))
+        self._differentiate(last, grads, self._memory, False, out)
+        return twist
+
+    def differentiate(
+        self,
+        rendering: FinishedRendering,
+        grads: tuple[torch.Tensor | None, ...],
+        memory: GrowingMemory,
+        *,
+        detach_features: bool = False,
+    ) -> CudaGradients:
+        """Gradients through a rendering of `render`.
+
+        Args:
+            grads: d loss / d image, depth, alpha, features; None counts as zero.
+            memory: to work in, besides the rendering's own.
+        """
+        names = PARAMETERS if rendering.buffers.features is not None else PARAMETERS[:-1]
+        arrays: dict[str, Any] = {name: torch.empty_like(getattr(rendering.parameters, name)) for name in names}
+        twist, touched = self._twist_and_touched(rendering)
+        out = _native.GaussianGradients(
+            **{name: pointer(array) for name, array in arrays.items()}, twist=pointer(twist), touched=pointer(touched)
+        )
+        self._differentiate(rendering, grads, memory, detach_features, out)
+        arrays.setdefault("features", None)
+        return CudaGradients(**arrays, twist=twist, touched=touched)
+
+    def _twist_and_touched(self, rendering: FinishedRendering) -> tuple[torch.Tensor, torch.Tensor]:
+        count = rendering.parameters.means.shape[0]
+        twist = torch.empty(6, dtype=torch.float64, device=self.device)
+        return twist, torch.empty(count, dtype=torch.uint8, device=self.device)
+
+    def _differentiate(
+        self,
+        rendering: FinishedRendering,
+        grads: tuple[torch.Tensor | None, ...],
+        memory: GrowingMemory,
+        detach_features: bool,
+        out: _native.GaussianGradients,
+    ) -> None:
+        given = dict(zip(("image", "depth", "alpha", "features"), grads, strict=True))
+        if given["features"] is not None and rendering.buffers.features is None:
+            raise RenderError("grad_features was given, but no features were rendered")
+        for name, gradient in given.items():
+            if gradient is not None:
+                self._check_tensor(f"grad_{name}", gradient, getattr(rendering.buffers, name).shape)
+        addresses = {name: pointer(given[name]) for name in _IMAGES}
+        image_gradients = _native.ImageGradients(**addresses, detach_features=int(detach_features))
+        rendering.native.stream = self.library.stream(self.device)
+        rows = memory.block("gradients", rendering.gradient_bytes)
+        arguments = [ctypes.byref(value) for value in (rendering.native, image_gradients, out)]
+        self.library.call("backward", *arguments, pointer(rows))
+
+    # --- checks ------------------------------------------------------------------------------------------------------
+
+    def _require_last(self) -> FinishedRendering:
+        if self._last is None:
+            raise RenderError("there is no rendering to differentiate: call forward first (and again after every step)")
+        return self._last
+
+    def _checked_parameters(self, gaussians: Gaussians) -> GaussianTensors:
+        parameters = GaussianTensors(**{name: getattr(gaussians, name).detach() for name in PARAMETERS})
+        check_gaussians(parameters)
+        for name in PARAMETERS:
+            self._check_tensor(name, getattr(parameters, name))
+        return parameters
+
+    def _check_tensor(self, name: str, tensor: torch.Tensor, shape: torch.Size | None = None) -> None:
+        if shape is not None and tensor.shape != shape:
+            raise RenderError(f"{name}: expected shape {list(shape)}, found {list(tensor.shape)}")
+        if tensor.dtype != torch.float32 or tensor.device != self.device:
+            raise RenderError(f"{name}: expected float32 on {self.device}, found {tensor.dtype} on {tensor.device}")
+        if not tensor.is_contiguous():
+            raise RenderError(f"{name}: expected a contiguous tensor, found strides {tensor.stride()}")

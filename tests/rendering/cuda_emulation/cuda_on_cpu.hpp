@@ -1,0 +1,160 @@
+// SPDX-License-Identifier: Apache-2.0
+// The part of the CUDA language and runtime that ggslam's kernels use, on a CPU, so that their logic can be tested where
+// there is no GPU. Included ahead of the kernels' sources (g++ -include), with GGSLAM_CUDA_EMULATION defined.
+//
+// Blocks run one after another. Each thread of a block is a fiber with a stack of its own, which runs until it reaches a
+// barrier or a warp collective and is resumed once all threads concerned have arrived: results that depend on a missing
+// barrier come out wrong here, too, above all as the order in which threads are resumed can be changed
+// (ggslam_emulation_order). Collectives insist on whole warps, barriers on whole blocks; a thread that never arrives ends
+// the process with a message.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <type_traits>
+
+#include "fibers.hpp"
+
+#define __global__
+#define __device__
+#define __host__
+#define __align__(bytes) alignas(bytes)
+#define __launch_bounds__(...)
+#define GGSLAM_SHARED static  // blocks run one after another, so one copy serves all
+
+// --- types ------------------------------------------------------------------------------------------------------------
+
+struct alignas(16) float4 {
+  float x, y, z, w;
+};
+inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
+
+using emulation::blockDim;
+using emulation::blockIdx;
+using emulation::gridDim;
+using emulation::threadIdx;
+using std::max;
+using std::min;
+
+// --- barriers, collectives, atomics -----------------------------------------------------------------------------------
+
+inline void __syncthreads() { emulation::meet_block(0); }
+inline int __syncthreads_count(int predicate) { return emulation::meet_block(predicate != 0); }
+
+inline void __syncwarp() { emulation::meet_warp(emulation::kSync, 0); }
+
+inline void require_whole_warp(unsigned mask) {
+  if (mask != 0xffffffffu) emulation::fail("a collective of part of a warp");
+}
+
+// The value that lane `from` gave.
+template <class T>
+T exchange(emulation::Operation operation, unsigned mask, T value, int from) {
+  static_assert(sizeof(T) <= 8, "at most eight bytes are exchanged");
+  require_whole_warp(mask);
+  std::uint64_t bits = 0;
+  std::memcpy(&bits, &value, sizeof(T));
+  const std::uint64_t* given = emulation::meet_warp(operation, bits);
+  std::memcpy(&value, &given[from & 31], sizeof(T));
+  return value;
+}
+
+template <class T>
+T __shfl_sync(unsigned mask, T value, int lane) {
+  return exchange(emulation::kShuffle, mask, value, lane);
+}
+template <class T>
+T __shfl_xor_sync(unsigned mask, T value, int bits) {
+  return exchange(emulation::kShuffleXor, mask, value, static_cast<int>(threadIdx.x % 32) ^ bits);
+}
+inline unsigned __ballot_sync(unsigned mask, int predicate) {
+  require_whole_warp(mask);
+  const std::uint64_t* given = emulation::meet_warp(emulation::kBallot, predicate != 0);
+  unsigned result = 0;
+  for (int lane = 0; lane < 32; ++lane) result |= static_cast<unsigned>(given[lane]) << lane;
+  return result;
+}
+inline unsigned __reduce_add_sync(unsigned mask, unsigned value) {
+  require_whole_warp(mask);
+  const std::uint64_t* given = emulation::meet_warp(emulation::kReduceAdd, value);
+  unsigned result = 0;
+  for (int lane = 0; lane < 32; ++lane) result += static_cast<unsigned>(given[lane]);
+  return result;
+}
+inline int __reduce_max_sync(unsigned mask, int value) {
+  require_whole_warp(mask);
+  const std::uint64_t* given = emulation::meet_warp(emulation::kReduceMax, static_cast<std::uint32_t>(value));
+  int result = static_cast<int>(given[0]);
+  for (int lane = 1; lane < 32; ++lane) result = std::max(result, static_cast<int>(given[lane]));
+  return result;
+}
+
+template <class T>
+T atomicAdd(T* place, T value) {
+  const T before = *place;
+  *place = before + value;
+  return before;
+}
+
+// --- arithmetic -------------------------------------------------------------------------------------------------------
+
+inline int __popc(unsigned x) { return __builtin_popcount(x); }
+inline int __ffs(int x) { return __builtin_ffs(x); }
+inline int __clz(int x) { return x == 0 ? 32 : __builtin_clz(static_cast<unsigned>(x)); }
+inline float __fdividef(float a, float b) { return a / b; }
+inline std::uint32_t __float_as_uint(float x) {
+  std::uint32_t bits;
+  std::memcpy(&bits, &x, sizeof(bits));
+  return bits;
+}
+
+// --- runtime: everything is done when the call returns ------------------------------------------------------------------
+
+using cudaStream_t = struct EmulatedStream*;
+using cudaEvent_t = struct EmulatedEvent*;
+enum cudaError_t { cudaSuccess = 0 };
+enum cudaMemcpyKind { cudaMemcpyDeviceToHost };
+constexpr unsigned cudaHostAllocDefault = 0, cudaEventDisableTiming = 0;
+
+inline const char* cudaGetErrorString(cudaError_t) { return "no error"; }
+inline cudaError_t cudaGetLastError() { return cudaSuccess; }
+inline cudaError_t cudaSetDevice(int) { return cudaSuccess; }
+inline cudaError_t cudaMemsetAsync(void* place, int value, std::size_t bytes, cudaStream_t) {
+  std::memset(place, value, bytes);
+  return cudaSuccess;
+}
+inline cudaError_t cudaMemcpyAsync(void* to, const void* from, std::size_t bytes, cudaMemcpyKind, cudaStream_t) {
+  std::memcpy(to, from, bytes);
+  return cudaSuccess;
+}
+inline cudaError_t cudaHostAlloc(void** place, std::size_t bytes, unsigned) {
+  *place = std::malloc(bytes);
+  return cudaSuccess;
+}
+inline cudaError_t cudaFreeHost(void* place) {
+  std::free(place);
+  return cudaSuccess;
+}
+inline cudaError_t cudaEventCreateWithFlags(cudaEvent_t* event, unsigned) {
+  *event = nullptr;
+  return cudaSuccess;
+}
+inline cudaError_t cudaEventRecord(cudaEvent_t, cudaStream_t) { return cudaSuccess; }
+inline cudaError_t cudaEventSynchronize(cudaEvent_t) { return cudaSuccess; }
+inline cudaError_t cudaEventDestroy(cudaEvent_t) { return cudaSuccess; }
+
+namespace ggslam::cuda {
+
+template <class Kernel, class... Arguments>
+void launch(Kernel kernel, std::int64_t blocks, int threads, cudaStream_t, const Arguments&... arguments) {
+  const auto thread = [&] { kernel(arguments...); };
+  using Thread = decltype(thread);
+  for (std::int64_t block = 0; block < blocks; ++block)
+    emulation::run_block(static_cast<unsigned>(block), static_cast<unsigned>(blocks), threads,
+                         [](const void* code) { (*static_cast<const Thread*>(code))(); }, &thread);
+}
+
+}  // namespace ggslam::cuda

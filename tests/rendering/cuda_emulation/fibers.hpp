@@ -1,0 +1,26 @@
+// SPDX-License-Identifier: Apache-2.0
+// Threads of one block as fibers of one CPU thread, with barriers and warp collectives. See cuda_on_cpu.hpp.
+#pragma once
+#include <cstdint>
+
+namespace emulation {
+
+struct Index {
+  unsigned x = 0;
+};
+extern Index threadIdx, blockIdx, blockDim, gridDim;
+
+enum Operation { kShuffle, kShuffleXor, kBallot, kReduceAdd, kReduceMax, kSync };
+
+[[noreturn]] void fail(const char* what);
+
+// Runs `threads` threads of one block, each calling code(argument).
+void run_block(unsigned block, unsigned blocks, int threads, void (*code)(const void*), const void* argument);
+
+// Waits for all threads of the block; returns the sum of what they brought.
+int meet_block(int value);
+
+// Waits for all lanes of the warp; returns what each of them gave, until the lane's next meeting but one.
+const std::uint64_t* meet_warp(Operation operation, std::uint64_t value);
+
+}  // namespace emulation

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finding nvcc, compiling the CUDA sources once, saying what is wrong. A script stands in for nvcc."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+from rendering_scenes import CAMERA, make_scene
+
+from ggslam.errors import MissingDependency, RenderError
+from ggslam.rendering import choose_backend, render
+from ggslam.rendering.cuda import compiler
+from ggslam.rendering.cuda.availability import describe_cuda_backend
+from ggslam.rendering.cuda.library import CudaLibrary
+
+COMPILES = """#!/bin/sh
+if [ "$1" = --version ]; then echo "nvcc {version}"; exit 0; fi
+echo compiled >> "{log}"
+while [ $# -gt 1 ]; do last=$2; shift; done
+echo library > "$last"
+"""
+FAILS = """#!/bin/sh
+if [ "$1" = --version ]; then echo "nvcc 1"; exit 0; fi
+echo "api.cu(3): error: nonsense" >&2
+exit 1
+"""
+
+
+def stand_in(folder: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+    script = folder / "nvcc"
+    script.write_text(text.format(version="1.0", log=folder / "log"))
+    script.chmod(0o755)
+    monkeypatch.setenv("GGSLAM_NVCC", str(script))
+    monkeypatch.setenv("GGSLAM_CACHE", str(folder / "cache"))
+    compiler.compiler_version.cache_clear()
+    return script
+
+
+def test_compiled_once_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, COMPILES, monkeypatch)
+    first = compiler.compiled_library("90")
+    assert compiler.compiled_library("90") == first and first.read_text() == "library\n"
+    assert (tmp_path / "log").read_text().count("compiled") == 1
+    assert compiler.compiled_library("80") != first
+    assert sorted(path.name for path in first.parent.iterdir()) == sorted(
+        [first.name, compiler.library_path(tmp_path / "nvcc", "80").name]
+    )
+
+
+def test_another_compiler_or_source_is_another_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = stand_in(tmp_path, COMPILES, monkeypatch)
+    first = compiler.library_path(script, "90")
+    script.write_text(script.read_text().replace("nvcc 1.0", "nvcc 2.0"))
+    compiler.compiler_version.cache_clear()
+    second = compiler.library_path(script, "90")
+    kernels = tmp_path / "kernels"
+    kernels.mkdir()
+    for source in compiler.KERNELS.iterdir():
+        (kernels / source.name).write_bytes(source.read_bytes() + (b"//" if source.name == "tile.cuh" else b""))
+    monkeypatch.setattr(compiler, "KERNELS", kernels)
+    assert len({first, second, compiler.library_path(script, "90")}) == 3
+
+
+def test_a_failing_compiler_is_quoted_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, FAILS, monkeypatch)
+    with pytest.raises(MissingDependency, match=r"(?s)compiling failed.*api\.cu\(3\): error: nonsense"):
+        compiler.compiled_library("90")
+    assert list((tmp_path / "cache").iterdir()) == []
+
+
+def test_no_compiler_is_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GGSLAM_NVCC", str(tmp_path / "absent"))
+    with pytest.raises(MissingDependency, match="needs nvcc"):
+        compiler.compiled_library("90")
+    assert describe_cuda_backend() == (False, "no nvcc to compile it with")
+
+
+def test_a_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, COMPILES, monkeypatch)
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("GGSLAM_CACHE", str(tmp_path / "file" / "cache"))
+    with pytest.raises(MissingDependency, match="cannot be written"):
+        compiler.compiled_library("90")
+
+
+def test_a_file_that_is_no_library(tmp_path: Path) -> None:
+    (tmp_path / "broken.so").write_text("library\n")
+    with pytest.raises(MissingDependency, match="cannot be loaded"):
+        CudaLibrary(tmp_path / "broken.so")
+
+
+def test_gaussians_on_the_cpu_are_not_for_the_cuda_backend() -> None:
+    scene = make_scene(5)
+    with pytest.raises(RenderError, match="on a CUDA device, found torch.float32 on cpu"):
+        render(scene, CAMERA, torch.eye(4), backend="cuda")
+    assert choose_backend(torch.device("cpu")) == "cpu"
+    assert torch.equal(
+        render(scene, CAMERA, torch.eye(4), backend="auto").image, render(scene, CAMERA, torch.eye(4)).image
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("architecture", ["80", "90", "100"])
+def test_nvcc_compiles_without_warnings_or_spills(tmp_path: Path, architecture: str) -> None:
+    nvcc = compiler.find_nvcc()
+    if nvcc is None:
+        pytest.skip("no nvcc")
+    command = compiler.compile_command(nvcc, architecture, tmp_path / "rasterizer.so")
+    command += ["-Xptxas", "-v", "-Werror", "all-warnings", "-Xcompiler", "-Wall"]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    ours = [part for part in run.stderr.split("Compiling entry function")[1:] if "ggslam" in part.split("\n")[0]]
+    assert len(ours) >= 21
+    for part in ours:
+        assert " 0 bytes spill stores, 0 bytes spill loads" in part, part[:300]
