@@ -5,8 +5,8 @@
     python scripts/bench_recordings.py --only room redkitchen --stop 80 --config fast-cpu default quality-cpu
 
 The recordings are the generated room and every folder of `--data` that is recognised and tells poses. Images wider than
-320 pixels are reduced to that. Each line is one run in a process of its own; speed is frames/s over those of the first line
-of the same recording. Steps after the last frame do not count in either.
+320 pixels are reduced to that. Each line is one run in a process of its own; speed is frames/s over those of the first
+line of the same recording. Steps after the last frame do not count in either.
 """
 
 from __future__ import annotations

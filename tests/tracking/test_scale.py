@@ -32,7 +32,7 @@ def test_rooms_are_the_measure() -> None:
 @pytest.mark.parametrize("size", [0.2, 1.0, 4.0])
 def test_the_defaults_track_scenes_of_all_sizes(room: Path, size: float) -> None:
     """The room as a doll's house and as a hall; with the voxels of a room all but the first frames of the hall are
-    lost, and the doll's house is tracked half as well."""
+    lost."""
     sequence = open_sequence(room, stop=10)
     assert sequence.ground_truth is not None
     slam = Slam(sequence.camera, load_config(None, ["mapping.iterations_per_frame=0", "identity.enabled=false"]))
