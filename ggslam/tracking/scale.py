@@ -13,7 +13,7 @@ import numpy as np
 
 from ggslam.tracking.settings import TrackerSettings
 
-NEAR_M, FAR_M = 1.0, 3.0
+NEAR_M, FAR_M = 1.0, 4.0
 """Median depths between which a scene is of the usual size."""
 
 

@@ -73,7 +73,7 @@ class TargetSettings:
     """How the map's Gaussians become what a frame is aligned to."""
 
     voxel: float = 0.03
-    """Edge of a fine voxel in metres in a room, where the first frame's median depth is 1 to 3 m; in larger and smaller
+    """Edge of a fine voxel in metres in a room, where the first frame's median depth is 1 to 4 m; in larger and smaller
     scenes it goes with that depth (`scale`). Coarse voxels are four times as wide."""
     min_opacity: float = 0.1
     """Gaussians less opaque than this take no part."""

@@ -18,7 +18,7 @@ from ggslam.tracking.settings import TrackerSettings
 
 
 def test_rooms_are_the_measure() -> None:
-    for depth, scale in ((1.0, 1.0), (2.2, 1.0), (3.0, 1.0), (12.0, 4.0), (0.5, 0.5)):
+    for depth, scale in ((1.0, 1.0), (2.2, 1.0), (4.0, 1.0), (16.0, 4.0), (0.5, 0.5)):
         image = np.full((6, 8), depth, np.float32)
         image[0] = 0
         assert scene_scale(image) == pytest.approx(scale)
