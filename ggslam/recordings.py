@@ -30,6 +30,7 @@ class SequenceRequest:
     depth_camera: Path | None = None
     min_confidence: int | None = None
     topics: tuple[str, ...] = ()
+    pose_convention: str | None = None
 
     def open(self) -> Sequence:
         """Opens the recording.
@@ -42,6 +43,7 @@ class SequenceRequest:
             self.path, format=self.format, start=self.start, stop=self.stop, stride=self.stride, scale=self.scale,
             masks=self.masks, depth_scale=self.depth_scale, on_bad_frame=self.on_bad_frame,  # type: ignore[arg-type]
             depth_camera=self.depth_camera, min_confidence=self.min_confidence, topics=self.topics,
+            pose_convention=self.pose_convention,
         )  # fmt: skip
 
 

@@ -38,6 +38,7 @@ def places_to_bytes(slam: Slam, cells: GaussianCells | None = None) -> bytes | N
     arrays |= {
         "camera": _camera_row(slam.camera),
         "noise": np.array([noise.constant, noise.square]),
+        "scale": np.array(slam.scale),
         "keyframe_poses": np.stack([k.T_world_camera for k in slam.mapper.keyframes]),
         "birth": np.concatenate([np.zeros(0, np.int32), *(part.birth_keyframe.numpy() for part in parts)]),
     }  # fmt: skip

@@ -43,6 +43,7 @@ from ggslam.slam_result import LearnedObjects, SlamResult, SlamTimes, StepReport
 from ggslam.step_log import StepLog
 from ggslam.tracking.feature_tracker import FeatureTracker
 from ggslam.tracking.keyframes import KeyframePolicy
+from ggslam.tracking.scale import scaled, scene_scale
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
 
@@ -90,6 +91,8 @@ class Slam:
         self.mapper = Mapper(self.map, self.config.mapping, self.context, self.config.seed, learner)
         if self.pager is not None:
             self.pager.serve(self.mapper)
+        self.scale = 1.0
+        """Size of the scene against a room's, see `tracking.scale`."""
         self.frames: list[TrackedFrame] = []
         self.dropped_frames: list[int] = []
         self.refine_iterations = 0
@@ -223,6 +226,8 @@ class Slam:
         check_frame(frame, self.camera)
         start = time.perf_counter()
         self._follow_moves()
+        if not len(self.surface):
+            self.use_scale(scene_scale(frame.depth))
         result = self.tracker.track(frame)
         if result.status is TrackingStatus.LOST and self.loops is not None and self.tracker.target is not None:
             found = self.loops.find(frame, result)
@@ -234,6 +239,11 @@ class Slam:
         self.times.tracking_by_frame.append(time.perf_counter() - start)
         self.times.tracking += self.times.tracking_by_frame[-1]
         return result
+
+    def use_scale(self, scale: float) -> None:
+        """Fits the tracker to a scene of this size; before the first keyframe."""
+        self.scale, self.tracker.settings = scale, scaled(self.config.tracking, scale)
+        self.surface.settings = self.tracker.settings.target
 
     def _follow_moves(self) -> None:
         """The tracker goes along with corrections of the map made since the last frame."""

@@ -86,12 +86,21 @@ def _load(
             f"{slam.camera.width}x{slam.camera.height}"
         )
     gaussians.birth_keyframe[:] = torch.from_numpy(birth.astype(np.int32))
+    slam.use_scale(_scale(arrays))
     slam.surface.load(_part(arrays, "surface_"))
     loops.load(_part(arrays, "loops_"))
     if len(loops.poses) != len(poses) or not np.isfinite(np.array(loops.poses)).all():
         raise ValueError(f"expected numbers for the poses of {len(poses)} keyframes")
     slam.tracker.noise = DepthNoise(constant, square)
     return gaussians, [_bare_keyframe(k, T, slam.camera) for k, T in enumerate(poses)]
+
+
+def _scale(arrays: dict[str, Any]) -> float:
+    """Size of the scene; runs of before it was measured lack it."""
+    scale = float(arrays.get("scale", 1.0))
+    if not 1e-3 <= scale <= 1e3:
+        raise ValueError(f"scale: expected 0.001 to 1000, found {scale:g}")
+    return scale
 
 
 def _objects(folder: RunFolder, gaussians: GaussianMap) -> LearnedObjects | None:

@@ -210,8 +210,8 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
         raise ConfigError(f"--sequence says where the recording of a run is; {request.source} is no run")
     if is_run and request.sequence != SequenceRequest(request.source, scale=request.sequence.scale):
         raise ConfigError(
-            f"{request.source} is a run, read as it was made: --start, --stop, --stride, --format, --depth-scale and "
-            "--skip-bad-frames are for recordings"
+            f"{request.source} is a run, read as it was made: --start, --stop, --stride, --format, --depth-scale, "
+            "--pose-convention and --skip-bad-frames are for recordings"
         )
     if request.mesh is not None:
         _check_mesh(request.mesh, request.source)

@@ -26,15 +26,17 @@ from pathlib import Path
 wheel, sdist = sys.argv[1:]
 packed = set(zipfile.ZipFile(wheel).namelist())
 source = {"/".join(name.split("/")[1:]) for name in tarfile.open(sdist).getnames()}
-needed = {"ggslam/py.typed", "ggslam/native/_lib/libggslam_core.so", "ggslam/configs/default.yaml",
-          "ggslam/rendering/cuda/kernels/api.cu", "ggslam/rendering/cuda/kernels/tile.cuh"}
-junk = [n for n in packed if n.startswith(("tests/", "scripts/", "docs/")) or "/src/" in n or n.endswith(".pyc")]
+presets = [path.name for path in Path("configs").glob("*.yaml")]
+data = [p for p in Path("ggslam").rglob("*") if p.suffix in (".js", ".css", ".html", ".typed", ".cu", ".cuh")]
+needed = {"ggslam/native/_lib/libggslam_core.so", *(f"ggslam/configs/{name}" for name in presets), *map(str, data)}
+assert any("viewer/static" in name for name in needed) and "ggslam/py.typed" in needed and len(presets) > 5
+junk = [n for n in packed if n.startswith(("tests/", "scripts/", "docs/", "examples/")) or "/src/" in n or n.endswith(".pyc")]
 assert needed <= packed, f"{wheel} lacks {needed - packed}"
 assert not junk, f"{wheel} holds {junk[:5]}"
 assert any(n.endswith("licenses/LICENSE") for n in packed), f"{wheel} lacks the licence"
 needed = {"LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "CMakeLists.txt", "pyproject.toml", "ggslam/py.typed",
-          "configs/default.yaml", "tests/conftest.py", "ggslam/native/src/dispatch.hpp",
-          "ggslam/rendering/cuda/kernels/api.cu", "ggslam/rendering/cuda/kernels/tile.cuh"}
+          "configs/default.yaml", "tests/conftest.py", "ggslam/native/src/dispatch.hpp", "examples/run_slam.py",
+          "docs/index.md", "ggslam/rendering/cuda/kernels/api.cu", "ggslam/rendering/cuda/kernels/tile.cuh"}
 ends = (".so", ".pyc", ".whl", ".o")
 junk = [n for n in source if n.endswith(ends) or n.split("/")[0] in (".git", "build", "dist", "runs", "demo", ".ci")]
 assert needed <= source, f"{sdist} lacks {needed - source}"
@@ -50,8 +52,11 @@ rm -rf "$work/away" && mkdir "$work/away" && cd "$work/away"
 ggslam="$work/empty/bin/ggslam"
 "$ggslam" doctor
 "$ggslam" synth room --frames 12 --width 160 --height 120
-"$ggslam" run room --out run
+"$ggslam" run room --config fast-cpu --out run
 for format in ply splat pcd; do "$ggslam" export run --format "$format" --out "map.$format"; done
 "$ggslam" export run --format colmap --voxel 0.03 --out colmap
+"$ggslam" export run --format mesh --voxel 0.05 --out mesh.ply
+"$ggslam" view run --html room.html
+"$work/empty/bin/python" "$root/examples/export_everything.py" run exports
 "$ggslam" volumes run --voxel 0.05
 echo "the wheel works"

@@ -2,8 +2,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from ggslam.config import Config, config_from_dict, config_to_dict, load_config, presets, save_config
 from ggslam.errors import ConfigError
@@ -21,11 +23,34 @@ def test_defaults_survive_the_dictionary() -> None:
     assert config_from_dict(config_to_dict(Config())) == Config()
 
 
-def test_every_preset_loads() -> None:
-    assert {"default", "fast", "quality"} <= set(presets())
-    for name in presets():
-        assert isinstance(load_config(name), Config)
+def test_default_is_the_default() -> None:
     assert load_config("default") == Config()
+
+
+def leaves(values: dict[str, Any], path: str = "") -> dict[str, Any]:
+    """Settings by their full names."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found |= leaves(value, f"{path}{name}.") if isinstance(value, dict) else {path + name: value}
+    return found
+
+
+@pytest.mark.parametrize("name", sorted(set(presets()) - {"default"}))
+def test_presets_are_short_explained_and_change_what_they_list(name: str) -> None:
+    text = presets()[name].read_text()
+    usual, changed = leaves(config_to_dict(Config())), leaves(config_to_dict(load_config(name)))
+    listed = leaves(yaml.safe_load(text))
+    assert {key for key in usual if usual[key] != changed[key]} == set(listed)  # nothing else, and nothing in vain
+    lines = text.splitlines()
+    assert lines[0].startswith("# ") and len(lines) <= 15
+    assert all("#" in line for line in lines if not line.endswith(":"))
+
+
+def test_the_presets_are_told_of() -> None:
+    assert set(presets()) == {"default", "fast-cpu", "quality-cpu", "gpu", "replica", "tum", "phone"}
+    page = Path(__file__).parents[1] / "docs" / "presets.md"
+    if page.is_file():  # a checkout
+        assert all(f"| `{name}` |" in page.read_text() for name in presets())
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,7 @@ def inspect(
     scale: options.Scale = 1.0,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
+    pose_convention: options.PoseConvention = None,
     masks: options.Masks = None,
     depth_camera: options.DepthCamera = None,
     min_confidence: options.MinConfidence = None,
@@ -66,6 +67,7 @@ def inspect(
     recording = open_sequence(
         sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, masks=masks,
         depth_scale=depth_scale, depth_camera=depth_camera, min_confidence=min_confidence, topics=topics or (),
+        pose_convention=pose_convention,
     )  # fmt: skip
     report = inspect_sequence(recording, samples=samples)
     for name, value in _lines(report):

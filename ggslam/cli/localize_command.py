@@ -65,6 +65,7 @@ def localize(
     scale: options.Scale = 1.0,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
+    pose_convention: options.PoseConvention = None,
     columns: Annotated[int, typer.Option(help="Numbers of a point in .bin scans.", min=3)] = 4,
     skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
     threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.", min=1, max=1024)] = None,
@@ -78,7 +79,7 @@ def localize(
         map=map_path,
         sequence=SequenceRequest(
             sequence, format=format_name, start=first, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
-            on_bad_frame="skip" if skip_bad_frames else "error",
+            on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
         ),
         start=start_pose, no_start=no_start, full=full_map, out=out, radius=radius, voxel=voxel, columns=columns,
         threads=threads,

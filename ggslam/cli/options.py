@@ -38,3 +38,11 @@ MinConfidence = Annotated[
 Topics = Annotated[
     list[str] | None, typer.Option("--topic", metavar="ROLE=TOPIC", help="Of a ROS bag: color, depth, color_info, ...")
 ]
+PoseConvention = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="What the recording's poses are, if not camera to world with OpenCV axes: world-to-camera, opengl, "
+        "world-to-camera-opengl, wxyz, world-to-camera-wxyz.",
+    ),
+]

@@ -59,6 +59,7 @@ def run(
     scale: options.Scale = 1.0,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
+    pose_convention: options.PoseConvention = None,
     masks: options.Masks = None,
     depth_camera: options.DepthCamera = None,
     min_confidence: options.MinConfidence = None,
@@ -110,6 +111,7 @@ def run(
         "path": sequence, "format": format_name, "start": start, "stop": stop, "stride": stride, "scale": scale,
         "masks": masks, "depth_scale": depth_scale, "on_bad_frame": "skip" if skip_bad_frames else "error",
         "depth_camera": depth_camera, "min_confidence": min_confidence, "topics": tuple(topics or ()),
+        "pose_convention": pose_convention,
     }  # fmt: skip
     live = is_live(sequence)
     if record is not None and not live:

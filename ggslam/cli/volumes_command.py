@@ -85,6 +85,7 @@ def volumes(
     ] = None,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
+    pose_convention: options.PoseConvention = None,
     sequence: Annotated[Path | None, typer.Option(help="Where the recording of the run is now, if it was moved.")]
     = None,
     skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
@@ -105,6 +106,7 @@ def volumes(
         sequence=SequenceRequest(
             source, format=format_name, start=start, stop=stop, stride=stride, scale=1.0 if scale is None else scale,
             depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error",
+            pose_convention=pose_convention,
         ),
         scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf, occupancy=occupancy, mesh=mesh,
         object_meshes=object_meshes, objects=objects, live=live, realtime=realtime, onto=onto,

@@ -14,6 +14,7 @@ from ggslam.sequences.folder import FolderFormat, SyntheticFormat
 from ggslam.sequences.icl_nuim import IclNuimFormat
 from ggslam.sequences.masks import find_masks
 from ggslam.sequences.polycam import PolycamFormat
+from ggslam.sequences.pose_conventions import convert_poses
 from ggslam.sequences.realsense import RealSenseFormat
 from ggslam.sequences.record3d import Record3DFormat
 from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat
@@ -64,6 +65,7 @@ def open_sequence(
     depth_camera: str | Path | None = None,
     min_confidence: int | None = None,
     topics: Iterable[str] = (),
+    pose_convention: str | None = None,
 ) -> Sequence:
     """Opens an RGB-D recording.
 
@@ -82,6 +84,7 @@ def open_sequence(
         min_confidence: depth less sure than this (0 low, 1 medium, 2 high) is dropped where the recording tells how
             sure it is; None: `DEFAULT_CONFIDENCE`.
         topics: of a ROS bag, "role=topic" each, where they are not found by themselves; see `ros_topics`.
+        pose_convention: what the recording's poses really are, if not what its format says; see `pose_conventions`.
 
     Raises:
         MissingDependency: a package is needed to read the recording.
@@ -100,6 +103,10 @@ def open_sequence(
         _use_masks(recording, Path(masks).expanduser())
     if depth_scale is not None:
         recording.depth_scale = depth_scale
+    if pose_convention is not None:
+        if recording.poses is None:
+            raise SequenceError(f"{folder}: tells no poses, so there are none to convert from {pose_convention}")
+        recording.poses = convert_poses(recording.poses, pose_convention)
     if not (math.isfinite(recording.depth_scale) and recording.depth_scale > 0):
         raise SequenceError(f"{folder}: depth scale must be a positive number, found {recording.depth_scale}")
     return Sequence(recording, _selection(recording, start, stop, stride), scale=scale, on_bad_frame=on_bad_frame)

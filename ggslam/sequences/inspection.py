@@ -12,7 +12,8 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences.alignment import Alignment, measure_alignment
-from ggslam.sequences.pose_doubts import AS_READ, PoseDoubt, doubt_poses, pairs_apart
+from ggslam.sequences.pose_conventions import CONVENTIONS, OURS
+from ggslam.sequences.pose_doubts import PoseDoubt, doubt_poses, pairs_apart
 from ggslam.sequences.sequence import Sequence
 
 SMALLEST_MEDIAN_DEPTH, LARGEST_MEDIAN_DEPTH = 0.1, 6.0
@@ -168,8 +169,9 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None) -> None:
     add = report.warnings.append
     if doubt.wrong_convention:
         add(
-            f"the true poses look like {doubt.convention}: read so, neighbouring depth images agree to "
-            f"{doubt.best:.2%}, as {AS_READ} only to {doubt.error:.2%}; convert them"
+            f"the true poses look like {CONVENTIONS[doubt.convention].description}: read so, neighbouring depth images "
+            f"agree to {doubt.best:.2%}, as {CONVENTIONS[OURS].description} only to {doubt.error:.2%}; "
+            f"try --pose-convention {doubt.convention}"
         )
     elif doubt.wrong_scale:
         found = report.depth_scale / doubt.ratio

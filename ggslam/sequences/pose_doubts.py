@@ -4,17 +4,16 @@ stand and as they are often written, with depth as it stands and in other units.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, matrix_to_quaternion, quaternion_to_matrix, transformed
+from ggslam.scene.poses import inverse, transformed
+from ggslam.sequences.pose_conventions import CONVENTIONS, OURS, PoseConvention
 from ggslam.sequences.sequence import Sequence
 
-AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 BASELINE_M, TURN_DEG, LOOKAHEAD = 0.15, 12.0, 40
 """Two frames are compared that far apart: as soon as one of the first two is reached, at most so many frames on."""
 GRID = 24
@@ -23,25 +22,6 @@ FEWEST = 200
 """Pixels that have to be seen twice for anything to be said."""
 
 
-def _reordered(T: np.ndarray) -> np.ndarray:
-    """The pose whose quaternion was written wxyz and read as xyzw."""
-    w, x, y, z = matrix_to_quaternion(T[:3, :3])
-    result = T.copy()
-    result[:3, :3] = quaternion_to_matrix(np.array([x, y, z, w]))  # what was read as x is w, and so on
-    return result
-
-
-Conversion = Callable[[np.ndarray], np.ndarray]
-CONVENTIONS: dict[str, Conversion] = {
-    "camera to world with OpenCV axes": lambda T: T,
-    "world to camera": inverse,
-    "OpenGL camera axes (y up, z back)": lambda T: T @ AXES,
-    "world to camera with OpenGL axes": lambda T: inverse(AXES @ T),
-    "quaternions in the order wxyz": _reordered,
-    "world to camera with quaternions in the order wxyz": lambda T: inverse(_reordered(T)),
-}
-"""Ways in which poses are often written; each function turns such a pose, read as the first kind, into ours."""
-AS_READ = next(iter(CONVENTIONS))
 RATIOS = np.geomspace(1 / 12, 12, 35)
 """By which depth is multiplied in search of its unit; 1 is among them."""
 
@@ -52,7 +32,7 @@ class PoseDoubt:
 
     Attributes:
         error: median relative difference of depth as it stands.
-        convention, ratio: reading of the poses, and factor on depth, that agree best.
+        convention, ratio: reading of the poses (of `CONVENTIONS`), and factor on depth, that agree best.
         best: median relative difference with these.
     """
 
@@ -64,13 +44,13 @@ class PoseDoubt:
     @property
     def wrong_convention(self) -> bool:
         """Whether the poses are clearly of another kind."""
-        return self.convention != AS_READ and self.best < 0.4 * self.error and self.error > 0.004
+        return self.convention != OURS and self.best < 0.4 * self.error and self.error > 0.004
 
     @property
     def wrong_scale(self) -> bool:
         """Whether depth clearly has another unit."""
         off = abs(np.log(self.ratio)) > np.log(1.4)
-        return self.convention == AS_READ and bool(off) and self.best < 0.5 * self.error and self.error > 0.006
+        return self.convention == OURS and bool(off) and self.best < 0.5 * self.error and self.error > 0.006
 
 
 def pairs_apart(sequence: Sequence, frames: list[Frame]) -> list[tuple[Frame, Frame]]:
@@ -103,37 +83,38 @@ def _later(sequence: Sequence, index: int) -> int | None:
 
 def doubt_poses(pairs: list[tuple[Frame, Frame]]) -> PoseDoubt | None:
     """Looks for the reading of the poses and the unit of depth that agree best; None if too little is seen twice."""
-    error = _error(pairs, CONVENTIONS[AS_READ], 1.0, FEWEST)
+    error = _error(pairs, CONVENTIONS[OURS], 1.0, FEWEST)
     if error is None:
         return None
     # A reading that sees less than half as much twice can look good by chance.
     fewest = max(FEWEST, _seen_twice(pairs) // 2)
-    best = PoseDoubt(error, AS_READ, 1.0, error)
-    for name, convert in CONVENTIONS.items():
-        for ratio in RATIOS if name == AS_READ else (1.0,):
-            found = _error(pairs, convert, float(ratio), fewest if name == AS_READ else FEWEST)
+    best = PoseDoubt(error, OURS, 1.0, error)
+    for name, convention in CONVENTIONS.items():
+        for ratio in RATIOS if name == OURS else (1.0,):
+            found = _error(pairs, convention, float(ratio), fewest if name == OURS else FEWEST)
             if found is not None and found < best.best:
                 best = PoseDoubt(error, name, float(ratio), found)
     return best
 
 
 def _seen_twice(pairs: list[tuple[Frame, Frame]]) -> int:
-    return sum(len(_differences(a, b, CONVENTIONS[AS_READ], 1.0)) for a, b in pairs)
+    return sum(len(_differences(a, b, CONVENTIONS[OURS], 1.0)) for a, b in pairs)
 
 
-def _error(pairs: list[tuple[Frame, Frame]], convert: Conversion, ratio: float, fewest: int) -> float | None:
-    errors = [_differences(a, b, convert, ratio) for a, b in pairs]
+def _error(pairs: list[tuple[Frame, Frame]], convention: PoseConvention, ratio: float, fewest: int) -> float | None:
+    errors = [_differences(a, b, convention, ratio) for a, b in pairs]
     known = np.concatenate(errors) if errors else np.zeros(0)
     return float(np.median(known)) if len(known) >= fewest else None
 
 
-def _differences(frame: Frame, other: Frame, convert: Conversion, ratio: float) -> np.ndarray:
+def _differences(frame: Frame, other: Frame, convention: PoseConvention, ratio: float) -> np.ndarray:
     """|seen - predicted| / predicted for pixels of `frame` that fall into `other`."""
     assert frame.T_world_camera is not None and other.T_world_camera is not None
     step = max(1, min(frame.depth.shape) // GRID)
     points = frame.camera.back_project(frame.depth[::1, ::1])[::step, ::step].reshape(-1, 3) * np.float32(ratio)
     points = points[points[:, 2] > 0]
-    points = transformed(points, inverse(convert(other.T_world_camera)) @ convert(frame.T_world_camera))
+    T_world_frame, T_world_other = map(convention.convert, (frame.T_world_camera, other.T_world_camera))
+    points = transformed(points, inverse(T_world_other) @ T_world_frame)
     points = points[points[:, 2] > 0.02 * ratio]
     c = other.camera
     u = np.rint(c.fx * points[:, 0] / points[:, 2] + c.cx).astype(int)

@@ -49,7 +49,7 @@ class PointSettings:
     """Share of the window that must lie on the point's surface, or the point is dropped."""
     min_depth: float = 0.1
     max_depth: float = 8.0
-    """Depth range in metres."""
+    """Depth range in metres; in scenes larger than a room the upper bound goes with the first frame's median depth."""
     min_thickness: float = 0.01
     """Lower bound of the smallest regularised eigenvalue (equation 1 of GS-ICP): a plane's thickness."""
     max_elongation: float = 4.0
@@ -73,7 +73,8 @@ class TargetSettings:
     """How the map's Gaussians become what a frame is aligned to."""
 
     voxel: float = 0.03
-    """Edge of a fine voxel in metres at a typical depth of 2 m; coarse voxels are four times as wide."""
+    """Edge of a fine voxel in metres in a room, where the first frame's median depth is 1 to 4 m; in larger and smaller
+    scenes it goes with that depth (`scale`). Coarse voxels are four times as wide."""
     min_opacity: float = 0.1
     """Gaussians less opaque than this take no part."""
     min_thickness: float = 0.01

@@ -65,7 +65,9 @@ class MeasuredSurface:
     """
 
     def __init__(self, settings: TargetSettings, context: NativeContext, archive: ArrayArchive | None = None) -> None:
-        self._settings, self._context, self._archive = settings, context, archive
+        self.settings = settings
+        """May be changed until the first keyframe is in."""
+        self._context, self._archive = context, archive
         self._parts: list[_Part] = []
         self.active: set[int] = set()
         """Numbers of the keyframes that take part."""
@@ -158,7 +160,7 @@ class MeasuredSurface:
             log_scales[rows] = np.log(SPACING * own[:, 2])[:, None] + np.log([1.0, 1.0, FLATNESS])
             begin += part.count
         return GicpTarget.from_arrays(
-            points, quaternions, log_scales, np.full(count, _OPACITY_LOGIT, np.float32), self._settings, self._context,
+            points, quaternions, log_scales, np.full(count, _OPACITY_LOGIT, np.float32), self.settings, self._context,
             base=base,
         )  # fmt: skip
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from ggslam.errors import SequenceError
 from ggslam.scene.poses import inverse
 from ggslam.sequences import inspect_sequence, open_sequence
 from ggslam.sequences.alignment import measure_alignment
@@ -64,19 +65,28 @@ def test_depth_scale_without_poses(copy: Path) -> None:
     assert any("is suspicious: the median depth is" in text for text in warnings_of(copy, depth_scale=true / 5))
 
 
+def assert_remedy(recording: Path, option: str, poses: np.ndarray) -> None:
+    """What the warning advises gives the true poses, and leaves nothing to warn of."""
+    sequence = open_sequence(recording, pose_convention=option)
+    np.testing.assert_allclose(sequence.ground_truth, poses, atol=1e-6)
+    assert not inspect_sequence(sequence).warnings
+
+
 @pytest.mark.parametrize(
-    ("name", "change"),
+    ("name", "option", "change"),
     [
-        ("world to camera", inverse), ("OpenGL camera axes", lambda T: T @ FLIP_YZ),
-        ("world to camera with OpenGL axes", lambda T: inverse(T @ FLIP_YZ)),
+        ("world to camera", "world-to-camera", inverse),
+        ("OpenGL camera axes", "opengl", lambda T: T @ FLIP_YZ),
+        ("world to camera with OpenGL axes", "world-to-camera-opengl", lambda T: inverse(T @ FLIP_YZ)),
     ],
-)  # fmt: skip
-def test_pose_convention(copy: Path, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
+)
+def test_pose_convention(copy: Path, name: str, option: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
     poses = open_sequence(copy).ground_truth
     assert poses is not None
     (copy / "poses.txt").write_text("".join(" ".join(map(str, change(T).ravel())) + "\n" for T in poses))
     (text,) = warnings_of(copy)
-    assert f"the true poses look like {name}" in text
+    assert f"the true poses look like {name}" in text and text.endswith(f"try --pose-convention {option}")
+    assert_remedy(copy, option, poses)
 
 
 def test_quaternion_order(copy: Path) -> None:
@@ -91,6 +101,8 @@ def test_quaternion_order(copy: Path) -> None:
     (copy / "poses.txt").write_text("\n".join(lines))
     (text,) = warnings_of(copy)
     assert "the true poses look like quaternions in the order wxyz" in text
+    assert text.endswith("try --pose-convention wxyz")
+    assert_remedy(copy, "wxyz", poses)
 
 
 def misplaced(depth: np.ndarray, shift: tuple[float, float], scale: float) -> np.ndarray:
@@ -128,3 +140,11 @@ def test_misaligned(copy: Path, shift: tuple[int, int], scale: float) -> None:
     assert report.alignment is not None
     found = np.array(report.alignment.shift) * 160
     assert np.abs(found + shift).max() <= 2 and report.alignment.scale == pytest.approx(1 / scale, abs=0.04)
+
+
+def test_a_convention_that_is_none(copy: Path) -> None:
+    with pytest.raises(SequenceError, match="known: opencv, world-to-camera, opengl"):
+        open_sequence(copy, pose_convention="opengles")
+    (copy / "poses.txt").unlink()
+    with pytest.raises(SequenceError, match="tells no poses"):
+        open_sequence(copy, pose_convention="opengl")

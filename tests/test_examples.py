@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The programs in examples/ run as their first lines say."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ggslam.cli.main import app
+from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.formats.trajectory import read_trajectory
+from ggslam.run_folder import RunFolder
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+pytestmark = pytest.mark.skipif(not EXAMPLES.is_dir(), reason="not in a checkout")
+
+
+Program = Callable[..., str]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Program:
+    """Runs a program of the folder in an empty folder; gives what it printed."""
+
+    def started(program: str, *arguments: object) -> str:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [program, *map(str, arguments)])
+        runpy.run_path(str(EXAMPLES / program), run_name="__main__")
+        return capsys.readouterr().out
+
+    return started
+
+
+def ggslam(*arguments: object) -> None:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0 and result.exception is None, (result.output, result.exception)
+
+
+@pytest.fixture(scope="module")
+def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the first half of the room."""
+    out = tmp_path_factory.mktemp("examples") / "run"
+    ggslam("run", room, "--stop", 12, "--config", "fast-cpu", "--no-eval", "--out", out)
+    return out
+
+
+def test_run_slam(run: Program, room: Path, tmp_path: Path) -> None:
+    said = run("run_slam.py", room, "out")
+    assert "frame 0: keyframe" in said and "24 frames" in said
+    assert len(read_trajectory(tmp_path / "out" / "trajectory.txt")) == 24
+    assert len(read_gaussian_ply(tmp_path / "out" / "map.ply")) > 1000
+
+
+def test_own_camera(run: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run("own_camera.py", 4).count("ok,") == 3
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    live = ["python:own_camera:DrawnRoom", "--stop", 4, "--record", "walk", "--out", "run", "--iterations", 1]
+    ggslam("run", *live)
+    assert len(list((tmp_path / "walk" / "rgb").iterdir())) == 4 and (tmp_path / "run" / "metrics.json").is_file()
+
+
+def test_remove_object(run: Program, finished: Path, tmp_path: Path) -> None:
+    said = run("remove_object.py", finished, "sofa", "without")
+    assert said.startswith("objects: ") and said.count("_color.png") == 3
+    before, after = (RunFolder.open(path).object_table() for path in (finished, tmp_path / "without"))
+    assert {o.name for o in before.objects} - {o.name for o in after.objects} == {"sofa"}
+
+
+def test_export_everything(run: Program, finished: Path, tmp_path: Path) -> None:
+    said = run("export_everything.py", finished, "out")
+    written = said.count("wrote ")
+    assert written + said.count("left out: ") == 14 and written >= 11
+    assert (tmp_path / "out" / "object_meshes").is_dir() and (tmp_path / "out" / "mesh.ply").is_file()
+
+
+def test_localise(run: Program, finished: Path, room: Path, tmp_path: Path) -> None:
+    said = run("localise.py", finished, room, "visit", 6, 10)
+    assert len(re.findall(r"frame \d+: \[", said)) == 4
+    found = read_trajectory(tmp_path / "visit" / "trajectory.txt").T_world_camera
+    known = RunFolder.open(finished).trajectory().T_world_camera[6:10]
+    assert np.linalg.norm(found[:, :3, 3] - known[:, :3, 3], axis=1).max() < 0.03
+
+
+def test_all_examples_are_listed_and_tested() -> None:
+    listed = re.findall(r"\]\((\w+\.py)\)", (EXAMPLES / "README.md").read_text())
+    assert sorted(listed) == sorted(path.name for path in EXAMPLES.glob("*.py"))
+    here = Path(__file__).read_text()
+    assert all(f'run("{name}"' in here for name in listed)
