@@ -15,21 +15,20 @@ from ggslam.native.loader import NativeContext
 from ggslam.rendering import _native
 from ggslam.rendering._native import pointer
 from ggslam.rendering.adam import AdamSettings
-from ggslam.rendering.pixel_terms import PixelTerms
-from ggslam.rendering.types import (
-    LOW_PASS,
-    PARAMETERS,
-    Gaussians,
-    GaussianTensors,
-    Gradients,
-    RenderBuffers,
-    active_coefficients,
-    check_gaussians,
-    check_pose,
+from ggslam.rendering.arguments import (
+    check_projection,
+    checked_parameters,
+    gaussian_arrays,
+    image_buffers,
+    image_gradients,
+    native_view,
 )
+from ggslam.rendering.pixel_terms import PixelTerms
+from ggslam.rendering.types import LOW_PASS, PARAMETERS, Gaussians, GaussianTensors, Gradients, RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 
+_CPU = torch.device("cpu")
 _FAILURES = {
     1: "out of memory",
     2: "too many pairs of a Gaussian and an image tile (2^31): the Gaussians are far too large for the image",
@@ -83,10 +82,7 @@ class CpuRasterizer:
         self._handle: ctypes.c_void_p | None = None
         self._library = _native.rasterizer_library()
         self.context = context or NativeContext(threads, instruction_set)
-        if not near_plane > 0:
-            raise RenderError(f"near_plane must be positive, found {near_plane}")
-        if not 0 < low_pass < 1e3:
-            raise RenderError(f"low_pass must be positive, found {low_pass}")
+        check_projection(near_plane, low_pass)
         self.near_plane = near_plane
         self.low_pass = low_pass
         self._handle = ctypes.c_void_p(self._library.ggslam_rasterizer_create(self.context.handle))
@@ -129,17 +125,11 @@ class CpuRasterizer:
         """
         self._last = None
         self.rendering += 1
-        parameters = _checked_parameters(gaussians)
-        arrays = _native.GaussianArrays(
-            count=parameters.means.shape[0],
-            **{name: pointer(getattr(parameters, name)) for name in PARAMETERS},
-            sh_coefficients=parameters.sh.shape[1],
-            active_sh_coefficients=active_coefficients(parameters, active_sh_degree),
-            feature_channels=parameters.features.shape[1],
-            render_features=int(features and parameters.features.shape[1] > 0),
-        )
-        view = self._view(camera, check_pose(T_camera_world))
-        buffers = self._buffers(camera, parameters.features.shape[1] if arrays.render_features else 0, median_depth)
+        parameters = checked_parameters(gaussians, _CPU)
+        arrays = gaussian_arrays(parameters, features, active_sh_degree)
+        view = native_view(camera, T_camera_world, self.near_plane, self.low_pass)
+        channels = arrays.feature_channels if arrays.render_features else 0
+        buffers = image_buffers(self._images, camera, channels, median_depth, _CPU)
         targets = _native.RenderTargets(
             **{field[0]: pointer(getattr(buffers, field[0])) for field in _native.RenderTargets._fields_}
         )
@@ -149,29 +139,6 @@ class CpuRasterizer:
         self._check(status)
         self._last = _LastForward(parameters, arrays, buffers)
         return buffers
-
-    def _view(self, camera: Camera, T_camera_world: np.ndarray) -> _native.View:
-        rows = (ctypes.c_float * 12)(*T_camera_world[:3].ravel().tolist())
-        return _native.View(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
-            self.near_plane, self.low_pass, rows,
-        )  # fmt: skip
-
-    def _image(self, name: str, shape: tuple[int, ...]) -> torch.Tensor:
-        image = self._images.get(name)
-        if image is None or image.shape != shape:
-            image = self._images[name] = torch.empty(shape, dtype=torch.float32)
-        return image
-
-    def _buffers(self, camera: Camera, channels: int, median_depth: bool) -> RenderBuffers:
-        size = (camera.height, camera.width)
-        return RenderBuffers(
-            image=self._image("image", (3, *size)),
-            depth=self._image("depth", size),
-            alpha=self._image("alpha", size),
-            features=self._image("features", (channels, *size)) if channels else None,
-            median_depth=self._image("median_depth", size) if median_depth else None,
-        )
 
     def statistics(self) -> dict[str, int]:
         """Of the last forward: `visible` Gaussians and `pairs` of a Gaussian and an image tile."""
@@ -226,7 +193,8 @@ class CpuRasterizer:
             RenderError: nothing was rendered, wrong shapes or dtypes, out of memory.
         """
         last = self._require_last()
-        grads = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, detach_features)
+        given = (grad_image, grad_depth, grad_alpha, grad_features)
+        grads = image_gradients(last.buffers, given, detach_features, _CPU)
         names = PARAMETERS if last.arrays.render_features else PARAMETERS[:-1]
         arrays: dict[str, Any] = {name: torch.empty_like(getattr(last.parameters, name)) for name in names}
         twist = np.zeros(6)
@@ -249,7 +217,8 @@ class CpuRasterizer:
     ) -> np.ndarray:
         """Only the `twist` of `backward`; the gradients of the Gaussians are not written."""
         last = self._require_last()
-        grads = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, False)
+        given = (grad_image, grad_depth, grad_alpha, grad_features)
+        grads = image_gradients(last.buffers, given, False, _CPU)
         twist = np.zeros(6)
         touched = torch.empty(last.arrays.count, dtype=torch.uint8)
         out = _native.GaussianGradients(twist=twist.ctypes.data, touched=pointer(touched))
@@ -284,7 +253,8 @@ class CpuRasterizer:
                 raise RenderError(f"backward_step: the map's {name} are not those that were rendered last")
         if not map.moments:
             raise RenderError("backward_step: the map was made without moments")
-        grads = self._image_gradients(last, grad_image, grad_depth, grad_alpha, grad_features, detach_features)
+        given = (grad_image, grad_depth, grad_alpha, grad_features)
+        grads = image_gradients(last.buffers, given, detach_features, _CPU)
         schedule = optimizer.schedule()
         adam = _native.AdamArguments(
             updates=pointer(map.updates), schedule=pointer(schedule), schedule_rows=schedule.shape[0],
@@ -319,43 +289,6 @@ class CpuRasterizer:
         return self._last
 
     @staticmethod
-    def _image_gradients(
-        last: _LastForward,
-        image: torch.Tensor | None,
-        depth: torch.Tensor | None,
-        alpha: torch.Tensor | None,
-        features: torch.Tensor | None,
-        detach_features: bool,
-    ) -> _native.ImageGradients:
-        buffers = last.buffers
-        if features is not None and buffers.features is None:
-            raise RenderError("grad_features was given, but no features were rendered")
-        given = {"image": image, "depth": depth, "alpha": alpha, "features": features}
-        for name, gradient in given.items():
-            if gradient is not None:
-                _check_tensor(f"grad_{name}", gradient, getattr(buffers, name).shape)
-        return _native.ImageGradients(
-            **{name: pointer(gradient) for name, gradient in given.items()}, detach_features=int(detach_features)
-        )
-
-    @staticmethod
     def _check(status: int) -> None:
         if status != 0:
             raise RenderError(f"rendering failed: {_FAILURES[status]}")
-
-
-def _check_tensor(name: str, tensor: torch.Tensor, shape: torch.Size | None = None) -> None:
-    if shape is not None and tensor.shape != shape:
-        raise RenderError(f"{name}: expected shape {list(shape)}, found {list(tensor.shape)}")
-    if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-        raise RenderError(f"{name}: expected float32 on the CPU, found {tensor.dtype} on {tensor.device}")
-    if not tensor.is_contiguous():
-        raise RenderError(f"{name}: expected a contiguous tensor, found strides {tensor.stride()}")
-
-
-def _checked_parameters(gaussians: Gaussians) -> GaussianTensors:
-    parameters = GaussianTensors(**{name: getattr(gaussians, name).detach() for name in PARAMETERS})
-    check_gaussians(parameters)
-    for name in PARAMETERS:
-        _check_tensor(name, getattr(parameters, name))
-    return parameters

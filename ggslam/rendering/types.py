@@ -84,13 +84,11 @@ class RenderBuffers:
 
 
 @dataclass
-class Gradients:
-    """Gradients of a loss with respect to the parameters of N Gaussians and the camera pose.
+class ParameterGradients:
+    """Gradients of a loss with respect to the parameters of N Gaussians.
 
     Attributes:
         means, quaternions, log_scales, opacity_logits, sh, features: as the parameters; features None if not rendered.
-        twist: float64 [6], d loss / d xi at xi = 0 for T_camera_world <- exp(xi) T_camera_world (left perturbation, in
-            the camera frame; translation first).
         touched: uint8 [N], 1 where the Gaussian contributed to some pixel. All other rows are zero.
     """
 
@@ -100,8 +98,19 @@ class Gradients:
     opacity_logits: torch.Tensor
     sh: torch.Tensor
     features: torch.Tensor | None
-    twist: np.ndarray
     touched: torch.Tensor
+
+
+@dataclass
+class Gradients(ParameterGradients):
+    """Gradients of a loss with respect to the parameters of N Gaussians and the camera pose.
+
+    Attributes:
+        twist: float64 [6], d loss / d xi at xi = 0 for T_camera_world <- exp(xi) T_camera_world (left perturbation, in
+            the camera frame; translation first).
+    """
+
+    twist: np.ndarray
 
 
 def check_gaussians(gaussians: Gaussians) -> None:

@@ -19,42 +19,31 @@ import torch
 from ggslam.errors import RenderError
 from ggslam.rendering import _native
 from ggslam.rendering._native import pointer
+from ggslam.rendering.arguments import (
+    check_projection,
+    checked_parameters,
+    gaussian_arrays,
+    image_buffers,
+    image_gradients,
+    native_view,
+)
 from ggslam.rendering.cuda.library import CudaLibrary, Rendering, library_for_device
 from ggslam.rendering.cuda.memory import Counter, FinishedRendering, GrowingMemory, target_pointers
-from ggslam.rendering.types import (
-    LOW_PASS,
-    PARAMETERS,
-    Gaussians,
-    GaussianTensors,
-    RenderBuffers,
-    active_coefficients,
-    check_gaussians,
-    check_pose,
-)
+from ggslam.rendering.types import LOW_PASS, PARAMETERS, Gaussians, ParameterGradients, RenderBuffers
 from ggslam.scene.camera import Camera
 
 _MAX_PAIRS = 2**31 - 1
-_IMAGES = ("image", "features", "depth", "alpha")
 
 
 @dataclass
-class CudaGradients:
+class CudaGradients(ParameterGradients):
     """`Gradients` on the device. Sums are formed by atomic additions: the last digits differ from run to run.
 
     Attributes:
-        means, quaternions, log_scales, opacity_logits, sh, features: as the parameters; features None if not rendered.
         twist: float64 [6] tensor on the device, d loss / d xi as in `Gradients`.
-        touched: uint8 [N], 1 where the Gaussian contributed to some pixel. All other rows are zero.
     """
 
-    means: torch.Tensor
-    quaternions: torch.Tensor
-    log_scales: torch.Tensor
-    opacity_logits: torch.Tensor
-    sh: torch.Tensor
-    features: torch.Tensor | None
     twist: torch.Tensor
-    touched: torch.Tensor
 
 
 class CudaRasterizer:
@@ -82,10 +71,7 @@ class CudaRasterizer:
         low_pass: float = LOW_PASS,
         library: CudaLibrary | None = None,
     ) -> None:
-        if not near_plane > 0:
-            raise RenderError(f"near_plane must be positive, found {near_plane}")
-        if not 0 < low_pass < 1e3:
-            raise RenderError(f"low_pass must be positive, found {low_pass}")
+        check_projection(near_plane, low_pass)
         self.near_plane = near_plane
         self.low_pass = low_pass
         chosen = None if device is None else torch.device(device)
@@ -134,22 +120,11 @@ class CudaRasterizer:
     ) -> FinishedRendering:
         """Renders in memory and images given by the caller (images are made where they do not fit), so that several
         renderings can wait to be differentiated."""
-        parameters = self._checked_parameters(gaussians)
-        channels = parameters.features.shape[1] if features else 0
-        arrays = _native.GaussianArrays(
-            count=parameters.means.shape[0],
-            **{name: pointer(getattr(parameters, name)) for name in PARAMETERS},
-            sh_coefficients=parameters.sh.shape[1],
-            active_sh_coefficients=active_coefficients(parameters, active_sh_degree),
-            feature_channels=parameters.features.shape[1],
-            render_features=int(channels > 0),
-        )
-        rows = (ctypes.c_float * 12)(*check_pose(T_camera_world)[:3].ravel().tolist())
-        view = _native.View(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
-            self.near_plane, self.low_pass, rows,
-        )  # fmt: skip
-        buffers = self._buffers(images, camera, channels, median_depth)
+        parameters = checked_parameters(gaussians, self.device)
+        arrays = gaussian_arrays(parameters, features, active_sh_degree)
+        view = native_view(camera, T_camera_world, self.near_plane, self.low_pass)
+        channels = arrays.feature_channels if arrays.render_features else 0
+        buffers = image_buffers(images, camera, channels, median_depth, self.device)
         stream, index = self.library.stream(self.device), self.device.index or 0
         native = Rendering(arrays, view, target_pointers(buffers), stream=stream, device=index)
         rendering = FinishedRendering(parameters, buffers, native)
@@ -180,25 +155,6 @@ class CudaRasterizer:
         rendering.gradient_bytes = sizes.gradient_rows
         rendering.use("pair_workspace", memory.block("pairs", sizes.pair_workspace))
         self.library.call("composite", ctypes.byref(rendering.native))
-
-    def _buffers(
-        self, images: dict[str, torch.Tensor], camera: Camera, channels: int, median_depth: bool
-    ) -> RenderBuffers:
-        size = (camera.height, camera.width)
-
-        def image(name: str, *shape: int) -> torch.Tensor:
-            found = images.get(name)
-            if found is None or found.shape != shape:
-                found = images[name] = torch.empty(shape, dtype=torch.float32, device=self.device)
-            return found
-
-        return RenderBuffers(
-            image=image("image", 3, *size),
-            depth=image("depth", *size),
-            alpha=image("alpha", *size),
-            features=image("features", channels, *size) if channels else None,
-            median_depth=image("median_depth", *size) if median_depth else None,
-        )
 
     def statistics(self) -> dict[str, int]:
         """Of the last forward: `visible` Gaussians and `pairs` of a Gaussian and an image tile."""
@@ -272,17 +228,10 @@ class CudaRasterizer:
         detach_features: bool,
         out: _native.GaussianGradients,
     ) -> None:
-        given = dict(zip(("image", "depth", "alpha", "features"), grads, strict=True))
-        if given["features"] is not None and rendering.buffers.features is None:
-            raise RenderError("grad_features was given, but no features were rendered")
-        for name, gradient in given.items():
-            if gradient is not None:
-                self._check_tensor(f"grad_{name}", gradient, getattr(rendering.buffers, name).shape)
-        addresses = {name: pointer(given[name]) for name in _IMAGES}
-        image_gradients = _native.ImageGradients(**addresses, detach_features=int(detach_features))
+        gradients = image_gradients(rendering.buffers, grads, detach_features, self.device)
         rendering.native.stream = self.library.stream(self.device)
         rows = memory.block("gradients", rendering.gradient_bytes)
-        arguments = [ctypes.byref(value) for value in (rendering.native, image_gradients, out)]
+        arguments = [ctypes.byref(value) for value in (rendering.native, gradients, out)]
         self.library.call("backward", *arguments, pointer(rows))
 
     # --- checks ------------------------------------------------------------------------------------------------------
@@ -291,18 +240,3 @@ class CudaRasterizer:
         if self._last is None:
             raise RenderError("there is no rendering to differentiate: call forward first (and again after every step)")
         return self._last
-
-    def _checked_parameters(self, gaussians: Gaussians) -> GaussianTensors:
-        parameters = GaussianTensors(**{name: getattr(gaussians, name).detach() for name in PARAMETERS})
-        check_gaussians(parameters)
-        for name in PARAMETERS:
-            self._check_tensor(name, getattr(parameters, name))
-        return parameters
-
-    def _check_tensor(self, name: str, tensor: torch.Tensor, shape: torch.Size | None = None) -> None:
-        if shape is not None and tensor.shape != shape:
-            raise RenderError(f"{name}: expected shape {list(shape)}, found {list(tensor.shape)}")
-        if tensor.dtype != torch.float32 or tensor.device != self.device:
-            raise RenderError(f"{name}: expected float32 on {self.device}, found {tensor.dtype} on {tensor.device}")
-        if not tensor.is_contiguous():
-            raise RenderError(f"{name}: expected a contiguous tensor, found strides {tensor.stride()}")
