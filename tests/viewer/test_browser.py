@@ -186,3 +186,13 @@ def test_names_of_objects_are_no_markup_on_the_page(browser: Any, run: RunFolder
         close_server(server)
         browser.get("about:blank")
         browser.get_log("browser")
+
+
+def test_the_static_page_of_a_run_without_objects_opens(browser: Any, run: RunFolder, tmp_path: Path) -> None:
+    plain = RunFolder(Path(shutil.copytree(run.path, tmp_path / "plain")))
+    (plain.path / "objects.json").unlink()
+    write_page(plain, tmp_path / "plain.html", max_splats=1000)
+    browser.get((tmp_path / "plain.html").as_uri())
+    b.wait_for(lambda: browser.execute_script("return !!window.ggslam && !!ggslam.renderer.sorted"))
+    assert not browser.find_element("id", "choose").is_displayed()
+    assert b.errors(browser) == []
