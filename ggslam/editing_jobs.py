@@ -4,8 +4,7 @@ usable from Python."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +13,7 @@ import numpy as np
 
 from ggslam.edited_run import save_edited
 from ggslam.editing_pictures import before_and_after
-from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.errors import ConfigError, GgslamError
 from ggslam.interrupts import uninterrupted
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.objects.displacement import Displacement
@@ -39,7 +38,7 @@ from ggslam.objects.table import ObjectTable
 from ggslam.objects.traces import drop_traces, places
 from ggslam.recordings import open_recording_of
 from ggslam.rendering_jobs import frame_poses, run_camera
-from ggslam.run_folder import MARKER, RunFolder
+from ggslam.run_folder import MARKER, RunFolder, as_written
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 
@@ -178,16 +177,16 @@ class _Source:
         Raises:
             RunFolderError: a file is missing or damaged, naming it.
         """
-        with _as_written(folder.path / MARKER):
+        with as_written(folder.path / MARKER):
             mark = folder.read_json(MARKER)
             list(mark.get("edits", []))
             displacement = Displacement.from_json(mark.get("displaced", {}))
-        with _as_written(folder.path / "timing.json"):
+        with as_written(folder.path / "timing.json"):
             folder.read_json("timing.json").items()
-        with _as_written(folder.path / "sequence.json"):
+        with as_written(folder.path / "sequence.json"):
             camera = run_camera(folder)
             folder.read_json("sequence.json")["open"]["path"]
-        with _as_written(folder.path / "keyframes.json"):
+        with as_written(folder.path / "keyframes.json"):
             record = folder.read_json("keyframes.json")
             poses = [(k["frame"], np.array(k["T_world_camera"], float)) for k in record["keyframes"]]
             # Keyframes of the map that the run began with have no images here.
@@ -195,15 +194,6 @@ class _Source:
             if not views or not frame_poses(record):
                 raise ValueError("it lists no keyframes or no tracked frames")
         return _Source(camera, record, views, displacement)
-
-
-@contextmanager
-def _as_written(path: Path) -> Iterator[None]:
-    """What goes wrong in the block is the file's fault."""
-    try:
-        yield
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        raise RunFolderError(f"{path}: not as ggslam writes it: {error!r}") from None
 
 
 def _apply_all(scene: SegmentedMap, edits: Sequence[Edit], displacement: Displacement) -> list[Change]:

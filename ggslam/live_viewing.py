@@ -24,6 +24,7 @@ from ggslam.viewer.cameras import vertical_fov, view_from_behind
 from ggslam.viewer.scene_nodes import SceneNodes
 from ggslam.viewer.server import keep_fitting
 from ggslam.viewer.splats import most_visible, splats_of
+from ggslam.viewer.words import plain
 
 if TYPE_CHECKING:
     import viser
@@ -67,7 +68,7 @@ class LiveView:
     def __init__(self, server: viser.ViserServer, title: str, max_splats: int = MAX_SPLATS) -> None:
         self._server, self._title, self._max_splats = server, title, max_splats
         self._nodes = SceneNodes(server)
-        self._text = server.gui.add_markdown(f"**{title}**  \nwaiting for the first frame")
+        self._text = server.gui.add_markdown(f"**{plain(title)}**  \nwaiting for the first frame")
         self._image = server.gui.add_image(np.full((8, 16, 3), 36, np.uint8), format="jpeg", jpeg_quality=80)
         self._rasterizer: CpuRasterizer | None = None
         self._camera: Camera | None = None
@@ -168,7 +169,7 @@ def _snapshot(slam: Slam, frame: Frame, report: StepReport, title: str) -> _Snap
     pose = None if report.frame.status == "lost" else slam.pose_of(report.frame)
     psnr = f"{report.psnr:.1f} dB" if np.isfinite(report.psnr) else "-"
     text = (
-        f"**{title}**  \nframe {report.frame.frame_index} · {len(keyframes)} keyframes · {report.gaussians:,} Gaussians"
-        f" · PSNR {psnr} · overlap {report.frame.overlap:.0%} · {report.frame.status}"
+        f"**{plain(title)}**  \nframe {report.frame.frame_index} · {len(keyframes)} keyframes"
+        f" · {report.gaussians:,} Gaussians · PSNR {psnr} · overlap {report.frame.overlap:.0%} · {report.frame.status}"
     )
     return _Snapshot(copies, poses, keyframes, frame, pose, text)

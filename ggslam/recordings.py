@@ -118,7 +118,7 @@ def open_recording_of(
         values["masks"] = None if used is None else Path(used)
         values["depth_camera"] = None if values.get("depth_camera") is None else Path(values["depth_camera"])
         request = SequenceRequest(**values)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise RunFolderError(f"{folder.path / 'sequence.json'}: not as ggslam writes it: {error!r}") from None
     if is_live(request.path):
         raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (--record)")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import ConfigError, RenderError
+from ggslam.errors import ConfigError, RenderError, RunFolderError
 from ggslam.formats.atomic import make_folder
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects_in_parts import ObjectsInParts
@@ -25,7 +25,7 @@ from ggslam.reporting.pictures import (
     legend,
     write_picture,
 )
-from ggslam.run_folder import RunFolder
+from ggslam.run_folder import RunFolder, as_written
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
@@ -41,16 +41,24 @@ def frame_poses(record: dict[str, Any]) -> dict[int, np.ndarray]:
 
     Args:
         record: content of the run's keyframes.json.
+
+    Raises:
+        RunFolderError: it is not as a run writes it, or a pose is no finite matrix [4, 4].
     """
-    keyframes = [np.array(k["T_world_camera"]) for k in record["keyframes"]]
-    tracked = [f for f in record["frames"] if f["status"] != "lost" and f["keyframe"] < len(keyframes)]
-    return {f["frame"]: keyframes[f["keyframe"]] @ np.array(f["T_keyframe_camera"]) for f in tracked}
+    with as_written(Path("keyframes.json")):
+        keyframes = [np.array(k["T_world_camera"], float) for k in record["keyframes"]]
+        tracked = [f for f in record["frames"] if f["status"] != "lost" and f["keyframe"] < len(keyframes)]
+        poses = {f["frame"]: keyframes[f["keyframe"]] @ np.array(f["T_keyframe_camera"], float) for f in tracked}
+    for frame, pose in poses.items():
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise RunFolderError(f"keyframes.json: pose of frame {frame}: expected 4x4 finite numbers")
+    return poses
 
 
 def run_camera(folder: RunFolder) -> Camera:
     """The camera that the run saw with."""
-    values: dict[str, Any] = folder.read_json("sequence.json")["camera"]
-    return Camera(**values)
+    with as_written(folder.path / "sequence.json"):
+        return Camera(**folder.read_json("sequence.json")["camera"])
 
 
 def select_frames(folder: RunFolder, numbers: str | None, every: int | None, count: int = 8) -> list[int]:

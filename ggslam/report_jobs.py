@@ -20,7 +20,7 @@ from ggslam.reporting.plot_files import write_plots
 from ggslam.reporting.run_data import FrameView, RunData
 from ggslam.reporting.run_page import run_page
 from ggslam.reporting.run_plots import all_plots
-from ggslam.run_folder import REPORT_FILE, RunFolder
+from ggslam.run_folder import REPORT_FILE, RunFolder, as_written
 from ggslam.sequences import Sequence
 
 COMPARED_VIEWS = 3
@@ -46,7 +46,9 @@ def write_report(folder: RunFolder, sequence: Sequence | None = None, plots: Pat
         views = rendered_views(folder, recording, spread(frame_poses(folder.read_json("keyframes.json"))))
     run = load_run(folder, recording, views)
     path = folder.path / REPORT_FILE
-    write_text(path, run_page(run))
+    with as_written(folder.path):
+        page = run_page(run)
+    write_text(path, page)
     if plots is not None:
         make_folder(plots)
         write_plots(plots, all_plots([run]))
@@ -83,8 +85,10 @@ def write_comparison(folders: list[RunFolder], out: Path, plots: Path | None = N
         group = [replace(runs[i], views=rendered_views(folders[i], recordings[i], frames)) for i in numbers]
         groups.append(_in_one_world(group))
         views.append(_same_views(group, frames))
+    with as_written(Path(" or ".join(str(folder.path) for folder in folders))):
+        page = comparison_page(groups, views)
     make_folder(out.parent)
-    write_text(out, comparison_page(groups, views))
+    write_text(out, page)
     if plots is not None:
         make_folder(plots)
         for number, group in enumerate(groups, start=1):

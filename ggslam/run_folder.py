@@ -22,7 +22,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -218,7 +219,7 @@ class RunFolder:
         path = self.path / "config.yaml"
         try:
             return config_from_dict(yaml.safe_load(path.read_text()), str(path))
-        except (OSError, yaml.YAMLError) as error:
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             raise RunFolderError(f"{path}: cannot be read: {error}") from None
 
     def gaussians(self, with_moments: bool = False) -> GaussianMap:
@@ -294,6 +295,15 @@ class RunFolder:
         """
         path = self.path / "votes.npz"
         return ObjectVotes.from_file(path) if path.is_file() else None
+
+
+@contextmanager
+def as_written(path: Path) -> Iterator[None]:
+    """What goes wrong in the block is the fault of a file, or of files in a folder: RunFolderError says so."""
+    try:
+        yield
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
+        raise RunFolderError(f"{path}: not as ggslam writes it: {error!r}") from error
 
 
 def segmented(result: SlamResult, names: Mapping[int, str] | None = None) -> SegmentedMap:

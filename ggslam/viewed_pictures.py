@@ -116,7 +116,9 @@ def table_of(cells: list[tuple[str, np.ndarray]], size: tuple[int, int]) -> np.n
     return sheet
 
 
-def _identity_colors(segmented: SegmentedMap) -> IdentityColors:
-    """Colours of identity vectors, fitted to those of the labelled Gaussians."""
+def _identity_colors(segmented: SegmentedMap) -> IdentityColors | None:
+    """Colours of identity vectors, fitted to those of the labelled Gaussians; None if there are none."""
     labelled = np.flatnonzero(segmented.gaussians.object_id.numpy() > 0)
+    if not len(labelled):
+        return None
     return IdentityColors(segmented.gaussians.features.numpy()[labelled[:: max(1, len(labelled) // FITTED)]])

@@ -241,7 +241,8 @@ class ViewedRun:
 
     def default_target(self) -> str:
         """See `EditableMap`."""
-        return str(self.folder.path.with_name(self.folder.path.name + "-edited"))
+        path = self.folder.path.resolve()  # "." has no name
+        return str(path.with_name(path.name + "-edited"))
 
     def save(self, target: str, inpaint: bool) -> str:
         """See `EditableMap`; an earlier run at `target` is not replaced."""
@@ -252,7 +253,11 @@ class ViewedRun:
                 raise ConfigError("a folder is needed to save to")
             sequence = self._sequence_path if inpaint else None
             edits = list(self._edits)
-        outcome = edit_run(self.folder, edits, Path(target).expanduser(), inpainting=inpaint, sequence=sequence)
+        try:
+            out = Path(target).expanduser()
+        except RuntimeError as error:  # "~nobody"
+            raise ConfigError(f"{target}: cannot be saved to: {error}") from None
+        outcome = edit_run(self.folder, edits, out, inpainting=inpaint, sequence=sequence)
         return "\n".join([f"saved to {outcome.folder.path}", *outcome.notes])
 
     def _scene(self) -> SegmentedMap:

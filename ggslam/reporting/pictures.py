@@ -22,6 +22,8 @@ def color_to_uint8(image: np.ndarray) -> np.ndarray:
 
 def color_of_depth(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """Depth [H, W] in metres as colours, uint8 [H, W, 3]: near is warm, far is cold, none is black."""
+    if not depth.size:  # OpenCV has no word for it
+        return np.zeros((*depth.shape, 3), np.uint8)
     level = np.clip((far - depth) / max(far - near, 1e-6), 0, 1)
     picture = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
     picture[depth <= 0] = 0

@@ -44,12 +44,13 @@ def top_view(centers: np.ndarray, positions: np.ndarray, forward: np.ndarray, up
     """Straight down on a map.
 
     Args:
-        centers: [N, 3], of the Gaussians.
+        centers: [N, 3], of the Gaussians; if there are none, the cameras' positions stand for them.
         positions: [K, 3], of the recording cameras.
         forward: [3], direction that will point up in the picture, if it is not parallel to `up`.
         up: [3], unit vector.
         fov: of the view along its shorter side, radians.
     """
+    centers = centers if len(centers) else positions
     low, high = np.percentile(centers, [1, 99], axis=0)
     middle = (low + high) / 2
     size = float(np.linalg.norm((high - low) - ((high - low) @ up) * up))

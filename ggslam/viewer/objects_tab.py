@@ -4,13 +4,17 @@
 from __future__ import annotations
 
 import html
+import threading
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ggslam.errors import ConfigError
 from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix
 from ggslam.viewer.cameras import upright_axes
 from ggslam.viewer.model import EditableMap, ListedObject
+from ggslam.viewer.words import plain
 
 if TYPE_CHECKING:
     import viser
@@ -32,6 +36,7 @@ class ObjectsTab:
         self._records: dict[int, ListedObject] = {}
         self._gizmo: viser.TransformControlsHandle | None = None
         self._motion = np.eye(4)
+        self._turn = threading.RLock()
         self._choice = gui.add_dropdown("Selected", [NOTHING], hint="Or click an object in the map")
         self._act = gui.add_button_group("Object", ["Hide", "Delete", "Export"])
         self._only = gui.add_button_group("Show", ["Only this", "All"])
@@ -50,16 +55,25 @@ class ObjectsTab:
         self.refresh()
 
     def _connect(self) -> None:
-        page = self._page
-        self._choice.on_update(page.guarded(lambda event: self._chosen() if event.client is not None else None))
-        self._act.on_click(page.guarded(lambda event: self._acted(event.client)))
-        self._only.on_click(page.guarded(lambda event: self._shown()))
-        self._rename.on_click(page.guarded(lambda event: self._edit(self._model.rename(self._one(), self._name.value))))
-        self._moving.on_update(page.guarded(lambda event: self._set_gizmo()))
-        self._keep.on_click(page.guarded(lambda event: self._moved()))
-        self._undo.on_click(page.guarded(lambda event: self._edit(self._model.undo())))
-        self._save.on_click(page.guarded(lambda event: self._saved(event.client)))
-        page.server.scene.on_click()(page.guarded(self._clicked))
+        alone = self._alone
+        self._choice.on_update(alone(lambda event: self._chosen() if event.client is not None else None))
+        self._act.on_click(alone(lambda event: self._acted(event.client)))
+        self._only.on_click(alone(lambda event: self._shown()))
+        self._rename.on_click(alone(lambda event: self._edit(self._model.rename(self._one(), self._name.value))))
+        self._moving.on_update(alone(lambda event: self._set_gizmo()))
+        self._keep.on_click(alone(lambda event: self._moved()))
+        self._undo.on_click(alone(lambda event: self._edit(self._model.undo())))
+        self._save.on_click(self._page.guarded(lambda event: self._saved(event.client)))  # may take minutes
+        self._page.server.scene.on_click()(alone(self._clicked))
+
+    def _alone(self, action: Callable[[Any], str | None]) -> Callable[[Any], None]:
+        """A callback that waits for those of other pages: what is selected and drawn is common to all."""
+
+        def in_turn(event: Any) -> str | None:
+            with self._turn:
+                return action(event)
+
+        return self._page.guarded(in_turn)
 
     # --- selecting ---------------------------------------------------------------------------------------------------
 
@@ -71,7 +85,7 @@ class ObjectsTab:
         self._choice.options = [NOTHING, *(record.label for record in self._records.values())]
         self._mark()
         edits = self._model.edits()
-        self._done.content = "\n".join(f"- {text}" for text in edits) or "*Nothing was edited yet.*"
+        self._done.content = "\n".join(f"- {plain(text)}" for text in edits) or "*Nothing was edited yet.*"
         self._undo.disabled = self._save.disabled = not edits
 
     def select(self, object_id: int | None) -> None:
@@ -94,7 +108,8 @@ class ObjectsTab:
         self._list.content = object_list(list(self._records.values()), self._page.hidden, self.selected)
 
     def _one(self) -> int:
-        assert self.selected is not None, "controls of an object are off while none is selected"
+        if self.selected is None:  # another page was faster
+            raise ConfigError("no object is selected any more")
         return self.selected
 
     def _chosen(self) -> None:

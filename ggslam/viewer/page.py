@@ -20,6 +20,7 @@ from ggslam.viewer.scene_nodes import SceneNodes
 from ggslam.viewer.server import keep_fitting
 from ggslam.viewer.time_tab import TimeTab
 from ggslam.viewer.view_tab import ViewTab
+from ggslam.viewer.words import plain
 
 if TYPE_CHECKING:
     import viser
@@ -80,13 +81,14 @@ class Page:
 
     def _draw_camera(self) -> None:
         poses = np.stack(list(self.model.frame_poses.values()))
-        self.depth = float(np.clip(0.01 * np.linalg.norm(np.ptp(self.centers, axis=0)), 0.02, 0.06))
+        extent = np.ptp(self.centers, axis=0) if len(self.centers) else np.zeros(3)  # all objects may have been removed
+        self.depth = float(np.clip(0.01 * np.linalg.norm(extent), 0.02, 0.06))
         self.nodes.set_path(poses[:, :3, 3])
         self.nodes.set_keyframes(self.model.keyframe_poses, self.model.camera, self.depth)
 
     def describe(self) -> None:
         """Says what is shown."""
-        self.summary.content = f"**{self.title}**  \n{self.model.describe()}"
+        self.summary.content = f"**{plain(self.title)}**  \n{self.model.describe()}"
 
     # --- cameras -----------------------------------------------------------------------------------------------------
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import socket
 from collections.abc import Iterator
@@ -101,9 +102,10 @@ def _check_free(host: str, port: int) -> None:
         with socket.socket(kind[0], kind[1]) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(kind[4])
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ConfigError(f"{host}:{port}: cannot be listened at: {reason}; choose another with --port") from None
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        option = "--port" if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES) else "--host"
+        raise ConfigError(f"{host}:{port}: cannot be listened at: {reason}; choose another with {option}") from None
 
 
 @contextlib.contextmanager

@@ -99,6 +99,22 @@ def test_damaged_files_are_named(copied: RunFolder) -> None:
         write_report(copied)
 
 
+@pytest.mark.parametrize("damage", [
+    ("keyframes.json", "[]"), ("sequence.json", '{"open": 3, "camera": {}}'), ("run.json", '{"environment": "x"}'),
+    ("steps.csv", "frame,step_ms,gaussians\nx,x,x\n"), ("timing.json", '{"frames": NaN, "tracking_s": 3}'),
+])  # fmt: skip
+def test_no_damage_ends_in_a_traceback(copied: RunFolder, damage: tuple[str, str]) -> None:
+    (copied.path / damage[0]).write_text(damage[1])
+    with pytest.raises((RunFolderError, FormatError)):
+        write_report(copied)
+
+
+def test_settings_that_are_no_text_are_told(copied: RunFolder) -> None:
+    (copied.path / "config.yaml").write_bytes(b"seed: \xe9\xff")
+    with pytest.raises(RunFolderError, match="config.yaml"):
+        write_report(copied)
+
+
 def test_a_page_compares_runs_and_plots_are_files(copied: RunFolder, small: Path, tmp_path: Path) -> None:
     other = tmp_path / "other" / "small"  # of one name with the first: the folders above tell them apart
     shutil.copytree(small, other)

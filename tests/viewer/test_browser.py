@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from ggslam.run_folder import RunFolder
 from ggslam.viewed_run import ViewedRun
 from ggslam.viewer.model import ListedObject
 from ggslam.viewer.server import address, close_server
-from ggslam.viewing_jobs import serve_run, write_page
+from ggslam.viewing_jobs import serve_run, show_run, write_page
 
 from . import browser as b
 
@@ -163,4 +165,34 @@ def test_the_static_page_shows_splats_and_objects_from_disk(browser: Any, run: R
     b.wait_for(lambda: b.screenshot(browser)[20:400, 20:540].mean() < before[20:400, 20:540].mean() / 2)
     loaded = browser.execute_script("return performance.getEntriesByType('resource').map((entry) => entry.name)")
     assert all(name.startswith(("data:", "blob:")) for name in loaded), loaded
+    assert b.errors(browser) == []
+
+
+def test_names_of_objects_are_no_markup_on_the_page(browser: Any, run: RunFolder, tmp_path: Path) -> None:
+    named = RunFolder(Path(shutil.copytree(run.path, tmp_path / "r<i>x</i>")))
+    table = named.object_table()
+    name = "<iframe srcdoc='<script>parent.taken=1</script>'></iframe>![a](http://127.0.0.1:9/leak)"
+    replace(table, objects=[replace(table.objects[0], name=name), *table.objects[1:]]).save(named.path / "objects.json")
+    server, model = serve_run(named, port=0, max_splats=1000)
+    try:
+        model.move(table.objects[0].id, np.eye(4))
+        show_run(server, model)
+        browser.get(address(server) + "/?fixedDpr=0.4")
+        b.press(browser, "[role=tab]", "Objects")
+        b.wait_for(lambda: f"moved {name}" in b.said(browser) and "r<i>x</i>" in b.said(browser))
+        assert not browser.execute_script("return window.taken || document.querySelectorAll('iframe').length")
+        assert b.errors(browser) == []
+    finally:
+        close_server(server)
+        browser.get("about:blank")
+        browser.get_log("browser")
+
+
+def test_the_static_page_of_a_run_without_objects_opens(browser: Any, run: RunFolder, tmp_path: Path) -> None:
+    plain = RunFolder(Path(shutil.copytree(run.path, tmp_path / "plain")))
+    (plain.path / "objects.json").unlink()
+    write_page(plain, tmp_path / "plain.html", max_splats=1000)
+    browser.get((tmp_path / "plain.html").as_uri())
+    b.wait_for(lambda: browser.execute_script("return !!window.ggslam && !!ggslam.renderer.sorted"))
+    assert not browser.find_element("id", "choose").is_displayed()
     assert b.errors(browser) == []

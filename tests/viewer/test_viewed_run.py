@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ggslam.editing_jobs import Edit, edit_run
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.objects.editing import remove_objects
+from ggslam.objects.segmented_rows import keep_rows
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import vote_label_image
 from ggslam.run_folder import RunFolder
 from ggslam.scene.poses import inverse, quaternion_to_matrix
 from ggslam.viewed_run import ViewedRun
+from ggslam.viewer.server import close_server
+from ggslam.viewing_jobs import serve_run, write_page
 
 
 @pytest.fixture
@@ -126,3 +131,46 @@ def test_pictures(viewed: ViewedRun) -> None:
     everything = {0, *(r.id for r in viewed.objects())}
     assert viewed.picture(viewed.camera, T, set()).std() > 10
     assert viewed.picture(viewed.camera, T, everything).max() == 0
+
+
+def test_a_run_named_by_a_dot_has_a_place_to_save_to(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(run.path)
+    model = ViewedRun(RunFolder.open(Path()))
+    assert model.default_target() == str(run.path.resolve()) + "-edited"
+    model.rename(some_object(model), "thing")
+    with pytest.raises(ConfigError, match="~nobody-of-this-name"):
+        model.save("~nobody-of-this-name/x", inpaint=False)
+
+
+def test_a_run_all_of_whose_gaussians_were_removed_is_shown(run: RunFolder, tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    empty = RunFolder(Path(shutil.copytree(run.path, tmp_path / "empty")))
+    scene = run.segmented_map()
+    remove_objects(scene, scene.table.ids())
+    keep_rows(scene, np.zeros(len(scene.gaussians), bool))
+    empty.save_objects(scene)
+    server, model = serve_run(empty, port=0)
+    close_server(server)
+    assert model.describe().startswith("0 Gaussians") and not model.objects()
+    for coloring in model.colorings:
+        assert model.splats(coloring, 0) == {}
+    write_page(empty, tmp_path / "empty.html")
+
+
+@pytest.mark.parametrize("damage", [
+    ("keyframes.json", "[]"), ("keyframes.json", "{}"), ("sequence.json", "{}"), ("sequence.json", '{"camera": null}'),
+])  # fmt: skip
+def test_damaged_files_are_named(run: RunFolder, tmp_path: Path, damage: tuple[str, str]) -> None:
+    copied = RunFolder(Path(shutil.copytree(run.path, tmp_path / "damaged")))
+    (copied.path / damage[0]).write_text(damage[1])
+    with pytest.raises(RunFolderError, match=damage[0]):
+        ViewedRun(copied)
+
+
+def test_a_pose_that_is_no_number_is_told(run: RunFolder, tmp_path: Path) -> None:
+    copied = RunFolder(Path(shutil.copytree(run.path, tmp_path / "damaged")))
+    record = copied.read_json("keyframes.json")
+    record["frames"][2]["T_keyframe_camera"][0][3] = None
+    copied.write_json("keyframes.json", record)
+    with pytest.raises(RunFolderError, match="keyframes.json: pose of frame 2"):
+        ViewedRun(copied)

@@ -78,7 +78,7 @@ function start(splats) {
   };
   element("objects").append(...scene.objects.map((o) => line(o.id, `${o.id} · ${o.name || "object"}`, o.color, o.gaussians)));
   if (objects.size) element("objects").append(line(0, "everything else", [110, 110, 110], scene.unlabelled));
-  else element("choose").remove();
+  else element("choose").style.display = "none";
   element("all").onclick = () => { hidden.clear(); show(); };
   element("none").onclick = () => { for (const id of [0, ...objects.keys()]) hidden.add(id); show(); };
   element("only").onclick = () => { if (selected) { for (const id of [0, ...objects.keys()]) hidden.add(id); hidden.delete(selected); show(); } };
