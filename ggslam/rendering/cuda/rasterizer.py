@@ -19,6 +19,8 @@ import torch
 from ggslam.errors import RenderError
 from ggslam.rendering import _native
 from ggslam.rendering._native import pointer
+from ggslam.rendering.adam import AdamSettings
+from ggslam.rendering.cuda.adam import AdamStep, adam_step
 from ggslam.rendering.cuda.library import CudaLibrary, Rendering, library_for_device
 from ggslam.rendering.cuda.memory import Counter, FinishedRendering, GrowingMemory, target_pointers
 from ggslam.rendering.types import (
@@ -32,6 +34,7 @@ from ggslam.rendering.types import (
     check_pose,
 )
 from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
 
 _MAX_PAIRS = 2**31 - 1
 _IMAGES = ("image", "features", "depth", "alpha")
@@ -53,6 +56,19 @@ class CudaGradients:
     opacity_logits: torch.Tensor
     sh: torch.Tensor
     features: torch.Tensor | None
+    twist: torch.Tensor
+    touched: torch.Tensor
+
+
+@dataclass
+class CudaStepResult:
+    """`StepResult` on the device.
+
+    Attributes:
+        twist: float64 [6] tensor on the device, the pose gradient, as in `CudaGradients`.
+        touched: uint8 [N], 1 where the Gaussian was updated.
+    """
+
     twist: torch.Tensor
     touched: torch.Tensor
 
@@ -90,12 +106,9 @@ class CudaRasterizer:
         self.low_pass = low_pass
         chosen = None if device is None else torch.device(device)
         self.library = library or library_for_device(chosen)
-        if chosen is None or (chosen.type == "cuda" and chosen.index is None):
-            on_gpu = self.library.device_type == "cuda"
-            chosen = torch.device("cuda", torch.cuda.current_device()) if on_gpu else torch.device("cpu")
-        self.device = chosen
-        self._counter = Counter(self.library, chosen.index or 0)
-        self._memory = GrowingMemory(chosen)
+        self.device = self.library.whole_device(chosen)
+        self._counter = Counter(self.library, self.device.index or 0)
+        self._memory = GrowingMemory(self.device)
         self._images: dict[str, torch.Tensor] = {}
         self._last: FinishedRendering | None = None
 
@@ -235,6 +248,31 @@ class CudaRasterizer:
         self._differentiate(last, grads, self._memory, False, out)
         return twist
 
+    def backward_step(
+        self,
+        map: GaussianMap,
+        grad_image: torch.Tensor | None,
+        grad_depth: torch.Tensor | None = None,
+        grad_alpha: torch.Tensor | None = None,
+        grad_features: torch.Tensor | None = None,
+        *,
+        optimizer: AdamSettings,
+        detach_features: bool = False,
+    ) -> CudaStepResult:
+        """`backward` and one Adam step in one pass, nothing of which the host waits for; arguments, effect and errors
+        as `CpuRasterizer.backward_step`, the map being on the rasterizer's device."""
+        last = self._require_last()
+        for name in PARAMETERS:
+            if getattr(map, name).data_ptr() != getattr(last.parameters, name).data_ptr():
+                raise RenderError(f"backward_step: the map's {name} are not those that were rendered last")
+        adam = adam_step(map, optimizer, self.device)
+        twist, touched = self._twist_and_touched(last)
+        out = _native.GaussianGradients(twist=pointer(twist), touched=pointer(touched))
+        grads = (grad_image, grad_depth, grad_alpha, grad_features)
+        self._differentiate(last, grads, self._memory, detach_features, out, adam)
+        self._last = None  # the parameters change now, so there is nothing left to differentiate
+        return CudaStepResult(twist, touched)
+
     def differentiate(
         self,
         rendering: FinishedRendering,
@@ -271,6 +309,7 @@ class CudaRasterizer:
         memory: GrowingMemory,
         detach_features: bool,
         out: _native.GaussianGradients,
+        adam: AdamStep | None = None,
     ) -> None:
         given = dict(zip(("image", "depth", "alpha", "features"), grads, strict=True))
         if given["features"] is not None and rendering.buffers.features is None:
@@ -283,7 +322,8 @@ class CudaRasterizer:
         rendering.native.stream = self.library.stream(self.device)
         rows = memory.block("gradients", rendering.gradient_bytes)
         arguments = [ctypes.byref(value) for value in (rendering.native, image_gradients, out)]
-        self.library.call("backward", *arguments, pointer(rows))
+        step = None if adam is None else ctypes.byref(adam)
+        self.library.call("backward", *arguments, step, pointer(rows))
 
     # --- checks ------------------------------------------------------------------------------------------------------
 
