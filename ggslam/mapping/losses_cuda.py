@@ -8,7 +8,7 @@ from the device, so that it can be optimised there. Sums have a fixed order: the
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from ggslam.mapping.losses import LossSettings, LossValues, RenderedImages
 from ggslam.rendering.cuda.library import CudaLibrary, library_for_device
 from ggslam.rendering.cuda.memory import GrowingMemory
 
-_VALUES = 9
+_VALUES = len(fields(LossValues))
 _POINTERS = ("image", "depth", "alpha", "target_color", "target_depth", "exposure", "d_image", "d_depth", "d_alpha",
              "results", "workspace", "stream")  # fmt: skip
 _WEIGHTS = ("dssim_weight", "depth_weight", "opacity_weight", "no_depth_weight", "minimum_alpha", "charbonnier_epsilon")
@@ -66,8 +66,8 @@ class DeviceLossResult:
 
     def read_values(self) -> LossValues:
         """The terms of the loss. Waits for the device."""
-        *values, valid_pixels = self.results[:_VALUES].tolist()
-        return LossValues(*values, int(valid_pixels))
+        values = dict(zip((field.name for field in fields(LossValues)), self.results.tolist(), strict=False))
+        return LossValues(**values | {"valid_pixels": int(values["valid_pixels"])})
 
 
 class _Job(ctypes.Structure):
@@ -150,9 +150,7 @@ class CudaImageLoss:
             raise RenderError(f"depth_scale: expected a number above 0, found {target.depth_scale!r}")
         return height, width
 
-    def _check(
-        self, name: str, tensor: torch.Tensor, types: tuple[torch.dtype, ...], shape: tuple[int, ...]
-    ) -> None:
+    def _check(self, name: str, tensor: torch.Tensor, types: tuple[torch.dtype, ...], shape: tuple[int, ...]) -> None:
         if tuple(tensor.shape) != shape or tensor.dtype not in types or tensor.device != self.device:
             expected = f"{' or '.join(map(str, types))} {list(shape)} on {self.device}"
             found = f"{tensor.dtype} {list(tensor.shape)} on {tensor.device}"

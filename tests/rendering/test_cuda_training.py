@@ -11,8 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from cuda_contract import moved
 from emulated_cuda import emulated_library
 from rendering_scenes import CAMERA, POSE, make_image_gradients, relative_error
+from test_cuda_emulated import GuardedMemory
 from test_fused_adam import SETTINGS as ADAM
 from test_fused_adam import make_map
 
@@ -32,8 +34,8 @@ from ggslam.scene.gaussian_map import GaussianMap
 GPU = pytest.param(
     "gpu", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 )
-TOLERANCE = {"cpu": 1e-5, "cuda": 3e-5}
-"""Relative; by the type of device. On a GPU sums over Gaussians' pixels come in changing order."""
+STEP_TOLERANCE = {"cpu": 1e-5, "cuda": 3e-4}
+"""Relative, of several steps; by the type of device. On a GPU sums over a Gaussian's pixels come in changing order."""
 EXPOSURE = np.array([[1.1, 0.02], [0.9, -0.03], [1.05, 0.01]])
 LOSSES = {
     "default": LossSettings(),
@@ -65,7 +67,7 @@ def other_order(request: pytest.FixtureRequest) -> Iterator[None]:
     functions.ggslam_emulation_order(0)
 
 
-# --- image loss --------------------------------------------------------------------------------------------------------
+# --- image loss -----------------------------------------------------------------------------------------------------
 
 
 def make_case(height: int, width: int, float_depth: bool = False) -> tuple[RenderBuffers, KeyframeImages]:
@@ -86,10 +88,6 @@ def make_case(height: int, width: int, float_depth: bool = False) -> tuple[Rende
     return view, KeyframeImages((255 * texture).astype(np.uint8), depth, scale, EXPOSURE)
 
 
-def moved_view(view: RenderBuffers, device: torch.device) -> RenderBuffers:
-    return RenderBuffers(view.image.to(device), view.depth.to(device), view.alpha.to(device))
-
-
 def moved_target(target: KeyframeImages, device: torch.device) -> DeviceKeyframeImages:
     exposure = None if target.exposure is None else torch.from_numpy(target.exposure).float().to(device)
     color, depth = torch.from_numpy(target.color).to(device), torch.from_numpy(target.depth).to(device)
@@ -97,7 +95,7 @@ def moved_target(target: KeyframeImages, device: torch.device) -> DeviceKeyframe
 
 
 def check_loss(loss: CudaImageLoss, view: RenderBuffers, target: KeyframeImages, settings: LossSettings) -> None:
-    result = loss.evaluate(moved_view(view, loss.device), moved_target(target, loss.device), settings)
+    result = loss.evaluate(moved(view, loss.device), moved_target(target, loss.device), settings)
     expected = ImageLoss(NativeContext(1)).evaluate(view, target, settings)
     found = result.read_values()
     for name, value in vars(expected.values).items():
@@ -148,7 +146,7 @@ def copies(result: DeviceLossResult) -> list[torch.Tensor]:
 def test_loss_repeats_bit_for_bit_after_a_broken_view(library: CudaLibrary) -> None:
     loss = CudaImageLoss(library=library)
     view, host_target = make_case(37, 53)
-    view, target = moved_view(view, loss.device), moved_target(host_target, loss.device)
+    view, target = moved(view, loss.device), moved_target(host_target, loss.device)
     first = copies(loss.evaluate(view, target, LOSSES["all"]))
     broken = RenderBuffers(*(torch.full_like(value, torch.nan) for value in (view.image, view.depth, view.alpha)))
     loss.evaluate(broken, target, LOSSES["all"])
@@ -158,6 +156,18 @@ def test_loss_repeats_bit_for_bit_after_a_broken_view(library: CudaLibrary) -> N
 
 def test_order_of_threads_does_not_matter_for_the_loss(other_order: None) -> None:
     check_loss(CudaImageLoss(library=emulated_library()), *make_case(37, 53), LOSSES["all"])
+
+
+@pytest.mark.parametrize("name", ["default", "l1 only"])
+def test_loss_does_not_depend_on_what_was_in_memory(name: str) -> None:
+    view, target = make_case(37, 53)
+    found = []
+    for value in (0, 255):
+        loss = CudaImageLoss(library=emulated_library())
+        loss._memory = memory = GuardedMemory(value)
+        found.append(copies(loss.evaluate(view, moved_target(target, loss.device), LOSSES[name])))
+        assert memory.untouched()
+    assert all(torch.equal(a.nan_to_num(-1), b.nan_to_num(-1)) for a, b in zip(*found, strict=True))
 
 
 def test_wrong_images_are_refused() -> None:
@@ -177,13 +187,13 @@ def test_wrong_images_are_refused() -> None:
         loss.evaluate(replace(view, depth=torch.zeros(9, 8).T), target, LossSettings())
 
 
-# --- optimizer ---------------------------------------------------------------------------------------------------------
+# --- optimizer ------------------------------------------------------------------------------------------------------
 
 
 def on_device(gaussians: GaussianMap, device: torch.device) -> GaussianMap:
-    moved = GaussianMap(gaussians.sh_degree, gaussians.feature_channels, device)
-    moved.append({name: rows.to(device) for name, rows in gaussians.take(torch.arange(len(gaussians))).items()})
-    return moved
+    copy = GaussianMap(gaussians.sh_degree, gaussians.feature_channels, device)
+    copy.append({name: rows.to(device) for name, rows in gaussians.take(torch.arange(len(gaussians))).items()})
+    return copy
 
 
 def check_steps(library: CudaLibrary, expected: GaussianMap, settings: AdamSettings, steps: int = 4) -> None:
@@ -192,34 +202,30 @@ def check_steps(library: CudaLibrary, expected: GaussianMap, settings: AdamSetti
     before = expected.updates.clone()
     start = {name: getattr(expected, name).clone() for name in PARAMETERS}
     found = on_device(expected, rasterizer.device)
-    tolerance = TOLERANCE[rasterizer.device.type]
+    tolerance = STEP_TOLERANCE[rasterizer.device.type]
     for step in range(steps):
-        gradients = [g.to(rasterizer.device) if g is not None else None
-                     for g in make_image_gradients(CAMERA, features, seed=step).arguments()]  # fmt: skip
+        gradients = make_image_gradients(CAMERA, features, seed=step)
         rasterizer.forward(found, CAMERA, POSE)
-        result = rasterizer.backward_step(found, *gradients, optimizer=settings)
+        given = moved(gradients, rasterizer.device).arguments()
+        result = rasterizer.backward_step(found, *given, optimizer=settings)
         cpu.forward(expected, CAMERA, POSE)
-        wanted = cpu.backward_step(
-            expected, *make_image_gradients(CAMERA, features, seed=step).arguments(), optimizer=settings
-        )
+        wanted = cpu.backward_step(expected, *gradients.arguments(), optimizer=settings)
         assert torch.equal(result.touched.cpu(), wanted.touched)
-        assert relative_error(result.twist.cpu(), torch.as_tensor(wanted.twist)) < 10 * tolerance
+        assert relative_error(result.twist.cpu(), torch.as_tensor(wanted.twist)) < tolerance
     assert torch.equal(found.updates.cpu(), expected.updates)
     never = expected.updates == before
     assert never.any() and not never.all()
     for name in PARAMETERS:
-        moved, wanted_move = getattr(found, name).cpu() - start[name], getattr(expected, name) - start[name]
-        assert not moved[never].any(), name
-        assert not moved.numel() or relative_error(moved, wanted_move) < 10 * tolerance, name
+        way, wanted_way = getattr(found, name).cpu() - start[name], getattr(expected, name) - start[name]
+        assert not way[never].any(), name
+        assert not way.numel() or relative_error(way, wanted_way) < tolerance, name
         for mine, other in zip(found.moments[name], expected.moments[name], strict=True):
-            assert not other.numel() or relative_error(mine.cpu(), other) < 10 * tolerance, name
+            assert not other.numel() or relative_error(mine.cpu(), other) < tolerance, name
 
 
 @pytest.mark.parametrize(("degree", "features"), [(0, 0), (0, 16), (1, 3), (2, 0), (3, 21)])
 def test_steps_are_those_of_the_cpu(library: CudaLibrary, degree: int, features: int) -> None:
     check_steps(library, make_map(degree, features), ADAM)
-
-
 
 
 @pytest.mark.parametrize("settings", [ADAM, AdamSettings(decay=0.999, decay_floor=0.1), AdamSettings(beta1=0.0)])
@@ -229,6 +235,10 @@ def test_steps_of_gaussians_of_every_age(library: CudaLibrary, settings: AdamSet
     for _, second in gaussians.moments.values():
         second.fill_(1e-4)
     check_steps(library, gaussians, settings, steps=2)
+
+
+def test_order_of_threads_does_not_matter_for_the_steps(other_order: None) -> None:
+    check_steps(emulated_library(), make_map(1, 5), ADAM, steps=2)
 
 
 def test_features_that_were_not_rendered_are_not_stepped(library: CudaLibrary) -> None:
@@ -268,3 +278,24 @@ def test_wrong_steps_are_refused() -> None:
 
 def test_structures_are_of_one_size() -> None:
     assert emulated_library().functions.ggslam_cuda_adam_step_size() == ctypes.sizeof(AdamStep)
+
+
+# --- both together ----------------------------------------------------------------------------------------------------
+
+
+def test_training_on_a_keyframe_goes_the_same_way(library: CudaLibrary) -> None:
+    """Forward, loss and step, some times over: the loss falls as on the CPU."""
+    _, target = make_case(CAMERA.height, CAMERA.width)
+    rasterizer, loss = CudaRasterizer(library=library), CudaImageLoss(library=library)
+    cpu, cpu_loss = CpuRasterizer(1), ImageLoss(NativeContext(1))
+    expected = make_map(0, 0)
+    found, device_target = on_device(expected, rasterizer.device), moved_target(target, rasterizer.device)
+    totals = []
+    for _ in range(8):
+        mine = loss.evaluate(rasterizer.forward(found, CAMERA, POSE), device_target, LossSettings())
+        totals.append(mine.read_values().total)
+        rasterizer.backward_step(found, mine.d_image, mine.d_depth, mine.d_alpha, optimizer=ADAM)
+        other = cpu_loss.evaluate(cpu.forward(expected, CAMERA, POSE), target, LossSettings())
+        cpu.backward_step(expected, other.d_image, other.d_depth, other.d_alpha, optimizer=ADAM)
+        assert totals[-1] == pytest.approx(other.values.total, rel=1e-4)
+    assert totals[-1] < totals[0]
