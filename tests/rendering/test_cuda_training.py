@@ -237,6 +237,11 @@ def test_steps_of_gaussians_of_every_age(library: CudaLibrary, settings: AdamSet
     check_steps(library, gaussians, settings, steps=2)
 
 
+def test_bias_correction_of_the_first_step_is_precise(library: CudaLibrary) -> None:
+    """1 - beta2^u is a small difference then."""
+    check_steps(library, make_map(0, 3), AdamSettings(beta2=0.9999), steps=1)
+
+
 def test_order_of_threads_does_not_matter_for_the_steps(other_order: None) -> None:
     check_steps(emulated_library(), make_map(1, 5), ADAM, steps=2)
 
