@@ -4,8 +4,9 @@
 # with a CUDA build of torch, numpy and pytest; installs nothing and needs no network. Goes on after a step that fails and
 # says at the end which did.
 #   FOLDER=...     where the log of each step goes (default: build/gpu_check)
-#   STEPS="..."    which steps to run (default: machine build compile tests bench)
+#   STEPS="..."    which steps to run (default: machine build compile tests bench training)
 #   BENCH="..."    arguments of scripts/bench_cuda_render.py
+#   TRAINING="..." arguments of scripts/bench_cuda_training.py
 #   SANITIZE=1     runs a few tests under compute-sanitizer's memcheck and racecheck, too (minutes)
 set -u
 cd "$(dirname "$0")/.."
@@ -20,7 +21,7 @@ failed=""
 step() {
   local name=$1
   shift
-  case " ${STEPS:-machine build compile tests bench} " in *" $name "*) ;; *) return ;; esac
+  case " ${STEPS:-machine build compile tests bench training} " in *" $name "*) ;; *) return ;; esac
   echo "=== $name"
   local start=$SECONDS
   "$@" 2>&1 | tee "$folder/$name.log"
@@ -53,8 +54,11 @@ print(compiled_library(architecture), f"{time.perf_counter() - start:.1f} s")
 CODE
   local arch
   arch=$("$python" -c 'import torch; print("".join(map(str, torch.cuda.get_device_capability())))')
-  nvcc -O3 -std=c++17 -ftz=true -Xptxas -v -gencode "arch=compute_$arch,code=sm_$arch" -c -o /dev/null \
-    ggslam/rendering/cuda/kernels/api.cu 2>&1 | grep -E "Compiling|spill|Used" | { c++filt 2>/dev/null || cat; }
+  local source
+  for source in api image_loss; do
+    nvcc -O3 -std=c++17 -ftz=true -Xptxas -v -gencode "arch=compute_$arch,code=sm_$arch" -c -o /dev/null \
+      "ggslam/rendering/cuda/kernels/$source.cu" 2>&1 | grep -E "Compiling|spill|Used" | { c++filt 2>/dev/null || cat; }
+  done
 }
 
 tests() {
@@ -65,7 +69,8 @@ sanitize() {
   local tool
   for tool in memcheck racecheck; do
     compute-sanitizer --tool "$tool" --error-exitcode 1 "$python" -m pytest -q -p no:cacheprovider -m gpu \
-      tests/rendering/test_cuda_device.py -k "channels or crowded" || return 1
+      tests/rendering/test_cuda_device.py tests/rendering/test_cuda_training.py \
+      -k "channels or crowded or every_size or every_age" || return 1
   done
 }
 
@@ -74,12 +79,18 @@ bench() {
   "$python" scripts/bench_cuda_render.py ${BENCH:-}
 }
 
+training() {
+  # shellcheck disable=SC2086
+  "$python" scripts/bench_cuda_training.py ${TRAINING:-}
+}
+
 step machine machine
 step build build
 step compile compile
 step tests tests
 [ -z "${SANITIZE:-}" ] || STEPS="sanitize" step sanitize sanitize
 step bench bench
+step training training
 if [ -n "$failed" ]; then
   echo "failed:$failed"
   exit 1

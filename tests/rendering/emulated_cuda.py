@@ -27,7 +27,8 @@ def emulated_library() -> CudaLibrary:
         pytest.skip("no g++ to compile the emulation of CUDA with")
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "emulated.so"
-        sources = [KERNELS / "api.cu", EMULATION / "fibers.cpp", EMULATION / "sorting_on_cpu.cpp"]
+        sources = [path for path in sorted(KERNELS.glob("*.cu")) if path.name != "sorting.cu"]
+        sources += [EMULATION / "fibers.cpp", EMULATION / "sorting_on_cpu.cpp"]
         command = [compiler, *FLAGS, "-I", str(EMULATION), "-I", str(KERNELS), "-include", "cuda_on_cpu.hpp"]
         command += ["-shared", "-x", "c++", *map(str, sources), "-o", str(library)]
         run = subprocess.run(command, capture_output=True, text=True, check=False)

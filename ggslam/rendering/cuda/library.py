@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The C interface of the CUDA rasterizer: structures as in kernels/contract.cuh, functions of kernels/api.cu."""
+"""The C interface of the CUDA kernels: structures as in kernels/contract.cuh, functions of kernels/*.cu."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ggslam.errors import MissingDependency, RenderError
 from ggslam.rendering import _native
 from ggslam.rendering.cuda.compiler import compiled_library
 
-VERSION = 1
+VERSION = 2
 _pointer = ctypes.c_void_p
 _int32 = ctypes.c_int32
 _int64 = ctypes.c_int64
@@ -65,7 +65,10 @@ class CudaLibrary:
         functions.ggslam_cuda_project.argtypes = [_pointer] * 2
         functions.ggslam_cuda_wait.argtypes = [_pointer] * 2
         functions.ggslam_cuda_composite.argtypes = [_pointer]
-        functions.ggslam_cuda_backward.argtypes = [_pointer] * 4
+        functions.ggslam_cuda_backward.argtypes = [_pointer] * 5
+        functions.ggslam_cuda_image_loss.argtypes = [_pointer]
+        functions.ggslam_cuda_image_loss_bytes.argtypes = [_pointer]
+        functions.ggslam_cuda_image_loss_bytes.restype = _int64
 
     def call(self, name: str, *arguments: object) -> None:
         """Calls ggslam_cuda_<name>.
@@ -77,6 +80,12 @@ class CudaLibrary:
         if status != 0:
             text = self.functions.ggslam_cuda_error_text(status).decode()
             raise RenderError(f"rendering failed: CUDA reports {text!r} in {name}")
+
+    def whole_device(self, device: torch.device | None) -> torch.device:
+        """The device with its number; None: the current one."""
+        if device is not None and (device.type != "cuda" or device.index is not None):
+            return device
+        return torch.device("cuda", torch.cuda.current_device()) if self.device_type == "cuda" else torch.device("cpu")
 
     def stream(self, device: torch.device) -> int | None:
         """Handle of torch's current stream on the device."""

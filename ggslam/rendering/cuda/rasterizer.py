@@ -19,6 +19,7 @@ import torch
 from ggslam.errors import RenderError
 from ggslam.rendering import _native
 from ggslam.rendering._native import pointer
+from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.arguments import (
     check_projection,
     checked_parameters,
@@ -27,10 +28,12 @@ from ggslam.rendering.arguments import (
     image_gradients,
     native_view,
 )
+from ggslam.rendering.cuda.adam import AdamStep, adam_step
 from ggslam.rendering.cuda.library import CudaLibrary, Rendering, library_for_device
 from ggslam.rendering.cuda.memory import Counter, FinishedRendering, GrowingMemory, target_pointers
 from ggslam.rendering.types import LOW_PASS, PARAMETERS, Gaussians, ParameterGradients, RenderBuffers
 from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
 
 _MAX_PAIRS = 2**31 - 1
 
@@ -44,6 +47,19 @@ class CudaGradients(ParameterGradients):
     """
 
     twist: torch.Tensor
+
+
+@dataclass
+class CudaStepResult:
+    """`StepResult` on the device.
+
+    Attributes:
+        twist: float64 [6] tensor on the device, the pose gradient, as in `CudaGradients`.
+        touched: uint8 [N], 1 where the Gaussian was updated.
+    """
+
+    twist: torch.Tensor
+    touched: torch.Tensor
 
 
 class CudaRasterizer:
@@ -76,12 +92,9 @@ class CudaRasterizer:
         self.low_pass = low_pass
         chosen = None if device is None else torch.device(device)
         self.library = library or library_for_device(chosen)
-        if chosen is None or (chosen.type == "cuda" and chosen.index is None):
-            on_gpu = self.library.device_type == "cuda"
-            chosen = torch.device("cuda", torch.cuda.current_device()) if on_gpu else torch.device("cpu")
-        self.device = chosen
-        self._counter = Counter(self.library, chosen.index or 0)
-        self._memory = GrowingMemory(chosen)
+        self.device = self.library.whole_device(chosen)
+        self._counter = Counter(self.library, self.device.index or 0)
+        self._memory = GrowingMemory(self.device)
         self._images: dict[str, torch.Tensor] = {}
         self._last: FinishedRendering | None = None
 
@@ -191,6 +204,31 @@ class CudaRasterizer:
         self._differentiate(last, grads, self._memory, False, out)
         return twist
 
+    def backward_step(
+        self,
+        map: GaussianMap,
+        grad_image: torch.Tensor | None,
+        grad_depth: torch.Tensor | None = None,
+        grad_alpha: torch.Tensor | None = None,
+        grad_features: torch.Tensor | None = None,
+        *,
+        optimizer: AdamSettings,
+        detach_features: bool = False,
+    ) -> CudaStepResult:
+        """`backward` and one Adam step in one pass, nothing of which the host waits for; arguments, effect and errors
+        as `CpuRasterizer.backward_step`, the map being on the rasterizer's device."""
+        last = self._require_last()
+        for name in PARAMETERS:
+            if getattr(map, name).data_ptr() != getattr(last.parameters, name).data_ptr():
+                raise RenderError(f"backward_step: the map's {name} are not those that were rendered last")
+        adam = adam_step(map, optimizer, self.device)
+        twist, touched = self._twist_and_touched(last)
+        out = _native.GaussianGradients(twist=pointer(twist), touched=pointer(touched))
+        grads = (grad_image, grad_depth, grad_alpha, grad_features)
+        self._differentiate(last, grads, self._memory, detach_features, out, adam)
+        self._last = None  # the parameters change now, so there is nothing left to differentiate
+        return CudaStepResult(twist, touched)
+
     def differentiate(
         self,
         rendering: FinishedRendering,
@@ -227,12 +265,14 @@ class CudaRasterizer:
         memory: GrowingMemory,
         detach_features: bool,
         out: _native.GaussianGradients,
+        adam: AdamStep | None = None,
     ) -> None:
         gradients = image_gradients(rendering.buffers, grads, detach_features, self.device)
         rendering.native.stream = self.library.stream(self.device)
         rows = memory.block("gradients", rendering.gradient_bytes)
         arguments = [ctypes.byref(value) for value in (rendering.native, gradients, out)]
-        self.library.call("backward", *arguments, pointer(rows))
+        step = None if adam is None else ctypes.byref(adam)
+        self.library.call("backward", *arguments, step, pointer(rows))
 
     # --- checks ------------------------------------------------------------------------------------------------------
 

@@ -7,10 +7,9 @@
 #include "binning.cuh"
 #include "composite_forward.cuh"
 #include "gather_kernel.cuh"
+#include "host.cuh"
 #include "project_kernel.cuh"
 #include "sorting.cuh"
-
-#define GGSLAM_EXPORT extern "C" __attribute__((visibility("default")))
 
 namespace ggslam::cuda {
 namespace {
@@ -24,8 +23,6 @@ struct Counter {
 struct Sizes {
   std::int64_t gaussian_workspace, pair_workspace, pixel_workspace, gradient_rows;  // bytes
 };
-
-std::int64_t blocks_for(std::int64_t count, int threads) { return (count + threads - 1) / threads; }
 
 cudaStream_t stream_of(const Rendering& r) { return static_cast<cudaStream_t>(r.stream); }
 
@@ -132,8 +129,27 @@ void differentiate_images(const Rendering& r, const ImageGradients& in, const Gr
   });
 }
 
+// Writes gradients, or makes a step of Adam with them if there is one.
+void gather(const Rendering& r, const GradientRows& rows, const GaussianGradients& out, const AdamStep* adam) {
+  const cudaStream_t stream = stream_of(r);
+  const std::int64_t n = r.gaussians.count, all = blocks_for(n, kGatherThreads);
+  const auto run = [&](auto kernel, const auto& finish) {
+    launch(kernel, std::min<std::int64_t>(all, kGatherBlocks), kGatherThreads, stream, r.gaussians,
+           view_constants(r.view), rows, out.twist, finish);
+  };
+  const int channels = r.gaussians.render_features ? r.gaussians.feature_channels : 0;
+  if (adam != nullptr) {
+    run(gather_kernel<StepParameters>, StepParameters{*adam});
+    if (channels > 0) launch(step_features_kernel, all, kGatherThreads, stream, n, channels, rows, *adam);
+    return;
+  }
+  run(gather_kernel<WriteGradients>, WriteGradients{out});
+  if (out.features != nullptr && channels > 0)
+    launch(gather_features_kernel, all, kGatherThreads, stream, n, channels, rows, out.features);
+}
+
 cudaError_t differentiate_all(const Rendering& r, const ImageGradients& in, const GaussianGradients& out,
-                              float* row_memory) {
+                              const AdamStep* adam, float* row_memory) {
   const cudaStream_t stream = stream_of(r);
   const std::int64_t n = r.gaussians.count;
   const GradientRows rows{row_memory, gradient_stride(r.gaussians), out.touched};
@@ -143,22 +159,8 @@ cudaError_t differentiate_all(const Rendering& r, const ImageGradients& in, cons
   launch(clear_rows_kernel, blocks_for(n, kGatherThreads), kGatherThreads, stream, n,
          gaussians_of(r).tile_counts, rows);
   differentiate_images(r, in, rows);
-  launch(gather_kernel, std::min<std::int64_t>(blocks_for(n, kGatherThreads), kGatherBlocks), kGatherThreads, stream,
-         r.gaussians, view_constants(r.view), rows, out);
-  const int channels = r.gaussians.render_features ? r.gaussians.feature_channels : 0;
-  if (out.features != nullptr && channels > 0)
-    launch(gather_features_kernel, blocks_for(n, kGatherThreads), kGatherThreads, stream, n, channels, rows,
-           out.features);
+  gather(r, rows, out, adam);
   return cudaSuccess;
-}
-
-// Runs work on the rendering's device and reports what went wrong.
-template <class Work>
-int on_device(int device, const Work& work) {
-  const cudaError_t chosen = cudaSetDevice(device);
-  if (chosen != cudaSuccess) return chosen;
-  const cudaError_t status = work(), launched = cudaGetLastError();
-  return status != cudaSuccess ? status : launched;
 }
 
 }  // namespace
@@ -166,7 +168,7 @@ int on_device(int device, const Work& work) {
 
 using namespace ggslam::cuda;
 
-GGSLAM_EXPORT int ggslam_cuda_version() { return 1; }
+GGSLAM_EXPORT int ggslam_cuda_version() { return 2; }
 
 GGSLAM_EXPORT const char* ggslam_cuda_error_text(int status) {
   return cudaGetErrorString(static_cast<cudaError_t>(status));
@@ -222,8 +224,12 @@ GGSLAM_EXPORT int ggslam_cuda_composite(const Rendering* r) {
   return on_device(r->device, [&] { return composite_all(*r); });
 }
 
-// Differentiates a rendering, whose arrays and memory must still be there and unchanged. row_memory: gradient_rows bytes.
+// Differentiates a rendering, whose arrays and memory must still be there and unchanged. adam: null, or a step to make
+// instead of writing gradients; it changes the arrays. row_memory: gradient_rows bytes.
 GGSLAM_EXPORT int ggslam_cuda_backward(const Rendering* r, const ImageGradients* image_gradients,
-                                       const GaussianGradients* gradients, float* row_memory) {
-  return on_device(r->device, [&] { return differentiate_all(*r, *image_gradients, *gradients, row_memory); });
+                                       const GaussianGradients* gradients, const AdamStep* adam, float* row_memory) {
+  return on_device(r->device, [&] { return differentiate_all(*r, *image_gradients, *gradients, adam, row_memory); });
 }
+
+// Size of the struct, so that a caller can check that its mirror of it is the same.
+GGSLAM_EXPORT int ggslam_cuda_adam_step_size() { return static_cast<int>(sizeof(AdamStep)); }

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// From each Gaussian's row of image-space gradients to the gradients of its parameters and of the camera pose.
+// From each Gaussian's row of image-space gradients to the gradients of its parameters and of the camera pose, or to
+// parameters that have made a step of Adam, without writing a gradient.
 #pragma once
+#include "adam.cuh"
 #include "composite_backward.cuh"
 #include "projection_backward.cuh"
 #include "view_colour.cuh"
@@ -35,18 +37,70 @@ gather_features_kernel(std::int64_t count, int channels, GradientRows in, float*
   }
 }
 
-__device__ inline void write_gradients(const GaussianArrays& arrays, const GaussianGradients& out, std::int64_t row,
-                                       const ParameterGradients& g, const float basis[16], const float colour[3]) {
-  for (int k = 0; k < 3; ++k) out.means[3 * row + k] = g.mean[k];
-  for (int k = 0; k < 4; ++k) out.quaternions[4 * row + k] = g.quaternion[k];
-  for (int k = 0; k < 3; ++k) out.log_scales[3 * row + k] = g.log_scale[k];
-  out.opacity_logits[row] = g.opacity_logit;
-  float* sh = out.sh + row * arrays.sh_coefficients * 3;
-#pragma unroll
-  for (int k = 0; k < 16; ++k)
-    if (k < arrays.sh_coefficients)
-      for (int channel = 0; channel < 3; ++channel) sh[3 * k + channel] = basis[k] * colour[channel];
+// Steps the features of the Gaussians that were touched; their updates are counted already. A block takes
+// kGatherThreads rows.
+__global__ void __launch_bounds__(kGatherThreads)
+step_features_kernel(std::int64_t count, int channels, GradientRows in, AdamStep adam) {
+  const std::int64_t first = static_cast<std::int64_t>(blockIdx.x) * kGatherThreads;
+  for (int k = threadIdx.x; k < kGatherThreads * channels; k += kGatherThreads) {
+    const std::int64_t row = first + k / channels;
+    if (row >= count || in.touched[row] == 0) continue;
+    const AdamFactors factors = adam_factors(adam, adam.updates[row]);
+    step_parameter(adam, adam.features, row * channels + k % channels,
+                   in.rows[row * in.stride + kBaseGradients + k % channels], step_size(adam, factors, kFeatures),
+                   factors.correction);
+  }
 }
+
+// What becomes of the gradients of a Gaussian: they are written,
+struct WriteGradients {
+  GaussianGradients out;
+
+  __device__ void operator()(const GaussianArrays& arrays, std::int64_t row, bool, const ParameterGradients& g,
+                             const float basis[16], const float colour[3]) const {
+    if (out.means == nullptr) return;
+    for (int k = 0; k < 3; ++k) out.means[3 * row + k] = g.mean[k];
+    for (int k = 0; k < 4; ++k) out.quaternions[4 * row + k] = g.quaternion[k];
+    for (int k = 0; k < 3; ++k) out.log_scales[3 * row + k] = g.log_scale[k];
+    out.opacity_logits[row] = g.opacity_logit;
+    float* sh = out.sh + row * arrays.sh_coefficients * 3;
+#pragma unroll
+    for (int k = 0; k < 16; ++k)
+      if (k < arrays.sh_coefficients)
+        for (int channel = 0; channel < 3; ++channel) sh[3 * k + channel] = basis[k] * colour[channel];
+  }
+};
+
+// or the Gaussian steps along them.
+struct StepParameters {
+  AdamStep adam;
+
+  __device__ void operator()(const GaussianArrays& arrays, std::int64_t row, bool touched, const ParameterGradients& g,
+                             const float basis[16], const float colour[3]) const {
+    if (!touched) return;
+    const std::int32_t update = adam.updates[row] + 1;
+    adam.updates[row] = update;
+    const AdamFactors factors = adam_factors(adam, update);
+    step_group<3>(adam.means, 3 * row, g.mean, factors, kMeans);
+    step_group<4>(adam.quaternions, 4 * row, g.quaternion, factors, kQuaternions);
+    step_group<3>(adam.log_scales, 3 * row, g.log_scale, factors, kLogScales);
+    step_group<1>(adam.opacity_logits, row, &g.opacity_logit, factors, kOpacityLogits);
+#pragma unroll
+    for (int k = 0; k < 16; ++k) {
+      if (k >= arrays.sh_coefficients) continue;
+      const float gradient[3] = {basis[k] * colour[0], basis[k] * colour[1], basis[k] * colour[2]};
+      step_group<3>(adam.sh, 3 * (row * arrays.sh_coefficients + k), gradient, factors, k == 0 ? kShConstant : kShRest);
+    }
+  }
+
+  template <int kWidth>
+  __device__ void step_group(const AdamArrays& arrays, std::int64_t first, const float* gradient,
+                             const AdamFactors& factors, AdamGroup group) const {
+    const float step = step_size(adam, factors, group);
+#pragma unroll
+    for (int k = 0; k < kWidth; ++k) step_parameter(adam, arrays, first + k, gradient[k], step, factors.correction);
+  }
+};
 
 __device__ inline SplatGradients load_row(const GradientRows& in, std::int64_t row) {
   const float* v = in.rows + row * in.stride;
@@ -54,8 +108,9 @@ __device__ inline SplatGradients load_row(const GradientRows& in, std::int64_t r
 }
 
 // twist is added to; it must be zero before.
+template <class Finish>
 __global__ void __launch_bounds__(kGatherThreads)
-gather_kernel(GaussianArrays arrays, ViewConstants c, GradientRows in, GaussianGradients out) {
+gather_kernel(GaussianArrays arrays, ViewConstants c, GradientRows in, double* out_twist, Finish finish) {
   const int lane = threadIdx.x % kWarp;
   const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * kGatherThreads;
   double twist = 0.0;  // lane k < 6: component k, of the warp
@@ -75,10 +130,10 @@ gather_kernel(GaussianArrays arrays, ViewConstants c, GradientRows in, GaussianG
       differentiate_view_colour(arrays, c, row, p.position, colour, basis, direction_gradient);
       g = differentiate_projection(c, raw, p, splat, direction_gradient);
     }
-    if (row < arrays.count && out.means != nullptr) write_gradients(arrays, out, row, g, basis, colour);
+    if (row < arrays.count) finish(arrays, row, touched, g, basis, colour);
     if (__ballot_sync(kAllLanes, touched) != 0) twist += static_cast<double>(sum_over_warp(g.twist, lane));
   }
-  if (lane < 6) atomicAdd(out.twist + lane, twist);
+  if (lane < 6) atomicAdd(out_twist + lane, twist);
 }
 
 }  // namespace ggslam::cuda

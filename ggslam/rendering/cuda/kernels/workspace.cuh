@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Device memory that a rendering works in: blocks, laid out here, allocated by the caller.
 #pragma once
+#include "carver.cuh"
 #include "splat.cuh"
 
 namespace ggslam::cuda {
@@ -39,23 +40,6 @@ inline int gradient_stride(const GaussianArrays& arrays) {
   const int features = arrays.render_features ? (arrays.feature_channels + 3) / 4 * 4 : 0;
   return (kBaseGradients + features + 15) / 16 * 16;
 }
-
-// Hands out parts of a block of memory, each aligned to 256 bytes. With a null block it only counts.
-class Carver {
- public:
-  explicit Carver(void* block) : block_(static_cast<char*>(block)) {}
-  template <class T>
-  T* take(std::int64_t count) {
-    T* part = reinterpret_cast<T*>(block_ + used_);
-    used_ += (static_cast<std::size_t>(count) * sizeof(T) + 255) / 256 * 256;
-    return part;
-  }
-  std::size_t used() const { return used_; }
-
- private:
-  char* block_;
-  std::size_t used_ = 0;
-};
 
 struct GaussianWorkspace {
   Totals* totals;
