@@ -52,6 +52,11 @@ def page(browser: Any, run: RunFolder) -> Iterator[tuple[Any, ViewedRun]]:
         browser.get_log("browser")  # a page whose server has ended says so
 
 
+def text_of(browser: Any) -> str:
+    """All text of the page, whether it is drawn by now or not."""
+    return str(browser.execute_script("return document.body.textContent"))
+
+
 def camera_of(server: Any) -> Any:
     """Of the page."""
     return next(iter(server.get_clients().values())).camera
@@ -169,7 +174,7 @@ def test_the_static_page_shows_splats_and_objects_from_disk(browser: Any, run: R
 
 
 def test_names_of_objects_are_no_markup_on_the_page(browser: Any, run: RunFolder, tmp_path: Path) -> None:
-    named = RunFolder(Path(shutil.copytree(run.path, tmp_path / "r<i>x</i>")))
+    named = RunFolder(Path(shutil.copytree(run.path, tmp_path / "r<i>x")))
     table = named.object_table()
     name = "<iframe srcdoc='<script>parent.taken=1</script>'></iframe>![a](http://127.0.0.1:9/leak)"
     replace(table, objects=[replace(table.objects[0], name=name), *table.objects[1:]]).save(named.path / "objects.json")
@@ -178,8 +183,9 @@ def test_names_of_objects_are_no_markup_on_the_page(browser: Any, run: RunFolder
         model.move(table.objects[0].id, np.eye(4))
         show_run(server, model)
         browser.get(address(server) + "/?fixedDpr=0.4")
+        b.wait_for(lambda: "r<i>x" in b.said(browser))
         b.press(browser, "[role=tab]", "Objects")
-        b.wait_for(lambda: f"moved {name}" in b.said(browser) and "r<i>x</i>" in b.said(browser))
+        b.wait_for(lambda: f"moved {name}" in text_of(browser))
         assert not browser.execute_script("return window.taken || document.querySelectorAll('iframe').length")
         assert b.errors(browser) == []
     finally:
