@@ -33,4 +33,4 @@ def main(run: str, recording: str, out: str, start: str = "0", stop: str = "30")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(*sys.argv[1:]) if len(sys.argv) in (4, 5, 6) else sys.exit(__doc__)

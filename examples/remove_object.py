@@ -18,7 +18,7 @@ from ggslam.run_folder import RunFolder
 def main(run: str, name: str, out: str) -> None:
     """`name`: a name or id of objects.json, or several: "mug,7"."""
     folder = RunFolder.open(run)
-    print("objects:", ", ".join(f"{record.name or 'object'} ({record.id})" for record in folder.object_table().objects))
+    print("objects:", ", ".join(record.label() for record in folder.object_table().objects))
     outcome = edit_run(folder, [Edit("remove", name)], Path(out), inpainting=True, overwrite=True)
     for line in [*outcome.changes, *outcome.notes]:
         print(line)
@@ -28,4 +28,4 @@ def main(run: str, name: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(*sys.argv[1:]) if len(sys.argv) == 4 else sys.exit(__doc__)

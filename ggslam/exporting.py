@@ -74,7 +74,7 @@ def export_objects(
     dataclasses.replace(scene.table, objects=chosen).save(path / "objects.json")
     if not plain:
         _write_classifier(path / "map.ply", scene.classifier)
-    return f"wrote {len(chosen)} objects to {path}: {total} Gaussians"
+    return f"wrote {len(chosen)} object{'s' * (len(chosen) != 1)} to {path}: {total} Gaussians"
 
 
 def export_segmented(

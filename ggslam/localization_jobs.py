@@ -166,7 +166,8 @@ def parsed_pose(text: str) -> np.ndarray:
     norm = float(np.linalg.norm(numbers[3:]))
     if len(numbers) != 7 or not (np.abs(numbers) <= _FARTHEST).all() or not 0.9 < norm < 1.1:
         expected = f'"x y z qx qy qz qw", metres and a unit quaternion, or "{GIVEN}"'
-        raise ConfigError(f"--start: expected {expected}, found {text!r}")
+        frame = " (the first frame to use is --first)" if text.strip().isdecimal() else ""
+        raise ConfigError(f"--start: expected {expected}, found {text!r}{frame}")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = quaternion_to_matrix(numbers[[6, 3, 4, 5]] / norm), numbers[:3]
     return T

@@ -185,7 +185,7 @@ def _write_each(out: Path, mesh: Mesh, labels: np.ndarray, table: ObjectTable, i
     without = len(ids) - len(written)
     lacking = f" ({without} have no surface at this voxel)" if without else ""
     total = sum(len(part.triangles) for part in written)
-    return f"wrote {len(written)} objects to {out}{lacking}: {total} triangles, from {origin}"
+    return f"wrote {len(written)} object{'s' * (len(written) != 1)} to {out}{lacking}: {total} triangles, from {origin}"
 
 
 def _size(mesh: Mesh) -> str:

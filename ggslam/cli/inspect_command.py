@@ -136,7 +136,10 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
     if r.pose_depth_error is not None:
         lines.append(("consistency", f"depth agrees with the poses to {r.pose_depth_error:.1%}"))
     if r.alignment is not None:
-        best = "where it is" if r.alignment.off == 0 else f"{r.alignment.off * r.camera.width:.1f} pixels away"
+        away = f"{r.alignment.off * r.camera.width:.1f} pixels away"
+        if not r.alignment.doubtful:
+            away += ", hardly better than where they are"
+        best = "where they are" if r.alignment.off == 0 else away
         lines.append(("alignment", f"outlines of depth fit the edges of colour best {best}"))
     if r.mask_kinds:
         kinds = ", ".join(f"{count} {kind}" for kind, count in r.mask_kinds.items())

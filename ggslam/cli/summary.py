@@ -50,7 +50,8 @@ def _print_segmentation(s: dict[str, Any]) -> None:
     columns = ["scores", *(title for title, *_ in _SEGMENTATION_COLUMNS)]
     console.print(table(f"objects against masks, %; {matched}", columns, rows))
     lowest = sorted(s["per_object"].items(), key=lambda item: item[1]["iou"])[:_LOWEST]
-    texts = [f"{o['name'] or 'object'} ({i}) {_text(o['iou'], 100, '.1f')} %" for i, o in lowest]
+    labels = [f"{o['name']} ({i})" if o["name"] else f"object {i}" for i, o in lowest]
+    texts = [f"{label} {_text(o['iou'], 100, '.1f')} %" for label, (_, o) in zip(labels, lowest, strict=True)]
     console.print(f"lowest IoU: {', '.join(texts)}", highlight=False, markup=False)
     g = s["gaussians"]
     right, by_opacity = (_text(g[key], 100, ".1f") for key in ("accuracy", "accuracy_by_opacity"))

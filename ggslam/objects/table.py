@@ -157,7 +157,8 @@ class ObjectTable:
 
     def find(self, name_or_id: str) -> list[int]:
         """Ids that "mug" or "7" stand for; a name that several objects share stands for all of them. Case and spaces
-        around do not matter; an id goes before a name of the same digits.
+        around do not matter; an id goes before a name of the same digits, a name before a label ("mug (2)", "object 7")
+        as messages print it.
 
         Raises:
             ConfigError: no object is called so; the message lists near names.
@@ -166,6 +167,8 @@ class ObjectTable:
         if wanted.isdecimal() and int(wanted) in self.ids():
             return [int(wanted)]
         found = [record.id for record in self.objects if record.name is not None and record.name.casefold() == wanted]
+        if not found:
+            found = [record.id for record in self.objects if record.label().casefold() == wanted]
         if not found:
             raise self._unknown(name_or_id)
         return found

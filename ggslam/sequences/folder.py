@@ -26,6 +26,7 @@ from ggslam.sequences.recording import (
     ReadOptions,
     Recording,
     image_files,
+    image_numbers,
     last_number,
     missing_depth_problems,
     nominal_timestamps,
@@ -65,10 +66,12 @@ class FolderFormat:
         distortion, fisheye = distortion_entry(path, settings)
         depth_camera = depth_camera_entry(path, settings["depth_camera"]) if "depth_camera" in settings else None
         timestamps, time_source = _timestamps(folder, colors, settings)
+        left_out = _without_color(folder, files)
         recording = Recording(
             self.name, folder, files, timestamps, number_entry(path, settings, "depth_scale"),
             camera, distortion=distortion, fisheye=fisheye, depth_camera=depth_camera,
             time_source=time_source, instance_names=_instances(path, settings), problems=missing_depth_problems(files),
+            warnings=left_out,
         )  # fmt: skip
         if (folder / "poses.txt").is_file():
             _add_poses(recording, folder / "poses.txt")
@@ -133,9 +136,28 @@ def _timestamps(folder: Path, colors: list[Path], settings: dict[str, Any]) -> t
     rate = number_entry(folder / "camera.yaml", settings, "frame_rate") if "frame_rate" in settings else NOMINAL_RATE
     if rate <= 0:
         raise SequenceError(f"{folder / 'camera.yaml'}: expected a positive 'frame_rate', found {rate:g}")
-    return nominal_timestamps(len(colors), rate), f"{rate:g} frames/s of camera.yaml" if "frame_rate" in settings else (
-        f"nominal {rate:g} frames/s"
-    )
+    source = f"{rate:g} frames/s of camera.yaml" if "frame_rate" in settings else f"nominal {rate:g} frames/s"
+    return _numbered_times(folder, colors) / rate, source
+
+
+def _numbered_times(folder: Path, colors: list[Path]) -> np.ndarray:
+    """Times in frames, float64 [n]: 0, 1, 2, ...; where numbers are left out of the images' names, with their gaps."""
+    numbers = image_numbers(colors)
+    steps = np.ones(0) if numbers is None else np.diff(numbers)
+    if numbers is None or not len(steps) or (steps == steps[0]).all():
+        return nominal_timestamps(len(colors), 1.0)
+    depths = image_numbers(image_files(folder / "depth", (".png",)))
+    first = numbers[0] if depths is None else min(numbers[0], depths[0])
+    return (numbers - first) / np.median(steps)
+
+
+def _without_color(folder: Path, files: list[FrameFiles]) -> list[str]:
+    """A warning if there are depth images whose colour image is missing."""
+    used = {entry.depth for entry in files}
+    unused = [path.name for path in image_files(folder / "depth", (".png",)) if path not in used]
+    if not unused:
+        return []
+    return [f"{folder / 'depth'}: {len(unused)} images have no colour image and are left out; the first: {unused[0]}"]
 
 
 def _add_poses(recording: Recording, path: Path) -> None:

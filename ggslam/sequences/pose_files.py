@@ -9,7 +9,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.poses import is_valid_pose, quaternion_to_matrix
-from ggslam.sequences.recording import Calibration, Recording, read_text
+from ggslam.sequences.recording import Calibration, Recording, image_numbers, read_text
 
 
 def data_lines(path: Path) -> list[tuple[int, str]]:
@@ -70,8 +70,10 @@ def read_matrix_rows(path: Path) -> tuple[np.ndarray, dict[int, str]]:
 
 
 def add_row_poses(recording: Recording, path: Path) -> None:
-    """Sets a recording's poses from a file with one row a frame (see `read_matrix_rows`), if there is that file. Rows
-    beyond the last frame are left out.
+    """Sets a recording's poses from a file with one row a frame (see `read_matrix_rows`), if there is that file. Where
+    there are more rows than frames, the number in a colour image's name is its row, counted from 0 (from 1 if the last
+    number is the number of rows), so that a frame that is missing shifts no pose; without such numbers, or where they
+    go beyond the rows, the first rows are taken.
 
     Raises:
         SequenceError: a row does not hold 12 or 16 numbers, or there are fewer rows than frames.
@@ -82,7 +84,14 @@ def add_row_poses(recording: Recording, path: Path) -> None:
     count = len(recording.files)
     if len(poses) < count:
         raise SequenceError(f"{path}: expected {count} poses, one a frame, found {len(poses)}")
-    recording.take_poses(poses[:count], path.name, problems)
+    rows = np.arange(count)
+    numbers = image_numbers(entry.color for entry in recording.files)
+    if len(poses) > count and numbers is not None:
+        by_name = numbers - (numbers[-1] == len(poses))
+        if by_name[0] >= 0 and by_name[-1] < len(poses):
+            rows = by_name
+    reasons = {frame: problems[row] for frame, row in enumerate(rows.tolist()) if row in problems}
+    recording.take_poses(poses[rows], path.name, reasons)
 
 
 def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:

@@ -227,6 +227,15 @@ def missing_depth_problems(files: Iterable[FrameFiles]) -> dict[int, str]:
     return problems
 
 
+def image_numbers(files: Iterable[ImageFile]) -> np.ndarray | None:
+    """Numbers in the names of images, int64 [n]; None unless each has one and they rise."""
+    numbers = [last_number(file.stem) for file in files]
+    if any(number is None or number >= 2**53 for number in numbers):
+        return None
+    found = np.array(numbers, np.int64)
+    return found if (np.diff(found) > 0).all() else None
+
+
 def nominal_timestamps(count: int, rate: float = NOMINAL_RATE) -> np.ndarray:
     """Evenly spaced times, float64 [count], seconds."""
     return np.arange(count, dtype=np.float64) / rate

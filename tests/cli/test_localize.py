@@ -130,6 +130,7 @@ def test_what_cannot_be_done_is_one_error(run: Path, room: Path, scans: Path, tm
     one_error(ggslam("localize", cloud, room), "no places")
     one_error(ggslam("localize", run, room, "--scale", 0.5), "camera", "--scale")
     one_error(ggslam("localize", run, room, "--start", "1 2 3"), "--start", "'1 2 3'")
+    one_error(ggslam("localize", run, room, "--start", "100"), "--first")
     one_error(ggslam("localize", run, room, "--start", "1e300 0 0 0 0 0 1"), "--start")
     one_error(ggslam("localize", run, room, "--start", ORIGIN, "--no-start"), "one of them")
     one_error(ggslam("submaps", room), "no grid store")

@@ -141,6 +141,7 @@ def test_names_and_ids() -> None:
     table = table_of({2: "mug", 7: "Big Book", 9: "mug", 12: None, 13: "12"})
     assert table.find("7") == [7] and table.find(" big book ") == [7] and table.find("MUG") == [2, 9]
     assert table.find("12") == [12] and table.find("13") == [13]
+    assert table.find("Mug (9)") == [9] and table.find("object 12") == [12]
     assert table.select("mug, 7,2") == [2, 9, 7] and table.select("all") == [2, 7, 9, 12, 13]
 
 

@@ -203,6 +203,28 @@ def test_folder_with_matrix_poses_and_other_names(make: Make) -> None:
     assert sequence.instance_names == {1: "wall"}
 
 
+def test_a_missing_colour_image_shifts_no_pose_of_a_folder(make: Make) -> None:
+    folder = make("folder")
+    lines = [" ".join(map(str, [i / 30, *expected_pose(i)[:3, 3], 0, 0, 0, 1])) for i in range(5)]
+    (folder / "poses.txt").write_text("\n".join(lines))
+    (folder / "timestamps.txt").unlink(missing_ok=True)
+    calibration = folder / "camera.yaml"
+    calibration.write_text(calibration.read_text() + "\nframe_rate: 30\n")
+    sorted((folder / "rgb").iterdir())[2].unlink()
+    sequence = open_sequence(folder)
+    for frame, row in enumerate([0, 1, 3, 4]):
+        np.testing.assert_allclose(sequence.ground_truth[frame][:3, 3], expected_pose(row)[:3, 3], atol=1e-9)
+    assert "1 images have no colour image" in sequence.warnings[0]
+
+
+def test_a_missing_frame_shifts_no_pose_of_replica(make: Make) -> None:
+    folder = make("replica")
+    sorted((folder / "results").glob("frame*"))[2].unlink()
+    sequence = open_sequence(folder)
+    for frame, row in enumerate([0, 1, 3, 4]):
+        np.testing.assert_allclose(sequence.ground_truth[frame], expected_pose(row), atol=1e-6)
+
+
 def test_colour_larger_than_depth_is_reduced(make: Make) -> None:
     folder = make("folder")
     for i in range(5):
