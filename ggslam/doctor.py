@@ -209,7 +209,7 @@ def _gpu() -> Iterator[Finding]:
 
 def _cuda_rasterizer() -> Finding:
     try:
-        from ggslam.rendering.cuda.availability import describe_cuda_backend
+        from ggslam.cuda.availability import describe_cuda_backend
 
         usable, detail = describe_cuda_backend()
     except ImportError as error:  # a package is missing, and said so above

@@ -24,9 +24,9 @@ import numpy as np
 import torch
 from bench_render import surface_points
 
+from ggslam.cuda.library import library_for_device
 from ggslam.rendering.autograd import render_cpu, rigid_inverse
 from ggslam.rendering.cuda.autograd import render_cuda
-from ggslam.rendering.cuda.library import library_for_device
 from ggslam.rendering.types import PARAMETERS, GaussianTensors
 from ggslam.scene.camera import Camera
 

@@ -47,7 +47,7 @@ compile() {
   "$python" - <<'CODE' || return 1
 import time
 import torch
-from ggslam.rendering.cuda.compiler import compiled_library
+from ggslam.cuda.compiler import compiled_library
 architecture = "".join(map(str, torch.cuda.get_device_capability()))
 start = time.perf_counter()
 print(compiled_library(architecture), f"{time.perf_counter() - start:.1f} s")
@@ -55,9 +55,9 @@ CODE
   local arch
   arch=$("$python" -c 'import torch; print("".join(map(str, torch.cuda.get_device_capability())))')
   local source
-  for source in api image_loss; do
+  for source in rendering/api mapping/image_loss; do
     nvcc -O3 -std=c++17 -ftz=true -Xptxas -v -gencode "arch=compute_$arch,code=sm_$arch" -c -o /dev/null \
-      "ggslam/rendering/cuda/kernels/$source.cu" 2>&1 | grep -E "Compiling|spill|Used" | { c++filt 2>/dev/null || cat; }
+      -I ggslam/cuda/kernels "ggslam/cuda/kernels/$source.cu" 2>&1 | grep -E "Compiling|spill|Used" | { c++filt 2>/dev/null || cat; }
   done
 }
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1] / "ggslam"
-BOTTOM = {"scene", "native", "errors"}
+BOTTOM = {"scene", "native", "errors", "cuda"}
 LOWER = {"rendering", "sequences", "formats", "features"}
 MIDDLE = {"tracking", "mapping", "evaluation", "reporting", "loops", "objects", "volumes", "submaps", "coding"}
 MIDDLE |= {"viewer"}

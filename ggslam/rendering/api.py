@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from ggslam.cuda.availability import cuda_backend_problem
 from ggslam.errors import RenderError
 from ggslam.rendering.autograd import render_cpu, rigid_inverse
 from ggslam.rendering.cuda.autograd import render_cuda
-from ggslam.rendering.cuda.availability import cuda_backend_problem
 from ggslam.rendering.gsplat_backend import render_gsplat
 from ggslam.rendering.reference import render_reference
 from ggslam.rendering.types import LOW_PASS, Gaussians, RenderBuffers, check_pose

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from cuda_emulation import emulated_library
 from rendering_scenes import (
     CAMERA,
     POSE,
@@ -27,6 +28,11 @@ IMAGES = ("image", "depth", "alpha", "features", "median_depth")
 FORWARD_TOLERANCE = 1e-5
 BACKWARD_TOLERANCE = 1e-5
 BORDERLINE_TOLERANCE = 1e-2
+
+
+def emulated_rasterizer(**options: float) -> CudaRasterizer:
+    """A rasterizer whose device is the CPU."""
+    return CudaRasterizer("cpu", library=emulated_library(), **options)
 
 
 def moved(tensors: Any, device: torch.device) -> Any:

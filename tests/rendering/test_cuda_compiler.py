@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -10,11 +11,11 @@ import pytest
 import torch
 from rendering_scenes import CAMERA, make_scene
 
+from ggslam.cuda import compiler
+from ggslam.cuda.availability import describe_cuda_backend
+from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import MissingDependency, RenderError
 from ggslam.rendering import choose_backend, render
-from ggslam.rendering.cuda import compiler
-from ggslam.rendering.cuda.availability import describe_cuda_backend
-from ggslam.rendering.cuda.library import CudaLibrary
 
 COMPILES = """#!/bin/sh
 if [ "$1" = --version ]; then echo "nvcc {version}"; exit 0; fi
@@ -57,9 +58,9 @@ def test_another_compiler_or_source_is_another_library(tmp_path: Path, monkeypat
     compiler.compiler_version.cache_clear()
     second = compiler.library_path(script, "90")
     kernels = tmp_path / "kernels"
-    kernels.mkdir()
-    for source in compiler.KERNELS.iterdir():
-        (kernels / source.name).write_bytes(source.read_bytes() + (b"//" if source.name == "tile.cuh" else b""))
+    shutil.copytree(compiler.KERNELS, kernels)
+    with (kernels / "rendering" / "tile.cuh").open("a") as source:
+        source.write("//")
     monkeypatch.setattr(compiler, "KERNELS", kernels)
     assert len({first, second, compiler.library_path(script, "90")}) == 3
 

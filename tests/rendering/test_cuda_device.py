@@ -12,8 +12,8 @@ from cuda_contract import CAMERA, POSE, check_against_cpu, check_against_referen
 from rendering_scenes import make_image_gradients, make_scene, relative_error
 from test_cpu_rules import bad_rows
 
+from ggslam.cuda.availability import cuda_backend_problem
 from ggslam.rendering import choose_backend, render
-from ggslam.rendering.cuda.availability import cuda_backend_problem
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import PARAMETERS, GaussianTensors
 from ggslam.scene.camera import Camera

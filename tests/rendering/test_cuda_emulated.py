@@ -9,15 +9,23 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
-from cuda_contract import CAMERA, POSE, check_against_cpu, check_against_reference, crowded_scene, run
-from emulated_cuda import emulated_library, emulated_rasterizer
+from cuda_contract import (
+    CAMERA,
+    POSE,
+    check_against_cpu,
+    check_against_reference,
+    crowded_scene,
+    emulated_rasterizer,
+    run,
+)
+from cuda_emulation import emulated_library
 from rendering_scenes import make_image_gradients, make_scene, relative_error
 from test_cpu_rules import bad_rows
 
+from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
 from ggslam.rendering.autograd import render_cpu
 from ggslam.rendering.cuda.autograd import render_cuda
-from ggslam.rendering.cuda.memory import GrowingMemory
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import PARAMETERS, GaussianTensors
 from ggslam.scene.camera import Camera

@@ -5,35 +5,30 @@ and on a GPU where there is one."""
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from cuda_contract import moved
-from emulated_cuda import emulated_library
+from cuda_emulation import emulated_library
 from rendering_scenes import CAMERA, POSE, make_image_gradients, relative_error
 from test_cuda_emulated import GuardedMemory
 from test_fused_adam import SETTINGS as ADAM
 from test_fused_adam import make_map
 
+from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
+from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages, DeviceLossResult
 from ggslam.mapping.losses import ImageLoss, KeyframeImages, LossSettings
-from ggslam.mapping.losses_cuda import CudaImageLoss, DeviceKeyframeImages, DeviceLossResult
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.cuda.adam import AdamStep
-from ggslam.rendering.cuda.availability import cuda_backend_problem
-from ggslam.rendering.cuda.library import CudaLibrary, library_for_device
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import PARAMETERS, RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 
-GPU = pytest.param(
-    "gpu", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
-)
 STEP_TOLERANCE = {"cpu": 1e-5, "cuda": 3e-4}
 """Relative, of several steps; by the type of device. On a GPU sums over a Gaussian's pixels come in changing order."""
 EXPOSURE = np.array([[1.1, 0.02], [0.9, -0.03], [1.05, 0.01]])
@@ -46,25 +41,6 @@ LOSSES = {
     "no colour without depth": LossSettings(no_depth_weight=0.0),
     "all": LossSettings(0.4, 2.0, "normalised", 0.1, "charbonnier", 0.02, 0.6, 0.3),
 }
-
-
-@pytest.fixture(params=["emulated", GPU])
-def library(request: pytest.FixtureRequest) -> CudaLibrary:
-    if request.param == "emulated":
-        return emulated_library()
-    problem = cuda_backend_problem()
-    if problem is not None:
-        pytest.skip(problem)
-    return library_for_device()
-
-
-@pytest.fixture(params=[1, 2], ids=["downwards", "jumping"])
-def other_order(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Threads of a block run in another order than upwards."""
-    functions = emulated_library().functions
-    functions.ggslam_emulation_order(request.param)
-    yield
-    functions.ggslam_emulation_order(0)
 
 
 # --- image loss -----------------------------------------------------------------------------------------------------
@@ -113,19 +89,19 @@ def check_loss(loss: CudaImageLoss, view: RenderBuffers, target: KeyframeImages,
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_loss_of_every_setting(library: CudaLibrary, name: str) -> None:
-    check_loss(CudaImageLoss(library=library), *make_case(37, 53), LOSSES[name])
+def test_loss_of_every_setting(cuda_library: CudaLibrary, name: str) -> None:
+    check_loss(CudaImageLoss(library=cuda_library), *make_case(37, 53), LOSSES[name])
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 9), (16, 32), (17, 33), (40, 70)])
-def test_loss_of_every_size(library: CudaLibrary, size: tuple[int, int]) -> None:
-    loss = CudaImageLoss(library=library)
+def test_loss_of_every_size(cuda_library: CudaLibrary, size: tuple[int, int]) -> None:
+    loss = CudaImageLoss(library=cuda_library)
     for name in ("default", "all"):
         check_loss(loss, *make_case(*size), LOSSES[name])
 
 
-def test_loss_of_other_inputs(library: CudaLibrary) -> None:
-    loss = CudaImageLoss(library=library)
+def test_loss_of_other_inputs(cuda_library: CudaLibrary) -> None:
+    loss = CudaImageLoss(library=cuda_library)
     view, target = make_case(37, 53, float_depth=True)
     check_loss(loss, view, target, LOSSES["all"])
     check_loss(loss, view, replace(target, exposure=None), LOSSES["all"])
@@ -143,8 +119,8 @@ def copies(result: DeviceLossResult) -> list[torch.Tensor]:
     return [value.cpu().clone() for value in vars(result).values()]
 
 
-def test_loss_repeats_bit_for_bit_after_a_broken_view(library: CudaLibrary) -> None:
-    loss = CudaImageLoss(library=library)
+def test_loss_repeats_bit_for_bit_after_a_broken_view(cuda_library: CudaLibrary) -> None:
+    loss = CudaImageLoss(library=cuda_library)
     view, host_target = make_case(37, 53)
     view, target = moved(view, loss.device), moved_target(host_target, loss.device)
     first = copies(loss.evaluate(view, target, LOSSES["all"]))
@@ -224,30 +200,30 @@ def check_steps(library: CudaLibrary, expected: GaussianMap, settings: AdamSetti
 
 
 @pytest.mark.parametrize(("degree", "features"), [(0, 0), (0, 16), (1, 3), (2, 0), (3, 21)])
-def test_steps_are_those_of_the_cpu(library: CudaLibrary, degree: int, features: int) -> None:
-    check_steps(library, make_map(degree, features), ADAM)
+def test_steps_are_those_of_the_cpu(cuda_library: CudaLibrary, degree: int, features: int) -> None:
+    check_steps(cuda_library, make_map(degree, features), ADAM)
 
 
 @pytest.mark.parametrize("settings", [ADAM, AdamSettings(decay=0.999, decay_floor=0.1), AdamSettings(beta1=0.0)])
-def test_steps_of_gaussians_of_every_age(library: CudaLibrary, settings: AdamSettings) -> None:
+def test_steps_of_gaussians_of_every_age(cuda_library: CudaLibrary, settings: AdamSettings) -> None:
     gaussians = make_map(1, 2)
     gaussians.updates.copy_(torch.logspace(0, 4.5, len(gaussians)).to(torch.int32) - 1)
     for _, second in gaussians.moments.values():
         second.fill_(1e-4)
-    check_steps(library, gaussians, settings, steps=2)
+    check_steps(cuda_library, gaussians, settings, steps=2)
 
 
-def test_bias_correction_of_the_first_step_is_precise(library: CudaLibrary) -> None:
+def test_bias_correction_of_the_first_step_is_precise(cuda_library: CudaLibrary) -> None:
     """1 - beta2^u is a small difference then."""
-    check_steps(library, make_map(0, 3), AdamSettings(beta2=0.9999), steps=1)
+    check_steps(cuda_library, make_map(0, 3), AdamSettings(beta2=0.9999), steps=1)
 
 
 def test_order_of_threads_does_not_matter_for_the_steps(other_order: None) -> None:
     check_steps(emulated_library(), make_map(1, 5), ADAM, steps=2)
 
 
-def test_features_that_were_not_rendered_are_not_stepped(library: CudaLibrary) -> None:
-    rasterizer = CudaRasterizer(library=library)
+def test_features_that_were_not_rendered_are_not_stepped(cuda_library: CudaLibrary) -> None:
+    rasterizer = CudaRasterizer(library=cuda_library)
     gaussians = on_device(make_map(0, 4), rasterizer.device)
     before = gaussians.features.clone()
     rasterizer.forward(gaussians, CAMERA, POSE, features=False)
@@ -256,8 +232,8 @@ def test_features_that_were_not_rendered_are_not_stepped(library: CudaLibrary) -
     assert torch.equal(gaussians.features, before) and gaussians.updates.any()
 
 
-def test_an_empty_map_makes_no_step(library: CudaLibrary) -> None:
-    rasterizer = CudaRasterizer(library=library)
+def test_an_empty_map_makes_no_step(cuda_library: CudaLibrary) -> None:
+    rasterizer = CudaRasterizer(library=cuda_library)
     gaussians = GaussianMap(0, 4, rasterizer.device)
     rasterizer.forward(gaussians, CAMERA, POSE)
     gradient = torch.ones(3, CAMERA.height, CAMERA.width, device=rasterizer.device)
@@ -288,10 +264,10 @@ def test_structures_are_of_one_size() -> None:
 # --- both together ----------------------------------------------------------------------------------------------------
 
 
-def test_training_on_a_keyframe_goes_the_same_way(library: CudaLibrary) -> None:
+def test_training_on_a_keyframe_goes_the_same_way(cuda_library: CudaLibrary) -> None:
     """Forward, loss and step, some times over: the loss falls as on the CPU."""
     _, target = make_case(CAMERA.height, CAMERA.width)
-    rasterizer, loss = CudaRasterizer(library=library), CudaImageLoss(library=library)
+    rasterizer, loss = CudaRasterizer(library=cuda_library), CudaImageLoss(library=cuda_library)
     cpu, cpu_loss = CpuRasterizer(1), ImageLoss(NativeContext(1))
     expected = make_map(0, 0)
     found, device_target = on_device(expected, rasterizer.device), moved_target(target, rasterizer.device)

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
+from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
 from ggslam.rendering.autograd import rigid_inverse
-from ggslam.rendering.cuda.memory import GrowingMemory
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import PARAMETERS, Gaussians, GaussianTensors, RenderBuffers
 from ggslam.scene.camera import Camera

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
 from ggslam.rendering import _native
 from ggslam.rendering._native import pointer
@@ -29,8 +31,8 @@ from ggslam.rendering.arguments import (
     native_view,
 )
 from ggslam.rendering.cuda.adam import AdamStep, adam_step
-from ggslam.rendering.cuda.library import CudaLibrary, Rendering, library_for_device
-from ggslam.rendering.cuda.memory import Counter, FinishedRendering, GrowingMemory, target_pointers
+from ggslam.rendering.cuda.contract import Rendering, declare_rasterizer
+from ggslam.rendering.cuda.finished import Counter, FinishedRendering, target_pointers
 from ggslam.rendering.types import LOW_PASS, PARAMETERS, Gaussians, ParameterGradients, RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -92,6 +94,7 @@ class CudaRasterizer:
         self.low_pass = low_pass
         chosen = None if device is None else torch.device(device)
         self.library = library or library_for_device(chosen)
+        declare_rasterizer(self.library)
         self.device = self.library.whole_device(chosen)
         self._counter = Counter(self.library, self.device.index or 0)
         self._memory = GrowingMemory(self.device)

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiles the CUDA sources to a shared library, once per GPU architecture, and keeps it in the user's cache folder."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+
+from ggslam.errors import MissingDependency
+
+KERNELS = Path(__file__).parent / "kernels"
+"""Folder of the CUDA sources."""
+
+_FLAGS = ("-O3", "-std=c++17", "-ftz=true", "-shared", "-Xcompiler", "-fPIC,-fvisibility=hidden", "--threads", "0")
+_ERROR_LINES = 12
+
+
+def find_nvcc() -> Path | None:
+    """The compiler: `GGSLAM_NVCC` in the environment, then the search path, `CUDA_HOME`, `/usr/local/cuda`."""
+    chosen = os.environ.get("GGSLAM_NVCC")
+    if chosen:
+        return Path(chosen) if Path(chosen).exists() else None
+    found = shutil.which("nvcc")
+    if found:
+        return Path(found)
+    homes = [os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH"), "/usr/local/cuda"]
+    candidates = [Path(home) / "bin" / "nvcc" for home in homes if home]
+    return next((path for path in candidates if path.exists()), None)
+
+
+def cache_folder() -> Path:
+    """Where compiled libraries are kept: `GGSLAM_CACHE` in the environment, else ggslam in the user's cache folder."""
+    if os.environ.get("GGSLAM_CACHE"):
+        return Path(os.environ["GGSLAM_CACHE"])
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "ggslam"
+
+
+@lru_cache(maxsize=4)
+def compiler_version(nvcc: Path) -> str:
+    """What `nvcc --version` says.
+
+    Raises:
+        MissingDependency: it cannot be run.
+    """
+    try:
+        run = subprocess.run([str(nvcc), "--version"], capture_output=True, text=True, timeout=60, check=True)
+    except (OSError, subprocess.SubprocessError) as error:
+        raise MissingDependency(f"the cuda backend: {nvcc} cannot be run: {error}") from error
+    return run.stdout.strip()
+
+
+def library_path(nvcc: Path, architecture: str) -> Path:
+    """The file in the cache for these sources, this compiler and an architecture such as "90"."""
+    digest = hashlib.sha256()
+    for source in sorted(KERNELS.rglob("*.cu*")):
+        digest.update(source.relative_to(KERNELS).as_posix().encode() + b"\0" + source.read_bytes() + b"\0")
+    digest.update("\0".join([compiler_version(nvcc), *_FLAGS]).encode())
+    return cache_folder() / f"kernels_sm{architecture}_{digest.hexdigest()[:20]}.so"
+
+
+def compile_command(nvcc: Path, architecture: str, output: Path) -> list[str]:
+    """The command that compiles all sources for one architecture."""
+    target = f"-gencode=arch=compute_{architecture},code=sm_{architecture}"
+    sources = [str(path) for path in sorted(KERNELS.rglob("*.cu"))]
+    return [str(nvcc), *_FLAGS, "-I", str(KERNELS), target, *sources, "-o", str(output)]
+
+
+def compiled_library(architecture: str) -> Path:
+    """The compiled library; compiles it (some ten seconds) if it is not in the cache.
+
+    Args:
+        architecture: compute capability without the point, such as "90".
+
+    Raises:
+        MissingDependency: no nvcc, it fails, or the cache folder cannot be written.
+    """
+    nvcc = find_nvcc()
+    if nvcc is None:
+        raise MissingDependency(
+            "the cuda backend is compiled when first used and needs nvcc of the CUDA toolkit: "
+            "put it on PATH or set CUDA_HOME or GGSLAM_NVCC"
+        )
+    path = library_path(nvcc, architecture)
+    if path.exists():
+        return path
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:  # beside the target: renaming is atomic
+            output = Path(folder) / path.name
+            _run(compile_command(nvcc, architecture, output))
+            output.replace(path)
+    except OSError as error:
+        raise MissingDependency(f"the cuda backend: {path.parent} cannot be written: {error}") from error
+    return path
+
+
+def _run(command: list[str]) -> None:
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    if run.returncode != 0:
+        lines = (run.stderr + run.stdout).strip().splitlines()[:_ERROR_LINES]
+        raise MissingDependency("\n".join([f"the cuda backend: compiling failed: {' '.join(command)}", *lines]))

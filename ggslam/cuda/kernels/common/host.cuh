@@ -1,0 +1,21 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the functions of the C interface have in common.
+#pragma once
+#include "common/platform.cuh"
+
+#define GGSLAM_EXPORT extern "C" __attribute__((visibility("default")))
+
+namespace ggslam::cuda {
+
+inline std::int64_t blocks_for(std::int64_t count, int threads) { return (count + threads - 1) / threads; }
+
+// Runs work on a device and reports what went wrong.
+template <class Work>
+int on_device(int device, const Work& work) {
+  const cudaError_t chosen = cudaSetDevice(device);
+  if (chosen != cudaSuccess) return chosen;
+  const cudaError_t status = work(), launched = cudaGetLastError();
+  return status != cudaSuccess ? status : launched;
+}
+
+}  // namespace ggslam::cuda

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Device memory for the kernels. All of it is torch's own."""
+
+from __future__ import annotations
+
+import torch
+
+
+def address(tensor: torch.Tensor | None) -> int | None:
+    """Of a tensor's first element; null for None."""
+    return None if tensor is None else tensor.data_ptr()
+
+
+class GrowingMemory:
+    """Bytes on a device that are kept from one rendering to the next and grow by a quarter more than is asked for.
+
+    Args:
+        device: where.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._blocks: dict[str, torch.Tensor] = {}
+
+    def block(self, name: str, size: int) -> torch.Tensor:
+        """uint8 [at least `size`] of that name; its content is undefined."""
+        block = self._blocks.get(name)
+        if block is None or block.numel() < size:
+            self._blocks.pop(name, None)  # free before asking for more
+            block = self._blocks[name] = torch.empty(size + size // 4, dtype=torch.uint8, device=self._device)
+        return block

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loss of `losses.py` on an NVIDIA GPU: the same values and gradients, by kernels that are only started here.
+
+Nothing waits for the device: the values stay there as a tensor until somebody asks for them, and the exposure is read
+from the device, so that it can be optimised there. Sums have a fixed order: the result repeats bit for bit.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+
+from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.cuda.memory import GrowingMemory
+from ggslam.errors import RenderError
+from ggslam.mapping.losses import LossSettings, LossValues, RenderedImages
+
+_VALUES = len(fields(LossValues))
+_POINTERS = ("image", "depth", "alpha", "target_color", "target_depth", "exposure", "d_image", "d_depth", "d_alpha",
+             "results", "workspace", "stream")  # fmt: skip
+_WEIGHTS = ("dssim_weight", "depth_weight", "opacity_weight", "no_depth_weight", "minimum_alpha", "charbonnier_epsilon")
+
+
+@dataclass(frozen=True)
+class DeviceKeyframeImages:
+    """The target, on the device of the loss; see `KeyframeImages`.
+
+    Attributes:
+        color: uint8 [H, W, 3].
+        depth: uint16 or float32 [H, W]; 0, negative, infinite or NaN: none.
+        depth_scale: metres per unit of `depth`.
+        exposure: float32 [3, 2], gain and offset applied to the rendered R, G, B; None: (1, 0). Its numbers are not
+            checked, for that would mean to wait for them.
+    """
+
+    color: torch.Tensor
+    depth: torch.Tensor
+    depth_scale: float
+    exposure: torch.Tensor | None = None
+
+
+@dataclass(frozen=True)
+class DeviceLossResult:
+    """Loss and gradients on the device. The tensors belong to the `CudaImageLoss` and are overwritten by its next
+    evaluation.
+
+    Attributes:
+        results: float64 [15], the numbers of `LossValues` in their order, then `exposure_gradient`.
+        d_image: d loss / d rendered image (before exposure), float32 [3, H, W].
+        d_depth: d loss / d accumulated depth, float32 [H, W].
+        d_alpha: d loss / d alpha, float32 [H, W].
+    """
+
+    results: torch.Tensor
+    d_image: torch.Tensor
+    d_depth: torch.Tensor
+    d_alpha: torch.Tensor
+
+    @property
+    def exposure_gradient(self) -> torch.Tensor:
+        """d loss / d exposure, float64 [3, 2]."""
+        return self.results[_VALUES:].view(3, 2)
+
+    def read_values(self) -> LossValues:
+        """The terms of the loss. Waits for the device."""
+        values = dict(zip((field.name for field in fields(LossValues)), self.results.tolist(), strict=False))
+        return LossValues(**values | {"valid_pixels": int(values["valid_pixels"])})
+
+
+class _Job(ctypes.Structure):
+    """Mirror of struct ImageLossJob in cuda/kernels/image_loss.cuh."""
+
+    _fields_ = [
+        *[(name, ctypes.c_void_p) for name in _POINTERS],
+        *[(name, ctypes.c_int32) for name in (
+            "device", "height", "width", "target_depth_is_float", "normalised_depth", "charbonnier")],
+        *[(name, ctypes.c_float) for name in ("depth_scale", *_WEIGHTS)],
+    ]  # fmt: skip
+
+
+class CudaImageLoss:
+    """Evaluates the loss on torch's current stream; keeps scratch memory and gradient images between calls. One
+    instance serves one caller and one stream at a time.
+
+    Args:
+        device: CUDA device; None: the current one.
+        library: the compiled kernels; None: those of the device, compiled if need be.
+
+    Raises:
+        MissingDependency: no CUDA device, or the kernels cannot be compiled.
+        NativeCoreError: the compiled kernels do not fit this code.
+    """
+
+    def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
+        chosen = None if device is None else torch.device(device)
+        self.library = library or library_for_device(chosen)
+        self.device = self.library.whole_device(chosen)
+        self.library.check_size("image_loss_job", _Job)
+        self.library.declare("image_loss", [ctypes.c_void_p])
+        self.library.declare("image_loss_bytes", [ctypes.c_void_p], ctypes.c_int64)
+        self._memory = GrowingMemory(self.device)
+        self._results = torch.empty(_VALUES + 6, dtype=torch.float64, device=self.device)
+        self._gradients = self._new_gradients(0, 0)
+
+    def evaluate(
+        self, rendered: RenderedImages, target: DeviceKeyframeImages, settings: LossSettings
+    ) -> DeviceLossResult:
+        """Starts the evaluation of loss and gradients of one view.
+
+        Raises:
+            RenderError: an array has another shape, type or device than `RenderedImages` and `DeviceKeyframeImages`
+                say.
+        """
+        height, width = self._target_size(target)
+        job = _Job(height=height, width=width, device=self.device.index or 0, depth_scale=target.depth_scale)
+        for name, shape in (("image", (3, height, width)), ("depth", (height, width)), ("alpha", (height, width))):
+            tensor = getattr(rendered, name)
+            self._check(f"rendered {name}", tensor, (torch.float32,), shape)
+            setattr(job, name, tensor.data_ptr())
+        job.target_color, job.target_depth = target.color.data_ptr(), target.depth.data_ptr()
+        job.target_depth_is_float = target.depth.dtype == torch.float32
+        job.exposure = None if target.exposure is None else target.exposure.data_ptr()
+        job.normalised_depth = settings.depth_kind == "normalised"
+        job.charbonnier = settings.color_kind == "charbonnier"
+        for name in _WEIGHTS:
+            setattr(job, name, getattr(settings, name))
+        if self._gradients[1].shape != (height, width):
+            self._gradients = self._new_gradients(height, width)
+        job.d_image, job.d_depth, job.d_alpha = (gradient.data_ptr() for gradient in self._gradients)
+        job.results, job.stream = self._results.data_ptr(), self.library.stream(self.device)
+        size = self.library.functions.ggslam_cuda_image_loss_bytes(ctypes.byref(job))
+        job.workspace = self._memory.block("loss", size).data_ptr()
+        self.library.call("image_loss", ctypes.byref(job))
+        return DeviceLossResult(self._results, *self._gradients)
+
+    def _new_gradients(self, height: int, width: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        image = torch.empty(3, height, width, device=self.device)
+        return image, torch.empty(height, width, device=self.device), torch.empty(height, width, device=self.device)
+
+    def _target_size(self, target: DeviceKeyframeImages) -> tuple[int, int]:
+        height, width = target.color.shape[:2] if target.color.ndim == 3 and target.color.numel() else (0, 0)
+        self._check("target color", target.color, (torch.uint8,), (height, width, 3))
+        self._check("target depth", target.depth, (torch.uint16, torch.float32), (height, width))
+        if target.exposure is not None:
+            self._check("exposure", target.exposure, (torch.float32,), (3, 2))
+        if not (np.isfinite(target.depth_scale) and target.depth_scale > 0):
+            raise RenderError(f"depth_scale: expected a number above 0, found {target.depth_scale!r}")
+        return height, width
+
+    def _check(self, name: str, tensor: torch.Tensor, types: tuple[torch.dtype, ...], shape: tuple[int, ...]) -> None:
+        if tuple(tensor.shape) != shape or tensor.dtype not in types or tensor.device != self.device:
+            expected = f"{' or '.join(map(str, types))} {list(shape)} on {self.device}"
+            found = f"{tensor.dtype} {list(tensor.shape)} on {tensor.device}"
+            raise RenderError(f"{name}: expected {expected}, found {found}")
+        if not tensor.is_contiguous():
+            raise RenderError(f"{name}: expected a contiguous tensor, found strides {tensor.stride()}")
