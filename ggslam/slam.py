@@ -26,9 +26,9 @@ from ggslam.config import Config
 from ggslam.errors import ConfigError, SequenceError
 from ggslam.loop_closing import Correction, LoopCloser
 from ggslam.map_paging import MapPager
+from ggslam.mapping.cpu_mapper import CpuMapper
 from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.keyframe import Keyframe
-from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.votes import vote_labels
 from ggslam.memory_budget import MB, MemoryBudget
 from ggslam.native.loader import NativeContext
@@ -88,7 +88,7 @@ class Slam:
         if self.config.loops.enabled:
             self.loops = LoopCloser(camera, self.config.loops, self.surface, self.tracker, self.context)
         self.policy = KeyframePolicy(self.config.keyframes)
-        self.mapper = Mapper(self.map, self.config.mapping, self.context, self.config.seed, learner)
+        self.mapper = CpuMapper(self.map, self.config.mapping, self.context, self.config.seed, learner)
         if self.pager is not None:
             self.pager.serve(self.mapper)
         self.scale = 1.0

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from ggslam.mapping.class_table import CODE_LENGTH, FIRST_CLASSES, ClassTable
+from ggslam.mapping.cpu_mapper import CpuMapper
 from ggslam.mapping.identity import IdentityLearner, cross_entropy
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
 from ggslam.mapping.labelling import KeyframeLabels
@@ -45,7 +46,7 @@ def pictures(small: int = 300, big: int = 2) -> np.ndarray:
 
 def make_mapper(**changes: object) -> Mapper:
     settings = dataclasses.replace(IdentitySettings(every=1, pixels=512), **changes)  # type: ignore[arg-type]
-    return Mapper(GaussianMap(0, 16), MapperSettings(), NativeContext(2), 0, IdentityLearner(settings))
+    return CpuMapper(GaussianMap(0, 16), MapperSettings(), NativeContext(2), 0, IdentityLearner(settings))
 
 
 def trained(mask: np.ndarray | None, iterations: int = 40, **changes: object) -> Mapper:
@@ -86,7 +87,7 @@ def test_votes_alone_label_the_gaussians() -> None:
 
 def test_identity_does_not_touch_colours_shapes_and_poses() -> None:
     """With detached gradients the map is, bit for bit, that of a run without objects."""
-    plain = Mapper(GaussianMap(), MapperSettings(), NativeContext(2))
+    plain = CpuMapper(GaussianMap(), MapperSettings(), NativeContext(2))
     plain.add_keyframe(wall(), np.eye(4))
     plain.run(12)
     mapper = trained(pictures(), 12)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from ggslam.mapping.cpu_mapper import CpuMapper
 from ggslam.mapping.insertion import fill_gaussians
 from ggslam.mapping.keyframe import PoseAdam, make_keyframe
 from ggslam.mapping.mapper import Mapper
@@ -31,7 +32,7 @@ def wall(index: int = 0) -> Frame:
 
 
 def make_mapper(threads: int = 2, **changes: object) -> Mapper:
-    return Mapper(GaussianMap(), dataclasses.replace(MapperSettings(), **changes), NativeContext(threads))  # type: ignore[arg-type]
+    return CpuMapper(GaussianMap(), dataclasses.replace(MapperSettings(), **changes), NativeContext(threads))  # type: ignore[arg-type]
 
 
 def test_a_keyframe_is_learned() -> None:
