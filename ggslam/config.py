@@ -57,6 +57,9 @@ class Config:
     """Of every random draw. A synchronous run on one machine repeats bit for bit."""
     threads: int = 0
     """Threads of the compiled core; 0: the processors this process may use."""
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    """Where map and keyframes are kept, trained and tracked: cuda: an NVIDIA GPU (compiled by nvcc when first used);
+    auto: that if it can be had and memory is not limited, else cpu."""
     sh_degree: int = 0
     """Spherical-harmonic degree of the colours, 0 to 3."""
     tracker: Literal["gicp", "features"] = "gicp"

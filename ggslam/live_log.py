@@ -75,7 +75,7 @@ class LiveLog:
     def _send_map(self, gaussians: GaussianMap) -> None:
         """In a real-time run the mapper works on the map meanwhile: arrays are cut to one length."""
         stride = max(1, -(-gaussians.count // MOST_POINTS))
-        arrays = [a[::stride].numpy().copy() for a in (gaussians.means, gaussians.rgb, gaussians.scales)]
+        arrays = [a[::stride].cpu().numpy().copy() for a in (gaussians.means, gaussians.rgb, gaussians.scales)]
         count = min(map(len, arrays))
         means, rgb, scales = (a[:count] for a in arrays)
         colors = (255 * np.clip(rgb, 0, 1) + 0.5).astype(np.uint8)

@@ -95,9 +95,10 @@ class RealtimeSlam:
 
     def _map(self) -> None:
         try:
-            while self._insert_next():
-                if self.slam.mapper.keyframes and self.slam.growing:
-                    self.slam.mapper.run(1)
+            with self.slam.mapper.beside_others():
+                while self._insert_next():
+                    if self.slam.mapper.keyframes and self.slam.growing:
+                        self.slam.mapper.run(1)
         except BaseException as error:  # handed to the caller's thread
             self._mapper_error = error
 

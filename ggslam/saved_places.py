@@ -16,23 +16,27 @@ from ggslam.scene.camera import Camera
 from ggslam.tracking.settings import DepthNoise
 
 if TYPE_CHECKING:
+    from ggslam.scene.gaussian_map import GaussianMap
     from ggslam.slam import Slam
     from ggslam.submaps.gaussian_cells import GaussianCells
 
 PLACES_FILE = "places.npz"
 
 
-def places_to_bytes(slam: Slam, cells: GaussianCells | None = None) -> bytes | None:
+def places_to_bytes(
+    slam: Slam, gaussians: GaussianMap, cells: GaussianCells | None = None
+) -> bytes | None:
     """Content of `places.npz`; None if the run looked for no loops and so remembers no places.
 
     Args:
         slam: the run.
+        gaussians: its map, or the part of it that is in memory.
         cells: its map, if that is on disk.
     """
     if slam.loops is None or not len(slam.surface):
         return None
     noise = slam.tracker.noise or DepthNoise()
-    parts = [slam.map] if cells is None else (part for _, part in cells.parts())
+    parts = [gaussians] if cells is None else (part for _, part in cells.parts())
     arrays = {f"surface_{name}": values for name, values in slam.surface.to_arrays().items()}
     arrays |= {f"loops_{name}": values for name, values in slam.loops.to_arrays().items()}
     arrays |= {

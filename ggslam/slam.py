@@ -10,27 +10,21 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 import threading
 import time
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ggslam.config import Config
+from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError, SequenceError
 from ggslam.loop_closing import Correction, LoopCloser
-from ggslam.map_paging import MapPager
-from ggslam.mapping.cpu_mapper import CpuMapper
-from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.keyframe import Keyframe
-from ggslam.mapping.votes import vote_labels
-from ggslam.memory_budget import MB, MemoryBudget
 from ggslam.native.loader import NativeContext
 from ggslam.object_masks import ObjectMasks, observations
 from ggslam.saved_places import places_to_bytes
@@ -39,13 +33,13 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.scene.poses import inverse
+from ggslam.slam_parts import make_mapper, make_pager, make_tracker, run_library
 from ggslam.slam_result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
 from ggslam.step_log import StepLog
-from ggslam.tracking.feature_tracker import FeatureTracker
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.scale import scaled, scene_scale
 from ggslam.tracking.surface import MeasuredSurface
-from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 
 @dataclass(frozen=True)
@@ -65,21 +59,21 @@ class Slam:
         config: all settings.
         has_masks: whether the recording has object masks; None: judged by the first keyframe's frame.
         paging: folder that what does not fit into `memory_limit_mb` moves to; None: a temporary one.
+        library: CUDA kernels to compute with; None: as `config.device` says.
 
     Raises:
-        ConfigError: a limit of memory that is less than the program itself takes.
+        ConfigError: a limit of memory that is less than the program itself takes; no such device.
     """
 
     def __init__(
-        self, camera: Camera, config: Config | None = None, has_masks: bool | None = None, paging: Path | None = None
-    ) -> None:
+        self, camera: Camera, config: Config | None = None, has_masks: bool | None = None, paging: Path | None = None,
+        library: CudaLibrary | None = None,
+    ) -> None:  # fmt: skip
         self.camera = camera
         self.config = config or Config()
         self.context = NativeContext(self.config.threads or None)
         self.masks = ObjectMasks(self.config.masks, has_masks)
-        wanted = self.config.identity.enabled and self.masks.active
-        learner = IdentityLearner(self.config.identity, self.config.seed) if wanted else None
-        self.map = GaussianMap(self.config.sh_degree, IDENTITY_CHANNELS if learner else 0)
+        library = run_library(self.config) if library is None else library
         self.tracker = make_tracker(camera, self.config, self.context)
         self.pager = make_pager(camera, self.config, paging)
         archive = None if self.pager is None else self.pager.archive
@@ -88,7 +82,7 @@ class Slam:
         if self.config.loops.enabled:
             self.loops = LoopCloser(camera, self.config.loops, self.surface, self.tracker, self.context)
         self.policy = KeyframePolicy(self.config.keyframes)
-        self.mapper = CpuMapper(self.map, self.config.mapping, self.context, self.config.seed, learner)
+        self.mapper = make_mapper(self.config, self.masks.active, self.context, library)
         if self.pager is not None:
             self.pager.serve(self.mapper)
         self.scale = 1.0
@@ -122,7 +116,7 @@ class Slam:
         """
         if self.pager is not None:
             raise ConfigError("memory_limit_mb: a run that starts in the map of another (--map) has no limit of memory")
-        self.map, self._objects, self._keyframes_made = gaussians, objects, len(keyframes)
+        self._objects, self._keyframes_made = objects, len(keyframes)
         self.mapper.adopt(gaussians, keyframes)
         if objects is None or gaussians.feature_channels != IDENTITY_CHANNELS:
             self.mapper.identity = None
@@ -156,6 +150,11 @@ class Slam:
         seconds = time.perf_counter() - start
         return self.note_step(is_keyframe, seconds)
 
+    @property
+    def map(self) -> GaussianMap:
+        """As trained so far; on the device that it is trained on."""
+        return self.mapper.map
+
     def note_step(self, is_keyframe: bool, seconds: float) -> StepReport:
         """What the step did that has just ended and took `seconds`; `steps` remembers it."""
         loops_s = 0.0 if self.loops is None else self.loops.seconds
@@ -184,10 +183,11 @@ class Slam:
         self.times.loops = self.loops.seconds if self.loops is not None else 0.0
         objects = self._learned_objects()
         cells = None if self.pager is None else self.pager.settle()
+        gaussians = self.map.to(torch.device("cpu"))
         return SlamResult(
-            self.map, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
-            self.refine_iterations, objects, self.loops.events if self.loops else [], places_to_bytes(self, cells),
-            cells, None if self.pager is None else self.pager.report(),
+            gaussians, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
+            self.refine_iterations, objects, self.loops.events if self.loops else [],
+            places_to_bytes(self, gaussians, cells), cells, None if self.pager is None else self.pager.report(),
             [] if self.pager is None else self.pager.budget.notes, None if self.pager is None else self.pager.close,
             self.steps.to_csv(),
         )  # fmt: skip
@@ -205,7 +205,7 @@ class Slam:
         self._settled = True  # if it fails below, the map can still be had by another call
         earlier = None if self._objects is None else self._objects.observations
         seen = observations(self.mapper.keyframes, identity.current, earlier)
-        sizes = np.bincount(vote_labels(self.map), minlength=65536)
+        sizes = np.bincount(self.mapper.vote_labels(), minlength=65536)
         if self.pager is not None:
             sizes += self.pager.vote_sizes()
         noise = self.masks.noise(identity.classifier.class_ids, seen, len(self.mapper.keyframes), sizes)
@@ -331,24 +331,6 @@ class Slam:
                 tracking.overlap, tracking.rmse_m, tracking.status.value, tracking.reason,
             )
         )  # fmt: skip
-
-
-def make_tracker(camera: Camera, config: Config, context: NativeContext) -> Tracker:
-    """The front-end that the settings name."""
-    if config.tracker == "features":
-        return FeatureTracker(camera, config.tracking, config.features, context)
-    return Tracker(camera, config.tracking, context)
-
-
-def make_pager(camera: Camera, config: Config, folder: Path | None) -> MapPager | None:
-    """Who keeps a run within its limit of memory, if it has one."""
-    if not config.memory_limit_mb:
-        return None
-    budget = MemoryBudget(int(config.memory_limit_mb * MB), int(config.paging.budget_mb * MB))
-    pager = MapPager(camera, config.paging, budget, folder or Path(tempfile.mkdtemp(prefix="ggslam-")))
-    if folder is None:
-        weakref.finalize(pager, shutil.rmtree, pager.folder, ignore_errors=True)
-    return pager
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shlex
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -37,6 +38,14 @@ EPILOG = """
 
   ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
 """
+
+
+class DeviceName(str, Enum):
+    """What a run computes on."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
 
 
 class TrackerName(str, Enum):
@@ -75,6 +84,9 @@ def run(
     tracker: Annotated[
         TrackerName | None, typer.Option(help="How frames are located: G-ICP (default), or edge and plane features.")
     ] = None,
+    device: Annotated[
+        DeviceName | None, typer.Option(help="Compute on the CPU (default), on an NVIDIA GPU, or on one if it is there.")
+    ] = None,
     earlier: Annotated[
         Path | None, typer.Option("--map", metavar="RUN", help="Start in the map of this run instead of an empty one.")
     ] = None,
@@ -104,7 +116,7 @@ def run(
     shortcuts = {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
         "threads": threads, "seed": seed, "loops.enabled": loops,
-        "tracker": None if tracker is None else tracker.value,
+        "tracker": None if tracker is None else tracker.value, "device": None if device is None else device.value,
     }  # fmt: skip
     overrides = [*(settings or []), *(f"{name}={value}" for name, value in shortcuts.items() if value is not None)]
     reading: dict[str, Any] = {
@@ -149,3 +161,6 @@ def _print(outcome: RunOutcome) -> None:
     console.print(f"{outcome.folder.path}: {outcome.headline()}", highlight=False, markup=False)
     if outcome.metrics is not None:
         print_scores(outcome.metrics)
+    if outcome.error is None:
+        path = shlex.quote(str(outcome.folder.path))
+        console.print(f"next: ggslam view {path} · ggslam export {path} map.glb --format mesh", highlight=False, markup=False)

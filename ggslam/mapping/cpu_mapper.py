@@ -58,6 +58,9 @@ class CpuMapper(Mapper):
     def last_psnr(self) -> float:
         return self._last_psnr
 
+    def vote_labels(self) -> np.ndarray:
+        return vote_labels(self.map)
+
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         super().adopt(gaussians, keyframes)
         self._pose_optimizers = [PoseAdam() for _ in keyframes]
@@ -109,13 +112,9 @@ class CpuMapper(Mapper):
         height, width = alpha.shape
         grid = np.arange(height * width, dtype=np.int32).reshape(height, width)[::stride, ::stride]
         terms = self._rasterizer.pixel_terms(grid.reshape(-1))
-        ids, share = terms.labels(vote_labels(self.map))
+        ids, share = terms.labels(self.vote_labels())
         ids, share = ids.reshape(grid.shape), share.reshape(grid.shape) * (alpha[::stride, ::stride] > 0.5)
-
-        def enlarged(image: np.ndarray) -> np.ndarray:
-            return image.repeat(stride, 0).repeat(stride, 1)[:height, :width]
-
-        return MapLabels(enlarged(np.where(share > 0, ids, 0).astype(np.uint16)), enlarged(share), depth)
+        return MapLabels.from_grid(ids, share, depth, stride)
 
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
         s, t0 = self.settings, time.perf_counter()

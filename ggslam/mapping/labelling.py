@@ -25,6 +25,16 @@ class MapLabels:
     confidence: np.ndarray
     depth: np.ndarray
 
+    @staticmethod
+    def from_grid(ids: np.ndarray, share: np.ndarray, depth: np.ndarray, stride: int) -> MapLabels:
+        """From ids and their shares on every `stride`-th pixel and row, [h, w]; depth [H, W]."""
+        height, width = depth.shape
+
+        def enlarged(image: np.ndarray) -> np.ndarray:
+            return image.repeat(stride, 0).repeat(stride, 1)[:height, :width]
+
+        return MapLabels(enlarged(np.where(share > 0, ids, 0).astype(np.uint16)), enlarged(share), depth)
+
 
 @dataclass(frozen=True)
 class KeyframeLabels:

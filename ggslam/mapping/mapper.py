@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,6 +96,14 @@ class Mapper(ABC):
     @abstractmethod
     def last_psnr(self) -> float:
         """Of the last iteration's view before its step, dB; NaN before the first."""
+
+    @abstractmethod
+    def vote_labels(self) -> np.ndarray:
+        """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none."""
+
+    def beside_others(self) -> AbstractContextManager[None]:
+        """Within, this thread's calls share the device with those of other threads."""
+        return nullcontext()
 
     # --- growth ------------------------------------------------------------------------------------------------------
 

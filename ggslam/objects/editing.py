@@ -190,8 +190,8 @@ def rename_object(scene: SegmentedMap, object_id: int, name: str) -> Change:
         ConfigError: unknown id; or a name that would be taken for an id or a list, or is "all", empty or another's.
     """
     what, name = _labels(scene, [object_id]), name.strip()
-    if not name or name.isdecimal() or "," in name or name.casefold() == "all":
-        raise ConfigError(f"name {name!r}: expected a word that is no number, without commas, and not 'all'")
+    if not name or name.isdecimal() or "," in name or name.casefold() == "all" or not name.isprintable():
+        raise ConfigError(f"name {name!r}: expected a printable word that is no number, without commas, and not 'all'")
     taken = [i for i, other in _names(scene.table).items() if other.casefold() == name.casefold() and i != object_id]
     if taken:
         raise ConfigError(f"name {name!r}: object {taken[0]} has it already")

@@ -85,7 +85,7 @@ def close_server(server: viser.ViserServer) -> None:
 def address(server: viser.ViserServer) -> str:
     """Where a browser finds it."""
     host = server.get_host()
-    name = "localhost" if host in ("127.0.0.1", "0.0.0.0", "::", "::1") else host
+    name = "localhost" if host in ("127.0.0.1", "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     return f"http://{name}:{server.get_port()}"
 
 

@@ -225,6 +225,7 @@ FAULTS: list[tuple[Callable[[SegmentedMap], object], str]] = [
     (lambda s: merge_objects(s, 1, 999), "999"),
     (lambda s: rename_object(s, 1, "12"), "12"),
     (lambda s: rename_object(s, 1, "a,b"), "a,b"),
+    (lambda s: rename_object(s, 1, "a\x1b[2Jb"), "printable"),
     (lambda s: rename_object(s, 1, "Sofa"), "has it already"),
     (lambda s: apply_edit(s, Edit("move", "sofa", "1 2")), "three numbers"),
     (lambda s: apply_edit(s, Edit("move", "sofa", "1 2 nan")), "finite"),

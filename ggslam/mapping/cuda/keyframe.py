@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes whose poses, exposures and images are on a device."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+
+from ggslam.cuda.memory import upload
+from ggslam.mapping.cuda.keyframe_states import KeyframeStates
+from ggslam.mapping.keyframe import Keyframe
+
+IMAGE_BYTES = 512_000_000
+"""Images of keyframes kept on the device; beyond, those that were used longest ago go and are uploaded again when they
+are needed (2 MB for 640x480, a tenth of a millisecond)."""
+
+
+@dataclass
+class DeviceImages:
+    """Images of a keyframe.
+
+    Attributes:
+        color: uint8 [H, W, 3].
+        depth: uint16 [H, W], see `Keyframe`.
+        mask: uint16 [H, W], uploaded when first asked for.
+        mask_of: the array that it was uploaded from.
+    """
+
+    color: torch.Tensor
+    depth: torch.Tensor
+    mask: torch.Tensor | None = None
+    mask_of: np.ndarray | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that they take."""
+        return sum(image.nbytes for image in (self.color, self.depth, self.mask) if image is not None)
+
+
+class CudaKeyframe(Keyframe):
+    """A keyframe whose pose and exposure are optimised on a device. Reading them here waits for it.
+
+    Args:
+        keyframe: images, as the host keeps them, and the first pose and exposure.
+        states: of all keyframes; this one gets the next row.
+        images: of all keyframes.
+    """
+
+    def __init__(self, keyframe: Keyframe, states: KeyframeStates, images: ImageStore) -> None:
+        self._states: KeyframeStates | None = None
+        self._images = images
+        values = vars(keyframe)  # without images that are in an archive
+        super().__init__(**{field.name: values[field.name] for field in fields(Keyframe)})
+        states.append(keyframe.T_camera_world, keyframe.exposure)
+        self._states = states
+
+    @property
+    def T_camera_world(self) -> np.ndarray:  # type: ignore[override]
+        """float64 [4, 4], as refined so far."""
+        assert self._states is not None
+        return self._states.read_poses()[self.index]
+
+    @T_camera_world.setter
+    def T_camera_world(self, T_camera_world: np.ndarray) -> None:
+        if self._states is not None:
+            self._states.write_pose(self.index, T_camera_world)
+
+    @property
+    def exposure(self) -> np.ndarray:  # type: ignore[override]
+        """float64 [3, 2], as optimised so far."""
+        assert self._states is not None
+        return self._states.read_exposures()[self.index]
+
+    @exposure.setter
+    def exposure(self, exposure: np.ndarray) -> None:
+        """Only the beginning sets it, and that goes with the row."""
+
+    @property
+    def device_images(self) -> DeviceImages:
+        """On the device."""
+        return self._images.of(self)
+
+    @property
+    def device_mask(self) -> torch.Tensor | None:
+        """uint16 [H, W], as it is now; None without one."""
+        return self._images.mask_of(self)
+
+
+class ImageStore:
+    """Images of keyframes on a device, no more than there is room for.
+
+    Args:
+        device: where.
+        limit: bytes.
+    """
+
+    def __init__(self, device: torch.device, limit: int = IMAGE_BYTES) -> None:
+        self._device, self._limit = device, limit
+        self._images: OrderedDict[int, DeviceImages] = OrderedDict()
+        self.nbytes = 0
+        """Memory that they take at present."""
+
+    def of(self, keyframe: Keyframe) -> DeviceImages:
+        """Those of a keyframe, uploaded if need be."""
+        images = self._images.pop(keyframe.index, None)
+        if images is None:
+            images = DeviceImages(upload(keyframe.color, self._device), upload(keyframe.depth, self._device))
+            self.nbytes += images.nbytes
+        self._images[keyframe.index] = images  # the one used last stands last
+        self._make_room()
+        return images
+
+    def mask_of(self, keyframe: Keyframe) -> torch.Tensor | None:
+        """The mask that a keyframe has now."""
+        mask = keyframe.mask
+        if mask is None:
+            return None
+        images = self.of(keyframe)
+        if images.mask is None or images.mask_of is not mask:
+            self.nbytes -= images.nbytes
+            images.mask, images.mask_of = upload(mask, self._device), mask
+            self.nbytes += images.nbytes
+            self._make_room()
+        return images.mask
+
+    def _make_room(self) -> None:
+        while self.nbytes > self._limit and len(self._images) > 1:
+            _, images = self._images.popitem(last=False)
+            self.nbytes -= images.nbytes

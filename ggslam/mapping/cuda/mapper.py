@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mapper on an NVIDIA GPU: map, keyframes, losses, optimizers and identity learning are there, and the host only
+starts work.
+
+It waits at new keyframes (for the number of Gaussians to insert, and for what the map shows of objects, if masks have
+to be matched), and when somebody asks for poses. What it tells of losses is what has arrived of them without waiting.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager
+from functools import partial
+
+import numpy as np
+import torch
+
+from ggslam.cuda.library import CudaLibrary
+from ggslam.cuda.memory import HostMirror
+from ggslam.cuda.streams import Pace, side_stream
+from ggslam.mapping.deformation import move_with_keyframes
+from ggslam.mapping.cuda.identity import CudaIdentityLearner
+from ggslam.mapping.cuda.insertion import DeviceInsertion
+from ggslam.mapping.cuda.keyframe import CudaKeyframe, ImageStore
+from ggslam.mapping.cuda.keyframe_states import KeyframeStates
+from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages
+from ggslam.mapping.cuda.votes import device_vote_labels
+from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, make_keyframe
+from ggslam.mapping.labelling import KeyframeLabels, Labeller, MapLabels
+from ggslam.mapping.mapper import LossSums, Mapper
+from ggslam.mapping.settings import MapperSettings
+from ggslam.rendering.cuda.rasterizer import CudaRasterizer
+from ggslam.scene.frame import Frame
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import inverse
+
+
+class CudaMapper(Mapper):
+    """See `Mapper`. Sums in changing order: runs on a GPU differ in the last digits.
+
+    Args:
+        gaussians: the map, on the device.
+        library: the kernels.
+        Others: as in `Mapper`.
+    """
+
+    def __init__(
+        self, gaussians: GaussianMap, settings: MapperSettings, library: CudaLibrary, seed: int = 0,
+        identity: CudaIdentityLearner | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(gaussians, settings, seed, identity)
+        self.device = library.whole_device(None)
+        self._rasterizer = CudaRasterizer(self.device, library=library, waits=False)
+        self._loss = CudaImageLoss(self.device, library)
+        self._insertion = DeviceInsertion(self.device, library)
+        self._states = KeyframeStates(self.device, library)
+        self._images = ImageStore(self.device)
+        self._mirror = HostMirror(self._states.sums)
+        self._pace = Pace(self.device)
+        self._repeated = 0
+
+    @property
+    def losses(self) -> LossSums:
+        return LossSums(*self._mirror.newest()[:4].tolist())
+
+    @property
+    def last_psnr(self) -> float:
+        return float(self._mirror.newest()[4])
+
+    def vote_labels(self) -> np.ndarray:
+        return device_vote_labels(self.map).cpu().numpy().astype(np.uint16)
+
+    def beside_others(self) -> AbstractContextManager[None]:
+        return side_stream(self.device)
+
+    def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
+        ours: list[Keyframe] = [CudaKeyframe(keyframe, self._states, self._images) for keyframe in keyframes]
+        super().adopt(gaussians.to(self.device), ours)
+
+    def move_keyframes(self, T_new_old: np.ndarray) -> None:
+        old = self._states.read_poses()
+        self._states.write_poses(np.stack([inverse(T @ inverse(pose)) for T, pose in zip(T_new_old, old, strict=True)]))
+        move_with_keyframes(self.map, T_new_old)
+
+    def run(self, iterations: int) -> None:
+        super().run(iterations + self._missed())
+        self._mirror.send()
+        self._pace.piece_ends()
+
+    def _missed(self) -> int:
+        """Iterations that did nothing, as far as is known, because their rendering found no room: to be made again."""
+        missed = int(self._mirror.newest()[6]) - self._repeated
+        self._repeated += missed
+        return missed
+
+    # --- growth ------------------------------------------------------------------------------------------------------
+
+    def _new_keyframe(self, frame: Frame, T_world_camera: np.ndarray) -> CudaKeyframe:
+        keyframe = make_keyframe(len(self.keyframes), frame, T_world_camera)
+        return CudaKeyframe(keyframe, self._states, self._images)
+
+    def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None) -> None:
+        assert isinstance(keyframe, CudaKeyframe)
+        images, s = keyframe.device_images, self.settings.insertion
+        alpha = expected_depth = show = None
+        if self.map.count:
+            view = self._rasterizer.forward(
+                self.map, keyframe.camera, self._states.pose(keyframe.index), features=False, wait=True
+            )
+            alpha, expected_depth = view.alpha, view.expected_depth
+            show = partial(self._show_labels, alpha, expected_depth)
+        if self.identity is not None and labeller is not None:
+            self._take_labels(keyframe, labeller(keyframe, show))
+        new = self._insertion.new_gaussians(
+            images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, alpha, expected_depth, keyframe.camera,
+            T_world_camera, s,
+        )  # fmt: skip
+        logit = torch.full_like(new.means[:, 0], float(np.log(s.opacity / (1 - s.opacity))))
+        rows = self.map.insert(
+            new.means, new.quaternions, new.log_scales, logit, new.rgb, birth_keyframe=keyframe.index
+        )
+        if self.identity is not None:
+            self.identity.begin_at(self.map, rows, new.pixels, keyframe.device_mask)
+
+    def _take_labels(self, keyframe: CudaKeyframe, labels: KeyframeLabels) -> None:
+        """The rasterizer's last rendering is the map as the keyframe sees it (if there was a map)."""
+        identity = self.identity
+        keyframe.mask = labels.mask
+        if labels.mask is None or identity is None:
+            return
+        for kept, dropped in labels.merges:
+            identity.merge(self.map, kept, dropped)
+        identity.observe(labels.mask)
+        for whole, part in labels.splits:
+            identity.split(self.map, self._rasterizer, labels.mask, whole, part)
+
+    def _show_labels(self, alpha: torch.Tensor, depth: torch.Tensor, stride: int = 2) -> MapLabels:
+        """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row; on the host."""
+        height, width = alpha.shape
+        pixels = torch.arange(height * width, dtype=torch.int32, device=self.device).view(height, width)
+        grid = pixels[::stride, ::stride]
+        ids, share = self._rasterizer.pixel_terms(grid.reshape(-1)).labels(device_vote_labels(self.map))
+        share = share.view(grid.shape) * (alpha[::stride, ::stride] > 0.5)
+        return MapLabels.from_grid(
+            ids.view(grid.shape).cpu().numpy(), share.cpu().numpy(), depth.cpu().numpy(), stride
+        )
+
+    # --- optimisation ------------------------------------------------------------------------------------------------
+
+    def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
+        assert isinstance(keyframe, CudaKeyframe)
+        s, row, t0 = self.settings, keyframe.index, time.perf_counter()
+        learn = self.identity is not None and self.identity.due(keyframe)
+        dense = learn and self.identity is not None and self.identity.settings.schedule == "dense"
+        view = self._rasterizer.forward(self.map, keyframe.camera, self._states.pose(row), features=dense)
+        t1 = time.perf_counter()
+        images = keyframe.device_images
+        exposure = self._states.exposure(row) if s.exposure.enabled else None
+        target = DeviceKeyframeImages(images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
+        loss = self._loss.evaluate(view, target, s.loss)
+        t2 = time.perf_counter()
+        grad_features = None
+        if learn and self.identity is not None:
+            grad_features = self.identity.step(self.map, self._rasterizer, keyframe, view)
+        t3 = time.perf_counter()
+        step = self._rasterizer.backward_step(
+            self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features,
+            optimizer=self._standard_adam if rate_factor == 1 else self._adam(rate_factor),
+            detach_features=self.identity is None or self.identity.settings.detach,
+        )  # fmt: skip
+        self._finish_step(row, step, loss, rate_factor)
+        t4 = time.perf_counter()
+        self.times.forward += t1 - t0
+        self.times.loss += t2 - t1
+        self.times.identity += t3 - t2
+        self.times.backward += t4 - t3
+        self.times.iterations += 1
+        keyframe.iterations += 1
+
+    def _train_identity(self, keyframe: Keyframe, steps: int, rate_factor: float) -> None:
+        if self.identity is None:
+            return
+        view = self._rasterizer.forward(self.map, keyframe.camera, self._states.pose(keyframe.index), features=False)
+        for _ in range(steps):
+            self.identity.step(self.map, self._rasterizer, keyframe, view, rate_factor)
