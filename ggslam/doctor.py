@@ -199,23 +199,23 @@ def _gpu() -> Iterator[Finding]:
         yield Finding("gpu", "CUDA", "ok", detail)
     else:
         build = f"this torch is built for CUDA {torch.version.cuda}" if torch.version.cuda else "this torch has no CUDA"
-        advice = "none is needed; for volumes --device cuda install a CUDA build of torch and the driver"
+        advice = "none is needed; for --device cuda install a CUDA build of torch and the driver"
         yield Finding("gpu", "CUDA", "missing", f"no GPU in use: {build}", advice)
     compiler = shutil.which("nvcc")
     if compiler is not None:
         yield Finding("gpu", "nvcc", "ok", _last_line([compiler, "--version"]) or compiler)
-    yield _cuda_rasterizer()
+    yield _cuda_kernels()
 
 
-def _cuda_rasterizer() -> Finding:
+def _cuda_kernels() -> Finding:
     try:
         from ggslam.cuda.availability import describe_cuda_backend
 
         usable, detail = describe_cuda_backend()
     except ImportError as error:  # a package is missing, and said so above
         usable, detail = False, str(error)
-    advice = "" if usable else "none is needed; to render on a GPU install nvcc (CUDA toolkit) and torch for CUDA"
-    return Finding("gpu", "rasterizer", "ok" if usable else "missing", detail, advice)
+    advice = "" if usable else "none is needed; for run --device cuda install nvcc (CUDA toolkit) and torch for CUDA"
+    return Finding("gpu", "kernels", "ok" if usable else "missing", detail, advice)
 
 
 def _last_line(command: list[str]) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the CUDA rasterizer can be used here."""
+"""Whether the CUDA kernels can be used here."""
 
 from __future__ import annotations
 
