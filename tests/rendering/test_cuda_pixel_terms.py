@@ -178,6 +178,18 @@ def test_votes_are_those_of_the_cpu(cuda_library: CudaLibrary) -> None:
     check_votes(Both(cuda_library, make_scene(200, 16)), ALL[::2].copy())
 
 
+def test_pixels_joined_to_others_need_no_labels(cuda_library: CudaLibrary) -> None:
+    both = Both(cuda_library, make_scene(200, 16))
+    expected, terms = both.equal_terms(ALL[::2].copy())
+    joined = terms.joined(CudaPixelTerms.of_gaussians(torch.arange(50, device=both.device), 32, cuda_library))
+    labels = (np.arange(len(terms)) % 3).astype(np.int32)
+    factors = np.linspace(0, 1, len(terms), dtype=np.float32)
+    expected.vote(both.map, labels.astype(np.uint16), factors)
+    joined.vote(both.device_map, both.given(labels), both.given(factors))
+    assert torch.equal(both.device_map.vote_ids.cpu(), both.map.vote_ids)
+    assert torch.allclose(both.device_map.vote_weights.cpu(), both.map.vote_weights, rtol=1e-5, atol=1e-6)
+
+
 def test_a_label_with_most_of_the_weight_survives_any_number_of_others(cuda_library: CudaLibrary) -> None:
     device = cuda_library.whole_device(None)
     gaussians = make_map(make_scene(300, 16), device)
@@ -193,6 +205,7 @@ def test_labels_are_those_of_the_cpu(cuda_library: CudaLibrary, labels: int) -> 
     """With 40 labels some pixels have more than are told apart."""
     both = Both(cuda_library, make_scene(600, 4))
     expected, terms = both.equal_terms(ALL, 48)
+    assert expected.counts.max() > 32
     of_gaussians = (np.arange(600) % labels).astype(np.int32)
     ids, shares = terms.labels(both.given(of_gaussians))
     expected_ids, expected_shares = expected.labels(of_gaussians.astype(np.uint16))
@@ -310,6 +323,8 @@ def test_impossible_requests_are_refused(cuda_library: CudaLibrary) -> None:
         terms.step(gaussians, torch.zeros(16, 5, device=device).T, RATES)
     with pytest.raises(RenderError, match="labels"):
         terms.vote(gaussians, torch.zeros(5, dtype=torch.int64, device=device))
+    with pytest.raises(RenderError, match="labels"):
+        terms.vote(gaussians, torch.zeros(6, dtype=torch.int32, device=device))
     plain = make_map(make_scene(50, 0), device)
     with pytest.raises(RenderError, match="1 to 64 channels, found 0"):
         terms.features(plain)

@@ -53,7 +53,7 @@ def _declared(library: CudaLibrary) -> CudaLibrary:
         "label": [_pointer, _pointer, _int64, _pointer, _pointer],
         "sort": [_pointer] * 3,
         "step": [_pointer, _pointer, _pointer, ctypes.c_int, _pointer],
-        "vote": [_pointer] * 6,
+        "vote": [_pointer, _pointer, _pointer, _pointer, _int64, _pointer, _pointer],
         "sum": [_pointer] * 4,
     }
     for name, types in arguments.items():
@@ -78,7 +78,7 @@ class CudaPixelTerms:
     weights: torch.Tensor
     counts: torch.Tensor
     library: CudaLibrary
-    _sorted: dict[int, torch.Tensor] = field(default_factory=dict, init=False, repr=False)
+    _sorted: dict[int, list[torch.Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     @staticmethod
     def empty(pixels: int, capacity: int, library: CudaLibrary, device: torch.device) -> CudaPixelTerms:
@@ -191,18 +191,20 @@ class CudaPixelTerms:
 
         Args:
             gaussians: the map; `vote_ids` and `vote_weights` are changed.
-            labels: object id seen at each pixel, int32 [P]; 0 votes for nothing.
-            pixel_weights: how much each pixel counts, float32 [P]; None: 1.
+            labels: object id seen at each pixel, int32 [P]; 0 votes for nothing. Also int32 [L] for the first L pixels
+                alone: terms that others were joined to are then sorted once for vote and step.
+            pixel_weights: how much each of these pixels counts, float32 [P] or [L]; None: 1.
 
         Raises:
             RenderError: wrong shape, type or device, a map without slots for votes.
         """
-        self._check("labels", labels, torch.int32, (len(self),))
+        labelled = min(labels.numel(), len(self))
+        self._check("labels", labels, torch.int32, (labelled,))
         self._check("vote_ids", gaussians.vote_ids, torch.int32, (len(gaussians), VOTE_SLOTS))
         if pixel_weights is not None:
-            self._check("pixel_weights", pixel_weights, torch.float32, (len(self),))
+            self._check("pixel_weights", pixel_weights, torch.float32, (labelled,))
         self._call(
-            "vote", self._by_gaussian(len(gaussians)), pointer(labels), pointer(pixel_weights),
+            "vote", self._by_gaussian(len(gaussians)), pointer(labels), pointer(pixel_weights), labelled,
             pointer(gaussians.vote_ids), pointer(gaussians.vote_weights),
         )  # fmt: skip
 
@@ -235,7 +237,7 @@ class CudaPixelTerms:
         size = len(self) * self.capacity
         known = count in self._sorted
         if not known:
-            self._sorted[count] = torch.empty(2, size, dtype=torch.int32, device=self.device)
+            self._sorted[count] = [torch.empty(size, dtype=torch.int32, device=self.device) for _ in range(2)]
         rows, places = self._sorted[count]
         by_gaussian = _TermsByGaussian(pointer(rows), pointer(places), size, count)
         if not known:

@@ -116,11 +116,11 @@ GGSLAM_EXPORT int ggslam_cuda_terms_step(const PixelTerms* terms, const TermsByG
   return visit_sorted(*terms, *sorted, step_terms_kernel, gradient, channels, width, *adam);
 }
 
-// Adds to the votes [N, 4] of the Gaussians in the terms.
+// Adds to the votes [N, 4] of the Gaussians in the terms of the first `labelled` pixels.
 GGSLAM_EXPORT int ggslam_cuda_terms_vote(const PixelTerms* terms, const TermsByGaussian* sorted,
                                          const std::int32_t* labels, const float* pixel_weights,
-                                         std::int32_t* vote_ids, float* vote_weights) {
-  return visit_sorted(*terms, *sorted, vote_terms_kernel, labels, pixel_weights, vote_ids, vote_weights);
+                                         std::int64_t labelled, std::int32_t* vote_ids, float* vote_weights) {
+  return visit_sorted(*terms, *sorted, vote_terms_kernel, labels, pixel_weights, labelled, vote_ids, vote_weights);
 }
 
 // Sets sums [N], zero before, of the Gaussians in the terms.

@@ -149,12 +149,12 @@ __device__ inline void add_vote(std::int32_t (&ids)[kVoteSlots], float (&weights
     if (s == slot) ids[s] = label, weights[s] += weight;
 }
 
-// Adds each pixel's weights, times those of the pixels [P] (null: 1), to the votes [N, slots] of its Gaussians under
-// labels [P]; label 0 votes for nothing. The order of the pixels decides, so terms are taken one after another; every
-// lane does the same.
+// Adds the weights of the first L pixels, times those of the pixels [L] (null: 1), to the votes [N, slots] of their
+// Gaussians under labels [L]; label 0 votes for nothing. The order of the pixels decides, so terms are taken one after
+// another; every lane does the same.
 __global__ void __launch_bounds__(kTermThreads)
 vote_terms_kernel(PixelTerms terms, TermsByGaussian sorted, const std::int32_t* labels, const float* pixel_weights,
-                  std::int32_t* vote_ids, float* vote_weights) {
+                  std::int64_t labelled, std::int32_t* vote_ids, float* vote_weights) {
   const std::int64_t first = first_place_of_gaussian(sorted);
   if (first < 0) return;  // the whole warp
   const std::int64_t at = static_cast<std::int64_t>(sorted.gaussians[first]) * kVoteSlots;
@@ -163,7 +163,7 @@ vote_terms_kernel(PixelTerms terms, TermsByGaussian sorted, const std::int32_t* 
 #pragma unroll
   for (int s = 0; s < kVoteSlots; ++s) ids[s] = vote_ids[at + s], weights[s] = vote_weights[at + s];
   visit_terms(terms, sorted, first, [&](int n, std::uint32_t my_pixel, float my_weight) {
-    const bool given = static_cast<int>(threadIdx.x % kWarp) < n;
+    const bool given = static_cast<int>(threadIdx.x % kWarp) < n && my_pixel < labelled;
     const std::int32_t my_label = given ? labels[my_pixel] : 0;
     const float my_vote = given && pixel_weights != nullptr ? pixel_weights[my_pixel] * my_weight : my_weight;
     for (unsigned left = __ballot_sync(kAllLanes, my_label != 0); left != 0; left &= left - 1) {
