@@ -160,6 +160,16 @@ def test_a_gaussian_seen_by_many_pixels_sums_them_all(cuda_library: CudaLibrary)
     assert torch.equal(terms.weight_sums(3).cpu(), torch.tensor([1.0, 0.0, 115.0]))
 
 
+def test_a_gradient_that_is_no_number_stays_with_its_gaussians(cuda_library: CudaLibrary) -> None:
+    device = cuda_library.whole_device(None)
+    gaussians = make_map(make_scene(3, 5), device)
+    terms = CudaPixelTerms.of_gaussians(torch.tensor([0, 1, 1, 1], device=device), 2, cuda_library)
+    gradient = torch.ones(4, 5, device=device)
+    gradient[0] = torch.nan
+    terms.step(gaussians, gradient, RATES)
+    assert torch.equal(gaussians.features.isfinite().all(1).cpu(), torch.tensor([False, True, True]))
+
+
 def check_votes(both: Both, pixels: np.ndarray) -> None:
     expected, terms = both.equal_terms(pixels)
     reference, found = copied(both.map, "cpu"), copied(both.map, both.device)
@@ -301,6 +311,23 @@ def test_terms_outlive_the_next_rendering_and_the_step_of_the_features(cuda_libr
     both.cuda.forward(both.device_map, CAMERA, np.eye(4), features=False)
     assert torch.equal(before.weights, weights)
     assert not torch.equal(both.cuda_terms(ALL, 32, 1e-3).weights, weights)
+
+
+def test_nothing_waits_for_the_device(cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch) -> None:
+    both = Both(cuda_library, make_scene(200, 16))
+    pixels, rows = both.given(ALL), torch.arange(9, device=both.device)
+    gradient = torch.ones(SIZE + 9, 16, device=both.device)
+    labels = torch.ones(SIZE, dtype=torch.int32, device=both.device)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the host asks for numbers that are on the device")
+
+    for name in ("item", "cpu", "numpy", "tolist", "nonzero", "__bool__", "__int__", "__float__", "__index__"):
+        monkeypatch.setattr(torch.Tensor, name, refuse)
+    terms = both.cuda.pixel_terms(pixels).joined(CudaPixelTerms.of_gaussians(rows, 48, cuda_library))
+    terms.features(both.device_map), terms.labels(labels[:200]), terms.opacity(), terms.weight_sums(200)
+    terms.step(both.device_map, gradient, RATES)
+    terms.vote(both.device_map, labels)
 
 
 def test_impossible_requests_are_refused(cuda_library: CudaLibrary) -> None:
