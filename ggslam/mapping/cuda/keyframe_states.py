@@ -101,7 +101,7 @@ class KeyframeStates:
         for name in ("keyframe_step", "keyframe_write"):
             self.library.declare(name, [ctypes.c_void_p])
         self._count = 0
-        self._table = self._new_table(_FIRST_ROOM)
+        self._use(self._new_table(_FIRST_ROOM))
         self._totals = torch.zeros(6, dtype=torch.float64, device=self.device)
         self._totals[4].fill_(torch.nan)
         self._step_job = _StepJob(device=self.device.index or 0, totals=self._totals.data_ptr())
@@ -129,7 +129,7 @@ class KeyframeStates:
             # of the stream, so they are done by then.
             table = self._new_table(2 * self._count)
             table[: self._count] = self._table
-            self._table = table
+            self._use(table)
         self._write(self._count, T_camera_world, exposure)
         self._count += 1
         return self._count - 1
@@ -137,11 +137,11 @@ class KeyframeStates:
     def pose(self, i: int) -> torch.Tensor:
         """First three rows of keyframe i's T_camera_world, as the rasterizer takes them: a view, float32 [12], that
         changes with its steps; valid until the next `append`."""
-        return self._floats(i, _State.pose_copy)
+        return self._poses[self._checked_index(i)]
 
     def exposure(self, i: int) -> torch.Tensor:
         """Keyframe i's exposure, as the image loss takes it: a view, float32 [3, 2], as `pose`."""
-        return self._floats(i, _State.exposure_copy).view(3, 2)
+        return self._exposures[self._checked_index(i)]
 
     def step(
         self,
@@ -219,6 +219,13 @@ class KeyframeStates:
     def _new_table(self, rows: int) -> torch.Tensor:
         return torch.empty(rows, ctypes.sizeof(_State), dtype=torch.uint8, device=self.device)
 
+    def _use(self, table: torch.Tensor) -> None:
+        self._table = table
+        for_rasterizer, for_loss = _State.pose_copy.offset // 4, _State.exposure_copy.offset // 4
+        numbers = table.view(torch.float32)
+        self._poses = numbers[:, for_rasterizer : for_rasterizer + 12]
+        self._exposures = numbers[:, for_loss : for_loss + 6].unflatten(1, (3, 2))
+
     def _checked_index(self, i: int) -> int:
         if not 0 <= i < self._count:
             raise IndexError(f"keyframe {i} of {self._count}")
@@ -226,10 +233,6 @@ class KeyframeStates:
 
     def _address(self, i: int) -> int:
         return self._table.data_ptr() + self._checked_index(i) * ctypes.sizeof(_State)
-
-    def _floats(self, i: int, field: ctypes._CField) -> torch.Tensor:
-        row = self._table[self._checked_index(i)]
-        return row[field.offset : field.offset + field.size].view(torch.float32)
 
     def _write(self, i: int, T_camera_world: np.ndarray, exposure: np.ndarray | None) -> None:
         job = _WriteJob(stream=self.library.stream(self.device), device=self.device.index or 0)

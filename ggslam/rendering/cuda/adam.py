@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-import weakref
 
 import torch
 
@@ -13,6 +12,7 @@ from ggslam.errors import RenderError
 from ggslam.rendering import _native
 from ggslam.rendering._native import ADAM_GROUPS, pointer
 from ggslam.rendering.adam import AdamSettings
+from ggslam.rendering.cuda.finished import MapState
 from ggslam.rendering.types import PARAMETERS
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -36,7 +36,7 @@ class AdamSteps:
     def __init__(self) -> None:
         self._step = AdamStep()
         self._optimizer: AdamSettings | None = None
-        self._map: tuple[weakref.ref[GaussianMap] | None, int, int] = (None, 0, 0)
+        self._map: MapState | None = None
 
     def make(self, gaussians: GaussianMap, optimizer: AdamSettings, device: torch.device) -> AdamStep:
         """The step on a map's arrays, which the caller keeps alive; valid until the next call.
@@ -46,12 +46,13 @@ class AdamSteps:
         """
         if not gaussians.with_moments:
             raise RenderError("backward_step: the map was made without moments")
-        known, version, allocations = self._map
-        if known is None or known() is not gaussians or (version, allocations) != _state(gaussians):
+        state = MapState.of(gaussians)
+        if state != self._map:
             if gaussians.updates.device != device:
                 found = gaussians.updates.device
                 raise RenderError(f"backward_step: expected a map on {device}, found one on {found}")
             self._point_to(gaussians)
+            self._map = state
         if optimizer is not self._optimizer:
             _set_numbers(self._step, optimizer)
             self._optimizer = optimizer
@@ -62,12 +63,6 @@ class AdamSteps:
         for name, (first, second) in gaussians.moments.items():
             arrays = _native.AdamArrays(pointer(getattr(gaussians, name)), pointer(first), pointer(second))
             setattr(self._step, name, arrays)
-        self._map = (weakref.ref(gaussians), *_state(gaussians))
-
-
-def _state(gaussians: GaussianMap) -> tuple[int, int]:
-    """Changes with the addresses of the arrays. That of an array without rows is null, hence the version."""
-    return gaussians.version, gaussians.allocations
 
 
 def _set_numbers(step: AdamStep, optimizer: AdamSettings) -> None:

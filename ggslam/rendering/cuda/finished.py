@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ctypes
+import weakref
 from dataclasses import dataclass, field
 
 import torch
@@ -14,6 +15,7 @@ from ggslam.rendering import _native
 from ggslam.rendering._native import pointer
 from ggslam.rendering.cuda.contract import Rendering, Sizes
 from ggslam.rendering.types import GaussianTensors, RenderBuffers
+from ggslam.scene.gaussian_map import GaussianMap
 
 _MAX_PAIRS = 2**31 - 1
 _STEP = 4096
@@ -103,6 +105,8 @@ class FinishedRendering:
     pairs: int | None = None
     gradient_bytes: int = 0
     memory: dict[str, torch.Tensor] = field(default_factory=dict)
+    source: MapState | None = None
+    """Of the map that the parameters are the arrays of; None: they are of no map, or that is not known."""
 
     def plan(self, library: CudaLibrary, pair_capacity: int) -> Sizes:
         """Sizes of the memory blocks for so many pairs."""
@@ -122,6 +126,21 @@ class FinishedRendering:
         """Lets the rendering work in this block, one of Rendering's workspaces."""
         self.memory[name] = block
         setattr(self.native, name, pointer(block))
+
+
+@dataclass(frozen=True)
+class MapState:
+    """Equal for two looks at a map if its arrays have the same rows at the same addresses."""
+
+    map: weakref.ref[GaussianMap]
+    version: int
+    allocations: int
+
+    @staticmethod
+    def of(gaussians: GaussianMap) -> MapState:
+        """As the map is now."""
+        # The address of an array without rows is null, so not only allocations count.
+        return MapState(weakref.ref(gaussians), gaussians.version, gaussians.allocations)
 
 
 def target_pointers(buffers: RenderBuffers) -> _native.RenderTargets:

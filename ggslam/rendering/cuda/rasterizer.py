@@ -37,7 +37,7 @@ from ggslam.rendering.arguments import (
 )
 from ggslam.rendering.cuda.adam import AdamStep, AdamSteps
 from ggslam.rendering.cuda.contract import Rendering, Sizes, declare_rasterizer
-from ggslam.rendering.cuda.finished import Counter, FinishedRendering, target_pointers
+from ggslam.rendering.cuda.finished import Counter, FinishedRendering, MapState, target_pointers
 from ggslam.rendering.types import (
     LOW_PASS,
     PARAMETERS,
@@ -182,6 +182,8 @@ class CudaRasterizer:
         if not self.waits:
             native.overflowed, native.overflows = self.last_overflowed.data_ptr(), self.overflows.data_ptr()
         rendering = FinishedRendering(parameters, buffers, native, pose)
+        if isinstance(gaussians, GaussianMap):
+            rendering.source = MapState.of(gaussians)
         self._run(rendering, memory)
         return rendering
 
@@ -269,9 +271,10 @@ class CudaRasterizer:
         """`backward` and one Adam step in one pass, nothing of which the host waits for; arguments, effect and errors
         as `CpuRasterizer.backward_step`, the map being on the rasterizer's device."""
         last = self._require_last()
-        for name in PARAMETERS:
-            if (pointer(getattr(map, name)) or None) != getattr(last.native.gaussians, name):
-                raise RenderError(f"backward_step: the map's {name} are not those that were rendered last")
+        if last.source != MapState.of(map):
+            for name in PARAMETERS:
+                if (pointer(getattr(map, name)) or None) != getattr(last.native.gaussians, name):
+                    raise RenderError(f"backward_step: the map's {name} are not those that were rendered last")
         adam = self._adam_steps.make(map, optimizer, self.device)
         twist, touched = self._twist_and_touched(last)
         out = _native.GaussianGradients(twist=pointer(twist), touched=pointer(touched))
