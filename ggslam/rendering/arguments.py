@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import ctypes
-
 import numpy as np
 import torch
 
@@ -70,10 +68,14 @@ def gaussian_arrays(
 
 def native_view(camera: Camera, T_camera_world: np.ndarray, near_plane: float, low_pass: float) -> _native.View:
     """Camera and pose [4, 4]; raises RenderError as `check_pose`."""
-    rows = (ctypes.c_float * 12)(*check_pose(T_camera_world)[:3].ravel().tolist())
-    return _native.View(
-        camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, near_plane, low_pass, rows
-    )
+    view = camera_view(camera, near_plane, low_pass)
+    view.camera_world[:] = check_pose(T_camera_world)[:3].ravel().tolist()
+    return view
+
+
+def camera_view(camera: Camera, near_plane: float, low_pass: float) -> _native.View:
+    """The camera without its pose, which stays zero."""
+    return _native.View(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, near_plane, low_pass)
 
 
 def image_buffers(

@@ -60,6 +60,8 @@ class GaussianMap:
     growth: float = 0.5
     """Share by which the room grows at least when it is used up, so that inserting is amortised; 0: not more than is
     needed."""
+    allocations: int = 0
+    """Increases when the arrays move in memory, so that addresses can be seen to be stale."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= 3:
@@ -86,6 +88,7 @@ class GaussianMap:
                 new[: self.count] = old[: self.count]
             return new
 
+        self.allocations += 1
         for name in _PARAMETERS:
             self._storage[name] = grown(self._storage.get(name), name, torch.float32)
             if self.with_moments:

@@ -12,6 +12,7 @@ from ggslam.errors import RenderError
 from ggslam.rendering import _native
 from ggslam.rendering._native import ADAM_GROUPS, pointer
 from ggslam.rendering.adam import AdamSettings
+from ggslam.rendering.cuda.finished import MapState
 from ggslam.rendering.types import PARAMETERS
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -29,28 +30,48 @@ class AdamStep(ctypes.Structure):
     ]  # fmt: skip
 
 
-def adam_step(gaussians: GaussianMap, optimizer: AdamSettings, device: torch.device) -> AdamStep:
-    """The step on a map's arrays, which the caller keeps alive.
+class AdamSteps:
+    """Makes the steps' arguments, anew only as far as the map or the settings are others than at the last step."""
 
-    Raises:
-        RenderError: the map has no moments, or its arrays are elsewhere than on `device`.
-    """
-    if not gaussians.moments:
-        raise RenderError("backward_step: the map was made without moments")
-    if gaussians.updates.device != device:
-        raise RenderError(f"backward_step: expected a map on {device}, found one on {gaussians.updates.device}")
+    def __init__(self) -> None:
+        self._step = AdamStep()
+        self._optimizer: AdamSettings | None = None
+        self._map: MapState | None = None
 
+    def make(self, gaussians: GaussianMap, optimizer: AdamSettings, device: torch.device) -> AdamStep:
+        """The step on a map's arrays, which the caller keeps alive; valid until the next call.
+
+        Raises:
+            RenderError: the map has no moments, or its arrays are elsewhere than on `device`.
+        """
+        if not gaussians.with_moments:
+            raise RenderError("backward_step: the map was made without moments")
+        state = MapState.of(gaussians)
+        if state != self._map:
+            if gaussians.updates.device != device:
+                found = gaussians.updates.device
+                raise RenderError(f"backward_step: expected a map on {device}, found one on {found}")
+            self._point_to(gaussians)
+            self._map = state
+        if optimizer is not self._optimizer:
+            _set_numbers(self._step, optimizer)
+            self._optimizer = optimizer
+        return self._step
+
+    def _point_to(self, gaussians: GaussianMap) -> None:
+        self._step.updates = pointer(gaussians.updates)
+        for name, (first, second) in gaussians.moments.items():
+            arrays = _native.AdamArrays(pointer(getattr(gaussians, name)), pointer(first), pointer(second))
+            setattr(self._step, name, arrays)
+
+
+def _set_numbers(step: AdamStep, optimizer: AdamSettings) -> None:
     def logarithm(factor: float) -> float:
         return math.log(factor) if factor > 0 else -math.inf
 
-    step = AdamStep(
-        updates=pointer(gaussians.updates),
-        decayed_groups=sum(1 << bit for bit, name in enumerate(ADAM_GROUPS) if name in optimizer.decayed_groups),
-        log_decay=logarithm(optimizer.decay), decay_floor=optimizer.decay_floor, beta1=optimizer.beta1,
-        beta2=optimizer.beta2, log_beta1=logarithm(optimizer.beta1), log_beta2=logarithm(optimizer.beta2),
-        epsilon=optimizer.epsilon,
-    )  # fmt: skip
     step.rates[:] = [float(optimizer.learning_rates.get(name, 0.0)) for name in ADAM_GROUPS]
-    for name, (first, second) in gaussians.moments.items():
-        setattr(step, name, _native.AdamArrays(pointer(getattr(gaussians, name)), pointer(first), pointer(second)))
-    return step
+    step.decayed_groups = sum(1 << bit for bit, name in enumerate(ADAM_GROUPS) if name in optimizer.decayed_groups)
+    step.log_decay, step.decay_floor = logarithm(optimizer.decay), optimizer.decay_floor
+    step.beta1, step.log_beta1 = optimizer.beta1, logarithm(optimizer.beta1)
+    step.beta2, step.log_beta2 = optimizer.beta2, logarithm(optimizer.beta2)
+    step.epsilon = optimizer.epsilon

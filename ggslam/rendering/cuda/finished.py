@@ -4,19 +4,26 @@
 from __future__ import annotations
 
 import ctypes
+import weakref
 from dataclasses import dataclass, field
 
 import torch
 
 from ggslam.cuda.library import CudaLibrary
+from ggslam.errors import RenderError
 from ggslam.rendering import _native
 from ggslam.rendering._native import pointer
 from ggslam.rendering.cuda.contract import Rendering, Sizes
 from ggslam.rendering.types import GaussianTensors, RenderBuffers
+from ggslam.scene.gaussian_map import GaussianMap
+
+_MAX_PAIRS = 2**31 - 1
+_STEP = 4096
 
 
 class Counter:
-    """Receives the number of visible Gaussians and of pairs of a Gaussian and a tile from the device.
+    """Receives the number of visible Gaussians and of pairs of a Gaussian and a tile from the device, and tells how
+    much room to make for the pairs of a rendering before their number is known.
 
     Args:
         library: the rasterizer.
@@ -27,18 +34,53 @@ class Counter:
         self._library = library
         self.handle = ctypes.c_void_p()
         self.expected_pairs: int | None = None
-        """Room to make for pairs before their number is known; None: wait for it."""
+        """Room to make for pairs before their number is known, if that is going to be waited for; None: none."""
+        self.spare_pairs = 1 << 16
+        """Room that `room_without_waiting` adds to a quarter more than was needed."""
+        self._needed = 0
         library.call("counter_create", device_index, ctypes.byref(self.handle))
 
     def wait(self) -> tuple[int, int]:
-        """Visible Gaussians and pairs of the last projection; waits for that projection, not for what follows."""
+        """Visible Gaussians and pairs of the last projection; waits for that projection, not for what follows.
+
+        Raises:
+            RenderError: more pairs than can be numbered.
+        """
         totals = (ctypes.c_int64 * 2)()
         self._library.call("wait", self.handle, totals)
-        return totals[0], totals[1]
+        visible, pairs = totals
+        _check_pairs(pairs)
+        self.expected_pairs = min(pairs + pairs // 16 + 4096, _MAX_PAIRS)
+        return visible, pairs
+
+    def room_without_waiting(self) -> int | None:
+        """Room to make for the pairs of the next rendering by what the renderings needed that are done: somewhat more
+        than the most of 64 of them; what was needed before that is forgotten over as many again. None while no pair
+        was ever seen.
+
+        Raises:
+            RenderError: one of them had more pairs than can be numbered.
+        """
+        recent = self._library.functions.ggslam_cuda_recent_pairs(self.handle)
+        _check_pairs(recent)
+        self._needed = max(recent, self._needed - (self._needed - recent) // 64 - 1)
+        if self._needed == 0:
+            return None
+        # Whole steps, so that the plan of the memory stays the same for a while.
+        room = (self._needed + self._needed // 4 + self.spare_pairs + _STEP - 1) // _STEP * _STEP
+        return min(room, _MAX_PAIRS)
 
     def __del__(self) -> None:
         if self.handle:
             self._library.functions.ggslam_cuda_counter_destroy(self.handle)
+
+
+def _check_pairs(pairs: int) -> None:
+    if pairs > _MAX_PAIRS:
+        raise RenderError(
+            "rendering failed: too many pairs of a Gaussian and an image tile (2^31): "
+            "the Gaussians are far too large for the image"
+        )
 
 
 @dataclass
@@ -49,8 +91,8 @@ class FinishedRendering:
         parameters: what was rendered.
         buffers: the images.
         native: the arguments of the C functions; its pointers lead into the tensors here.
-        visible: number of Gaussians in view.
-        pairs: number of pairs of a Gaussian and an image tile.
+        pose: where the kernels read the pose; None: it is among the arguments.
+        visible, pairs: number of Gaussians in view and of pairs of a Gaussian and an image tile; None: not known here.
         gradient_bytes: memory that differentiating it needs.
         memory: the blocks that the rendering works in.
     """
@@ -58,10 +100,13 @@ class FinishedRendering:
     parameters: GaussianTensors
     buffers: RenderBuffers
     native: Rendering
-    visible: int = 0
-    pairs: int = 0
+    pose: torch.Tensor | None = None
+    visible: int | None = None
+    pairs: int | None = None
     gradient_bytes: int = 0
     memory: dict[str, torch.Tensor] = field(default_factory=dict)
+    source: MapState | None = None
+    """Of the map that the parameters are the arrays of; None: they are of no map, or that is not known."""
 
     def plan(self, library: CudaLibrary, pair_capacity: int) -> Sizes:
         """Sizes of the memory blocks for so many pairs."""
@@ -70,10 +115,32 @@ class FinishedRendering:
         library.call("plan", ctypes.byref(self.native), ctypes.byref(sizes))
         return sizes
 
+    def totals(self) -> tuple[int, int]:
+        """Visible Gaussians and pairs; waits for the device if they are not known here."""
+        if self.visible is None or self.pairs is None:
+            # They are the first numbers of the Gaussians' workspace.
+            self.visible, self.pairs = self.memory["gaussian_workspace"][:16].view(torch.int64).tolist()
+        return self.visible, self.pairs
+
     def use(self, name: str, block: torch.Tensor) -> None:
         """Lets the rendering work in this block, one of Rendering's workspaces."""
         self.memory[name] = block
         setattr(self.native, name, pointer(block))
+
+
+@dataclass(frozen=True)
+class MapState:
+    """Equal for two looks at a map if its arrays have the same rows at the same addresses."""
+
+    map: weakref.ref[GaussianMap]
+    version: int
+    allocations: int
+
+    @staticmethod
+    def of(gaussians: GaussianMap) -> MapState:
+        """As the map is now."""
+        # The address of an array without rows is null, so not only allocations count.
+        return MapState(weakref.ref(gaussians), gaussians.version, gaussians.allocations)
 
 
 def target_pointers(buffers: RenderBuffers) -> _native.RenderTargets:

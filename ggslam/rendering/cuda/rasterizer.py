@@ -5,6 +5,9 @@ Work is only started, on torch's current stream. The host waits once per renderi
 number of pairs of a Gaussian and an image tile has to be known to have made room for them. What follows is started
 before that, with the room that the last rendering needed and some more, and repeated in the rare case that it was not
 enough; so the device does not idle while the host waits.
+
+With `waits=False` the host does not wait at all. The room is made by what earlier renderings needed, and a rendering
+for which it does not suffice is told and counted on the device: what was to be learned from it has to be repeated.
 """
 
 from __future__ import annotations
@@ -23,22 +26,31 @@ from ggslam.rendering import _native
 from ggslam.rendering._native import pointer
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.arguments import (
+    camera_view,
     check_projection,
+    check_tensor,
     checked_parameters,
     gaussian_arrays,
     image_buffers,
     image_gradients,
     native_view,
 )
-from ggslam.rendering.cuda.adam import AdamStep, adam_step
-from ggslam.rendering.cuda.contract import Rendering, declare_rasterizer
-from ggslam.rendering.cuda.finished import Counter, FinishedRendering, target_pointers
+from ggslam.rendering.cuda.adam import AdamStep, AdamSteps
+from ggslam.rendering.cuda.contract import Rendering, Sizes, declare_rasterizer
+from ggslam.rendering.cuda.finished import Counter, FinishedRendering, MapState, target_pointers
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
-from ggslam.rendering.types import LOW_PASS, PARAMETERS, Gaussians, ParameterGradients, RenderBuffers
+from ggslam.rendering.types import (
+    LOW_PASS,
+    PARAMETERS,
+    Gaussians,
+    GaussianTensors,
+    ParameterGradients,
+    RenderBuffers,
+)
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 
-_MAX_PAIRS = 2**31 - 1
+_POSE_SHAPE = torch.Size([12])
 
 
 @dataclass
@@ -77,6 +89,14 @@ class CudaRasterizer:
         near_plane: metres; Gaussians whose mean is nearer are left out.
         low_pass: pixels^2 added to both variances of a projected Gaussian.
         library: the compiled rasterizer; None: that of the device, compiled if need be.
+        waits: False: calls never wait for the device, except as long as nothing was ever in view, and `statistics`. A
+            rendering with more pairs than room was made for then lacks the farthest Gaussians here and there in its
+            images; differentiating it gives zero and touches nothing, so that a step with it changes nothing.
+
+    Attributes:
+        last_overflowed: int32 [1] on the device, 1 after a rendering that ran out of room, else 0. Of the last
+            rendering in stream order; always 0 with `waits`.
+        overflows: int64 [1] on the device, how many renderings did so far.
 
     Raises:
         RenderError: an impossible near plane or low-pass filter.
@@ -89,6 +109,7 @@ class CudaRasterizer:
         near_plane: float = 0.05,
         low_pass: float = LOW_PASS,
         library: CudaLibrary | None = None,
+        waits: bool = True,
     ) -> None:
         check_projection(near_plane, low_pass)
         self.near_plane = near_plane
@@ -97,7 +118,12 @@ class CudaRasterizer:
         self.library = library or library_for_device(chosen)
         declare_rasterizer(self.library)
         self.device = self.library.whole_device(chosen)
+        self.waits = waits
+        self.last_overflowed = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self.overflows = torch.zeros(1, dtype=torch.int64, device=self.device)
         self._counter = Counter(self.library, self.device.index or 0)
+        self._adam_steps = AdamSteps()
+        self._planned: tuple[object, Sizes, int, int] = (None, Sizes(), 0, 0)
         self._memory = GrowingMemory(self.device)
         self._images: dict[str, torch.Tensor] = {}
         self._last: FinishedRendering | None = None
@@ -108,14 +134,20 @@ class CudaRasterizer:
         self,
         gaussians: Gaussians,
         camera: Camera,
-        T_camera_world: np.ndarray,
+        T_camera_world: np.ndarray | torch.Tensor,
         *,
         features: bool = True,
         median_depth: bool = False,
         active_sh_degree: int | None = None,
     ) -> RenderBuffers:
         """Renders. Arguments, results and errors as `CpuRasterizer.forward`, tensors being on the rasterizer's device;
-        the images belong to the rasterizer and are overwritten by its next call."""
+        the images belong to the rasterizer and are overwritten by its next call.
+
+        Args:
+            T_camera_world: float64 [4, 4]; or on the device, float32 [12], its first three rows, which nobody changes
+                before the rendering is differentiated. Its numbers are not checked then, as that would mean to wait for
+                them: where they are not finite, nothing is in view.
+        """
         self._last = None
         self._last = self.render(
             gaussians, camera, T_camera_world, self._memory, self._images,
@@ -127,7 +159,7 @@ class CudaRasterizer:
         self,
         gaussians: Gaussians,
         camera: Camera,
-        T_camera_world: np.ndarray,
+        T_camera_world: np.ndarray | torch.Tensor,
         memory: GrowingMemory,
         images: dict[str, torch.Tensor],
         *,
@@ -137,46 +169,64 @@ class CudaRasterizer:
     ) -> FinishedRendering:
         """Renders in memory and images given by the caller (images are made where they do not fit), so that several
         renderings can wait to be differentiated."""
-        parameters = checked_parameters(gaussians, self.device)
+        parameters = self._parameters(gaussians)
         arrays = gaussian_arrays(parameters, features, active_sh_degree)
-        view = native_view(camera, T_camera_world, self.near_plane, self.low_pass)
+        if isinstance(T_camera_world, torch.Tensor):
+            check_tensor("T_camera_world", T_camera_world, self.device, _POSE_SHAPE)
+            pose, view = T_camera_world, camera_view(camera, self.near_plane, self.low_pass)
+        else:
+            pose, view = None, native_view(camera, T_camera_world, self.near_plane, self.low_pass)
         channels = arrays.feature_channels if arrays.render_features else 0
         buffers = image_buffers(images, camera, channels, median_depth, self.device)
         stream, index = self.library.stream(self.device), self.device.index or 0
-        native = Rendering(arrays, view, target_pointers(buffers), stream=stream, device=index)
-        rendering = FinishedRendering(parameters, buffers, native)
+        native = Rendering(arrays, view, pointer(pose), target_pointers(buffers), stream=stream, device=index)
+        if not self.waits:
+            native.overflowed, native.overflows = self.last_overflowed.data_ptr(), self.overflows.data_ptr()
+        rendering = FinishedRendering(parameters, buffers, native, pose)
+        if isinstance(gaussians, GaussianMap):
+            rendering.source = MapState.of(gaussians)
         self._run(rendering, memory)
         return rendering
 
     def _run(self, rendering: FinishedRendering, memory: GrowingMemory) -> None:
         counter = self._counter
-        expected = counter.expected_pairs
-        sizes = rendering.plan(self.library, expected or 0)
+        room = counter.expected_pairs if self.waits else counter.room_without_waiting()
+        # Blocks that grow free what kernels may still be working with. That does no harm: torch gives the memory away
+        # again in the order of the stream, and all the work is on one stream.
+        sizes = self._plan(rendering, room or 0)
         rendering.use("gaussian_workspace", memory.block("gaussians", sizes.gaussian_workspace))
         rendering.use("pixel_workspace", memory.block("pixels", sizes.pixel_workspace))
         self.library.call("project", ctypes.byref(rendering.native), counter.handle)
-        if expected is not None:
-            self._composite(rendering, expected, memory)
+        if room is not None:
+            self._composite(rendering, sizes, memory)
+            if not self.waits:
+                return
         rendering.visible, rendering.pairs = counter.wait()
-        if rendering.pairs > _MAX_PAIRS:
-            raise RenderError(
-                "rendering failed: too many pairs of a Gaussian and an image tile (2^31): "
-                "the Gaussians are far too large for the image"
-            )
-        if expected is None or rendering.pairs > expected:
-            self._composite(rendering, rendering.pairs, memory)
-        counter.expected_pairs = min(rendering.pairs + rendering.pairs // 16 + 4096, _MAX_PAIRS)
+        if room is None or rendering.pairs > room:
+            self._composite(rendering, self._plan(rendering, rendering.pairs), memory)
 
-    def _composite(self, rendering: FinishedRendering, pairs: int, memory: GrowingMemory) -> None:
-        sizes = rendering.plan(self.library, pairs)
+    def _plan(self, rendering: FinishedRendering, pair_capacity: int) -> Sizes:
+        """Sizes of the memory blocks for so many pairs; asks the library only if it is another case than the last."""
+        native = rendering.native
+        key = (*rendering.parameters.features.shape, native.gaussians.render_features, native.view.width,
+               native.view.height, pair_capacity)  # fmt: skip
+        if key != self._planned[0]:
+            sizes = rendering.plan(self.library, pair_capacity)
+            self._planned = (key, sizes, native.gaussian_sorting_bytes, native.pair_sorting_bytes)
+        native.pair_capacity = pair_capacity
+        _, sizes, native.gaussian_sorting_bytes, native.pair_sorting_bytes = self._planned
+        return sizes
+
+    def _composite(self, rendering: FinishedRendering, sizes: Sizes, memory: GrowingMemory) -> None:
         rendering.gradient_bytes = sizes.gradient_rows
         rendering.use("pair_workspace", memory.block("pairs", sizes.pair_workspace))
         self.library.call("composite", ctypes.byref(rendering.native))
 
     def statistics(self) -> dict[str, int]:
-        """Of the last forward: `visible` Gaussians and `pairs` of a Gaussian and an image tile."""
-        last = self._require_last()
-        return {"visible": last.visible, "pairs": last.pairs}
+        """Of the last forward: `visible` Gaussians and `pairs` of a Gaussian and an image tile. Waits for the device if
+        the rendering did not."""
+        visible, pairs = self._require_last().totals()
+        return {"visible": visible, "pairs": pairs}
 
     def pixel_terms(self, pixels: torch.Tensor, capacity: int = 48, min_weight: float = 1e-3) -> CudaPixelTerms:
         """Which Gaussians some pixels of the last `forward` are made of, with their weights.
@@ -239,10 +289,11 @@ class CudaRasterizer:
         """`backward` and one Adam step in one pass, nothing of which the host waits for; arguments, effect and errors
         as `CpuRasterizer.backward_step`, the map being on the rasterizer's device."""
         last = self._require_last()
-        for name in PARAMETERS:
-            if getattr(map, name).data_ptr() != getattr(last.parameters, name).data_ptr():
-                raise RenderError(f"backward_step: the map's {name} are not those that were rendered last")
-        adam = adam_step(map, optimizer, self.device)
+        if last.source != MapState.of(map):
+            for name in PARAMETERS:
+                if (pointer(getattr(map, name)) or None) != getattr(last.native.gaussians, name):
+                    raise RenderError(f"backward_step: the map's {name} are not those that were rendered last")
+        adam = self._adam_steps.make(map, optimizer, self.device)
         twist, touched = self._twist_and_touched(last)
         out = _native.GaussianGradients(twist=pointer(twist), touched=pointer(touched))
         grads = (grad_image, grad_depth, grad_alpha, grad_features)
@@ -296,6 +347,11 @@ class CudaRasterizer:
         self.library.call("backward", *arguments, step, pointer(rows))
 
     # --- checks ------------------------------------------------------------------------------------------------------
+
+    def _parameters(self, gaussians: Gaussians) -> GaussianTensors:
+        if isinstance(gaussians, GaussianMap) and gaussians.device == self.device:  # shaped as it should by itself
+            return GaussianTensors(*(getattr(gaussians, name) for name in PARAMETERS))
+        return checked_parameters(gaussians, self.device)
 
     def _require_last(self) -> FinishedRendering:
         if self._last is None:

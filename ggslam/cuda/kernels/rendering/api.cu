@@ -2,6 +2,7 @@
 // The C interface. Calls only start work on the caller's stream; wait is the one that waits, and only for the
 // projection. All return 0 or a cudaError_t.
 #include <algorithm>
+#include <cstring>
 #include <new>
 
 #include "rendering/binning.cuh"
@@ -14,10 +15,13 @@
 namespace ggslam::cuda {
 namespace {
 
-// Receives the totals of a projection on the host.
+constexpr std::uint64_t kRecent = 64;
+
+// Receives the totals of the last kRecent projections on the host.
 struct Counter {
-  Totals* totals = nullptr;  // page-locked host memory
-  cudaEvent_t ready = nullptr;
+  Totals* totals = nullptr;  // [kRecent] by turns, page-locked host memory
+  std::uint64_t started = 0;
+  cudaEvent_t ready = nullptr;  // after the last one's
 };
 
 struct Sizes {
@@ -56,15 +60,15 @@ void for_each_group(const GaussianArrays& arrays, const Run& run) {
   } while (first < channels);
 }
 
-cudaError_t project_all(const Rendering& r, const Counter& counter) {
+cudaError_t project_all(const Rendering& r, Counter& counter) {
   const GaussianWorkspace w = gaussians_of(r);
   const cudaStream_t stream = stream_of(r);
   const std::uint32_t hidden = hidden_key(r.view);
   const std::int64_t n = r.gaussians.count;
   cudaMemsetAsync(w.totals, 0, sizeof(Totals), stream);
-  launch(project_kernel, blocks_for(n, kProjectThreads), kProjectThreads, stream, r.gaussians, view_constants(r.view),
+  launch(project_kernel, blocks_for(n, kProjectThreads), kProjectThreads, stream, r.gaussians, view_constants(r.view), r.pose,
          make_grid(r.view), float_bits(r.view.near_plane), hidden, w);
-  cudaMemcpyAsync(counter.totals, w.totals, sizeof(Totals), cudaMemcpyDeviceToHost, stream);
+  cudaMemcpyAsync(counter.totals + counter.started++ % kRecent, w.totals, sizeof(Totals), cudaMemcpyDeviceToHost, stream);
   cudaEventRecord(counter.ready, stream);
   if (n == 0) return cudaSuccess;
   const cudaError_t sorted = sort_pairs(w.sorting, w.sorting_bytes, w.depth_keys, w.sorted_depth_keys, w.rows,
@@ -77,17 +81,17 @@ cudaError_t project_all(const Rendering& r, const Counter& counter) {
 cudaError_t list_pairs(const Rendering& r, const Grid& grid, const GaussianWorkspace& w, const PairWorkspace& pairs,
                        const PixelWorkspace& pixels) {
   const cudaStream_t stream = stream_of(r);
-  const std::uint32_t capacity = static_cast<std::uint32_t>(r.pair_capacity);
+  const std::uint32_t capacity = pairs.capacity;
   const std::int64_t n = r.gaussians.count;
   // Places that stay unwritten: all ones is beyond every tile, also in the lowest bits by which it is sorted.
   cudaMemsetAsync(pairs.tiles, 0xff, sizeof(std::uint32_t) * capacity, stream);
-  launch(write_pairs_kernel, blocks_for(n, kBinThreads), kBinThreads, stream, n, grid, w, pairs, capacity);
+  launch(write_pairs_kernel, blocks_for(n, kBinThreads), kBinThreads, stream, n, grid, w, pairs);
   cudaError_t status = cudaSuccess;
   if (capacity > 0)
     status = sort_pairs(pairs.sorting, pairs.sorting_bytes, pairs.tiles, pairs.sorted_tiles, pairs.rows,
                         pairs.sorted_rows, capacity, bits_of(static_cast<std::uint32_t>(grid.tiles())), stream);
-  launch(tile_starts_kernel, blocks_for(r.pair_capacity + 1, kBinThreads), kBinThreads, stream, capacity,
-         pairs.sorted_tiles, grid.tiles(), pixels.tile_start);
+  launch(tile_starts_kernel, blocks_for(r.pair_capacity + 1, kBinThreads), kBinThreads, stream, w,
+         pairs, grid.tiles(), pixels.tile_start, RoomReport{r.overflowed, r.overflows});
   return status;
 }
 
@@ -135,7 +139,7 @@ void gather(const Rendering& r, const GradientRows& rows, const GaussianGradient
   const std::int64_t n = r.gaussians.count, all = blocks_for(n, kGatherThreads);
   const auto run = [&](auto kernel, const auto& finish) {
     launch(kernel, std::min<std::int64_t>(all, kGatherBlocks), kGatherThreads, stream, r.gaussians,
-           view_constants(r.view), rows, out.twist, finish);
+           view_constants(r.view), r.pose, rows, out.twist, finish);
   };
   const int channels = r.gaussians.render_features ? r.gaussians.feature_channels : 0;
   if (adam != nullptr) {
@@ -178,14 +182,20 @@ GGSLAM_EXPORT int ggslam_cuda_counter_create(int device, void** counter) {
   auto* c = new Counter;
   *counter = c;
   return on_device(device, [&] {
-    const cudaError_t status = cudaHostAlloc(reinterpret_cast<void**>(&c->totals), sizeof(Totals), cudaHostAllocDefault);
-    return status != cudaSuccess ? status : cudaEventCreateWithFlags(&c->ready, cudaEventDisableTiming);
+    const std::size_t bytes = kRecent * sizeof(Totals);
+    const cudaError_t status = cudaHostAlloc(reinterpret_cast<void**>(&c->totals), bytes, cudaHostAllocDefault);
+    if (status != cudaSuccess) return status;
+    std::memset(c->totals, 0, bytes);
+    return cudaEventCreateWithFlags(&c->ready, cudaEventDisableTiming);
   });
 }
 
 GGSLAM_EXPORT void ggslam_cuda_counter_destroy(void* counter) {
   auto* c = static_cast<Counter*>(counter);
-  if (c->ready != nullptr) cudaEventDestroy(c->ready);
+  if (c->ready != nullptr) {
+    cudaEventSynchronize(c->ready);  // nothing may be written to the totals any more
+    cudaEventDestroy(c->ready);
+  }
   if (c->totals != nullptr) cudaFreeHost(c->totals);
   delete c;
 }
@@ -214,9 +224,19 @@ GGSLAM_EXPORT int ggslam_cuda_project(const Rendering* r, void* counter) {
 GGSLAM_EXPORT int ggslam_cuda_wait(const void* counter, std::int64_t* totals) {
   const auto* c = static_cast<const Counter*>(counter);
   const cudaError_t status = cudaEventSynchronize(c->ready);
-  totals[0] = static_cast<std::int64_t>(c->totals->visible);
-  totals[1] = static_cast<std::int64_t>(c->totals->pairs);
+  const Totals& last = c->totals[(c->started + kRecent - 1) % kRecent];
+  totals[0] = static_cast<std::int64_t>(last.visible);
+  totals[1] = static_cast<std::int64_t>(last.pairs);
   return status;
+}
+
+// The largest number of pairs of the last kRecent projections. Does not wait: in the place of one that is still to come
+// stands the number of an older one. Each number is written as a whole.
+GGSLAM_EXPORT std::int64_t ggslam_cuda_recent_pairs(const void* counter) {
+  const volatile Totals* totals = static_cast<const Counter*>(counter)->totals;
+  std::uint64_t most = 0;
+  for (std::uint64_t i = 0; i < kRecent; ++i) most = std::max<std::uint64_t>(most, totals[i].pairs);
+  return static_cast<std::int64_t>(most);
 }
 
 // Lists pairs by tile and composites. May be called again for the same projection, with more room for pairs.
@@ -231,5 +251,7 @@ GGSLAM_EXPORT int ggslam_cuda_backward(const Rendering* r, const ImageGradients*
   return on_device(r->device, [&] { return differentiate_all(*r, *image_gradients, *gradients, adam, row_memory); });
 }
 
-// Size of the struct, so that a caller can check that its mirror of it is the same.
+// Sizes of structs, so that a caller can check that its mirrors of them are the same.
+GGSLAM_EXPORT int ggslam_cuda_rendering_size() { return static_cast<int>(sizeof(Rendering)); }
+
 GGSLAM_EXPORT int ggslam_cuda_adam_step_size() { return static_cast<int>(sizeof(AdamStep)); }

@@ -14,9 +14,10 @@ __global__ void __launch_bounds__(kBinThreads) gather_counts_kernel(std::int64_t
   if (i < count) w.counts_by_depth[i] = w.tile_counts[w.rows_by_depth[i]];
 }
 
-// Pairs that find no room are dropped: the host learns the true number and starts again with more room.
+// Pairs that find no room, those of the farthest Gaussians, are dropped: either the host waits for the true number and
+// starts again with more room, or the rendering cannot be differentiated (see load_pixel).
 __global__ void __launch_bounds__(kBinThreads)
-write_pairs_kernel(std::int64_t count, Grid grid, GaussianWorkspace w, PairWorkspace pairs, std::uint32_t capacity) {
+write_pairs_kernel(std::int64_t count, Grid grid, GaussianWorkspace w, PairWorkspace pairs) {
   const std::int64_t i = static_cast<std::int64_t>(blockIdx.x) * kBinThreads + threadIdx.x;
   std::uint32_t row = 0, number = 0, first = 0;
   Splat splat = {};
@@ -29,23 +30,33 @@ write_pairs_kernel(std::int64_t count, Grid grid, GaussianWorkspace w, PairWorks
     rectangle = w.rectangles[row];
   }
   visit_reached_tiles(splat, rectangle, grid.tiles_x, row, first, [&](unsigned of, unsigned place, int tile) {
-    if (place >= capacity) return;
+    if (place >= pairs.capacity) return;
     pairs.tiles[place] = static_cast<std::uint32_t>(tile);
     pairs.rows[place] = of;
   });
 }
 
+// Where it is told whether a rendering found room for its pairs; both null: nowhere.
+struct RoomReport {
+  std::int32_t* overflowed;  // [1]: 1 if it did not
+  std::int64_t* overflows;   // [1]: how many did not
+};
+
 // tile_start[t]: first pair of tile t or, if it has none, of the next tile that has. Places that no pair was written to
 // hold a tile number beyond the last tile. One thread more than there are pairs.
 __global__ void __launch_bounds__(kBinThreads)
-tile_starts_kernel(std::uint32_t capacity, const std::uint32_t* sorted_tiles, int tiles, std::uint32_t* tile_start) {
+tile_starts_kernel(GaussianWorkspace w, PairWorkspace pairs, int tiles, std::uint32_t* tile_start, RoomReport report) {
   const std::uint32_t i = blockIdx.x * static_cast<std::uint32_t>(kBinThreads) + threadIdx.x;
-  if (i > capacity) return;
+  if (i == 0 && report.overflowed != nullptr) {
+    *report.overflowed = out_of_room(w, pairs) ? 1 : 0;
+    *report.overflows += *report.overflowed;
+  }
+  if (i > pairs.capacity) return;
   const auto tile_of = [&](std::uint32_t place) {
-    const std::uint32_t tile = sorted_tiles[place];
+    const std::uint32_t tile = pairs.sorted_tiles[place];
     return tile < static_cast<std::uint32_t>(tiles) ? static_cast<int>(tile) : tiles;
   };
-  const int before = i == 0 ? -1 : tile_of(i - 1), here = i == capacity ? tiles : tile_of(i);
+  const int before = i == 0 ? -1 : tile_of(i - 1), here = i == pairs.capacity ? tiles : tile_of(i);
   for (int tile = before + 1; tile <= here; ++tile) tile_start[tile] = i;
 }
 

@@ -31,14 +31,16 @@ __device__ inline float value_or_zero(const float* plane, bool inside, std::int6
   return plane != nullptr && inside ? plane[index] : 0.0f;
 }
 
+// complete: no pairs were dropped. Otherwise no Gaussian counts as having contributed: without the pairs that found no
+// room gradients would be wrong, and so none are formed, no Gaussian is touched and the twist stays zero.
 template <int kFeatures>
 __device__ inline PixelState<kFeatures> load_pixel(const ImageGradients& in, const PixelWorkspace& w, const Grid& grid,
-                                                   const FeatureGroup& group, const Pixel& pixel) {
+                                                   const FeatureGroup& group, const Pixel& pixel, bool complete) {
   const std::int64_t plane = static_cast<std::int64_t>(grid.width) * grid.height;
   PixelState<kFeatures> p;
   p.x = static_cast<float>(pixel.x), p.y = static_cast<float>(pixel.y);
   p.transmittance = pixel.inside ? w.transmittance[pixel.index] : 0.0f;
-  p.last = pixel.inside ? w.last_entry[pixel.index] : -1;
+  p.last = pixel.inside && complete ? w.last_entry[pixel.index] : -1;
   const bool base = pixel.inside && group.first == 0;  // later groups add their features' part only
   p.red = value_or_zero(in.image, base, pixel.index);
   p.green = value_or_zero(in.image, base, plane + pixel.index);
@@ -125,7 +127,8 @@ differentiate_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussia
   GGSLAM_SHARED Batch<kBatch, kFeatures> batch;
   GGSLAM_SHARED WarpQueue<kFeatures> queues[kWarps];
   const int tile = static_cast<int>(blockIdx.x), lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  PixelState<kFeatures> pixel = load_pixel<kFeatures>(in, w, grid, group, pixel_of_thread(grid, tile));
+  PixelState<kFeatures> pixel = load_pixel<kFeatures>(in, w, grid, group, pixel_of_thread(grid, tile),
+                                                      !out_of_room(gaussians, pairs));
   WarpQueue<kFeatures>& queue = queues[warp];
   share_image_gradients(pixel, queue.pixel(lane));
   QueuedSplat mine = {};

@@ -29,7 +29,7 @@ struct View {
   std::int32_t width, height;
   float fx, fy, cx, cy, near_plane;
   float low_pass;          // pixels^2 added to both diagonal terms of the 2D covariance
-  float camera_world[12];  // first three rows of T_camera_world
+  float camera_world[12];  // first three rows of T_camera_world; see Rendering's pose
 };
 
 struct RenderTargets {  // planes [H, W]; features and median_depth may be null
@@ -51,10 +51,14 @@ struct GaussianGradients {  // gradient arrays may all be null; twist and touche
 struct Rendering {
   GaussianArrays gaussians;
   View view;
+  const float* pose;  // camera_world on the device, unchanged until all that was started is done; null: the view's own
   RenderTargets targets;
   void *gaussian_workspace, *pair_workspace, *pixel_workspace;
   std::int64_t pair_capacity;  // pairs of a Gaussian and a tile that pair_workspace has room for
   std::int64_t gaussian_sorting_bytes, pair_sorting_bytes;  // scratch for sorting, as set by ggslam_cuda_plan
+  // On the device, both null or neither: [1] 1 if this rendering ran out of room for pairs, else 0; [1] how many did.
+  std::int32_t* overflowed;
+  std::int64_t* overflows;
   void* stream;
   std::int32_t device;
 };

@@ -110,7 +110,9 @@ __device__ inline SplatGradients load_row(const GradientRows& in, std::int64_t r
 // twist is added to; it must be zero before.
 template <class Finish>
 __global__ void __launch_bounds__(kGatherThreads)
-gather_kernel(GaussianArrays arrays, ViewConstants c, GradientRows in, double* out_twist, Finish finish) {
+gather_kernel(GaussianArrays arrays, ViewConstants c, const float* pose, GradientRows in, double* out_twist,
+              Finish finish) {
+  read_pose(pose, c);
   const int lane = threadIdx.x % kWarp;
   const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * kGatherThreads;
   double twist = 0.0;  // lane k < 6: component k, of the warp

@@ -63,8 +63,9 @@ __device__ inline void add_totals(Totals* totals, bool visible, unsigned pairs) 
 // first_depth: bits of the near plane as a float. Keys are the bits of the depth above it, which are ordered like the
 // depth; Gaussians that are not visible get `hidden`, larger than any depth's key.
 __global__ void __launch_bounds__(kProjectThreads)
-project_kernel(GaussianArrays arrays, ViewConstants c, Grid grid, std::uint32_t first_depth, std::uint32_t hidden,
-               GaussianWorkspace w) {
+project_kernel(GaussianArrays arrays, ViewConstants c, const float* pose, Grid grid, std::uint32_t first_depth,
+               std::uint32_t hidden, GaussianWorkspace w) {
+  read_pose(pose, c);
   const std::int64_t row = static_cast<std::int64_t>(blockIdx.x) * kProjectThreads + threadIdx.x;
   Splat splat = {};
   TileRectangle rectangle = {};

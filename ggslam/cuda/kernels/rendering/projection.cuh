@@ -31,6 +31,15 @@ inline ViewConstants view_constants(const View& view) {
   return c;
 }
 
+// What a kernel does first: takes the pose from where Rendering's pose leads, if that is not null.
+__device__ inline void read_pose(const float* pose, ViewConstants& c) {
+  if (pose == nullptr) return;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) c.W[i][j] = pose[4 * i + j];
+    c.t[i] = pose[4 * i + 3];
+  }
+}
+
 struct RawGaussian {
   float mean[3], quaternion[4], log_scale[3], opacity_logit;
 };

@@ -42,7 +42,7 @@ inline int gradient_stride(const GaussianArrays& arrays) {
 }
 
 struct GaussianWorkspace {
-  Totals* totals;
+  Totals* totals;              // at the beginning of the block
   Splat* splats;               // [N]; those of Gaussians that are not visible are undefined
   TileRectangle* rectangles;   // [N], likewise
   std::uint32_t* tile_counts;  // [N], 0: not visible
@@ -57,6 +57,7 @@ struct PairWorkspace {
   std::uint32_t *tiles, *sorted_tiles;  // [pairs]
   std::uint32_t *rows, *sorted_rows;    // [pairs]
   std::uint8_t* contributed;            // [pairs]: warps of the tile to which the splat contributed, one bit each
+  std::uint32_t capacity;
   void* sorting;
   std::size_t bytes, sorting_bytes;
 };
@@ -67,6 +68,11 @@ struct PixelWorkspace {
   std::int32_t* last_entry;   // [H, W], number in the tile's list of the last contribution, -1 for none
   std::size_t bytes;
 };
+
+// Whether pairs found no room. Known once the projection is done.
+__device__ inline bool out_of_room(const GaussianWorkspace& gaussians, const PairWorkspace& pairs) {
+  return gaussians.totals->pairs > pairs.capacity;
+}
 
 inline GaussianWorkspace gaussian_workspace(void* block, std::int64_t n, std::size_t sorting_bytes) {
   Carver carver(block);
@@ -90,6 +96,7 @@ inline PairWorkspace pair_workspace(void* block, std::int64_t pairs, std::size_t
   for (std::uint32_t** part : {&w.tiles, &w.sorted_tiles, &w.rows, &w.sorted_rows})
     *part = carver.take<std::uint32_t>(pairs);
   w.contributed = carver.take<std::uint8_t>(pairs);
+  w.capacity = static_cast<std::uint32_t>(pairs);
   w.sorting = carver.take<char>(static_cast<std::int64_t>(sorting_bytes));
   w.sorting_bytes = sorting_bytes;
   w.bytes = carver.used();

@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses and exposures of the keyframes on an NVIDIA GPU, where they are optimised along with the map.
+
+An iteration reads them there and steps them there, so that the host never waits for a gradient. The arithmetic is that
+of `PoseAdam`, `ExposureAdam` and the sums of `Mapper.iterate`, in double precision.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.errors import RenderError
+from ggslam.mapping.losses import LossValues
+from ggslam.mapping.settings import ExposureSettings
+
+_RESULTS = torch.Size([len(LossValues.__dataclass_fields__) + 6])
+_TWIST, _FLAG = torch.Size([6]), torch.Size([1])
+_FIRST_ROOM = 64
+
+
+class _Moments(ctypes.Structure):
+    """Mirror of struct AdamMoments in cuda/kernels/mapping/keyframe_step.cuh, as the others here."""
+
+    _fields_ = [("first", ctypes.c_double * 6), ("second", ctypes.c_double * 6)]
+
+
+class _State(ctypes.Structure):
+    """Mirror of struct KeyframeState."""
+
+    _fields_ = [
+        ("pose", ctypes.c_double * 16), ("exposure", ctypes.c_double * 6),
+        ("pose_moments", _Moments), ("exposure_moments", _Moments),
+        ("pose_steps", ctypes.c_int64), ("exposure_steps", ctypes.c_int64),
+        ("pose_copy", ctypes.c_float * 12), ("exposure_copy", ctypes.c_float * 6),
+    ]  # fmt: skip
+
+
+class _StepJob(ctypes.Structure):
+    """Mirror of struct KeyframeStepJob."""
+
+    _fields_ = [
+        *[(name, ctypes.c_void_p) for name in ("state", "twist", "results", "skipped", "totals", "stream")],
+        *[(name, ctypes.c_double) for name in ("pose_rate", "exposure_rate", "exposure_regularization")],
+        ("step_exposure", ctypes.c_int32), ("device", ctypes.c_int32),
+    ]  # fmt: skip
+
+
+class _WriteJob(ctypes.Structure):
+    """Mirror of struct KeyframeWriteJob."""
+
+    _fields_ = [
+        ("state", ctypes.c_void_p), ("stream", ctypes.c_void_p),
+        ("pose", ctypes.c_double * 16), ("exposure", ctypes.c_double * 6),
+        ("is_new", ctypes.c_int32), ("device", ctypes.c_int32),
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class IterationSums:
+    """Of all iterations so far that were not skipped; see `LossValues`.
+
+    Attributes:
+        total, color, ssim, depth: sums of these terms.
+        last_psnr: of the last iteration, NaN before the first.
+        iterations: how many there were.
+    """
+
+    total: float
+    color: float
+    ssim: float
+    depth: float
+    last_psnr: float
+    iterations: int
+
+
+class KeyframeStates:
+    """A table on the device with one row for each keyframe. Work is only started, on torch's current stream, but for
+    the methods whose names begin with `read`. One instance serves one caller and one stream at a time.
+
+    Args:
+        device: CUDA device; None: the current one.
+        library: the compiled kernels; None: those of the device, compiled if need be.
+
+    Raises:
+        MissingDependency: no CUDA device, or the kernels cannot be compiled.
+        NativeCoreError: the compiled kernels do not fit this code.
+    """
+
+    def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
+        chosen = None if device is None else torch.device(device)
+        self.library = library or library_for_device(chosen)
+        self.device = self.library.whole_device(chosen)
+        mirrors = {"keyframe_state": _State, "keyframe_step_job": _StepJob, "keyframe_write_job": _WriteJob}
+        for name, mirror in mirrors.items():
+            self.library.check_size(name, mirror)
+        for name in ("keyframe_step", "keyframe_write"):
+            self.library.declare(name, [ctypes.c_void_p])
+        self._count = 0
+        self._use(self._new_table(_FIRST_ROOM))
+        self._totals = torch.zeros(6, dtype=torch.float64, device=self.device)
+        self._totals[4].fill_(torch.nan)
+        self._step_job = _StepJob(device=self.device.index or 0, totals=self._totals.data_ptr())
+        self._read_table: np.ndarray | None = None
+        self._read_sums: IterationSums | None = None
+
+    def __len__(self) -> int:
+        return self._count
+
+    # --- one keyframe ------------------------------------------------------------------------------------------------
+
+    def append(self, T_camera_world: np.ndarray, exposure: np.ndarray) -> int:
+        """Adds a keyframe, for which no step was made yet; returns its number. Views of other keyframes that were
+        handed out before must not be used any more: the table may have moved.
+
+        Args:
+            T_camera_world: [4, 4].
+            exposure: gain and offset per channel [3, 2].
+
+        Raises:
+            RenderError: another shape.
+        """
+        if self._count == len(self._table):
+            # Kernels that were started may still read the old table. torch gives its memory away again in the order
+            # of the stream, so they are done by then.
+            table = self._new_table(2 * self._count)
+            table[: self._count] = self._table
+            self._use(table)
+        self._write(self._count, T_camera_world, exposure)
+        self._count += 1
+        return self._count - 1
+
+    def pose(self, i: int) -> torch.Tensor:
+        """First three rows of keyframe i's T_camera_world, as the rasterizer takes them: a view, float32 [12], that
+        changes with its steps; valid until the next `append`."""
+        return self._poses[self._checked_index(i)]
+
+    def exposure(self, i: int) -> torch.Tensor:
+        """Keyframe i's exposure, as the image loss takes it: a view, float32 [3, 2], as `pose`."""
+        return self._exposures[self._checked_index(i)]
+
+    def step(
+        self,
+        i: int,
+        twist: torch.Tensor,
+        loss_results: torch.Tensor,
+        skipped: torch.Tensor | None = None,
+        pose_rate: float = 0.0,
+        exposure: ExposureSettings | None = None,
+    ) -> None:
+        """Pose and exposure of keyframe i follow their gradients, and the terms of the loss are added to the sums.
+
+        A gradient with a number that is not finite is passed over, that of the pose and that of the exposure each by
+        itself.
+
+        Args:
+            twist: d loss / d xi, float64 [6], see `CudaGradients`.
+            loss_results: `DeviceLossResult.results`, float64 [15].
+            skipped: int32 [1], such as the rasterizer's `last_overflowed`: where it is not 0, nothing changes, the
+                sums neither. None: it is 0.
+            pose_rate: size of the pose's step in metres and radians; 0: the pose stays.
+            exposure: rate and regularization of the exposure; None: it stays.
+
+        Raises:
+            IndexError: no such keyframe.
+            RenderError: a tensor of another type, shape or device.
+        """
+        job = self._step_job
+        job.state = self._address(i)
+        job.twist = self._checked("twist", twist, torch.float64, _TWIST)
+        job.results = self._checked("loss_results", loss_results, torch.float64, _RESULTS)
+        job.skipped = None if skipped is None else self._checked("skipped", skipped, torch.int32, _FLAG)
+        job.pose_rate, job.step_exposure = pose_rate, exposure is not None
+        if exposure is not None:
+            job.exposure_rate, job.exposure_regularization = exposure.rate, exposure.regularization
+        job.stream = self.library.stream(self.device)
+        self.library.call("keyframe_step", ctypes.byref(job))
+        self._read_table = self._read_sums = None
+
+    def write_pose(self, i: int, T_camera_world: np.ndarray) -> None:
+        """Sets keyframe i's pose [4, 4]; the moments of its steps stay.
+
+        Raises:
+            IndexError: no such keyframe.
+            RenderError: another shape.
+        """
+        self._write(self._checked_index(i), T_camera_world, None)
+
+    def write_poses(self, T_camera_world: np.ndarray) -> None:
+        """Sets the poses of all keyframes [K, 4, 4], as `write_pose`."""
+        if len(T_camera_world) != self._count:
+            raise RenderError(f"T_camera_world: expected {self._count} poses, found {len(T_camera_world)}")
+        for i, pose in enumerate(T_camera_world):
+            self.write_pose(i, pose)
+
+    # --- all of them, on the host ------------------------------------------------------------------------------------
+
+    def read_poses(self) -> np.ndarray:
+        """T_camera_world of all keyframes, float64 [K, 4, 4]. Waits for the device, unless nothing changed since."""
+        return self._read_doubles(_State.pose).reshape(self._count, 4, 4)
+
+    def read_exposures(self) -> np.ndarray:
+        """Exposures of all keyframes, float64 [K, 3, 2], as `read_poses`."""
+        return self._read_doubles(_State.exposure).reshape(self._count, 3, 2)
+
+    def read_sums(self) -> IterationSums:
+        """The sums so far. Waits for the device, unless nothing was added since."""
+        if self._read_sums is None:
+            total, color, ssim, depth, last_psnr, iterations = self._totals.tolist()
+            self._read_sums = IterationSums(total, color, ssim, depth, last_psnr, int(iterations))
+        return self._read_sums
+
+    # --- the table ---------------------------------------------------------------------------------------------------
+
+    def _new_table(self, rows: int) -> torch.Tensor:
+        return torch.empty(rows, ctypes.sizeof(_State), dtype=torch.uint8, device=self.device)
+
+    def _use(self, table: torch.Tensor) -> None:
+        self._table = table
+        for_rasterizer, for_loss = _State.pose_copy.offset // 4, _State.exposure_copy.offset // 4
+        numbers = table.view(torch.float32)
+        self._poses = numbers[:, for_rasterizer : for_rasterizer + 12]
+        self._exposures = numbers[:, for_loss : for_loss + 6].unflatten(1, (3, 2))
+
+    def _checked_index(self, i: int) -> int:
+        if not 0 <= i < self._count:
+            raise IndexError(f"keyframe {i} of {self._count}")
+        return i
+
+    def _address(self, i: int) -> int:
+        return self._table.data_ptr() + self._checked_index(i) * ctypes.sizeof(_State)
+
+    def _write(self, i: int, T_camera_world: np.ndarray, exposure: np.ndarray | None) -> None:
+        job = _WriteJob(stream=self.library.stream(self.device), device=self.device.index or 0)
+        job.state = self._table.data_ptr() + i * ctypes.sizeof(_State)
+        for name, array, shape in (("pose", T_camera_world, (4, 4)), ("exposure", exposure, (3, 2))):
+            if array is None:
+                continue
+            if np.shape(array) != shape:
+                raise RenderError(f"{name} of a keyframe: expected {list(shape)}, found {list(np.shape(array))}")
+            getattr(job, name)[:] = np.asarray(array, np.float64).ravel().tolist()
+        job.is_new = exposure is not None
+        self.library.call("keyframe_write", ctypes.byref(job))
+        self._read_table = None
+
+    def _read_doubles(self, field: ctypes._CField) -> np.ndarray:
+        if self._read_table is None:
+            self._read_table = self._table[: self._count].cpu().numpy().copy()
+        part = self._read_table[:, field.offset : field.offset + field.size]
+        return part.copy().view(np.float64)
+
+    def _checked(self, name: str, tensor: torch.Tensor, dtype: torch.dtype, shape: torch.Size) -> int:
+        if tensor.dtype != dtype or tensor.shape != shape or tensor.device != self.device:
+            expected, found = f"{dtype} {list(shape)} on {self.device}", f"{tensor.dtype} {list(tensor.shape)}"
+            raise RenderError(f"{name}: expected {expected}, found {found} on {tensor.device}")
+        if not tensor.is_contiguous():
+            raise RenderError(f"{name}: expected a contiguous tensor, found strides {tensor.stride()}")
+        return tensor.data_ptr()
