@@ -114,6 +114,6 @@ def test_nvcc_compiles_without_warnings_or_spills(tmp_path: Path, architecture: 
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     ours = [part for part in run.stderr.split("Compiling entry function")[1:] if "ggslam" in part.split("\n")[0]]
-    assert len(ours) >= 29
+    assert len(ours) >= 37
     for part in ours:
         assert " 0 bytes spill stores, 0 bytes spill loads" in part, part[:300]

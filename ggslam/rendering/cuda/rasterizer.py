@@ -33,6 +33,7 @@ from ggslam.rendering.arguments import (
 from ggslam.rendering.cuda.adam import AdamStep, adam_step
 from ggslam.rendering.cuda.contract import Rendering, declare_rasterizer
 from ggslam.rendering.cuda.finished import Counter, FinishedRendering, target_pointers
+from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.types import LOW_PASS, PARAMETERS, Gaussians, ParameterGradients, RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -176,6 +177,23 @@ class CudaRasterizer:
         """Of the last forward: `visible` Gaussians and `pairs` of a Gaussian and an image tile."""
         last = self._require_last()
         return {"visible": last.visible, "pairs": last.pairs}
+
+    def pixel_terms(self, pixels: torch.Tensor, capacity: int = 48, min_weight: float = 1e-3) -> CudaPixelTerms:
+        """Which Gaussians some pixels of the last `forward` are made of, with their weights.
+
+        Args:
+            pixels: int32 [P] on the rasterizer's device, row * width + column. One outside the image gets no terms:
+                to refuse it would mean to wait for the device.
+            capacity: contributions kept of each pixel, from the front.
+            min_weight: weaker contributions are left out.
+
+        Raises:
+            RenderError: nothing was rendered, pixels of another shape, type or device.
+        """
+        last = self._require_last()
+        if pixels.device != self.device:
+            raise RenderError(f"pixels: expected a tensor on {self.device}, found one on {pixels.device}")
+        return CudaPixelTerms.of_rendering(last.native, pixels, capacity, min_weight, self.library)
 
     # --- backward --------------------------------------------------------------------------------------------------
 
