@@ -55,7 +55,7 @@ GGSLAM_EXPORT int ggslam_cuda_class_adam(const ClassAdamJob* job) {
   return on_device(job->device, [&] {
     const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);
     launch(class_adam_kernel, blocks_for(job->size, kClassThreads), kClassThreads, stream, *job);
-    launch(count_step_kernel, 1, 1, stream, *job);
+    launch(count_step_kernel, 1, kWarp, stream, *job);
     return cudaSuccess;
   });
 }

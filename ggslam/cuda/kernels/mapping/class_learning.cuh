@@ -152,7 +152,7 @@ __global__ void __launch_bounds__(kClassThreads) class_adam_kernel(ClassAdamJob 
 }
 
 __global__ void count_step_kernel(ClassAdamJob job) {
-  if (*job.known > 0) *job.steps += 1;
+  if (threadIdx.x == 0 && *job.known > 0) *job.steps += 1;
 }
 
 }  // namespace ggslam::cuda
