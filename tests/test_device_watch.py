@@ -192,6 +192,19 @@ def test_device_memory_is_no_array_of_numpy(watch: DeviceWatch) -> None:
             convert(ramp(2))
 
 
+def test_operations_on_uint16_are_refused(watch: DeviceWatch) -> None:
+    depth = torch.full((4, 3), 7, dtype=torch.int16, device="cuda").view(torch.uint16)
+    row = torch.empty(3, dtype=torch.uint16, device="cuda").copy_(depth[2])
+    assert watch.read(row.view(torch.int16).to(torch.int32) & 0xFFFF).tolist() == [7, 7, 7]
+    assert depth.to("cuda", torch.float32).sum().item() == 84
+    for refused in (
+        lambda: depth + 1, lambda: depth[row.view(torch.int16).long() - 7], lambda: depth == 7, lambda: depth.sum(),
+        lambda: torch.zeros(3, dtype=torch.uint16, device="cuda"), lambda: depth.zero_(),
+    ):  # fmt: skip
+        with pytest.raises(NotImplementedError, match="uint16"):
+            refused()
+
+
 class Job(ctypes.Structure):
     _fields_ = [("values", ctypes.c_void_p), ("stream", ctypes.c_void_p)]
 

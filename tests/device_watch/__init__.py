@@ -15,7 +15,8 @@ run on the CPU, and kernels in their emulation. What is recorded:
     downloads  asynchronous copies to page-locked memory, which holds garbage until the host has waited for them
     calls      functions of the kernels' library
 
-What raises: `DeviceMixing` as said; whatever torch itself refuses for tensors on a device, such as `.numpy()`.
+What raises: `DeviceMixing` as said; NotImplementedError for operations on uint16 that torch may not have on a device;
+whatever torch itself refuses for tensors there, such as `.numpy()`.
 Not modelled: the order of streams, CUDA graphs, memory that is used again too early, autograd, operations that torch
 has for one of both only. Factories such as torch.zeros know the device only in the thread that entered the watch.
 """

@@ -21,6 +21,19 @@ TAKE_NUMBERS = {"fill", "fill_", "masked_fill", "masked_fill_"}
 """Operations, besides pointwise ones, that take a number of the host (a tensor of no dimensions) beside tensors of the
 device."""
 
+FEW_OPERATIONS = (torch.uint16, torch.uint32, torch.uint64)
+OF_ALL_TYPES = {
+    "_local_scalar_dense",
+    "_to_copy",
+    "clone",
+    "copy_",
+    "empty",
+    "empty_like",
+    "empty_strided",
+    "new_empty",
+}
+"""Operations, besides views, that torch surely has for `FEW_OPERATIONS` on CUDA devices."""
+
 INDEXING = {"index", "_unsafe_index", "index_put", "index_put_", "_index_put_impl_"}
 MASKS = (torch.bool, torch.uint8)
 
@@ -57,6 +70,17 @@ def host_indices(name: str, args: tuple[Any, ...]) -> list[torch.Tensor]:
     if len(args) > 2 and not isinstance(args[2], DeviceTensor) and not _fills_mask(name, args):
         moved.append(args[2])
     return moved
+
+
+def check_type(func: Any, tensors: list[torch.Tensor], device: torch.device | None, dtype: torch.dtype | None) -> None:
+    """Raises NotImplementedError for an operation on unsigned numbers that a CUDA device may not have."""
+    types = {tensor.dtype for tensor in tensors if isinstance(tensor, DeviceTensor)}
+    if device is not None and device.type == "cuda":
+        types.add(dtype)  # type: ignore[arg-type]
+    name, results = func.overloadpacket.__name__, func._schema.returns
+    view = any(result.alias_info is not None and not result.alias_info.is_write for result in results)
+    if types.intersection(FEW_OPERATIONS) and not view and name not in OF_ALL_TYPES:
+        raise NotImplementedError(f"{func}: torch may not have it for {types} on a CUDA device; take a view of int16")
 
 
 def check_mixing(func: Any, tensors: list[torch.Tensor], args: tuple[Any, ...]) -> None:

@@ -16,7 +16,7 @@ from torch.utils._pytree import tree_flatten, tree_map_only, tree_unflatten
 
 from device_watch.guard import register_guard
 from device_watch.records import DeviceMixing, Record, here
-from device_watch.rules import check_mixing, host_indices, waits
+from device_watch.rules import check_mixing, check_type, host_indices, waits
 from device_watch.stand_ins import DeviceGenerator, HostGenerator, replacements
 from device_watch.tensors import DEVICE, DeviceMemory, DeviceTensor, _watches
 from ggslam.cuda.library import CudaLibrary
@@ -158,6 +158,7 @@ class DeviceWatch:
         flat, spec = tree_flatten((args, kwargs))
         tensors = [value for value in flat if isinstance(value, torch.Tensor)]
         check_mixing(func, tensors, args)
+        check_type(func, tensors, kwargs.get("device"), kwargs.get("dtype"))
         for index in host_indices(name, args):
             self._record_upload(name, index, False)
         if waits(func, args):
