@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 import torch
+from device_watch import DeviceWatch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.mapping.class_table import FIRST_CLASSES, ClassTable
@@ -25,8 +26,10 @@ from ggslam.mapping.neighbours import kl_gradient
 from ggslam.mapping.pixel_pool import PixelPool, at_boundary, draw_pool
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
+from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.pixel_terms import PixelTerms
 from ggslam.rendering.types import RenderBuffers
+from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 
 HEIGHT, WIDTH = 16, 24
@@ -54,7 +57,8 @@ class View:
         random = np.random.default_rng(5)
         pixel = np.arange(HEIGHT * WIDTH)
         places = pixel * COUNT // len(pixel)  # neighbours share Gaussians
-        self.gaussians = ((places[:, None] + random.permuted(np.tile(np.arange(8), (len(pixel), 1)), axis=1)) % COUNT)[:, :6]
+        near = random.permuted(np.tile(np.arange(8), (len(pixel), 1)), axis=1)
+        self.gaussians = (places[:, None] + near[:, :6]) % COUNT
         self.weights = random.uniform(0.01, 0.16, (len(pixel), 6)).astype(np.float32)
         self.counts = random.integers(0, 7, len(pixel)).astype(np.int32)
 
@@ -82,9 +86,8 @@ class MaskedKeyframe:
     mask: np.ndarray | None
     device: torch.device
 
-    @property
-    def device_mask(self) -> torch.Tensor | None:
-        return None if self.mask is None else torch.from_numpy(self.mask).to(self.device)
+    def __post_init__(self) -> None:
+        self.device_mask = None if self.mask is None else torch.from_numpy(self.mask).to(self.device)
 
 
 def near(points: torch.Tensor, rows: torch.Tensor, k: int, library: CudaLibrary) -> torch.Tensor:
@@ -100,7 +103,7 @@ def make_map(device: torch.device | str, count: int = COUNT) -> GaussianMap:
 
 
 class Both:
-    """A learner on the CPU and one on the device, each with a map of the same Gaussians, which saw the same keyframe."""
+    """A learner on the CPU and one on the device, each with a map of the same Gaussians, given the same keyframe."""
 
     def __init__(self, library: CudaLibrary, mask: np.ndarray | None = None, **changes: object) -> None:
         self.settings = dataclasses.replace(IdentitySettings(every=1, pixels=64, neighbours=ALONE), **changes)  # type: ignore[arg-type]
@@ -468,3 +471,69 @@ def test_consecutive_parts_of_a_pool_are_used(cuda_library: CudaLibrary) -> None
     both.cuda._draw(1, mask)
     both.cuda.keep_pools([1])
     assert list(both.cuda._pools) == [1]
+
+
+# --- with a rasterizer ------------------------------------------------------------------------------------------------
+
+CAMERA = Camera(WIDTH, HEIGHT, 20.0, 20.0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)
+
+
+def wall(device: torch.device | str) -> GaussianMap:
+    """A Gaussian at every second pixel and row, 2 m away."""
+    u, v = np.meshgrid(np.arange(0.5, WIDTH, 2), np.arange(0.5, HEIGHT, 2))
+    z = np.full(u.size, 2.0)
+    means = np.stack([(u.reshape(-1) - CAMERA.cx) / 10, (v.reshape(-1) - CAMERA.cy) / 10, z], 1).astype(np.float32)
+    gaussians, count = GaussianMap(0, 16, torch.device(device)), len(means)
+    quaternions = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4)
+    parameters = [torch.from_numpy(means), quaternions, torch.full((count, 3), -2.3), torch.full((count,), 3.0)]
+    gaussians.insert(*(parameter.to(device) for parameter in parameters), torch.zeros(count, 3, device=device))
+    return gaussians
+
+
+def test_objects_are_learned(cuda_library: CudaLibrary) -> None:
+    device = cuda_library.whole_device(None)
+    settings = IdentitySettings(every=1, pixels=128, neighbours=NeighbourSettings(samples=40))
+    learner = CudaIdentityLearner(settings, 0, device, cuda_library, near)
+    gaussians, rasterizer = wall(device), CudaRasterizer(device, library=cuda_library)
+    keyframe = MaskedKeyframe(0, picture(), device)
+    learner.observe(picture())
+    unknown = torch.zeros(len(gaussians), dtype=torch.int32, device=device)
+    learner.begin(gaussians, slice(0, len(gaussians)), unknown)
+    view = rasterizer.forward(gaussians, CAMERA, np.eye(4), features=False)
+    for _ in range(25):
+        assert learner.due(keyframe)
+        learner.step(gaussians, rasterizer, keyframe, view)
+    learner.label(gaussians)
+    expected = picture()[::2, ::2].reshape(-1)
+    assert (gaussians.object_id.cpu().numpy() == expected).mean() > 0.8  # some stand at a boundary
+    shown = rasterizer.forward(gaussians, CAMERA, np.eye(4)).features
+    assert shown is not None
+    ids, _ = learner.classifier.labels(shown.cpu().numpy().transpose(1, 2, 0))
+    assert (ids == picture())[picture() > 0].mean() > 0.9
+    assert learner.last_loss < 0.7
+
+
+@pytest.mark.parametrize("schedule", ["sampled", "dense", "votes"])
+def test_a_step_waits_for_nothing(schedule: str) -> None:
+    with DeviceWatch() as watch:
+        pull = NeighbourSettings(samples=20, every=2)
+        settings = IdentitySettings(schedule=schedule, every=1, pixels=64, neighbours=pull)  # type: ignore[arg-type]
+        learner = CudaIdentityLearner(settings, library=watch.library, neighbours=near)
+        gaussians, rasterizer = wall("cuda"), CudaRasterizer(library=watch.library)
+        keyframe = MaskedKeyframe(0, picture(), learner.device)
+        learner.observe(picture())
+        learner.begin(gaussians, slice(0, len(gaussians)), torch.ones(len(gaussians), dtype=torch.int32, device="cuda"))
+        view = rasterizer.forward(gaussians, CAMERA, np.eye(4), features=schedule == "dense")
+        learner.split(gaussians, rasterizer, picture(), 1, 300)
+        watch.forget()
+        for _ in range(4):
+            assert learner.due(keyframe)
+            learner.step(gaussians, rasterizer, keyframe, view)
+        assert watch.waits == [] and watch.uploads == [] and watch.downloads == []
+        names = {call.operation for call in watch.calls}
+        assert "draw_pixels" in names and ("cross_entropy" in names) == (schedule != "votes")
+        assert np.isfinite(learner.last_loss) == (schedule != "votes") and bool(watch.waits) == (schedule != "votes")
+        learner.merge(gaussians, 1, 2)
+        learner.forget(gaussians, [300])
+        learner.label(gaussians)
+        assert set(watch.read(gaussians.object_id).tolist()) == {1}
