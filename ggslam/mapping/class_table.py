@@ -14,6 +14,58 @@ ROW_LENGTH = 4.0
 CODE_LENGTH = 2.0
 
 
+class ClassNumbers:
+    """Which class each object id has: numbers from 0 on, without gaps."""
+
+    def __init__(self) -> None:
+        self._ids = np.zeros(FIRST_CLASSES, np.uint16)
+        self._class_of = np.full(65536, -1, np.int32)
+        self.count = 0
+
+    @property
+    def ids(self) -> np.ndarray:
+        """Object id of each class, uint16 [count]; a view."""
+        return self._ids[: self.count]
+
+    @property
+    def table(self) -> np.ndarray:
+        """Class number of every object id, int32 [65536], -1 where there is none; a view."""
+        return self._class_of
+
+    def of(self, object_ids: np.ndarray) -> np.ndarray:
+        """Class number of each object id, int32 of the same shape; -1 where there is none."""
+        return self._class_of[object_ids]
+
+    def add(self, object_ids: np.ndarray) -> slice:
+        """Gives the next numbers to those ids (uint16, distinct) that are not 0 and have none yet; returns them."""
+        new = object_ids[(object_ids != 0) & (self._class_of[object_ids] < 0)]
+        numbers = slice(self.count, self.count + len(new))
+        if numbers.stop > len(self._ids):
+            self._ids = np.pad(self._ids, (0, max(numbers.stop, 2 * len(self._ids)) - len(self._ids)))
+        self._ids[numbers], self._class_of[new] = new, np.arange(numbers.start, numbers.stop)
+        self.count = numbers.stop
+        return numbers
+
+    def remove(self, object_id: int) -> int | None:
+        """Takes an id's number away, which the class with the last number gets; returns the number, None if the id has
+        none."""
+        number, last = int(self._class_of[object_id]), self.count - 1
+        if number < 0:
+            return None
+        self._class_of[self._ids[last]] = number
+        self._class_of[object_id] = -1
+        self._ids[number], self._ids[last] = self._ids[last], 0
+        self.count = last
+        return number
+
+
+def new_rows(rng: np.random.Generator, count: int, channels: int) -> np.ndarray:
+    """Weights of new classes, float32 [count, channels]: directions drawn evenly."""
+    directions = rng.normal(size=(count, channels)).astype(np.float32)
+    directions *= ROW_LENGTH / np.linalg.norm(directions, axis=1, keepdims=True)
+    return directions
+
+
 class ClassTable:
     """A growing linear classifier with its optimizer.
 
@@ -26,59 +78,54 @@ class ClassTable:
         self._rng, self._channels = rng, channels
         self._rows = np.zeros((FIRST_CLASSES, channels + 1), np.float32)  # weights, then the bias
         self._moments = np.zeros((2, FIRST_CLASSES, channels + 1), np.float32)
-        self._ids = np.zeros(FIRST_CLASSES, np.uint16)
-        self._class_of = np.full(65536, -1, np.int32)
+        self._numbers = ClassNumbers()
         self._steps = 0
-        self.count = 0
+
+    @property
+    def count(self) -> int:
+        """Number of classes."""
+        return self._numbers.count
 
     @property
     def classifier(self) -> IdentityClassifier:
         """Views of the classes there are."""
         n = self.count
-        return IdentityClassifier(self._ids[:n], self._rows[:n, :-1], self._rows[:n, -1])
+        return IdentityClassifier(self._numbers.ids, self._rows[:n, :-1], self._rows[:n, -1])
 
     def classes(self, object_ids: np.ndarray) -> np.ndarray:
         """Class number of each object id, int32 of the same shape; -1 where there is none."""
-        return self._class_of[object_ids]
+        return self._numbers.of(object_ids)
 
     def add(self, object_ids: np.ndarray) -> None:
         """Makes a class of each id (uint16, distinct) that is not 0 and has none yet."""
-        new = object_ids[(object_ids != 0) & (self._class_of[object_ids] < 0)]
-        needed = self.count + len(new)
-        if needed > len(self._rows):
-            extra = max(needed, 2 * len(self._rows)) - len(self._rows)
+        new = self._numbers.add(object_ids)
+        if new.stop > len(self._rows):
+            extra = max(new.stop, 2 * len(self._rows)) - len(self._rows)
             self._rows = np.pad(self._rows, ((0, extra), (0, 0)))
             self._moments = np.pad(self._moments, ((0, 0), (0, extra), (0, 0)))
-            self._ids = np.pad(self._ids, (0, extra))
-        directions = self._rng.normal(size=(len(new), self._channels)).astype(np.float32)
-        directions *= ROW_LENGTH / np.linalg.norm(directions, axis=1, keepdims=True)
-        rows = slice(self.count, needed)
-        self._rows[rows, :-1], self._rows[rows, -1], self._ids[rows] = directions, 0, new
-        self._class_of[new] = np.arange(self.count, needed)
-        self.count = needed
+        self._rows[new, :-1] = new_rows(self._rng, new.stop - new.start, self._channels)
+        self._rows[new, -1] = 0
 
     def resume(self, classifier: IdentityClassifier) -> None:
         """Takes over the classes of a classifier, with fresh moments."""
         self.add(classifier.class_ids)
-        number = self._class_of[classifier.class_ids]
+        number = self._numbers.of(classifier.class_ids)
         self._rows[number, :-1], self._rows[number, -1] = classifier.weight, classifier.bias
 
     def remove(self, object_id: int) -> None:
         """Forgets a class; the last one takes its place."""
-        number, last = int(self._class_of[object_id]), self.count - 1
-        if number < 0:
+        number = self._numbers.remove(object_id)
+        if number is None:
             return
-        self._class_of[self._ids[last]] = number
-        self._class_of[object_id] = -1
-        for array in (self._rows, self._ids, self._moments[0], self._moments[1]):
+        last = self.count
+        for array in (self._rows, self._moments[0], self._moments[1]):
             array[number] = array[last]
             array[last] = 0
-        self.count = last
 
     def codes(self, object_ids: np.ndarray) -> np.ndarray:
         """Identity vectors that the classifier takes for these objects, float32 [M, F]; zeros for those without a
         class."""
-        number = self._class_of[object_ids]
+        number = self._numbers.of(object_ids)
         weights = self._rows[: self.count, :-1]
         codes = CODE_LENGTH * weights / np.maximum(np.linalg.norm(weights, axis=1, keepdims=True), 1e-12)
         return np.concatenate([codes, np.zeros((1, self._channels), np.float32)])[number]

@@ -15,14 +15,13 @@ nearest neighbours. Otherwise than there
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from ggslam.mapping.class_table import ClassTable
-from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.mapping.identity_objects import BIRTH_VOTE, MIN_WEIGHT, POOL_STEPS, TERMS, IdentityObjects
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.neighbours import NeighbourIndex, kl_gradient
 from ggslam.mapping.pixel_pool import PixelPool, draw_pool
@@ -36,25 +35,10 @@ from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClas
 SH_C0 = 0.28209479177387814
 MANY_CLASSES = 128
 """Beyond so many classes a step's softmax runs over those in its sample and this many others, drawn at random."""
-POOL_STEPS = 8
-"""Steps' worth of pixels that are drawn from a keyframe at once."""
-TERMS, MIN_WEIGHT = 32, 5e-3
-"""Contributions to a pixel that training looks at: at most so many, none lighter."""
-BIRTH_VOTE = 0.1
-"""Weight of the vote that a Gaussian gets for the pixel it is born from."""
 
 
 @dataclass
-class IdentityTimes:
-    """Seconds spent so far."""
-
-    steps: float = 0.0
-    labelling: float = 0.0
-    count: int = 0
-
-
-@dataclass
-class IdentityLearner:
+class IdentityLearner(IdentityObjects):
     """Trains identity vectors and classifier, counts votes.
 
     Args:
@@ -62,76 +46,30 @@ class IdentityLearner:
         seed: of sampling.
     """
 
-    settings: IdentitySettings
-    seed: int = 0
-    times: IdentityTimes = field(default_factory=IdentityTimes)
     last_loss: float = float("nan")
     """Cross-entropy of the last step."""
 
     def __post_init__(self) -> None:
-        self._rng = np.random.default_rng([self.seed, 16])
-        self.table = ClassTable(self._rng)
-        self._alias = np.arange(65536, dtype=np.uint16)
-        self._whole_of = np.zeros(65536, np.uint16)
+        super().__post_init__()
+        self.table: ClassTable = ClassTable(self._rng)
+        self._pools: dict[int, PixelPool] = {}
         self._shown: np.ndarray | None = None  # labels by votes, of the last keyframe's time
         self._shown_order = -1
-        self._pools: dict[int, PixelPool] = {}
         self._index = NeighbourIndex(self.settings.neighbours.growth)
-        self._iterations = 0
-
-    @property
-    def classifier(self) -> IdentityClassifier:
-        """As trained so far."""
-        return self.table.classifier
-
-    def resume(self, classifier: IdentityClassifier) -> None:
-        """Goes on with the classes of a map made before, whose Gaussians bring their vectors and votes."""
-        self.table.resume(classifier)
-
-    # --- a map that is partly on disk ---------------------------------------------------------------------------------
-
-    def catch_up(self, gaussians: GaussianMap) -> None:
-        """The votes of Gaussians that were on disk follow the merges and removals of objects since; their identity
-        vectors are left to further steps."""
-        if (self._alias != np.arange(65536)).any():
-            merge_votes(gaussians, self._alias)
-
-    def catch_up_and_label(self, gaussians: GaussianMap) -> None:
-        """The end for a part of the map that was on disk, see `label`."""
-        self.catch_up(gaussians)
-        self.label(gaussians)
-
-    def keep_pools(self, keyframes: Iterable[int]) -> None:
-        """Forgets the pixels that were drawn ahead from any but these keyframes."""
-        self._pools = {number: self._pools[number] for number in keyframes if number in self._pools}
 
     # --- objects ------------------------------------------------------------------------------------------------------
 
-    def current(self, ids: np.ndarray) -> np.ndarray:
-        """Object ids with those replaced that were merged into others."""
-        return self._alias[ids]
-
-    def observe(self, mask: np.ndarray) -> None:
-        """A keyframe with this mask (uint16 [H, W]) arrives: its objects get classes."""
+    def _labels_changed(self) -> None:
         self._shown = None
-        self.table.add(np.flatnonzero(np.bincount(self.current(mask).reshape(-1), minlength=1)).astype(np.uint16))
 
-    def merge(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
-        """Two objects turned out to be one: masks, votes and classes of `dropped` become those of `kept`."""
-        kept = int(self._alias[kept])
-        if kept == dropped:
-            return
-        self._alias[self._alias == dropped] = kept
-        self._whole_of[dropped] = 0
-        self._shown = None
+    def _merge_votes(self, gaussians: GaussianMap) -> None:
         merge_votes(gaussians, self._alias)
-        self.table.add(np.array([kept], np.uint16))
-        was = self.table.classes(np.array([dropped]))[0] >= 0
-        if was:
-            labels = vote_labels(gaussians)
-            wrong = self.table.classifier.labels(gaussians.features.numpy())[0] == dropped
-            self.table.remove(dropped)
-            gaussians.features.numpy()[wrong] = self.table.codes(np.where(labels[wrong] > 0, labels[wrong], kept))
+
+    def _dissolve(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
+        labels = vote_labels(gaussians)
+        wrong = self.table.classifier.labels(gaussians.features.numpy())[0] == dropped
+        self.table.remove(dropped)
+        gaussians.features.numpy()[wrong] = self.table.codes(np.where(labels[wrong] > 0, labels[wrong], kept))
 
     def split(
         self, gaussians: GaussianMap, rasterizer: CpuRasterizer, mask: np.ndarray, whole: int, part: int
@@ -140,9 +78,8 @@ class IdentityLearner:
         it there than elsewhere, now votes for the part as it did for the whole. In older keyframes the map decides
         from now on which pixels of the whole are the part's (`_as_mapped`)."""
         whole, part = int(self._alias[whole]), int(self._alias[part])
-        if whole == part:
+        if not self._split_off(whole, part):
             return
-        self._whole_of[part] = whole
         terms = rasterizer.pixel_terms(np.arange(mask.size))
         inside = self.current(mask.reshape(-1)) == part
         used = np.arange(terms.weights.shape[1]) < terms.counts[:, None]
@@ -154,7 +91,6 @@ class IdentityLearner:
         ids = gaussians.vote_ids.numpy()
         ids[rows] = np.where(ids[rows] == whole, part, ids[rows])
         merge_votes(gaussians, self._alias)
-        self._shown = None
         if self.settings.initialisation == "votes" and len(rows):
             gaussians.features.numpy()[rows] = self.table.codes(vote_labels(gaussians)[rows])
 
@@ -187,9 +123,7 @@ class IdentityLearner:
 
     def due(self, keyframe: Keyframe) -> bool:
         """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
-        self._iterations += 1
-        has = keyframe.mask is not None and self.table.count > 0
-        return has and self._iterations % self.settings.every == 0
+        return self._count_iteration(keyframe.mask is not None)
 
     def step(
         self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: Keyframe, view: RenderBuffers,
@@ -287,15 +221,6 @@ class IdentityLearner:
         part = slice(pool.used, pool.used + self.settings.pixels)
         pool.used = part.stop
         return pool.pixels[part], pool.vote_weights[part]
-
-    def forget(self, gaussians: GaussianMap, object_ids: list[int]) -> None:
-        """Objects that were none: their class goes, their Gaussians become what else they look like."""
-        for object_id in object_ids:
-            self.table.remove(object_id)
-            self._alias[self._alias == object_id] = 0
-        self._whole_of[object_ids] = 0
-        self._shown = None
-        merge_votes(gaussians, self._alias)
 
     # --- results ------------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The classifier while it is trained on an NVIDIA GPU: `ggslam.mapping.class_table` with its rows on the device.
+
+Which id has which class is known on the host as well: ids appear and go with keyframes, not with steps.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ggslam.mapping.class_table import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
+from ggslam.mapping.cuda.class_learning import ClassKernels
+from ggslam.mapping.identity_objects import IDS
+from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
+
+_LOGITS_AT_ONCE = 2**24
+"""Of many vectors so many logits are in memory at a time."""
+
+
+class CudaClassTable:
+    """A growing linear classifier with its optimizer.
+
+    Args:
+        rng: draws the rows of new classes, as for `ClassTable`.
+        kernels: of the device.
+        channels: length of an identity vector.
+    """
+
+    def __init__(
+        self, rng: np.random.Generator, kernels: ClassKernels, channels: int = IDENTITY_CHANNELS
+    ) -> None:
+        self._rng, self._kernels, self._channels, self._device = rng, kernels, channels, kernels.device
+        self._numbers = ClassNumbers()
+        self._rows = self._zeros(FIRST_CLASSES)  # weights, then the bias
+        self._moments = (self._zeros(FIRST_CLASSES), self._zeros(FIRST_CLASSES))
+        self._steps = torch.zeros(1, dtype=torch.int32, device=self._device)
+        self.ids = torch.zeros(0, dtype=torch.int32, device=self._device)
+        """Object id of each class, int32 [count]."""
+        self.class_of = torch.full((IDS,), -1, dtype=torch.int32, device=self._device)
+        """Class number of every object id, int32 [65536], -1 where there is none."""
+
+    @property
+    def count(self) -> int:
+        """Number of classes."""
+        return self._numbers.count
+
+    @property
+    def rows(self) -> torch.Tensor:
+        """Weights, then the bias, of each class, float32 [count, F + 1]; a view."""
+        return self._rows[: self.count]
+
+    @property
+    def weight(self) -> torch.Tensor:
+        """float32 [count, F]; a view."""
+        return self.rows[:, :-1]
+
+    @property
+    def classifier(self) -> IdentityClassifier:
+        """A copy on the host. Waits for the device."""
+        rows = self.rows.to("cpu", copy=True).numpy()
+        return IdentityClassifier(self._numbers.ids.copy(), rows[:, :-1], rows[:, -1])
+
+    def classes(self, object_ids: np.ndarray) -> np.ndarray:
+        """Class number of each object id, int32 of the same shape; -1 where there is none."""
+        return self._numbers.of(object_ids)
+
+    # --- ids that appear and go ---------------------------------------------------------------------------------------
+
+    def add(self, object_ids: np.ndarray) -> None:
+        """Makes a class of each id (uint16, distinct) that is not 0 and has none yet. May wait for the device if there
+        are such."""
+        new = self._numbers.add(object_ids)
+        if new.stop > len(self._rows):
+            extra = max(new.stop, 2 * len(self._rows)) - len(self._rows)
+            self._rows = torch.cat([self._rows, self._zeros(extra)])
+            self._moments = (
+                torch.cat([self._moments[0], self._zeros(extra)]), torch.cat([self._moments[1], self._zeros(extra)])
+            )  # fmt: skip
+        weights = new_rows(self._rng, new.stop - new.start, self._channels)
+        if len(weights):
+            self._rows[new] = torch.from_numpy(np.pad(weights, ((0, 0), (0, 1)))).to(self._device)
+            self._tell_numbers()
+
+    def resume(self, classifier: IdentityClassifier) -> None:
+        """Takes over the classes of a classifier, with fresh moments."""
+        self.add(classifier.class_ids)
+        rows = self.rows.to("cpu", copy=True).numpy()
+        number = self._numbers.of(classifier.class_ids)
+        rows[number, :-1], rows[number, -1] = classifier.weight, classifier.bias
+        self.rows.copy_(torch.from_numpy(rows))
+
+    def remove(self, object_id: int) -> None:
+        """Forgets a class; the last one takes its place."""
+        number = self._numbers.remove(object_id)
+        if number is None:
+            return
+        for array in (self._rows, *self._moments):
+            array[number] = array[self.count]
+            array[self.count] = 0
+        self._tell_numbers()
+
+    def _tell_numbers(self) -> None:
+        self.ids = torch.from_numpy(self._numbers.ids.astype(np.int32)).to(self._device)
+        self.class_of.copy_(torch.from_numpy(self._numbers.table))
+
+    # --- vectors ------------------------------------------------------------------------------------------------------
+
+    def codes(self, object_ids: torch.Tensor) -> torch.Tensor:
+        """Identity vectors that the classifier takes for these objects (int32 [M] on the device), float32 [M, F]; zeros
+        for those without a class."""
+        codes = CODE_LENGTH * self.weight / torch.linalg.vector_norm(self.weight, dim=1, keepdim=True).clamp_min(1e-12)
+        padded = torch.cat([torch.zeros(1, self._channels, device=self._device), codes])
+        return padded[self.class_of[object_ids.long()].long() + 1]
+
+    def logits(self, features: torch.Tensor) -> torch.Tensor:
+        """float32 [M, C] of identity vectors [M, F]."""
+        return torch.addmm(self.rows[:, -1], features, self.weight.T)
+
+    def labels(self, features: torch.Tensor, min_confidence: float = 0.0) -> torch.Tensor:
+        """Most probable object of each identity vector [N, F], int32 [N]; 0 where nothing is more probable than every
+        object, and below `min_confidence`."""
+        out = torch.zeros(len(features), dtype=torch.int32, device=self._device)
+        part = max(1, _LOGITS_AT_ONCE // max(1, self.count))
+        for begin in range(0, len(features) if self.count else 0, part):
+            logits = self.logits(features[begin : begin + part])
+            highest, best = logits.max(1)
+            probability = 1 / ((logits - highest[:, None]).exp().sum(1) + (NOTHING_LOGIT - highest).exp())
+            something = (highest > NOTHING_LOGIT) & (probability >= min_confidence)
+            out[begin : begin + part] = torch.where(something, self.ids[best], 0)
+        return out
+
+    # --- training -----------------------------------------------------------------------------------------------------
+
+    def cross_entropy(
+        self, features: torch.Tensor, targets: torch.Tensor, known: torch.Tensor, losses: torch.Tensor, weight: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Softmax cross-entropy over all classes, see `ClassKernels.cross_entropy`.
+
+        Args:
+            features: float32 [P, F].
+
+        Returns:
+            The gradients of the weighted loss by the features [P, F] and by the rows [C, F + 1].
+        """
+        ones = torch.ones(len(features), 1, device=self._device)
+        extended = torch.cat([features, ones], 1)
+        logits = torch.mm(extended, self.rows.T)
+        self._kernels.cross_entropy(logits, targets, known, losses, weight)
+        return torch.mm(logits, self.weight), torch.mm(logits.T, extended)
+
+    def step(self, gradients: torch.Tensor, known: torch.Tensor, rate: float) -> None:
+        """Adam on all rows with gradients [C, F + 1]; none if `known` (int32 [1]) is 0."""
+        self._kernels.adam(self.rows, self._moments, gradients, known, self._steps, rate)
+
+    def _zeros(self, classes: int) -> torch.Tensor:
+        return torch.zeros(classes, self._channels + 1, device=self._device)

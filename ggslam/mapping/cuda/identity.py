@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identity learning on an NVIDIA GPU: `ggslam.mapping.identity` with map, masks, samples, classifier and votes on the
+device.
+
+A step is only started, on torch's current stream: nothing in it waits for the device. What comes with keyframes (new
+ids, merges, splits, removals) and the results may wait. Otherwise than on the CPU the softmax always runs over all
+classes, and neighbours are those of the map as it is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.mapping.cuda.class_learning import ClassKernels
+from ggslam.mapping.cuda.class_table import CudaClassTable
+from ggslam.mapping.cuda.pixel_pool import DevicePixelPool, PixelDrawer
+from ggslam.mapping.cuda.votes import merge_votes, vote_labels, vote_shares
+from ggslam.mapping.identity_objects import BIRTH_VOTE, IDS, MIN_WEIGHT, POOL_STEPS, TERMS, IdentityObjects
+from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
+from ggslam.rendering.cuda.rasterizer import CudaRasterizer
+from ggslam.rendering.pixel_terms import FeatureAdamSettings
+from ggslam.rendering.types import RenderBuffers
+from ggslam.scene.gaussian_map import SH_C0, GaussianMap
+from ggslam.scene.identity import IDENTITY_CHANNELS
+
+Neighbours = Callable[[torch.Tensor, torch.Tensor, int, CudaLibrary], torch.Tensor]
+"""Of points (float32 [N, 3]), rows (int64 [M]) and k: the k nearest other points of each of the rows, int64 [M, k]."""
+LOGITS_AT_ONCE = 2**24
+"""The dense schedule takes as many pixels at a time as make so many logits; the 3-D loss no more than a tenth of it."""
+SPLIT_PIXELS, SPLIT_TERMS, SPLIT_MIN_WEIGHT = 32768, 48, 1e-3
+"""A split looks at so many pixels at a time, with so many contributions to each, none lighter."""
+
+
+class MaskedKeyframe(Protocol):
+    """What is asked of a keyframe: its number, and its mask, uint16 [H, W] on the device, or None."""
+
+    @property
+    def index(self) -> int: ...
+
+    @property
+    def device_mask(self) -> torch.Tensor | None: ...
+
+
+class CudaIdentityLearner(IdentityObjects):
+    """Trains identity vectors and classifier, counts votes.
+
+    Args:
+        settings: see there.
+        seed: of sampling. On one device all draws repeat with the same seed.
+        device: CUDA device of the map; None: the current one.
+        library: the compiled kernels; None: those of the device, compiled if need be.
+        neighbours: finds nearest Gaussians without a wait; None: `device_neighbours`.
+
+    Raises:
+        MissingDependency: no CUDA device, or the kernels cannot be compiled.
+        NativeCoreError: the compiled kernels do not fit this code.
+    """
+
+    def __init__(
+        self,
+        settings: IdentitySettings,
+        seed: int = 0,
+        device: torch.device | str | None = None,
+        library: CudaLibrary | None = None,
+        neighbours: Neighbours | None = None,
+    ) -> None:
+        super().__init__(settings, seed)
+        chosen = None if device is None else torch.device(device)
+        self.library = library or library_for_device(chosen)
+        self.device = self.library.whole_device(chosen)
+        self._kernels = ClassKernels(self.device, self.library)
+        self.table: CudaClassTable = CudaClassTable(self._rng, self._kernels)
+        drawn_from = int(np.random.default_rng([seed, 17]).integers(2**62))
+        self._drawer = PixelDrawer(self.device, self.library, drawn_from)
+        self._neighbours = neighbours or _device_neighbours()
+        self._pools: dict[int, DevicePixelPool] = {}
+        self._shown: torch.Tensor | None = None  # labels by votes, of the last keyframe's time
+        self._shown_order = -1
+        self._has_parts = False
+        self._device_alias = torch.arange(IDS, dtype=torch.int32, device=self.device)
+        self._device_whole_of = torch.zeros(IDS, dtype=torch.int32, device=self.device)
+        self._last: tuple[torch.Tensor, torch.Tensor] | None = None  # losses of the last step's pixels, their number
+
+    @property
+    def last_loss(self) -> float:
+        """Cross-entropy of the last step, NaN if there was none. Waits for the device."""
+        if self._last is None:
+            return float("nan")
+        losses, known = self._last
+        return float(losses.double().sum() / known)
+
+    # --- objects ------------------------------------------------------------------------------------------------------
+
+    def _labels_changed(self) -> None:
+        self._shown = None
+
+    def _ids_changed(self) -> None:
+        super()._ids_changed()
+        self._has_parts = bool(self._whole_of.any())
+        self._device_alias.copy_(torch.from_numpy(self._alias.astype(np.int32)))
+        self._device_whole_of.copy_(torch.from_numpy(self._whole_of.astype(np.int32)))
+
+    def _merge_votes(self, gaussians: GaussianMap) -> None:
+        merge_votes(gaussians, self._device_alias)
+
+    def _dissolve(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
+        labels = vote_labels(gaussians)
+        wrong = self.table.labels(gaussians.features) == dropped
+        self.table.remove(dropped)
+        codes = self.table.codes(torch.where(labels > 0, labels, kept))
+        gaussians.features.copy_(torch.where(wrong[:, None], codes, gaussians.features))
+
+    def split(
+        self, gaussians: GaussianMap, rasterizer: CudaRasterizer, mask: np.ndarray, whole: int, part: int
+    ) -> None:
+        """An object turned out to be two, see `IdentityLearner.split`; `mask` (uint16 [H, W]) is on the host."""
+        whole, part = int(self._alias[whole]), int(self._alias[part])
+        if not self._split_off(whole, part):
+            return
+        inside = torch.from_numpy((self.current(mask.reshape(-1)) == part).astype(np.float32)).to(self.device)
+        here, everywhere = (torch.zeros(len(gaussians), device=self.device) for _ in range(2))
+        for begin in range(0, mask.size, SPLIT_PIXELS):
+            pixels = torch.arange(begin, min(begin + SPLIT_PIXELS, mask.size), dtype=torch.int32, device=self.device)
+            terms = rasterizer.pixel_terms(pixels, SPLIT_TERMS, SPLIT_MIN_WEIGHT)
+            here += terms.weight_sums(len(gaussians), inside[begin : begin + SPLIT_PIXELS])
+            everywhere += terms.weight_sums(len(gaussians))
+        chosen = (here > 0.5 * everywhere.clamp_min(1e-9))[:, None]
+        gaussians.vote_ids.masked_fill_(chosen & (gaussians.vote_ids == whole), part)
+        self._merge_votes(gaussians)
+        if self.settings.initialisation == "votes":
+            codes = self.table.codes(vote_labels(gaussians))
+            gaussians.features.copy_(torch.where(chosen, codes, gaussians.features))
+
+    def _as_mapped(self, gaussians: GaussianMap, terms: CudaPixelTerms, labels: torch.Tensor) -> torch.Tensor:
+        """Labels of pixels, those of a whole replaced by its part's where the map shows the part."""
+        if not self._has_parts:
+            return labels
+        if self._shown is None or self._shown_order != gaussians.order or len(self._shown) != len(gaussians):
+            self._shown, self._shown_order = vote_labels(gaussians), gaussians.order
+        shown, _ = terms.labels(self._shown)
+        return torch.where((self._device_whole_of[shown.long()] == labels) & (shown > 0), shown, labels)
+
+    def begin(self, gaussians: GaussianMap, rows: slice, labels: torch.Tensor) -> None:
+        """New Gaussians get their first identity vectors and votes.
+
+        Args:
+            rows: where they are in the map.
+            labels: int32 [M] on the device, object under the pixel each was born from, 0 = unknown.
+        """
+        ids = self._device_alias[labels.long()]
+        gaussians.vote_ids[rows, 0] = ids
+        gaussians.vote_weights[rows, 0] = BIRTH_VOTE * (ids > 0)
+        if self.settings.initialisation == "votes":
+            gaussians.features[rows] = self.table.codes(ids)
+        else:
+            shape = (len(labels), IDENTITY_CHANNELS)
+            random = torch.rand(shape, generator=self._drawer.generator, device=self.device)
+            gaussians.features[rows] = (random - 0.5) / SH_C0
+
+    # --- steps --------------------------------------------------------------------------------------------------------
+
+    def due(self, keyframe: MaskedKeyframe) -> bool:
+        """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
+        return self._count_iteration(keyframe.device_mask is not None)
+
+    def step(
+        self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: MaskedKeyframe, view: RenderBuffers,
+        rate_factor: float = 1.0,
+    ) -> torch.Tensor | None:  # fmt: skip
+        """Starts one step on the view that `rasterizer` rendered last, which must be that of `keyframe`; arguments and
+        result as `IdentityLearner.step`, on the device. `times.steps` counts the seconds it takes to start."""
+        start = time.perf_counter()
+        mask = keyframe.device_mask
+        assert mask is not None
+        gradient = self._dense(gaussians, mask, view) if self.settings.schedule == "dense" else None
+        pixels, vote_weights = self._draw(keyframe.index, mask)
+        labels = self._kernels.labels(mask, pixels, self._device_alias)
+        terms = rasterizer.pixel_terms(pixels, TERMS, MIN_WEIGHT)
+        labels = self._as_mapped(gaussians, terms, labels)
+        if self.settings.schedule == "sampled" and self.table.count:
+            self._train(gaussians, terms, labels, vote_weights, rate_factor)
+        else:
+            terms.vote(gaussians, labels, vote_weights)
+        self.times.steps += time.perf_counter() - start
+        self.times.count += 1
+        return gradient
+
+    def _train(
+        self, gaussians: GaussianMap, terms: CudaPixelTerms, labels: torch.Tensor, vote_weights: torch.Tensor,
+        rate_factor: float,
+    ) -> None:  # fmt: skip
+        s = self.settings
+        classes, known = self._kernels.classes(labels, self.table.class_of)
+        # Without a known pixel nothing may change; a Gaussian in no term makes no step.
+        counts = torch.where(known > 0, terms.counts, 0)
+        terms = CudaPixelTerms(terms.gaussians, terms.weights, counts, terms.library)
+        terms.vote(gaussians, labels, vote_weights)
+        losses = torch.empty(len(labels), device=self.device)
+        gradient, rows = self.table.cross_entropy(terms.features(gaussians), classes, known, losses, s.weight)
+        self._last = losses, known
+        if self._pulls(gaussians):
+            pulled, pull = self._pull_together(gaussians)
+            others = CudaPixelTerms.of_gaussians(pulled, terms.capacity, terms.library)
+            others = CudaPixelTerms(
+                others.gaussians, others.weights, torch.where(known > 0, others.counts, 0), others.library
+            )
+            terms, gradient = terms.joined(others), torch.cat([gradient, pull])
+        terms.step(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate))
+        self.table.step(rows, known, rate_factor * s.classifier_rate)
+
+    def _dense(self, gaussians: GaussianMap, mask: torch.Tensor, view: RenderBuffers) -> torch.Tensor:
+        """Cross-entropy of a whole rendered identity image, as published; updates the classifier."""
+        s, size = self.settings, mask.numel()
+        assert view.features is not None
+        pixels = torch.arange(size, dtype=torch.int32, device=self.device)
+        classes, known = self._kernels.classes(
+            self._kernels.labels(mask, pixels, self._device_alias), self.table.class_of
+        )
+        features, out = view.features.view(IDENTITY_CHANNELS, size), torch.empty_like(view.features)
+        losses, rows = torch.empty(size, device=self.device), torch.zeros_like(self.table.rows)
+        part = max(1, LOGITS_AT_ONCE // max(1, self.table.count))
+        for begin in range(0, size, part):
+            here = slice(begin, begin + part)
+            gradient, of_rows = self.table.cross_entropy(
+                features[:, here].T, classes[here], known, losses[here], s.weight
+            )
+            out.view(IDENTITY_CHANNELS, size)[:, here] = gradient.T
+            rows += of_rows
+        self._last = losses, known
+        self.table.step(rows, known, s.classifier_rate)
+        if self._pulls(gaussians):
+            pulled, pull = self._pull_together(gaussians)
+            terms = CudaPixelTerms.of_gaussians(pulled, 1, self.library)
+            terms.step(gaussians, pull, FeatureAdamSettings(rate=s.rate))
+        return out
+
+    def _pulls(self, gaussians: GaussianMap) -> bool:
+        s = self.settings.neighbours
+        return s.weight > 0 and self.times.count % s.every == 0 and len(gaussians) > 1
+
+    def _pull_together(self, gaussians: GaussianMap) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows int64 [R] of the 3-D loss and their gradients float32 [R, F]; a row may appear more than once."""
+        s, classes, size = self.settings.neighbours, self.table.count, len(gaussians)
+        k = min(s.neighbours, size - 1)
+        samples = min(s.samples, max(16, LOGITS_AT_ONCE // 10 // ((k + 1) * classes)))
+        rows = torch.randint(size, (samples,), generator=self._drawer.generator, device=self.device)
+        near = self._neighbours(gaussians.means, rows, k, self.library)
+        pulled = torch.cat([rows, near.reshape(-1)])
+        logits = self.table.logits(gaussians.features[pulled])
+        gradients = self._kernels.neighbour_loss(logits, samples, s.weight * s.value / classes)
+        return pulled, torch.mm(gradients, self.table.weight)
+
+    def _draw(self, number: int, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The next pixels of keyframe `number`, int32 [P], and the weight each has as a vote."""
+        pool, wanted = self._pools.get(number), self.settings.pixels
+        if pool is None or pool.used + wanted > len(pool.pixels):
+            pool = self._drawer.draw(mask, self._device_alias, POOL_STEPS * wanted, self.settings)
+            self._pools[number] = pool
+        part = slice(pool.used, pool.used + wanted)
+        pool.used = part.stop
+        return pool.pixels[part], pool.vote_weights[part]
+
+    # --- results ------------------------------------------------------------------------------------------------------
+
+    def label(self, gaussians: GaussianMap) -> None:
+        """Writes each Gaussian's object into `object_id`, see `IdentityLearner.label`."""
+        start = time.perf_counter()
+        ids, share = vote_shares(gaussians)
+        sure = share >= self.settings.min_confidence
+        if self.settings.schedule != "votes":
+            learned = self.table.labels(gaussians.features, self.settings.min_confidence)
+            ids = torch.where(sure, ids, torch.where(share > 0, learned, 0))
+        gaussians.object_id.copy_(ids)
+        self.times.labelling += time.perf_counter() - start
+
+
+def _device_neighbours() -> Neighbours:
+    from ggslam.mapping.cuda.neighbours import device_neighbours
+
+    return device_neighbours

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which pixels of a keyframe's mask identity learning looks at: `ggslam.mapping.pixel_pool` on an NVIDIA GPU, by
+kernels that are only started here."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+
+import torch
+
+from ggslam.cuda.library import CudaLibrary
+from ggslam.errors import RenderError
+from ggslam.mapping.identity_objects import IDS
+from ggslam.mapping.identity_settings import IdentitySettings
+
+_POINTERS = ("mask", "alias", "counts", "per_pixel", "odds", "sums", "random", "pixels", "vote_weights", "stream")
+
+
+class _Job(ctypes.Structure):
+    """Mirror of struct PixelPoolJob in cuda/kernels/mapping/pixel_pool.cuh."""
+
+    _fields_ = [
+        *[(name, ctypes.c_void_p) for name in _POINTERS],
+        *[(name, ctypes.c_double) for name in ("balance", "boundary")],
+        *[(name, ctypes.c_int32) for name in ("device", "height", "width", "drawn")],
+    ]  # fmt: skip
+
+
+@dataclass
+class DevicePixelPool:
+    """Pixels of one keyframe drawn for steps to come, on the device.
+
+    Attributes:
+        pixels: int32 [M], flat indices. Where nothing is labelled they are unlabelled pixels.
+        vote_weights: float32 [M], inverse of the density with which each was drawn, mean 1.
+        used: how many of them are used up.
+    """
+
+    pixels: torch.Tensor
+    vote_weights: torch.Tensor
+    used: int = 0
+
+
+class PixelDrawer:
+    """Draws pixels of masks with the distribution of `draw_pool`, one by one. Where no labelled pixel lies at a
+    boundary, all are drawn anywhere.
+
+    Args:
+        device: where masks are.
+        library: the compiled kernels.
+        seed: of the draw.
+    """
+
+    def __init__(self, device: torch.device, library: CudaLibrary, seed: int) -> None:
+        self._device, self._library = device, library
+        library.check_size("pixel_pool_job", _Job)
+        for name in ("pixel_odds", "draw_pixels"):
+            library.declare(name, [ctypes.c_void_p])
+        self._generator = torch.Generator(device).manual_seed(seed)
+        self._counts = torch.empty(2, IDS, dtype=torch.int32, device=device)
+        self._per_pixel = torch.empty(2, IDS, dtype=torch.float64, device=device)
+
+    @property
+    def generator(self) -> torch.Generator:
+        """What random numbers come from."""
+        return self._generator
+
+    def draw(
+        self, mask: torch.Tensor, alias: torch.Tensor, wanted: int, settings: IdentitySettings
+    ) -> DevicePixelPool:
+        """Draws labelled pixels, as `draw_pool`.
+
+        Args:
+            mask: uint16 [H, W] on the device; 0 is never drawn while there is anything else.
+            alias: int32 [65536] on the device, what ids have become.
+            wanted: how many; a pixel may come twice.
+
+        Raises:
+            RenderError: not such a mask.
+        """
+        fits = mask.dtype == torch.uint16 and mask.ndim == 2 and mask.numel() and mask.device == self._device
+        if not fits or not mask.is_contiguous():
+            raise RenderError(
+                f"mask: expected a contiguous torch.uint16 [H, W] on {self._device}, found {mask.dtype} "
+                f"{list(mask.shape)} on {mask.device}"
+            )
+        odds = torch.empty(mask.numel(), dtype=torch.int64, device=self._device)
+        pixels = torch.empty(wanted, dtype=torch.int32, device=self._device)
+        weights = torch.empty(wanted, dtype=torch.float32, device=self._device)
+        random = torch.rand(wanted, generator=self._generator, dtype=torch.float64, device=self._device)
+        job = _Job(
+            mask=mask.data_ptr(), alias=alias.data_ptr(), counts=self._counts.data_ptr(),
+            per_pixel=self._per_pixel.data_ptr(), odds=odds.data_ptr(), random=random.data_ptr(),
+            pixels=pixels.data_ptr(), vote_weights=weights.data_ptr(), stream=self._library.stream(self._device),
+            balance=settings.balance, boundary=settings.boundary, device=self._device.index or 0,
+            height=mask.shape[0], width=mask.shape[1], drawn=wanted,
+        )  # fmt: skip
+        self._library.call("pixel_odds", ctypes.byref(job))
+        sums = odds.cumsum(0)
+        job.sums = sums.data_ptr()
+        self._library.call("draw_pixels", ctypes.byref(job))
+        return DevicePixelPool(pixels, weights / weights.mean().clamp_min(1e-30))
