@@ -59,7 +59,7 @@ def make_mapper(config: Config, learns: bool, context: NativeContext, library: C
         learner = IdentityLearner(config.identity, config.seed) if learns else None
         return CpuMapper(GaussianMap(config.sh_degree, channels), config.mapping, context, config.seed, learner)
     device = library.whole_device(None)
-    device_learner = CudaIdentityLearner(config.identity, config.seed, library) if learns else None
+    device_learner = CudaIdentityLearner(config.identity, config.seed, device, library) if learns else None
     return CudaMapper(
         GaussianMap(config.sh_degree, channels, device), config.mapping, library, config.seed, device_learner
     )

@@ -34,6 +34,8 @@ class CpuMapper(Mapper):
         Others: as in `Mapper`.
     """
 
+    identity: IdentityLearner | None
+
     def __init__(
         self,
         gaussians: GaussianMap,

@@ -13,7 +13,7 @@ import numpy as np
 
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
-from ggslam.mapping.identity import IdentityLearner
+from ggslam.mapping.identity_objects import IdentityObjects
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.labelling import Labeller
 from ggslam.mapping.pruning import prune
@@ -73,11 +73,11 @@ class Mapper(ABC):
     """
 
     def __init__(
-        self, gaussians: GaussianMap, settings: MapperSettings, seed: int = 0, identity: IdentityLearner | None = None
+        self, gaussians: GaussianMap, settings: MapperSettings, seed: int = 0, identity: IdentityObjects | None = None
     ) -> None:
         self.map = gaussians
         self.settings = settings
-        self.identity = identity
+        self.identity: IdentityObjects | None = identity
         self.keyframes: list[Keyframe] = []
         self.times = MapperTimes()
         self.depth_sigma = 0.004

@@ -102,9 +102,10 @@ class KeyframeStates:
             self.library.declare(name, [ctypes.c_void_p])
         self._count = 0
         self._use(self._new_table(_FIRST_ROOM))
-        self._totals = torch.zeros(6, dtype=torch.float64, device=self.device)
-        self._totals[4].fill_(torch.nan)
-        self._step_job = _StepJob(device=self.device.index or 0, totals=self._totals.data_ptr())
+        self.totals = torch.zeros(6, dtype=torch.float64, device=self.device)
+        """On the device, float64 [6]: the numbers of `IterationSums` in their order."""
+        self.totals[4].fill_(torch.nan)
+        self._step_job = _StepJob(device=self.device.index or 0, totals=self.totals.data_ptr())
         self._read_table: np.ndarray | None = None
         self._read_sums: IterationSums | None = None
 
@@ -210,7 +211,7 @@ class KeyframeStates:
     def read_sums(self) -> IterationSums:
         """The sums so far. Waits for the device, unless nothing was added since."""
         if self._read_sums is None:
-            total, color, ssim, depth, last_psnr, iterations = self._totals.tolist()
+            total, color, ssim, depth, last_psnr, iterations = self.totals.tolist()
             self._read_sums = IterationSums(total, color, ssim, depth, last_psnr, int(iterations))
         return self._read_sums
 

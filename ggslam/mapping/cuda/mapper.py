@@ -23,13 +23,14 @@ from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.insertion import DeviceInsertion
 from ggslam.mapping.cuda.keyframe import CudaKeyframe, ImageStore
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
-from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages
-from ggslam.mapping.cuda.votes import device_vote_labels
+from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages, DeviceLossResult
+from ggslam.mapping.cuda.votes import vote_labels
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, make_keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller, MapLabels
 from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.mapping.settings import MapperSettings
-from ggslam.rendering.cuda.rasterizer import CudaRasterizer
+from ggslam.rendering.cuda.rasterizer import CudaRasterizer, CudaStepResult
+from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
@@ -44,6 +45,8 @@ class CudaMapper(Mapper):
         Others: as in `Mapper`.
     """
 
+    identity: CudaIdentityLearner | None
+
     def __init__(
         self, gaussians: GaussianMap, settings: MapperSettings, library: CudaLibrary, seed: int = 0,
         identity: CudaIdentityLearner | None = None,
@@ -55,20 +58,21 @@ class CudaMapper(Mapper):
         self._insertion = DeviceInsertion(self.device, library)
         self._states = KeyframeStates(self.device, library)
         self._images = ImageStore(self.device)
-        self._mirror = HostMirror(self._states.sums)
+        self._totals = HostMirror(self._states.totals)
+        self._overflows = HostMirror(self._rasterizer.overflows)
         self._pace = Pace(self.device)
         self._repeated = 0
 
     @property
     def losses(self) -> LossSums:
-        return LossSums(*self._mirror.newest()[:4].tolist())
+        return LossSums(*self._totals.newest()[:4].tolist())
 
     @property
     def last_psnr(self) -> float:
-        return float(self._mirror.newest()[4])
+        return float(self._totals.newest()[4])
 
     def vote_labels(self) -> np.ndarray:
-        return device_vote_labels(self.map).cpu().numpy().astype(np.uint16)
+        return vote_labels(self.map).cpu().numpy().astype(np.uint16)
 
     def beside_others(self) -> AbstractContextManager[None]:
         return side_stream(self.device)
@@ -84,12 +88,13 @@ class CudaMapper(Mapper):
 
     def run(self, iterations: int) -> None:
         super().run(iterations + self._missed())
-        self._mirror.send()
+        self._totals.send()
+        self._overflows.send()
         self._pace.piece_ends()
 
     def _missed(self) -> int:
         """Iterations that did nothing, as far as is known, because their rendering found no room: to be made again."""
-        missed = int(self._mirror.newest()[6]) - self._repeated
+        missed = int(self._overflows.newest()[0]) - self._repeated
         self._repeated += missed
         return missed
 
@@ -104,9 +109,7 @@ class CudaMapper(Mapper):
         images, s = keyframe.device_images, self.settings.insertion
         alpha = expected_depth = show = None
         if self.map.count:
-            view = self._rasterizer.forward(
-                self.map, keyframe.camera, self._states.pose(keyframe.index), features=False, wait=True
-            )
+            view = self._rendered_whole(keyframe)
             alpha, expected_depth = view.alpha, view.expected_depth
             show = partial(self._show_labels, alpha, expected_depth)
         if self.identity is not None and labeller is not None:
@@ -120,7 +123,17 @@ class CudaMapper(Mapper):
             new.means, new.quaternions, new.log_scales, logit, new.rgb, birth_keyframe=keyframe.index
         )
         if self.identity is not None:
-            self.identity.begin_at(self.map, rows, new.pixels, keyframe.device_mask)
+            self.identity.begin(self.map, rows, _labels(keyframe.device_mask, new.pixels))
+
+    def _rendered_whole(self, keyframe: CudaKeyframe) -> RenderBuffers:
+        """With room for everything: what seems to be missing is inserted."""
+        self._rasterizer.waits = True
+        try:
+            return self._rasterizer.forward(
+                self.map, keyframe.camera, self._states.pose(keyframe.index), features=False
+            )
+        finally:
+            self._rasterizer.waits = False
 
     def _take_labels(self, keyframe: CudaKeyframe, labels: KeyframeLabels) -> None:
         """The rasterizer's last rendering is the map as the keyframe sees it (if there was a map)."""
@@ -139,7 +152,7 @@ class CudaMapper(Mapper):
         height, width = alpha.shape
         pixels = torch.arange(height * width, dtype=torch.int32, device=self.device).view(height, width)
         grid = pixels[::stride, ::stride]
-        ids, share = self._rasterizer.pixel_terms(grid.reshape(-1)).labels(device_vote_labels(self.map))
+        ids, share = self._rasterizer.pixel_terms(grid.reshape(-1)).labels(vote_labels(self.map))
         share = share.view(grid.shape) * (alpha[::stride, ::stride] > 0.5)
         return MapLabels.from_grid(
             ids.view(grid.shape).cpu().numpy(), share.cpu().numpy(), depth.cpu().numpy(), stride
@@ -177,9 +190,27 @@ class CudaMapper(Mapper):
         self.times.iterations += 1
         keyframe.iterations += 1
 
+    def _finish_step(self, row: int, step: CudaStepResult, loss: DeviceLossResult, rate_factor: float) -> None:
+        """Pose and exposure of a keyframe follow their gradients, and the sums go on. The first keyframe stays: it is
+        the world."""
+        s, moves = self.settings, row > 0
+        rate = min(s.pose_refinement.rate_sigmas * self.depth_sigma, s.pose_refinement.max_rate)
+        self._states.step(
+            row, step.twist, loss.results, self._rasterizer.last_overflowed,
+            rate_factor * rate if moves and s.pose_refinement.enabled else 0.0,
+            s.exposure if moves and s.exposure.enabled else None,
+        )  # fmt: skip
+
     def _train_identity(self, keyframe: Keyframe, steps: int, rate_factor: float) -> None:
         if self.identity is None:
             return
         view = self._rasterizer.forward(self.map, keyframe.camera, self._states.pose(keyframe.index), features=False)
         for _ in range(steps):
             self.identity.step(self.map, self._rasterizer, keyframe, view, rate_factor)
+
+
+def _labels(mask: torch.Tensor | None, pixels: torch.Tensor) -> torch.Tensor:
+    """Object under each pixel, int32 [M], 0 without a mask."""
+    if mask is None:
+        return torch.zeros(len(pixels), dtype=torch.int32, device=pixels.device)
+    return mask.view(torch.int16).reshape(-1)[pixels].int() & 0xFFFF
