@@ -85,7 +85,7 @@ def run(
         TrackerName | None, typer.Option(help="How frames are located: G-ICP (default), or edge and plane features.")
     ] = None,
     device: Annotated[
-        DeviceName | None, typer.Option(help="Compute on the CPU (default), on an NVIDIA GPU, or on one if it is there.")
+        DeviceName | None, typer.Option(help="Compute on the CPU (default), on an NVIDIA GPU, or on one if there is.")
     ] = None,
     earlier: Annotated[
         Path | None, typer.Option("--map", metavar="RUN", help="Start in the map of this run instead of an empty one.")
@@ -163,4 +163,5 @@ def _print(outcome: RunOutcome) -> None:
         print_scores(outcome.metrics)
     if outcome.error is None:
         path = shlex.quote(str(outcome.folder.path))
-        console.print(f"next: ggslam view {path} · ggslam export {path} map.glb --format mesh", highlight=False, markup=False)
+        hint = f"next: ggslam view {path} · ggslam export {path} map.glb --format mesh"
+        console.print(hint, highlight=False, markup=False)

@@ -18,13 +18,13 @@ import torch
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import HostMirror
 from ggslam.cuda.streams import Pace, side_stream
-from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.insertion import DeviceInsertion
 from ggslam.mapping.cuda.keyframe import CudaKeyframe, ImageStore
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages, DeviceLossResult
 from ggslam.mapping.cuda.votes import vote_labels
+from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, make_keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller, MapLabels
 from ggslam.mapping.mapper import LossSums, Mapper
@@ -202,6 +202,7 @@ class CudaMapper(Mapper):
         )  # fmt: skip
 
     def _train_identity(self, keyframe: Keyframe, steps: int, rate_factor: float) -> None:
+        assert isinstance(keyframe, CudaKeyframe)
         if self.identity is None:
             return
         view = self._rasterizer.forward(self.map, keyframe.camera, self._states.pose(keyframe.index), features=False)
