@@ -9,20 +9,30 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+import torch
 
+from ggslam.features.orb import View
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.sequences.factory import open_sequence
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
+from ggslam.tracking.cuda.transfers import Download
 from ggslam.tracking.engine import NativeEngine
-from ggslam.tracking.gicp import AlignmentStatus, GicpTarget, PhotometricPart
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import FramePoints
-from ggslam.tracking.settings import AlignSettings, DepthNoise, PhotometricSettings, PointSettings, TrackerSettings
+from ggslam.tracking.settings import (
+    AlignSettings,
+    DepthNoise,
+    PhotometricMode,
+    PhotometricSettings,
+    PointSettings,
+    TrackerSettings,
+)
 from ggslam.tracking.surface import MeasuredSurface
-from ggslam.tracking.tracker import Tracker, TrackingStatus
+from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
 
 if TYPE_CHECKING:
     from ggslam.cuda.library import CudaLibrary
@@ -99,9 +109,7 @@ def test_few_points_and_none(engine: CudaTrackingEngine, native: NativeEngine, t
     depth[40:47, 40 : 40 + 7 * kept] = np.linspace(1.0, 1.2, 7 * kept, dtype=np.float32)
     settings = PointSettings(count=50)
     found, expected = (e.points(depth, settings, NOISE) for e in (engine, native))
-    aligned, other = (
-        e.align(p, target, np.eye(4), SETTINGS, NOISE) for e, p in ((engine, found), (native, expected))
-    )
+    aligned, other = (e.align(p, target, np.eye(4), SETTINGS, NOISE) for e, p in ((engine, found), (native, expected)))
     assert len(found) == len(expected) and found.median_depth == pytest.approx(expected.median_depth)
     check_points(found, expected)
     assert aligned.status is other.status is AlignmentStatus.LOST
@@ -224,61 +232,86 @@ def test_grey_values_pull_as_they_do_in_the_core(
     check_alignment(engine, native, frames[2].depth, target, guess, photometric=weighty)
 
 
-def track(frames: list[Frame], engine: CudaTrackingEngine | None, settings: TrackerSettings) -> list:
-    """Tracks the frames; the first is the only keyframe."""
-    context = NativeContext(2)
-    tracker = Tracker(frames[0].camera, settings, context, truth_of(frames[0]), engine)
-    surface, results = MeasuredSurface(settings.target, context), []
+def track(tracker: Tracker, frames: list[Frame]) -> list[TrackingResult]:
+    """Tracks the frames; each is a keyframe."""
+    surface, results = MeasuredSurface(tracker.settings.target, tracker.context), []
     for frame in frames:
         results.append(tracker.track(frame))
-        if len(results) == 1:
-            tracker.set_target(surface.add(results[0].points, truth_of(frame)))
+        tracker.set_target(surface.add(results[-1].points, results[-1].T_world_camera))
     return results
+
+
+def tracker_settings(mode: PhotometricMode) -> TrackerSettings:
+    return TrackerSettings(points=POINTS, align=SETTINGS, photometric=PhotometricSettings(mode=mode, points=800))
 
 
 @pytest.mark.parametrize("mode", ["never", "auto", "always"])
 def test_a_tracker_goes_the_same_way_with_either_engine(
-    engine: CudaTrackingEngine, frames: list[Frame], mode: str
+    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], mode: PhotometricMode
 ) -> None:
-    photometric = PhotometricSettings(mode=mode, points=800)  # type: ignore[arg-type]
-    settings = TrackerSettings(points=POINTS, align=SETTINGS, photometric=photometric)
-    for found, expected in zip(track(frames, engine, settings), track(frames, None, settings), strict=True):
-        assert found.status is expected.status and found.reason == expected.reason
-        assert np.abs(se3_log(inverse(expected.T_world_camera) @ found.T_world_camera)).max() < 1e-4
-        assert found.overlap == pytest.approx(expected.overlap, abs=2e-3)
-    assert found.status is not TrackingStatus.LOST
+    found, expected = (
+        track(Tracker(frames[0].camera, tracker_settings(mode), native.context, truth_of(frames[0]), e), frames)
+        for e in (engine, None)
+    )
+    for one, two in zip(found, expected, strict=True):
+        assert one.status is two.status and one.reason == two.reason
+        assert np.abs(se3_log(inverse(two.T_world_camera) @ one.T_world_camera)).max() < 1e-4
+        assert one.overlap == pytest.approx(two.overlap, abs=2e-3)
+    assert {result.status for result in found[2:]} == {TrackingStatus.OK}
 
 
-def test_a_change_of_the_median_depth_changes_the_mode_in_the_same_frame(engine: CudaTrackingEngine) -> None:
-    """The mode goes with the frame's own median depth, though the device tells it only with the alignment."""
-    camera = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
-    modes = []
+@pytest.mark.parametrize("mode", ["never", "always"])
+def test_the_host_waits_once_for_a_frame(
+    engine: CudaTrackingEngine, frames: list[Frame], mode: PhotometricMode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits = []
+    monkeypatch.setattr(Download, "wait", lambda self, wait=Download.wait: waits.append("result") or wait(self))
+    cpu = torch.Tensor.cpu
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda self: waits.append("tensor") or cpu(self))
+    settings = tracker_settings(mode)
+    tracker = Tracker(frames[0].camera, settings, NativeContext(1), truth_of(frames[0]), engine)
+    surface, expected = MeasuredSurface(settings.target, tracker.context), []
+    for frame in frames[:5]:
+        result = tracker.track(frame)
+        expected.append(len(waits))
+        tracker.set_target(surface.add(result.points, result.T_world_camera))  # a keyframe's points are fetched
+        waits.clear()
+    assert expected[2:] == [1, 1, 1]
+
+
+def test_the_mode_goes_with_the_median_depth_of_the_frame_itself(
+    engine: CudaTrackingEngine, native: NativeEngine
+) -> None:
+    """Although the device tells it only with the alignment."""
 
     class Watching(Tracker):
-        def _photometric_part(self, view: object) -> None:
-            modes.append(len(results))
+        def _locate_by(
+            self, mode: PhotometricMode, view: View, points: FramePoints, target: GicpTarget
+        ) -> tuple[AlignmentResult, str]:
+            modes.append((len(depths), mode))
+            return super()._locate_by(mode, view, points, target)
 
-    tracker = Watching(camera, TrackerSettings(noise=DepthNoise(0.0001, 0.0004)), NativeContext(1), None, engine)
-    surface, results = MeasuredSurface(tracker.settings.target, tracker.context), []
-    ball = (np.indices((120, 160)) - np.array([60, 80])[:, None, None]) ** 2
-    for z in (1.0, 1.0, 2.0, 2.0, 1.0):  # noise above and below 1 mm
-        depth = (z - 0.3 * np.exp(-ball.sum(0) / 800)).astype(np.float32)
-        color = np.zeros((120, 160, 3), np.uint8)
-        if results:
-            tracker.set_target(surface.of([0 if z == 1 else 1]))
-        results.append(tracker.track(Frame(0, 0, 0.0, color, depth, camera)))
-        if len(results) == 1:
-            for scale in (1.0, 2.0):
-                surface.add(engine.points(depth + np.float32(scale - 1), PointSettings(), NOISE), np.eye(4))
-    assert {2, 3} <= set(modes)
+    camera, color = Camera(160, 120, 120.0, 120.0, 79.5, 59.5), np.zeros((120, 160, 3), np.uint8)
+    for given in (engine, None):
+        modes: list[tuple[int, str]] = []
+        depths: list[float] = []
+        settings = TrackerSettings(noise=DepthNoise(0.0001, 0.0004), points=POINTS)  # 1 mm at 1.5 m
+        tracker = Watching(camera, settings, native.context, None, given)
+        for z in (1.0, 1.0, 2.0, 2.0, 1.0):
+            depth = np.full((120, 160), z, np.float32)
+            tracker.track(Frame(0, 0, 0.0, color, depth, camera))
+            wall = native.points(depth, POINTS, NOISE)
+            tracker.set_target(MeasuredSurface(settings.target, native.context).add(wall, np.eye(4)))
+            depths.append(z)
+        decided = dict(modes)
+        assert decided == {1: "degenerate", 2: "always", 3: "always", 4: "degenerate"}
+        assert len(modes) == (6 if given is engine else 4)
 
 
 def test_what_is_not_asked_for_is_not_fetched(
     engine: CudaTrackingEngine, frames: list[Frame], target: GicpTarget, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import torch
-
-    fetched = []
+    fetched: list[int] = []
     monkeypatch.setattr(torch.Tensor, "cpu", lambda tensor: fetched.append(tensor.numel()) or tensor.to("cpu"))
     points = engine.points(frames[2].depth, POINTS, NOISE)
     found = engine.align(points, target, truth_of(frames[2]), SETTINGS, NOISE)

@@ -38,7 +38,7 @@ class Upload:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._buffer = _page_locked(0, device)
+        self._buffer = _page_locked(1, device)
         self._sent = _Marker(device)
 
     def begin(self, size: int) -> np.ndarray:

@@ -14,6 +14,7 @@ constexpr int kAlignThreads = 128;
 constexpr int kAlignWarps = kAlignThreads / kWarp;
 constexpr int kAlignBlocksPerProcessor = 4;  // lets a thread have 128 registers: points are few, latency is what counts
 constexpr int kSumStride = 48;  // sums of a block: the most that either kind of point has
+static_assert(kAlignThreads > kUnknowns * (kUnknowns + 1), "each entry of the normal equations has a thread");
 static_assert(kGreySums <= kSumStride && kAlignSums <= kWarp && kReportSums <= kWarp, "there is room for all sums");
 
 struct AlignBlocks {
@@ -131,19 +132,6 @@ __device__ inline void join_parts(int count, double (&parts)[kAlignWarps][kSumSt
   __syncthreads();
 }
 
-__device__ inline void set_equations(const double (&total)[kSumStride], NormalEquations& out) {
-  const double f = 1 / fmax(total[kWeight], 1e-30);
-  int k = 0;
-  for (int i = 0; i < kUnknowns; ++i) {
-    out.b[i] = i < 6 ? f * total[kRight + i] : 0;
-    for (int j = i; j < kUnknowns; ++j)
-      out.h[i][j] = out.h[j][i] = i < 6 && j < 6 ? f * total[kMatrix + k++] : 0;
-  }
-  out.cost = f * total[kCostSum];
-  out.matches = total[kMatches];
-  out.grey_count = out.grey_absolute = 0;
-}
-
 // What textured points that are lost cost, and all others: a point that leaves the image costs what a badly fitting one
 // does.
 __device__ inline double grey_cost(const AlignJob& job, const double (&total)[kSumStride]) {
@@ -152,24 +140,36 @@ __device__ inline double grey_cost(const AlignJob& job, const double (&total)[kS
   return job.settings.photometric_weight / points * (total[kGreyCost] + lost * huber * huber);
 }
 
-__device__ inline void add_photometric(const AlignJob& job, const double (&total)[kSumStride], const AlignState& s,
-                                       NormalEquations& out) {
-  const double f = static_cast<double>(job.settings.photometric_weight) / job.photometric_points.count;
-  out.grey_count = total[kGreyCount];
-  out.grey_absolute = total[kGreyAbsolute];
-  out.cost += grey_cost(job, total);
-  int k = 0;
-  for (int i = 0; i < kUnknowns; ++i) {
-    out.b[i] += f * total[kGreyRight + i];
-    for (int j = i; j < kUnknowns; ++j, ++k) {
-      out.h[i][j] += f * total[kGreyMatrix + k];
-      out.h[j][i] = out.h[i][j];
-    }
-  }
+// Place of entry (i, j) in the upper triangle of an n x n matrix.
+__device__ inline int triangle_place(int i, int j, int n) {
+  const int low = min(i, j), high = max(i, j);
+  return low * n - low * (low - 1) / 2 + high - low;
+}
+
+// The normal equations from the sums over points, and over textured points if `grey` is not null: geometry per unit of
+// weight, grey values per point. All threads of the block take part.
+__device__ inline void set_equations(const AlignJob& job, const double (&total)[kSumStride], const double* grey,
+                                     const AlignState& s, NormalEquations& out) {
+  const double f = 1 / fmax(total[kWeight], 1e-30);
+  const double g = grey ? static_cast<double>(job.settings.photometric_weight) / job.photometric_points.count : 0;
   // Weak prior on gain 1 and bias 0, so that an image without contrast leaves them where they are.
-  const double prior = 1e-4 * job.settings.photometric_weight;
-  out.h[6][6] += prior, out.h[7][7] += prior;
-  out.b[6] += prior * (1 - s.candidate_gain), out.b[7] -= prior * s.candidate_bias;
+  const double prior = grey ? 1e-4 * job.settings.photometric_weight : 0;
+  const int thread = static_cast<int>(threadIdx.x);
+  if (thread < kUnknowns * kUnknowns) {
+    const int i = thread / kUnknowns, j = thread % kUnknowns;
+    double entry = i < 6 && j < 6 ? f * total[kMatrix + triangle_place(i, j, 6)] : 0;
+    if (grey) entry += g * grey[kGreyMatrix + triangle_place(i, j, kUnknowns)];
+    out.h[i][j] = entry + (i == j && i >= 6 ? prior : 0);
+  } else if (thread < kUnknowns * (kUnknowns + 1)) {
+    const int i = thread - kUnknowns * kUnknowns;
+    double entry = i < 6 ? f * total[kRight + i] : 0;
+    if (grey) entry += g * grey[kGreyRight + i];
+    out.b[i] = entry + (i == 6 ? prior * (1 - s.candidate_gain) : i == 7 ? -prior * s.candidate_bias : 0);
+  } else if (thread == kAlignThreads - 1) {
+    out.cost = f * total[kCostSum];
+    out.matches = total[kMatches];
+    out.grey_count = grey ? grey[kGreyCount] : 0;
+  }
 }
 
 // One linearisation at the candidate, and the step after it. `begins`: the first of an alignment, which starts at the
@@ -220,9 +220,10 @@ __global__ void __launch_bounds__(kAlignThreads, kAlignBlocksPerProcessor)
   if (kGreys) sum_blocks(work.sums, point_blocks, gridDim.x, kGreySums, grey_parts);
   join_parts(kAlignSums, parts);
   if (kGreys) join_parts(kGreySums, grey_parts);
+  set_equations(job, parts[0], kGreys ? grey_parts[0] : nullptr, state, next);
+  __syncthreads();
   if (thread == 0) {
-    set_equations(parts[0], next);
-    if (kGreys) add_photometric(job, grey_parts[0], state, next);
+    if (kGreys) next.cost += grey_cost(job, grey_parts[0]);
     advance(state, next, job.settings, kGreys);
   }
   __syncthreads();

@@ -18,7 +18,7 @@ struct NormalEquations {
   double h[kUnknowns][kUnknowns];
   double b[kUnknowns];
   double cost;  // per unit of weight
-  double matches, grey_count, grey_absolute;
+  double matches, grey_count;
 };
 
 enum AlignPhase { kCoarsePhase, kFinePhase, kReportPhase };
@@ -77,34 +77,38 @@ __device__ inline void orthonormalize(double (&r)[9]) {
 }
 
 // Solves (H + damping diag(H)) x = b for the first n unknowns (6 or 8) by Cholesky, the others being 0; false if H is not
-// positive. Unknowns left out become equations x = 0, so that all indices are known to the compiler.
+// positive. Unknowns left out become equations x = 0, so that all indices are known to the compiler. Of the factor's
+// diagonal the reciprocals are kept: nothing is divided.
 __device__ inline bool solve(const NormalEquations& system, double damping, int n, double (&x)[kUnknowns]) {
-  double l[kUnknowns][kUnknowns];
+  double l[kUnknowns][kUnknowns], reciprocal[kUnknowns];
   bool positive = true;
 #pragma unroll
-  for (int i = 0; i < kUnknowns; ++i)
+  for (int j = 0; j < kUnknowns; ++j)
 #pragma unroll
-    for (int j = 0; j <= i; ++j) {
-      const bool used = i < n;
-      double sum = used ? system.h[i][j] : (i == j ? 1.0 : 0.0);
+    for (int i = j; i < kUnknowns; ++i) {
+      double sum = i < n ? system.h[i][j] : (i == j ? 1.0 : 0.0);
       if (i == j) sum += damping * sum + 1e-12;
 #pragma unroll
       for (int k = 0; k < j; ++k) sum -= l[i][k] * l[j][k];
-      if (i == j) positive = positive && sum > 0;
-      l[i][j] = i == j ? sqrt(sum) : sum / l[j][j];
+      if (i == j) {
+        positive = positive && sum > 0;
+        reciprocal[j] = rsqrt(sum);
+      } else {
+        l[i][j] = sum * reciprocal[j];
+      }
     }
 #pragma unroll
   for (int i = 0; i < kUnknowns; ++i) {
     x[i] = i < n ? system.b[i] : 0.0;
 #pragma unroll
     for (int k = 0; k < i; ++k) x[i] -= l[i][k] * x[k];
-    x[i] /= l[i][i];
+    x[i] *= reciprocal[i];
   }
 #pragma unroll
   for (int i = kUnknowns - 1; i >= 0; --i) {
 #pragma unroll
     for (int k = i + 1; k < kUnknowns; ++k) x[i] -= l[k][i] * x[k];
-    x[i] /= l[i][i];
+    x[i] *= reciprocal[i];
   }
   return positive;
 }
