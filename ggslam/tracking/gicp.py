@@ -264,12 +264,8 @@ def _result(
 ) -> AlignmentResult:
     T = np.array(found.pose).reshape(4, 4)
     information = np.array(found.information).reshape(6, 6)
-    visibility, weak = observability(information, T[:3, :3], source, noise, settings.degenerate_below)
-    status = AlignmentStatus.OK
-    if not found.usable:
-        status = AlignmentStatus.LOST
-    elif len(weak):
-        status = AlignmentStatus.DEGENERATE
+    spread = PointSpread.of(source, noise)
+    status, visibility, weak = judge(information, T[:3, :3], spread, bool(found.usable), settings.degenerate_below)
     return AlignmentResult(
         T, status, bool(found.converged), found.coarse_iterations + found.fine_iterations, found.overlap, found.rmse,
         about_point(information, T[:3, 3]), information, visibility, weak, matches, squared, found.cost,
@@ -288,8 +284,51 @@ def about_point(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return A.T @ information @ A
 
 
+@dataclass(frozen=True)
+class PointSpread:
+    """Where a frame's points lie, each weighed by the inverse variance of its depth.
+
+    Attributes:
+        total: sum of the weights, one per square metre; 0: there are no points.
+        centroid: [3], camera frame, metres.
+        radius: root mean square distance from it, metres.
+    """
+
+    total: float
+    centroid: np.ndarray
+    radius: float
+
+    @classmethod
+    def of(cls, source: FramePoints, noise: DepthNoise) -> PointSpread:
+        """Of these points."""
+        if not len(source):
+            return cls(0.0, np.zeros(3), 0.0)
+        z = source.points[:, 2]
+        inverse_variance = 1.0 / (noise.constant + noise.square * z * z) ** 2
+        total = float(inverse_variance.sum())
+        centroid = inverse_variance @ source.points / total
+        radius = float(np.sqrt(inverse_variance @ ((source.points - centroid) ** 2).sum(1) / total))
+        return cls(total, centroid, radius)
+
+
+def judge(
+    information: np.ndarray, R_world_camera: np.ndarray, spread: PointSpread, usable: bool, limit: float
+) -> tuple[AlignmentStatus, np.ndarray, np.ndarray]:
+    """What an alignment is worth: its status, visibility and weak directions (see `AlignmentResult`).
+
+    Args:
+        information: float64 [6, 6] about the camera centre.
+        usable: whether there are enough matches.
+        limit: as of `observability`.
+    """
+    visibility, weak = observability(information, R_world_camera, spread, limit)
+    if not usable:
+        return AlignmentStatus.LOST, visibility, weak
+    return AlignmentStatus.DEGENERATE if len(weak) else AlignmentStatus.OK, visibility, weak
+
+
 def observability(
-    information: np.ndarray, R_world_camera: np.ndarray, source: FramePoints, noise: DepthNoise, limit: float
+    information: np.ndarray, R_world_camera: np.ndarray, spread: PointSpread, limit: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """How well each direction of motion is seen: eigenvalues [6], ascending, and the eigenvectors [k, 6] of those
     below `limit`.
@@ -299,14 +338,9 @@ def observability(
     point's information by its own noise. An eigenvalue is then the mean of (normal . motion)^2: the share of points
     that see the direction.
     """
-    if not len(source):
+    if not spread.total:
         return np.zeros(6), np.eye(6)
-    z = source.points[:, 2]
-    inverse_variance = 1.0 / (noise.constant + noise.square * z * z) ** 2
-    total = float(inverse_variance.sum())
-    centroid = inverse_variance @ source.points / total
-    radius = float(np.sqrt(inverse_variance @ ((source.points - centroid) ** 2).sum(1) / total))
-    about = about_point(information, -R_world_camera @ centroid)
-    scale = np.array([1.0, 1.0, 1.0] + [1.0 / max(radius, 1e-3)] * 3)
-    values, vectors = np.linalg.eigh(about * np.outer(scale, scale) / total)
+    about = about_point(information, -R_world_camera @ spread.centroid)
+    scale = np.array([1.0, 1.0, 1.0] + [1.0 / max(spread.radius, 1e-3)] * 3)
+    values, vectors = np.linalg.eigh(about * np.outer(scale, scale) / spread.total)
     return values, vectors[:, values < limit].T

@@ -100,6 +100,7 @@ def library() -> ctypes.CDLL:
     core.ggslam_gicp_target_size.argtypes = [c_void_p, ctypes.c_int]
     core.ggslam_gicp_target_voxels.argtypes = [c_void_p, ctypes.c_int, c_void_p]
     core.ggslam_gicp_target_voxels.restype = None
+    core.ggslam_gicp_target_blocks.argtypes = [c_void_p, ctypes.c_int, c_void_p]
     core.ggslam_target_part_create.argtypes = [c_void_p, POINTER(TargetInput), POINTER(TargetSettings), c_uint64]
     core.ggslam_target_part_create.restype = c_void_p
     core.ggslam_target_part_destroy.argtypes = [c_void_p]

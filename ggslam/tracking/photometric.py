@@ -8,6 +8,7 @@ a frame's points are compared with a reference image, a keyframe's or a rendered
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -42,10 +43,16 @@ class GreyDepth:
         )  # fmt: skip
         grey = cv2.cvtColor(color[: h * shrink, : w * shrink], cv2.COLOR_RGB2GRAY)
         grey = cv2.resize(grey, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-        cells = [depth[r : h * shrink : shrink, c : w * shrink : shrink] for r in range(shrink) for c in range(shrink)]
-        nearest = np.minimum.reduce(cells)  # 0 if any is unknown
-        furthest = np.maximum.reduce(cells)
+        nearest = _over_cells(np.minimum, depth, (h, w), shrink)  # 0 if any is unknown
+        furthest = _over_cells(np.maximum, depth, (h, w), shrink)
         return cls(grey, np.where(furthest < nearest * 1.03, nearest, np.float32(0)), smaller)
+
+
+def _over_cells(choose: np.ufunc, depth: np.ndarray, shape: tuple[int, int], shrink: int) -> np.ndarray:
+    """`choose` over cells of `shrink` x `shrink` pixels, [h, w]: first over rows, which lie together in memory."""
+    h, w = shape
+    rows = reduce(choose, (depth[r : h * shrink : shrink, : w * shrink] for r in range(shrink)))
+    return reduce(choose, (rows[:, c::shrink] for c in range(shrink)))
 
 
 @dataclass(frozen=True)

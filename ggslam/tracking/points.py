@@ -40,10 +40,35 @@ class FramePoints:
         """Median depth in metres; 0 without points."""
         return float(np.median(self.points[:, 2])) if len(self.points) else 0.0
 
+    def median_depth_if_known(self) -> float | None:
+        """Median depth in metres, unless someone would have to be waited for."""
+        return self.median_depth
+
 
 def grid_stride(pixels: int, count: int) -> int:
     """Pixel stride at which a regular grid over `pixels` pixels with depth has about `count` points."""
     return max(1, round(math.sqrt(pixels / count)))
+
+
+def check_depth(depth: np.ndarray, camera: Camera) -> None:
+    """Looks whether a depth image fits its camera.
+
+    Raises:
+        ValueError: it has another shape.
+    """
+    if depth.shape != (camera.height, camera.width):
+        raise ValueError(f"depth is {depth.shape}, expected {(camera.height, camera.width)} of the camera")
+
+
+def native_points_settings(
+    camera: Camera, settings: PointSettings, noise: DepthNoise, stride: int
+) -> native.DepthPointsSettings:
+    """The core's form of the settings, for points `stride` pixels apart."""
+    return native.DepthPointsSettings(
+        camera.fx, camera.fy, camera.cx, camera.cy, noise.constant, noise.square, settings.min_depth,
+        settings.max_depth, settings.min_thickness, settings.max_elongation, settings.min_neighbours,
+        camera.width, camera.height, stride, settings.window, max(1, round(camera.width / 320)),
+    )  # fmt: skip
 
 
 def extract_points(
@@ -61,8 +86,7 @@ def extract_points(
     Raises:
         ValueError: `depth` has another shape than `camera`.
     """
-    if depth.shape != (camera.height, camera.width):
-        raise ValueError(f"depth is {depth.shape}, expected {(camera.height, camera.width)} of the camera")
+    check_depth(depth, camera)
     depth = np.ascontiguousarray(depth, np.float32)
     stride = grid_stride(int(np.count_nonzero(depth > 0)), settings.count)
     room = math.ceil(camera.width / stride) * math.ceil(camera.height / stride)
@@ -70,11 +94,7 @@ def extract_points(
         np.empty((room, 3), np.float32), np.empty((room, 3), np.float32), np.empty((room, 6), np.float32),
         np.empty((room, 2), np.int32), np.empty(room, np.float32),
     )  # fmt: skip
-    arguments = native.DepthPointsSettings(
-        camera.fx, camera.fy, camera.cx, camera.cy, noise.constant, noise.square, settings.min_depth,
-        settings.max_depth, settings.min_thickness, settings.max_elongation, settings.min_neighbours,
-        camera.width, camera.height, stride, settings.window, max(1, round(camera.width / 320)),
-    )  # fmt: skip
+    arguments = native_points_settings(camera, settings, noise, stride)
     arrays = (found.points, found.normals, found.covariances, found.pixels, found.weights)
     out = native.DepthPointsOutput(*(native.address(array) for array in arrays))
     count = native.library().ggslam_depth_points(context.handle, native.address(depth), arguments, out)

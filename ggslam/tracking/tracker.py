@@ -14,10 +14,11 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalized, separation
-from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart, align
+from ggslam.tracking.engine import NativeEngine, TrackingEngine
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
-from ggslam.tracking.points import FramePoints, extract_points
+from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise, PhotometricMode, TrackerSettings
 
 __all__ = ["Tracker", "TrackerSettings", "TrackingResult", "TrackingStatus"]
@@ -81,6 +82,7 @@ class Tracker:
         settings: see `TrackerSettings`.
         context: threads to work on; the tracker's own, so that it does not wait for other users.
         T_world_camera: pose of the first frame.
+        engine: where points are extracted and aligned; None: on the threads of `context`.
     """
 
     def __init__(
@@ -89,6 +91,7 @@ class Tracker:
         settings: TrackerSettings | None = None,
         context: NativeContext | None = None,
         T_world_camera: np.ndarray | None = None,
+        engine: TrackingEngine | None = None,
     ) -> None:
         self.camera = camera
         self.settings = settings or TrackerSettings()
@@ -97,12 +100,19 @@ class Tracker:
         """What frames are aligned to; None until the first keyframe is in."""
         self.noise: DepthNoise | None = self.settings.noise
         """Of the depth camera; measured on the first frame if the settings leave it open."""
+        self._given_engine = engine
+        self._median_depth: float | None = None
         self._pose = np.eye(4) if T_world_camera is None else np.array(T_world_camera, float)
         self._velocity = np.eye(4)
         self._was_lost = False
         self._views: list[View] = []
         self._reference_view: View | None = None
         self._reference: PhotometricReference | None = None
+
+    @property
+    def engine(self) -> TrackingEngine:
+        """Where points are extracted and aligned."""
+        return self._given_engine or NativeEngine(self.camera, self.context)
 
     def set_target(self, target: GicpTarget) -> None:
         """Frames are aligned to `target` from the next one on."""
@@ -126,7 +136,7 @@ class Tracker:
         if self.noise is None:
             self.noise = estimate_noise(frame.depth, self.camera)
         noise = self.noise or DepthNoise()
-        points = extract_points(frame.depth, self.camera, self.settings.points, noise, self.context)
+        points = self.engine.points(frame.depth, self.settings.points, noise)
         view = View(frame.color, frame.depth, self._pose)
         if target is None:
             return self._first(view, points)
@@ -178,7 +188,20 @@ class Tracker:
 
     def _locate(self, view: View, points: FramePoints, target: GicpTarget) -> tuple[AlignmentResult, str]:
         """The best alignment, and which start it came from (empty: constant velocity)."""
-        mode = self._mode(points)
+        depth = points.median_depth_if_known()
+        expected = self._median_depth if depth is None else depth
+        mode = self._mode(points.median_depth if expected is None else expected)
+        found = self._locate_by(mode, view, points, target)
+        if depth is None:  # it is known now, and seldom so far from the frame's before that the mode is another one
+            self._median_depth = points.median_depth
+            actual = self._mode(self._median_depth)
+            return found if actual == mode else self._locate_by(actual, view, points, target)
+        return found
+
+    def _locate_by(
+        self, mode: PhotometricMode, view: View, points: FramePoints, target: GicpTarget
+    ) -> tuple[AlignmentResult, str]:
+        """As `_locate`, in a photometric mode."""
         guess = self._pose @ self._velocity
         photometric = self._photometric_part(view) if mode == "always" or self._was_lost else None
         found = self._align(points, target, guess, photometric)
@@ -194,13 +217,13 @@ class Tracker:
             return found, ""
         return self._retry(view, points, target, found, photometric)
 
-    def _mode(self, points: FramePoints) -> PhotometricMode:
+    def _mode(self, median_depth: float) -> PhotometricMode:
         """The photometric mode with "auto" decided."""
         settings = self.settings.photometric
         if settings.mode != "auto":
             return settings.mode
         assert self.noise is not None
-        return "always" if self.noise.sigma(points.median_depth) > settings.noisy_m else "degenerate"
+        return "always" if self.noise.sigma(median_depth) > settings.noisy_m else "degenerate"
 
     def _align(
         self, points: FramePoints, target: GicpTarget, guess: np.ndarray, photometric: PhotometricPart | None,
@@ -208,7 +231,7 @@ class Tracker:
     ) -> AlignmentResult:  # fmt: skip
         assert self.noise is not None
         settings = self.settings.align if coarse else dataclasses.replace(self.settings.align, coarse_iterations=0)
-        return align(points, target, guess, settings, self.noise, self.context, photometric)
+        return self.engine.align(points, target, guess, settings, self.noise, photometric)
 
     def _photometric_part(self, view: View) -> PhotometricPart | None:
         """Textured points of the view and the reference; None without either."""

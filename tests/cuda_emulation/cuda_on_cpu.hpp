@@ -99,16 +99,39 @@ T atomicAdd(T* place, T value) {
   return before;
 }
 
+// Compares and exchanges; returns what was there.
+template <class T>
+T atomicCAS(T* place, T expected, T value) {
+  const T before = *place;
+  if (before == expected) *place = value;
+  return before;
+}
+
+inline void __threadfence() {}  // blocks run one after another
+template <class T>
+T __ldcg(const T* place) {
+  return *place;
+}
+
 // --- arithmetic -------------------------------------------------------------------------------------------------------
 
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
+inline int __popcll(unsigned long long x) { return __builtin_popcountll(x); }
 inline int __ffs(int x) { return __builtin_ffs(x); }
 inline int __clz(int x) { return x == 0 ? 32 : __builtin_clz(static_cast<unsigned>(x)); }
+inline double rsqrt(double x) { return 1 / std::sqrt(x); }
+inline double sinpi(double x) { return std::sin(3.14159265358979323846 * x); }
+inline double cospi(double x) { return std::cos(3.14159265358979323846 * x); }
 inline float __fdividef(float a, float b) { return a / b; }
 inline std::uint32_t __float_as_uint(float x) {
   std::uint32_t bits;
   std::memcpy(&bits, &x, sizeof(bits));
   return bits;
+}
+inline float __uint_as_float(std::uint32_t bits) {
+  float x;
+  std::memcpy(&x, &bits, sizeof(x));
+  return x;
 }
 
 // --- runtime: everything is done when the call returns ------------------------------------------------------------------

@@ -256,3 +256,12 @@ GGSLAM_EXPORT void ggslam_gicp_target_voxels(const void* target_, int level, flo
   const auto& voxels = (level ? target.coarse : target.fine).voxels;
   std::copy_n(reinterpret_cast<const float*>(voxels.data()), voxels.size() * 16, out);
 }
+
+// Number of blocks of a level. Copies them unless `out` is null: [n, 3] key, occupied, first.
+GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target_, int level_, uint64_t* out) {
+  const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
+  const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;
+  for (std::size_t b = 0; out && b < level.blocks.size(); ++b, out += 3)
+    out[0] = level.block_keys[b], out[1] = level.blocks[b].occupied, out[2] = level.blocks[b].first;
+  return static_cast<int>(level.blocks.size());
+}

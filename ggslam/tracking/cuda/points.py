@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of a frame that stay on the device until someone on the host looks at them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from ggslam.tracking.cuda.contract import HEADER_BYTES, PointArrays
+from ggslam.tracking.points import FramePoints
+
+_ROWS = {"points": 3, "normals": 3, "covariances": 6, "pixels": 2, "weights": 1}
+_BEGIN = 64
+"""Words before the arrays, of which the header takes the first two."""
+
+
+class DevicePoints(FramePoints):
+    """`FramePoints` on a device. The arrays are copied to the host, all at once, when any of them is first asked for;
+    keyframes and loops need them. Their number and their median depth come with the frame's alignment.
+
+    Args:
+        room: points at most; their number is known to the device alone.
+        device: where they are.
+    """
+
+    _block: torch.Tensor
+    _header: tuple[int, float] | None
+
+    def __init__(self, room: int, device: torch.device) -> None:
+        words = torch.empty(_BEGIN + room * sum(_ROWS.values()), dtype=torch.float32, device=device)
+        for name, value in (("room", room), ("_block", words), ("_header", None)):
+            object.__setattr__(self, name, value)
+
+    room: int
+
+    def arrays(self) -> PointArrays:
+        """Addresses on the device; this object must stay alive."""
+        begin = self._block.data_ptr()
+        return PointArrays(begin, *(begin + 4 * offset for offset in self._offsets().values()))
+
+    def settle(self, count: int, median_depth: float) -> None:
+        """Takes what the device says of the points, once it is known."""
+        object.__setattr__(self, "_header", (count, median_depth))
+
+    def __len__(self) -> int:
+        """Waits for the device if the points were not aligned yet."""
+        return self._known_header()[0]
+
+    @property
+    def median_depth(self) -> float:
+        """Median depth in metres, 0 without points. Waits for the device if the points were not aligned yet."""
+        return self._known_header()[1]
+
+    def median_depth_if_known(self) -> float | None:
+        """Median depth in metres; None before the points were aligned."""
+        return None if self._header is None else self._header[1]
+
+    def __getattr__(self, name: str) -> Any:
+        """The arrays, at the first look at any of them."""
+        if name not in _ROWS:
+            raise AttributeError(name)
+        words = self._block.cpu().numpy()
+        count, _ = self._header_of(words)
+        for field, offset in self._offsets().items():
+            width = _ROWS[field]
+            rows = words[offset : offset + width * count]
+            rows = rows.view(np.int32) if field == "pixels" else rows
+            object.__setattr__(self, field, rows.reshape(count, width) if width > 1 else rows)
+        return object.__getattribute__(self, name)
+
+    def _known_header(self) -> tuple[int, float]:
+        if self._header is None:
+            self.settle(*self._header_of(self._block[: HEADER_BYTES // 4].cpu().numpy()))
+        assert self._header is not None
+        return self._header
+
+    @staticmethod
+    def _header_of(words: np.ndarray) -> tuple[int, float]:
+        return int(words[:1].view(np.int32)[0]), float(words[1])
+
+    def _offsets(self) -> dict[str, int]:
+        """First word of each array."""
+        ends = np.cumsum([_BEGIN, *(self.room * width for width in _ROWS.values())]).tolist()
+        return dict(zip(_ROWS, ends[:-1], strict=True))

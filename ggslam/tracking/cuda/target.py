@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Targets on the device: the voxels of the compiled core, and the hash table that finds them."""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+
+import numpy as np
+import torch
+
+from ggslam.cuda.library import CudaLibrary
+from ggslam.cuda.memory import GrowingMemory
+from ggslam.tracking import native
+from ggslam.tracking.cuda.contract import BLOCK_BYTES, SLOT_BYTES, VOXEL_BYTES, VoxelLevel, VoxelTableJob
+from ggslam.tracking.cuda.transfers import Upload
+from ggslam.tracking.gicp import GicpTarget
+
+_PLACES_PER_BLOCK = 4
+"""Of the hash table, at least: most look-ups end at the first place."""
+
+
+class DeviceTarget:
+    """The newest target on the device. It is sent when it is first used, in one copy; the next one takes its memory.
+
+    Args:
+        library: the compiled kernels.
+        device: where to.
+    """
+
+    def __init__(self, library: CudaLibrary, device: torch.device) -> None:
+        self._library, self._device = library, device
+        self._core = native.library()
+        self._memory = GrowingMemory(device)
+        self._upload = Upload(device)
+        self._target: weakref.ref[GicpTarget] | None = None
+        self._levels: tuple[VoxelLevel, VoxelLevel] | None = None
+
+    def levels(self, target: GicpTarget) -> tuple[VoxelLevel, VoxelLevel]:
+        """Fine and coarse voxels of the target, valid until another one is asked for."""
+        if self._levels is None or self._target is None or self._target() is not target:
+            self._levels = None
+            self._levels = self._sent(target)
+            self._target = weakref.ref(target)
+        return self._levels
+
+    def _sent(self, target: GicpTarget) -> tuple[VoxelLevel, VoxelLevel]:
+        core, handle = self._core, target.handle
+        voxels = [core.ggslam_gicp_target_size(handle, level) for level in (0, 1)]
+        blocks = [core.ggslam_gicp_target_blocks(handle, level, None) for level in (0, 1)]
+        sizes = [VOXEL_BYTES * n for n in voxels] + [BLOCK_BYTES * n for n in blocks]
+        begins = np.cumsum([0, *sizes]).tolist()
+        host = native.address(self._upload.begin(begins[-1]))
+        for level in (0, 1):
+            core.ggslam_gicp_target_voxels(handle, level, host + begins[level])
+            core.ggslam_gicp_target_blocks(handle, level, host + begins[2 + level])
+        sent = self._memory.block("target", begins[-1])
+        self._upload.send(sent[: begins[-1]])
+        first = sent.data_ptr()
+        fine, coarse = (
+            self._level(level, first + begins[level], first + begins[2 + level], blocks[level], target.voxel)
+            for level in (0, 1)
+        )
+        return fine, coarse
+
+    def _level(self, level: int, voxels: int, blocks: int, count: int, voxel: float) -> VoxelLevel:
+        """Starts the making of a level's hash table."""
+        places = 64
+        while places < _PLACES_PER_BLOCK * count:
+            places *= 2
+        slots = self._memory.block(f"slots {level}", SLOT_BYTES * places)
+        size = np.float32(voxel) * np.float32(4 if level else 1)
+        found = VoxelLevel(voxels, slots.data_ptr(), places - 1, size, np.float32(1) / size)
+        job = VoxelTableJob(blocks, found, self._library.stream(self._device), self._device.index or 0, count)
+        self._library.call("voxel_table", ctypes.byref(job))
+        return found
