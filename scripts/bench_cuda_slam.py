@@ -6,11 +6,12 @@
     python scripts/bench_cuda_slam.py --parts profile --out build/gpu_check
 
 Recordings are those of --only that are in --data; without any, a generated room, which is made once and kept (--room).
-Frames, masks included, are decoded before the clock starts: no figure here contains reading. Object identity is on. Parts:
+Frames, masks included, are decoded before the clock starts: no figure here contains reading. Object identity is on.
+Parts:
 
-    speed     synchronous runs: frames/s, ms of tracking and of the rest of a step per frame, iterations, errors, memory.
-              What the host waits for is counted where it waits; what the GPU still has to do at the end is waited for
-              before the clock stops
+    speed     synchronous runs: frames/s, ms of tracking and of the rest of a step per frame, iterations, errors,
+              memory. What the host waits for is counted where it waits; what the GPU still has to do at the end is
+              waited for before the clock stops
     realtime  frames arrive at --realtime per second on the GPU, at --realtime-cpu on the CPU: PSNR of both
     loops     the recording played forwards and backwards --loops times in one run: memory after every loop
     profile   what runs on the GPU in 50 frames, kernel by kernel, and how often it does nothing; see --out
