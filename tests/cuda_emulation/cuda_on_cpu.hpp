@@ -4,9 +4,9 @@
 //
 // Blocks run one after another. Each thread of a block is a fiber with a stack of its own, which runs until it reaches a
 // barrier or a warp collective and is resumed once all threads concerned have arrived: results that depend on a missing
-// barrier come out wrong here, too, above all as the order in which threads are resumed can be changed
-// (ggslam_emulation_order). Collectives insist on whole warps, barriers on whole blocks; a thread that never arrives ends
-// the process with a message.
+// barrier come out wrong here, too, above all as the order in which blocks run and threads are resumed can be changed
+// (ggslam_emulation_order) and shared memory is NaN when a block begins. Collectives insist on whole warps, barriers on
+// whole blocks; a thread that never arrives ends the process with a message.
 #pragma once
 #include <algorithm>
 #include <cmath>
