@@ -175,6 +175,18 @@ def test_gradients_of_a_rendering_that_ran_out_of_room_are_zero(cuda_library: Cu
     assert rasterizer.overflows.tolist() == [1]
 
 
+def test_one_may_wait_for_a_rendering_that_has_to_be_complete(cuda_library: CudaLibrary) -> None:
+    rasterizer, scene = tight_rasterizer(cuda_library), dense_scene()
+    expected = render_and_differentiate(CudaRasterizer(library=cuda_library), scene, POSE)
+    render_and_differentiate(rasterizer, scene, FAR)
+    rasterizer.waits = True
+    assert_same(render_and_differentiate(rasterizer, scene, POSE), expected, rasterizer.device)
+    assert rasterizer.last_overflowed.tolist() == [0] and rasterizer.overflows.tolist() == [0]
+    rasterizer.waits = False
+    assert_same(render_and_differentiate(rasterizer, scene, POSE), expected, rasterizer.device)
+    assert rasterizer.last_overflowed.tolist() == [0] and rasterizer.overflows.tolist() == [0]
+
+
 def test_room_is_given_back_slowly(cuda_library: CudaLibrary) -> None:
     rasterizer = tight_rasterizer(cuda_library)
     scene = moved(dense_scene(), rasterizer.device)

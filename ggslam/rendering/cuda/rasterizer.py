@@ -94,9 +94,10 @@ class CudaRasterizer:
             images; differentiating it gives zero and touches nothing, so that a step with it changes nothing.
 
     Attributes:
+        waits: as the argument; may be changed between renderings, for one whose images have to be complete.
         last_overflowed: int32 [1] on the device, 1 after a rendering that ran out of room, else 0. Of the last
-            rendering in stream order; always 0 with `waits`.
-        overflows: int64 [1] on the device, how many renderings did so far.
+            rendering in stream order; 0 after one that was waited for.
+        overflows: int64 [1] on the device, how many renderings ran out of room so far.
 
     Raises:
         RenderError: an impossible near plane or low-pass filter.
@@ -180,8 +181,8 @@ class CudaRasterizer:
         buffers = image_buffers(images, camera, channels, median_depth, self.device)
         stream, index = self.library.stream(self.device), self.device.index or 0
         native = Rendering(arrays, view, pointer(pose), target_pointers(buffers), stream=stream, device=index)
-        if not self.waits:
-            native.overflowed, native.overflows = self.last_overflowed.data_ptr(), self.overflows.data_ptr()
+        native.overflowed = self.last_overflowed.data_ptr()
+        native.overflows = None if self.waits else self.overflows.data_ptr()
         rendering = FinishedRendering(parameters, buffers, native, pose)
         if isinstance(gaussians, GaussianMap):
             rendering.source = MapState.of(gaussians)

@@ -36,10 +36,10 @@ write_pairs_kernel(std::int64_t count, Grid grid, GaussianWorkspace w, PairWorks
   });
 }
 
-// Where it is told whether a rendering found room for its pairs; both null: nowhere.
+// Where it is told whether a rendering found room for its pairs, see Rendering.
 struct RoomReport {
-  std::int32_t* overflowed;  // [1]: 1 if it did not
-  std::int64_t* overflows;   // [1]: how many did not
+  std::int32_t* overflowed;
+  std::int64_t* overflows;
 };
 
 // tile_start[t]: first pair of tile t or, if it has none, of the next tile that has. Places that no pair was written to
@@ -47,9 +47,10 @@ struct RoomReport {
 __global__ void __launch_bounds__(kBinThreads)
 tile_starts_kernel(GaussianWorkspace w, PairWorkspace pairs, int tiles, std::uint32_t* tile_start, RoomReport report) {
   const std::uint32_t i = blockIdx.x * static_cast<std::uint32_t>(kBinThreads) + threadIdx.x;
-  if (i == 0 && report.overflowed != nullptr) {
-    *report.overflowed = out_of_room(w, pairs) ? 1 : 0;
-    *report.overflows += *report.overflowed;
+  if (i == 0) {
+    const bool overflowed = out_of_room(w, pairs);
+    *report.overflowed = overflowed ? 1 : 0;
+    if (overflowed && report.overflows != nullptr) ++*report.overflows;
   }
   if (i > pairs.capacity) return;
   const auto tile_of = [&](std::uint32_t place) {

@@ -56,9 +56,8 @@ struct Rendering {
   void *gaussian_workspace, *pair_workspace, *pixel_workspace;
   std::int64_t pair_capacity;  // pairs of a Gaussian and a tile that pair_workspace has room for
   std::int64_t gaussian_sorting_bytes, pair_sorting_bytes;  // scratch for sorting, as set by ggslam_cuda_plan
-  // On the device, both null or neither: [1] 1 if this rendering ran out of room for pairs, else 0; [1] how many did.
-  std::int32_t* overflowed;
-  std::int64_t* overflows;
+  std::int32_t* overflowed;  // on the device, [1]: becomes 1 if there was too little room for pairs, else 0
+  std::int64_t* overflows;   // on the device, [1]: then becomes one more; may be null
   void* stream;
   std::int32_t device;
 };

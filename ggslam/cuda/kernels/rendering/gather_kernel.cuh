@@ -110,9 +110,14 @@ __device__ inline SplatGradients load_row(const GradientRows& in, std::int64_t r
 // twist is added to; it must be zero before.
 template <class Finish>
 __global__ void __launch_bounds__(kGatherThreads)
-gather_kernel(GaussianArrays arrays, ViewConstants c, const float* pose, GradientRows in, double* out_twist,
+gather_kernel(GaussianArrays arrays, ViewConstants view, const float* pose, GradientRows in, double* out_twist,
               Finish finish) {
-  read_pose(pose, c);
+  GGSLAM_SHARED ViewConstants c;  // as private variables its pose would take more registers than there are
+  if (threadIdx.x == 0) {
+    c = view;
+    read_pose(pose, c);
+  }
+  __syncthreads();
   const int lane = threadIdx.x % kWarp;
   const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * kGatherThreads;
   double twist = 0.0;  // lane k < 6: component k, of the warp
