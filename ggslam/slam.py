@@ -74,7 +74,7 @@ class Slam:
         self.context = NativeContext(self.config.threads or None)
         self.masks = ObjectMasks(self.config.masks, has_masks)
         library = run_library(self.config) if library is None else library
-        self.tracker = make_tracker(camera, self.config, self.context)
+        self.tracker = make_tracker(camera, self.config, self.context, library)
         self.pager = make_pager(camera, self.config, paging)
         archive = None if self.pager is None else self.pager.archive
         self.surface = MeasuredSurface(self.config.tracking.target, self.context, archive)

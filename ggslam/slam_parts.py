@@ -22,6 +22,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
+from ggslam.tracking.cuda.engine import CudaTrackingEngine
 from ggslam.tracking.feature_tracker import FeatureTracker
 from ggslam.tracking.tracker import Tracker
 
@@ -65,11 +66,19 @@ def make_mapper(config: Config, learns: bool, context: NativeContext, library: C
     )
 
 
-def make_tracker(camera: Camera, config: Config, context: NativeContext) -> Tracker:
-    """The front-end that the settings name."""
+def make_tracker(camera: Camera, config: Config, context: NativeContext, library: CudaLibrary | None) -> Tracker:
+    """The front-end that the settings name.
+
+    Args:
+        camera: of all frames.
+        config: of the run.
+        context: threads of the CPU.
+        library: CUDA kernels to align with; None: on the CPU, where features are tracked in any case.
+    """
     if config.tracker == "features":
         return FeatureTracker(camera, config.tracking, config.features, context)
-    return Tracker(camera, config.tracking, context)
+    engine = None if library is None else CudaTrackingEngine(camera, library.whole_device(None), library)
+    return Tracker(camera, config.tracking, context, engine=engine)
 
 
 def make_pager(camera: Camera, config: Config, folder: Path | None) -> MapPager | None:
