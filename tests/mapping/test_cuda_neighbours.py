@@ -60,8 +60,10 @@ def test_points_at_the_same_place_are_neighbours_of_each_other(cuda_library: Cud
 def test_among_equally_near_points_the_lowest_numbers_are_taken(cuda_library: CudaLibrary) -> None:
     cloud = np.zeros((5000, 3), np.float32)
     cloud[100:] = np.eye(3, dtype=np.float32)[np.arange(4900) % 3]
-    found = search(cuda_library, cloud, np.array([50, 4999, 2]), 7)
+    cloud[[60, 1500, 4000]] = 7.0
+    found = search(cuda_library, cloud, np.array([50, 4999, 2, 4000]), 7)
     np.testing.assert_array_equal(found[0], np.arange(7))
+    np.testing.assert_array_equal(found[3, :2], [60, 1500])
     np.testing.assert_array_equal(found[2], [0, 1, 3, 4, 5, 6, 7])
     np.testing.assert_array_equal(found[1], 100 + np.arange(7) * 3 + (4999 - 100) % 3)
 
