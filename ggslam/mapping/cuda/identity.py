@@ -199,8 +199,8 @@ class CudaIdentityLearner(IdentityObjects):
         s = self.settings
         classes, known = self._kernels.classes(labels, self.table.class_of)
         # Without a known pixel nothing may change; a Gaussian in no term makes no step.
-        counts = torch.where(known > 0, terms.counts, 0)
-        terms = CudaPixelTerms(terms.gaussians, terms.weights, counts, terms.library)
+        some = known > 0
+        terms = CudaPixelTerms(terms.gaussians, terms.weights, terms.counts * some, terms.library)
         terms.vote(gaussians, labels, vote_weights)
         losses = torch.empty(len(labels), device=self.device)
         gradient, rows = self.table.cross_entropy(terms.features(gaussians), classes, known, losses, s.weight)
@@ -208,9 +208,7 @@ class CudaIdentityLearner(IdentityObjects):
         if self._pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
             others = CudaPixelTerms.of_gaussians(pulled, terms.capacity, terms.library)
-            others = CudaPixelTerms(
-                others.gaussians, others.weights, torch.where(known > 0, others.counts, 0), others.library
-            )
+            others = CudaPixelTerms(others.gaussians, others.weights, others.counts * some, others.library)
             terms, gradient = terms.joined(others), torch.cat([gradient, pull])
         terms.step(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate))
         self.table.step(rows, known, rate_factor * s.classifier_rate)
