@@ -25,10 +25,11 @@ def move_with_keyframes(gaussians: GaussianMap, T_new_old: np.ndarray) -> None:
         T_new_old: [K, 4, 4], for each keyframe what moves the world about it from the old to the new place.
     """
     birth = gaussians.birth_keyframe.long()
-    R = torch.as_tensor(T_new_old[:, :3, :3], dtype=torch.float32)
-    t = torch.as_tensor(T_new_old[:, :3, 3], dtype=torch.float32)
-    turn = left_multiplication(torch.as_tensor(np.stack([matrix_to_quaternion(r) for r in T_new_old[:, :3, :3]])))
-    moved = torch.as_tensor(np.abs(T_new_old - np.eye(4)).max((1, 2)) > 0)
+    R = torch.as_tensor(T_new_old[:, :3, :3], dtype=torch.float32).to(gaussians.device)
+    t = torch.as_tensor(T_new_old[:, :3, 3], dtype=torch.float32).to(gaussians.device)
+    quaternions = torch.as_tensor(np.stack([matrix_to_quaternion(r) for r in T_new_old[:, :3, :3]]))
+    turn = left_multiplication(quaternions).to(gaussians.device)
+    moved = torch.as_tensor(np.abs(T_new_old - np.eye(4)).max((1, 2)) > 0).to(gaussians.device)
     rows = torch.nonzero((birth >= 0) & moved[birth.clamp(min=0)], as_tuple=True)[0]
     for block in rows.split(_BLOCK):
         own = birth[block]

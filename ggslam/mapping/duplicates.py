@@ -19,21 +19,22 @@ def remove_duplicates(
     (and in any case if nearer than `least_distance_m`), so that what fills a hole between the kept ones stays.
 
     Args:
-        gaussians: the map, after the loop was closed.
+        gaussians: the map, after the loop was closed. Where it is on a GPU, means and scales are copied to the host.
         kept_births: numbers of the keyframes whose Gaussians stay.
         doubted_births: numbers of the keyframes whose Gaussians are judged.
         least_distance_m: what counts as the same place anyway: the depth camera's noise, metres.
     """
-    birth = gaussians.birth_keyframe.numpy()
-    kept = np.isin(birth, kept_births) & (gaussians.opacities.numpy() > 0.3)
+    birth = gaussians.birth_keyframe.cpu().numpy()
+    kept = np.isin(birth, kept_births) & (gaussians.opacities.cpu().numpy() > 0.3)
     doubted = np.flatnonzero(np.isin(birth, doubted_births))
     if not kept.any() or not len(doubted):
         return 0
-    tree = cKDTree(gaussians.means.numpy()[kept])
+    means = gaussians.means.cpu().numpy()
+    tree = cKDTree(means[kept])
     # The middle of the three scales is the lesser extent along a disc's surface.
-    extent = np.sort(gaussians.scales.numpy()[doubted], axis=1)[:, 1]
+    extent = np.sort(gaussians.scales.cpu().numpy()[doubted], axis=1)[:, 1]
     reach = np.maximum(extent, least_distance_m)
-    distance, _ = tree.query(gaussians.means.numpy()[doubted], distance_upper_bound=float(reach.max()))
+    distance, _ = tree.query(means[doubted], distance_upper_bound=float(reach.max()))
     stays = np.ones(len(gaussians), bool)
     stays[doubted[distance < reach]] = False
     return gaussians.keep(torch.from_numpy(stays))

@@ -14,6 +14,8 @@ SH_C0 = 0.28209479177387814
 
 _PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features")
 _BOOKKEEPING = ("birth_keyframe", "object_id", "updates", "feature_updates", "vote_ids", "vote_weights")
+_ZERO_AT_BIRTH = ("updates", "feature_updates", "vote_ids", "vote_weights")
+_MOMENTS = ("first", "second")
 VOTE_SLOTS = 4
 """Object ids that a Gaussian keeps votes for."""
 
@@ -65,10 +67,15 @@ class GaussianMap:
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
         self._storage: dict[str, torch.Tensor] = {}
-        self._moments: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
         self._allocate(0)
 
     # --- storage -------------------------------------------------------------------------------------------------
+
+    @property
+    def _names(self) -> list[str]:
+        """Of all arrays: parameters, bookkeeping, moments (`means.first`, `means.second`)."""
+        moments = [f"{name}.{which}" for name in _PARAMETERS for which in _MOMENTS] if self.with_moments else []
+        return [*_PARAMETERS, *_BOOKKEEPING, *moments]
 
     def _shape(self, name: str) -> tuple[int, ...]:
         slots = VOTE_SLOTS if self.feature_channels else 0
@@ -77,23 +84,16 @@ class GaussianMap:
             "sh": ((self.sh_degree + 1) ** 2, 3), "features": (self.feature_channels,),
             "vote_ids": (slots,), "vote_weights": (slots,),
         }  # fmt: skip
-        return shapes.get(name, ())
+        return shapes.get(name.partition(".")[0], ())
 
     def _allocate(self, capacity: int) -> None:
-        def grown(old: torch.Tensor | None, name: str, dtype: torch.dtype) -> torch.Tensor:
+        for name in self._names:  # one after the other, so that no more than one of them is there twice
+            whole = name in _BOOKKEEPING and name != "vote_weights"
+            dtype = torch.int32 if whole else torch.float32
             new = torch.zeros((capacity, *self._shape(name)), dtype=dtype, device=self.device)
-            if old is not None:
-                new[: self.count] = old[: self.count]
-            return new
-
-        for name in _PARAMETERS:
-            self._storage[name] = grown(self._storage.get(name), name, torch.float32)
-            if self.with_moments:
-                first, second = self._moments.get(name, (None, None))
-                self._moments[name] = (grown(first, name, torch.float32), grown(second, name, torch.float32))
-        for name in _BOOKKEEPING:
-            dtype = torch.float32 if name == "vote_weights" else torch.int32
-            self._storage[name] = grown(self._storage.get(name), name, dtype)
+            if name in self._storage:
+                new[: self.count] = self._storage[name][: self.count]
+            self._storage[name] = new
 
     @property
     def capacity(self) -> int:
@@ -126,7 +126,10 @@ class GaussianMap:
     @property
     def moments(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Adam's first and second moment of each parameter, views of the used rows."""
-        return {name: (a[: self.count], b[: self.count]) for name, (a, b) in self._moments.items()}
+        if not self.with_moments:
+            return {}
+        rows, arrays = self.count, self._storage
+        return {name: (arrays[f"{name}.first"][:rows], arrays[f"{name}.second"][:rows]) for name in _PARAMETERS}
 
     # --- derived quantities ----------------------------------------------------------------------------------------
 
@@ -148,11 +151,19 @@ class GaussianMap:
     # --- whole rows --------------------------------------------------------------------------------------------------
 
     def _arrays(self, count: int) -> dict[str, torch.Tensor]:
-        """The first `count` rows of every array: parameters, bookkeeping, moments (`means.first`, `means.second`)."""
-        arrays = {name: array[:count] for name, array in self._storage.items()}
-        for name, (first, second) in self._moments.items():
-            arrays |= {f"{name}.first": first[:count], f"{name}.second": second[:count]}
-        return arrays
+        """The first `count` rows of every array, by name."""
+        return {name: array[:count] for name, array in self._storage.items()}
+
+    def to(self, device: torch.device | str) -> GaussianMap:
+        """A copy on a device, with room for the used rows only: all arrays bit for bit, moments, counters, settings."""
+        out = GaussianMap(
+            self.sh_degree, self.feature_channels, torch.device(device), self.with_moments, growth=self.growth
+        )
+        out._allocate(self.count)
+        for name, array in self._arrays(self.count).items():
+            out._storage[name].copy_(array)
+        out.count, out.version, out.order = self.count, self.version, self.order
+        return out
 
     def take(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
         """Copies of whole rows, index int64 [M]: everything that is known of these Gaussians, for `append`."""
@@ -185,13 +196,18 @@ class GaussianMap:
         means: torch.Tensor,
         quaternions: torch.Tensor,
         log_scales: torch.Tensor,
-        opacity_logits: torch.Tensor,
+        opacity_logits: torch.Tensor | float,
         rgb: torch.Tensor,
         features: torch.Tensor | None = None,
         birth_keyframe: int = -1,
         object_id: torch.Tensor | None = None,
     ) -> slice:
         """Appends M Gaussians (shapes as in the class; `rgb` [M, 3] in [0, 1]) with zero moments.
+
+        On a GPU nothing waits for it, given that the tensors are there.
+
+        Args:
+            opacity_logits: [M], or one number for all.
 
         Returns:
             The rows they occupy.
@@ -202,16 +218,14 @@ class GaussianMap:
         given = {"means": means, "quaternions": quaternions, "log_scales": log_scales, "opacity_logits": opacity_logits}
         for name, value in given.items():
             self._storage[name][rows] = value
-        self._storage["sh"][rows] = 0
+        self._storage["sh"][rows].zero_()
         self._storage["sh"][rows, 0] = rgb_to_sh(rgb)
         self._storage["features"][rows] = 0 if features is None else features
-        self._storage["birth_keyframe"][rows] = birth_keyframe
+        self._storage["birth_keyframe"][rows].fill_(birth_keyframe)
         self._storage["object_id"][rows] = 0 if object_id is None else object_id.to(torch.int32)
-        for name in ("updates", "feature_updates", "vote_ids", "vote_weights"):
-            self._storage[name][rows] = 0
-        for first, second in self._moments.values():
-            first[rows] = 0
-            second[rows] = 0
+        for name in self._names:
+            if name in _ZERO_AT_BIRTH or "." in name:  # the moments
+                self._storage[name][rows].zero_()
         self.count += added
         self.version += 1
         return rows
@@ -227,9 +241,8 @@ class GaussianMap:
 
     def reorder(self, index: torch.Tensor) -> None:
         """Makes row i the former row index[i] (int64 [M]); rows not named are dropped. Moments move along."""
-        kept = index.shape[0]
-        arrays = list(self._storage.values()) + [m for pair in self._moments.values() for m in pair]
-        for array in arrays:
+        kept, index = index.shape[0], index.to(self.device)  # once, not for each array
+        for array in self._storage.values():
             array[:kept] = array[: self.count][index]
         self.count = kept
         self.version += 1

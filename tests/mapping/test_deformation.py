@@ -6,8 +6,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from ggslam.cuda.library import CudaLibrary
 from ggslam.mapping.deformation import left_multiplication, move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
+from ggslam.mapping.pruning import prune
+from ggslam.mapping.settings import PruningSettings
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix, se3_exp
 
@@ -80,3 +83,22 @@ def test_nothing_is_double_with_transparent_gaussians() -> None:
     sheet(1.0, 0, gaussians, opacity=-3.0)
     sheet(1.0, 7, gaussians)
     assert remove_duplicates(gaussians, np.array([0]), np.array([7]), 0.01) == 0
+
+
+def test_a_map_on_a_device_is_moved_and_cleaned_as_on_the_host(cuda_library: CudaLibrary) -> None:
+    here = GaussianMap()
+    for z, birth in ((1.0, 0), (1.004, 1), (1.5, 1)):
+        sheet(z, birth, here)
+    here.log_scales[3, 0], here.means[5, 1], here.opacity_logits[7] = 3.0, torch.nan, -9.0
+    here.moments["quaternions"][0][:] = torch.rand(len(here), 4)
+    there = here.to(cuda_library.whole_device(None))
+    T = np.stack([np.eye(4), se3_exp(np.array([0.0, 0.0, 2e-3, 0.0, 0.0, 1e-3]))])
+    for gaussians in (here, there):
+        assert prune(gaussians, PruningSettings()) == 3
+        move_with_keyframes(gaussians, T)
+        assert 0 < remove_duplicates(gaussians, np.array([0]), np.array([1]), 0.01) < 800
+    assert len(there) == len(here)
+    rows = torch.arange(len(here))
+    found, expected = there.to("cpu").take(rows), here.take(rows)
+    for name, array in expected.items():
+        torch.testing.assert_close(found[name], array, atol=1e-6, rtol=1e-5)

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import pytest
 import torch
 
+from ggslam.cuda.library import CudaLibrary
 from ggslam.scene.gaussian_map import GaussianMap, rgb_to_sh, sh_to_rgb
 from ggslam.scene.poses import quaternion_to_matrix, se3_exp
 
@@ -59,6 +62,21 @@ def test_growth_keeps_what_was_there_and_is_amortised() -> None:
     assert len(capacities) <= 4 and out.birth_keyframe[12_345] == 12 and out.version == 40
 
 
+def test_while_growing_no_more_than_one_array_is_there_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = GaussianMap(feature_channels=2)
+    insert(out, 10)
+    old = [weakref.ref(array) for array in out._storage.values()]
+    zeros, left = torch.zeros, []
+
+    def counting_zeros(*arguments: object, **options: object) -> torch.Tensor:
+        left.append(sum(array() is not None for array in old))
+        return zeros(*arguments, **options)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(torch, "zeros", counting_zeros)
+    out.reserve(out.capacity + 1)
+    assert left == list(range(24, 0, -1)) and not any(array() is not None for array in old)
+
+
 def test_views_write_through() -> None:
     out = GaussianMap()
     insert(out, 10)
@@ -96,6 +114,45 @@ def test_rows_inserted_after_pruning_start_afresh() -> None:
         (out.updates[rows] == 0).all() and (out.object_id[rows] == 0).all() and (out.birth_keyframe[rows] == -1).all()
     )
     torch.testing.assert_close(out.rgb[rows], torch.full((5, 3), 0.25))
+
+
+def test_a_copy_on_a_device_has_everything_and_is_its_own(cuda_library: CudaLibrary) -> None:
+    original = GaussianMap(sh_degree=1, feature_channels=2, growth=0.25)
+    insert(original, 60)
+    mark_moments(original)
+    original.keep(torch.arange(60) % 2 == 0)
+    original.updates[:], original.vote_ids[:], original.vote_weights[:] = 3, 5, 0.5
+    there = original.to(cuda_library.whole_device(None))
+    assert there.device == there.means.device == cuda_library.whole_device(None)
+    assert there.capacity == there.count == 30 and there.growth == 0.25
+    there.means[0] = 77.0
+    assert original.means[0, 0] == 0
+    there.means[0] = 0.0
+    back = there.to("cpu")
+    assert (back.count, back.version, back.order) == (30, original.version, original.order)
+    rows = torch.arange(30)
+    found, expected = back.take(rows), original.take(rows)
+    assert found.keys() == expected.keys() and len(found) == 24
+    assert all(torch.equal(found[name], array) for name, array in expected.items())
+    assert GaussianMap(with_moments=False).to("cpu").moments == {}
+
+
+def test_a_map_on_a_device_grows_and_shrinks_as_on_the_host(cuda_library: CudaLibrary) -> None:
+    here = GaussianMap(feature_channels=1)
+    insert(here, 100)
+    mark_moments(here)
+    there = here.to(cuda_library.whole_device(None))
+    new = {"quaternions": torch.rand(20, 4), "log_scales": torch.rand(20, 3), "rgb": torch.rand(20, 3)}
+    for out in (here, there):
+        device = out.device
+        given = {name: value.to(device) for name, value in new.items()}
+        out.insert(torch.zeros(20, 3, device=device), opacity_logits=0.25, birth_keyframe=4, **given)
+        out.keep(torch.arange(120, device=device) % 3 > 0)
+        out.reorder(torch.arange(79, -1, -1))
+        out.append(out.take(torch.tensor([3, 5], device=device)))
+    found, expected = there.to("cpu").take(torch.arange(82)), here.take(torch.arange(82))
+    assert all(torch.equal(found[name], array) for name, array in expected.items())
+    assert (there.opacity_logits[:13] == 0.25).all() and (there.version, there.order) == (here.version, here.order)
 
 
 def test_moving_turns_position_and_orientation() -> None:

@@ -1,0 +1,92 @@
+// SPDX-License-Identifier: Apache-2.0
+// The arguments of inserting Gaussians from a keyframe, and the memory that it works in. What is inserted where is
+// stated in ggslam/mapping/insertion.py.
+#pragma once
+#include "common/carver.cuh"
+#include "common/sorting.cuh"
+
+namespace ggslam::cuda {
+
+// One keyframe, all pointers lead to device memory. ggslam/mapping/cuda/insertion.py mirrors it field by field.
+struct InsertionJob {
+  const std::uint8_t* color;     // [H, W, 3]
+  const std::uint16_t* depth;    // [H, W], 0 = none
+  const float *alpha, *rendered_depth;  // [H, W], rendered: alpha and expected depth in metres; both null: an empty map
+  // Written by ggslam_cuda_insertion_select: how many Gaussians there will be.
+  std::int32_t* total;
+  // Written by ggslam_cuda_insertion_build, of `count` rows: [3], [4] wxyz, [3], [3] and flat pixel indices.
+  float *means, *quaternions, *log_scales, *rgb;
+  std::int64_t* pixels;
+  void* workspace;
+  void* stream;
+  std::int32_t device, height, width, count;
+  std::int32_t adaptive_stride, fill_stride;
+  float units_per_metre;  // of depth
+  float fx, fy, cx, cy;
+  float rotation[9], translation[3];  // of T_world_camera
+  float alpha_threshold, depth_tolerance_m, depth_tolerance_relative, scale_pixels, flatness, max_slope,
+      texture_threshold, max_depth_m;
+};
+
+namespace insertion {
+
+// Number of grid lines of a stride, the first at stride / 2.
+__host__ __device__ inline int grid_lines(int size, int stride) {
+  return stride > 0 && size > stride / 2 ? (size - stride / 2 - 1) / stride + 1 : 0;
+}
+
+// The candidates are all pixels, row by row, and after them the points of the grid for filling, row by row.
+struct Candidates {
+  std::int64_t pixels;
+  int fill_wide;
+  std::int64_t count;
+};
+
+inline Candidates candidates_of(const InsertionJob& job) {
+  const std::int64_t pixels = static_cast<std::int64_t>(job.height) * job.width;
+  const int wide = grid_lines(job.width, job.fill_stride), high = grid_lines(job.height, job.fill_stride);
+  return {pixels, wide, pixels + static_cast<std::int64_t>(wide) * high};
+}
+
+constexpr std::uint32_t kCoarse = 0x80000000u;  // in a chosen candidate's number: it has stride 2
+
+struct Workspace {
+  std::uint32_t* chosen;    // [candidates], 1 where a Gaussian is to be
+  std::uint32_t* sums;      // [candidates], running sum of `chosen`
+  std::uint32_t* order;     // [candidates]: the chosen ones' numbers, one after the other, with kCoarse
+  std::uint8_t* coarse;     // [pixels]
+  std::int32_t* known_row;  // [H, W]: row of the nearest pixel with depth in the same column, -1 = none
+  float* fill_depth;        // [candidates - pixels], metres
+  void* scratch;
+  std::size_t scratch_bytes, bytes;
+};
+
+inline Workspace workspace_of(void* block, const InsertionJob& job) {
+  const Candidates c = candidates_of(job);
+  Carver carver(block);
+  Workspace w;
+  w.chosen = carver.take<std::uint32_t>(c.count);
+  w.sums = carver.take<std::uint32_t>(c.count);
+  w.order = carver.take<std::uint32_t>(c.count);
+  w.coarse = carver.take<std::uint8_t>(c.pixels);
+  w.known_row = carver.take<std::int32_t>(c.count > c.pixels ? c.pixels : 0);
+  w.fill_depth = carver.take<float>(c.count - c.pixels);
+  w.scratch_bytes = sorting_bytes(c.count);
+  w.scratch = carver.take<char>(static_cast<std::int64_t>(w.scratch_bytes));
+  w.bytes = carver.used();
+  return w;
+}
+
+__device__ inline float depth_at(const InsertionJob& job, int x, int y) {
+  return static_cast<float>(job.depth[static_cast<std::int64_t>(y) * job.width + x]) / job.units_per_metre;
+}
+
+// The index in [0, size) that OpenCV's border "reflect 101" (dcb|abcd|cba) takes for i.
+__device__ inline int reflected(int i, int size) {
+  if (size == 1) return 0;
+  while (i < 0 || i >= size) i = i < 0 ? -i : 2 * size - 2 - i;
+  return i;
+}
+
+}  // namespace insertion
+}  // namespace ggslam::cuda

@@ -1,0 +1,33 @@
+// SPDX-License-Identifier: Apache-2.0
+// The C interface of the search for nearest points. Only starts work on the caller's stream. Functions return 0 or a
+// cudaError_t.
+#include "mapping/neighbours.cuh"
+
+#include "common/host.cuh"
+
+using namespace ggslam::cuda;
+using namespace ggslam::cuda::neighbours;
+
+// Bytes of memory that a search takes. Asks for point_count, row_count and k.
+GGSLAM_EXPORT std::int64_t ggslam_cuda_neighbours_bytes(const NeighbourJob* job) {
+  return static_cast<std::int64_t>(workspace_of(nullptr, *job).bytes);
+}
+
+// Size of the struct, so that a caller can check that its mirror of it is the same.
+GGSLAM_EXPORT int ggslam_cuda_neighbour_job_size() { return static_cast<int>(sizeof(NeighbourJob)); }
+
+// The most neighbours of each row that a search finds.
+GGSLAM_EXPORT int ggslam_cuda_most_neighbours() { return kMostNeighbours; }
+
+// Finds the neighbours. The caller has checked sizes and pointers.
+GGSLAM_EXPORT int ggslam_cuda_neighbours(const NeighbourJob* job) {
+  return on_device(job->device, [&] {
+    const Workspace w = workspace_of(job->workspace, *job);
+    const Parts parts = parts_of(*job);
+    const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);
+    const std::int64_t row_blocks = blocks_for(job->row_count, kRowsPerBlock);
+    launch(search_kernel, row_blocks * parts.count, kThreads, stream, *job, parts, w);
+    launch(merge_kernel, row_blocks, kThreads, stream, *job, parts, w);
+    return cudaSuccess;
+  });
+}

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""New Gaussians for a keyframe on an NVIDIA GPU: what `ggslam.mapping.insertion` does, by kernels.
+
+The same Gaussians in the same order, to rounding, with two differences where holes are filled. The nearest pixel with
+depth is found exactly, where the CPU takes the nearest by an approximate distance; among equally near ones either may
+take another. And mean colours are rounded to the nearest of 256 levels, where OpenCV, for an even `fill_stride`, may
+take the next.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.cuda.memory import GrowingMemory, address
+from ggslam.errors import RenderError
+from ggslam.mapping.settings import InsertionSettings
+from ggslam.rendering.types import check_pose
+from ggslam.scene.camera import Camera
+
+_POINTERS = ("color", "depth", "alpha", "rendered_depth", "total", "means", "quaternions", "log_scales", "rgb",
+             "pixels", "workspace", "stream")  # fmt: skip
+_NUMBERS = ("alpha_threshold", "depth_tolerance_m", "depth_tolerance_relative", "scale_pixels", "flatness",
+            "max_slope", "texture_threshold", "max_depth_m")  # fmt: skip
+_MOST_PIXELS = 1 << 29
+"""Pixels and points for filling are numbered together in 31 bits."""
+
+
+@dataclass(frozen=True)
+class DeviceGaussians:
+    """Gaussians to insert, world frame, float32 on the device; see `NewGaussians`.
+
+    Attributes:
+        means: [M, 3], metres.
+        quaternions: [M, 4] wxyz, of unit length.
+        log_scales: [M, 3], natural logarithm of the standard deviations in metres.
+        rgb: [M, 3] in [0, 1].
+        pixels: int64 [M], flat index of the pixel that each comes from.
+    """
+
+    means: torch.Tensor
+    quaternions: torch.Tensor
+    log_scales: torch.Tensor
+    rgb: torch.Tensor
+    pixels: torch.Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+
+class _Job(ctypes.Structure):
+    """Mirror of struct InsertionJob in cuda/kernels/mapping/insertion.cuh."""
+
+    _fields_ = [
+        *[(name, ctypes.c_void_p) for name in _POINTERS],
+        *[(name, ctypes.c_int32) for name in ("device", "height", "width", "count", "adaptive_stride", "fill_stride")],
+        *[(name, ctypes.c_float) for name in ("units_per_metre", "fx", "fy", "cx", "cy")],
+        ("rotation", ctypes.c_float * 9), ("translation", ctypes.c_float * 3),
+        *[(name, ctypes.c_float) for name in _NUMBERS],
+    ]  # fmt: skip
+
+
+class DeviceInsertion:
+    """Finds new Gaussians on torch's current stream; keeps scratch memory between keyframes. One instance serves one
+    caller and one stream at a time.
+
+    Args:
+        device: CUDA device; None: the current one.
+        library: the compiled kernels; None: those of the device, compiled if need be.
+
+    Raises:
+        MissingDependency: no CUDA device, or the kernels cannot be compiled.
+        NativeCoreError: the compiled kernels do not fit this code.
+    """
+
+    def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
+        chosen = None if device is None else torch.device(device)
+        self.library = library or library_for_device(chosen)
+        self.device = self.library.whole_device(chosen)
+        self.library.check_size("insertion_job", _Job)
+        for name in ("insertion_select", "insertion_build"):
+            self.library.declare(name, [ctypes.c_void_p])
+        self.library.declare("insertion_bytes", [ctypes.c_void_p], ctypes.c_int64)
+        self._memory = GrowingMemory(self.device)
+        self._total = torch.empty(1, dtype=torch.int32, device=self.device)
+
+    def new_gaussians(
+        self,
+        color: torch.Tensor,
+        depth: torch.Tensor,
+        depth_scale: float,
+        alpha: torch.Tensor | None,
+        expected_depth: torch.Tensor | None,
+        camera: Camera,
+        T_world_camera: np.ndarray,
+        settings: InsertionSettings,
+    ) -> DeviceGaussians:
+        """The Gaussians that the map lacks: first those of `new_gaussians` at the pixels that are `unexplained`, then,
+        if holes are filled, those of `fill_gaussians`. Waits for the device once, for their number.
+
+        Args:
+            color: measured, uint8 [H, W, 3].
+            depth: measured, uint16 [H, W], 0 = none.
+            depth_scale: metres per unit of `depth`.
+            alpha: rendered alpha, float32 [H, W]; None: the map is empty, so Gaussians are wanted everywhere.
+            expected_depth: rendered expected depth, float32 [H, W], metres; not None unless `alpha` is.
+            camera: intrinsics of the image size [H, W].
+            T_world_camera: [4, 4], pose of the camera.
+
+        Raises:
+            RenderError: an array has another shape, type or device, or a number is impossible.
+        """
+        self._check_images(color, depth, alpha, expected_depth, camera)
+        if not (math.isfinite(depth_scale) and depth_scale > 0):
+            raise RenderError(f"depth_scale: expected a number above 0, found {depth_scale!r}")
+        job = self._job(camera, check_pose(T_world_camera, "T_world_camera"), settings)
+        job.units_per_metre = 1 / depth_scale
+        job.color, job.depth = color.data_ptr(), depth.data_ptr()
+        job.alpha, job.rendered_depth = address(alpha), address(expected_depth)
+        job.total = self._total.data_ptr()
+        size = self.library.functions.ggslam_cuda_insertion_bytes(ctypes.byref(job))
+        job.workspace = self._memory.block("insertion", size).data_ptr()
+        self.library.call("insertion_select", ctypes.byref(job))
+        job.count = int(self._total.item())  # the one wait
+        new = self._empty(job.count)
+        for name in ("means", "quaternions", "log_scales", "rgb", "pixels"):
+            setattr(job, name, getattr(new, name).data_ptr())
+        self.library.call("insertion_build", ctypes.byref(job))
+        return new
+
+    def _job(self, camera: Camera, T_world_camera: np.ndarray, settings: InsertionSettings) -> _Job:
+        job = _Job(
+            device=self.device.index or 0, height=camera.height, width=camera.width, fx=camera.fx, fy=camera.fy,
+            cx=camera.cx, cy=camera.cy, adaptive_stride=settings.adaptive_stride, fill_stride=settings.fill_stride,
+        )  # fmt: skip
+        job.rotation[:] = T_world_camera[:3, :3].reshape(-1).tolist()
+        job.translation[:] = T_world_camera[:3, 3].tolist()
+        for name in _NUMBERS:
+            setattr(job, name, getattr(settings, name))
+        job.stream = self.library.stream(self.device)
+        return job
+
+    def _empty(self, count: int) -> DeviceGaussians:
+        means, quaternions, log_scales, rgb = (torch.empty(count, n, device=self.device) for n in (3, 4, 3, 3))
+        pixels = torch.empty(count, dtype=torch.int64, device=self.device)
+        return DeviceGaussians(means, quaternions, log_scales, rgb, pixels)
+
+    def _check_images(
+        self, color: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor | None,
+        expected_depth: torch.Tensor | None, camera: Camera,
+    ) -> None:  # fmt: skip
+        shape = (camera.height, camera.width)
+        if camera.height * camera.width > _MOST_PIXELS:
+            raise RenderError(f"insertion: expected at most {_MOST_PIXELS} pixels, found {list(shape)}")
+        self._check("color", color, torch.uint8, (*shape, 3))
+        self._check("depth", depth, torch.uint16, shape)
+        if (alpha is None) != (expected_depth is None):
+            raise RenderError("insertion: expected both or neither of alpha and expected_depth")
+        if alpha is not None and expected_depth is not None:
+            self._check("alpha", alpha, torch.float32, shape)
+            self._check("expected_depth", expected_depth, torch.float32, shape)
+
+    def _check(self, name: str, tensor: torch.Tensor, dtype: torch.dtype, shape: tuple[int, ...]) -> None:
+        if tuple(tensor.shape) != shape or tensor.dtype != dtype or tensor.device != self.device:
+            found = f"{tensor.dtype} {list(tensor.shape)} on {tensor.device}"
+            raise RenderError(f"{name}: expected {dtype} {list(shape)} on {self.device}, found {found}")
+        if not tensor.is_contiguous():
+            raise RenderError(f"{name}: expected a contiguous tensor, found strides {tensor.stride()}")
