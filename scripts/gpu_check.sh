@@ -4,29 +4,62 @@
 # with a CUDA build of torch, numpy and pytest; installs nothing and needs no network. Goes on after a step that fails and
 # says at the end which did.
 #   FOLDER=...     where the log of each step goes (default: build/gpu_check)
-#   STEPS="..."    which steps to run (default: machine build compile tests bench training)
+#   ARCHIVE=...    also puts all of that into one file .tar.gz at the end, whatever happened
+#   STEPS="..."    which steps to run, in this order whatever is said:
+#                    machine build compile tests slam realtime profile loops bench training
+#   SHORT=1        less of everything, for ten minutes in all; no step begins or goes on after LIMIT seconds
+#   LIMIT=...      seconds; 0: none (default: 0, with SHORT 540)
+#   DATA=...       folder with recordings (default: GGSLAM_DATA, else ../shared/data, shared/data or build/recordings,
+#                  whichever there is); without recordings a room is generated
+#   SLAM="..."     arguments of scripts/bench_cuda_slam.py, for the steps slam, realtime, profile and loops
 #   BENCH="..."    arguments of scripts/bench_cuda_render.py
 #   TRAINING="..." arguments of scripts/bench_cuda_training.py
 #   SANITIZE=1     runs a few tests under compute-sanitizer's memcheck and racecheck, too (minutes)
 set -u
 cd "$(dirname "$0")/.."
 export PYTHONPATH=$PWD:$PWD/scripts PYTHONUNBUFFERED=1 OMP_WAIT_POLICY=PASSIVE
-python=${PYTHON:-python3}
-folder=${FOLDER:-build/gpu_check}
+export python=${PYTHON:-python3}
+export folder=${FOLDER:-build/gpu_check}
 export GGSLAM_CACHE=${GGSLAM_CACHE:-$PWD/build/cuda_cache}
 mkdir -p "$folder"
-failed=""
+for place in "${DATA:-}" "${GGSLAM_DATA:-}" ../shared/data shared/data build/recordings; do
+  [ -z "$place" ] || [ ! -d "$place" ] || { export GGSLAM_DATA=$place && break; }
+done
+wanted=${STEPS:-machine build compile tests slam realtime profile loops bench training}
+export PICK="not slow" SLAM=${SLAM:-} BENCH=${BENCH:-} TRAINING=${TRAINING:-} LOOPS=""
+limit=${LIMIT:-0}
+if [ -n "${SHORT:-}" ]; then
+  limit=${LIMIT:-540}
+  PICK="gpu and not slow"
+  SLAM=${SLAM:---only redkitchen --frames 100}
+  LOOPS="--frames 40 --loops 5"
+  BENCH=${BENCH:---counts 300000 --sizes 640x480 --repeat 15}
+  TRAINING=${TRAINING:---counts 300000 --sizes 640x480 --repeat 15}
+fi
+failed="" times=""
 
-# step NAME COMMAND...: runs a command if the step is wanted, shows its output and keeps it.
+finish() {
+  [ -z "${ARCHIVE:-}" ] || tar czf "$ARCHIVE" -C "$folder" .
+}
+trap finish EXIT
+
+# step NAME FUNCTION: runs it if the step is wanted and there is time, shows its output and keeps it.
 step() {
-  local name=$1
-  shift
-  case " ${STEPS:-machine build compile tests bench training} " in *" $name "*) ;; *) return ;; esac
+  local name=$1 left=86400 start=$SECONDS status
+  case " $wanted " in *" $name "*) ;; *) return ;; esac
+  if [ "$limit" -gt 0 ]; then
+    left=$((limit - SECONDS))
+    if [ "$left" -le 5 ]; then
+      echo "=== $name: left out, no time"
+      failed="$failed $name" times="$times $name:-"
+      return
+    fi
+  fi
   echo "=== $name"
-  local start=$SECONDS
-  "$@" 2>&1 | tee "$folder/$name.log"
-  local status=${PIPESTATUS[0]}
+  timeout -k 10 "$left" bash -uc "$2" 2>&1 | tee "$folder/$name.log"
+  status=${PIPESTATUS[0]}
   echo "=== $name: status $status, $((SECONDS - start)) s"
+  times="$times $name:$((SECONDS - start))"
   [ "$status" -eq 0 ] || failed="$failed $name"
 }
 
@@ -34,6 +67,7 @@ machine() {
   nvidia-smi --query-gpu=name,driver_version,memory.total,compute_cap --format=csv
   nvcc --version | tail -2
   "$python" -c 'import sys, torch; print(sys.version.split()[0], torch.__version__, torch.cuda.is_available())'
+  echo "$(nproc) processors, recordings: $(ls "${GGSLAM_DATA:-/nowhere}" 2>/dev/null | tr '\n' ' ')"
   "$python" -c 'import torch; assert torch.cuda.is_available(), "torch finds no GPU"'
 }
 
@@ -42,7 +76,7 @@ build() {
     test -f ggslam/native/_lib/libggslam_core.so
 }
 
-# Compiles the rasterizer for this GPU as a user's first call does, then once more to list registers and spills.
+# Compiles the kernels for this GPU as a user's first call does, then once more to list registers and spills.
 compile() {
   "$python" - <<'CODE' || return 1
 import time
@@ -52,17 +86,20 @@ architecture = "".join(map(str, torch.cuda.get_device_capability()))
 start = time.perf_counter()
 print(compiled_library(architecture), f"{time.perf_counter() - start:.1f} s")
 CODE
-  local arch
+  local arch source
   arch=$("$python" -c 'import torch; print("".join(map(str, torch.cuda.get_device_capability())))')
-  local source
-  for source in rendering/api mapping/image_loss; do
-    nvcc -O3 -std=c++17 -ftz=true -Xptxas -v -gencode "arch=compute_$arch,code=sm_$arch" -c -o /dev/null \
-      -I ggslam/cuda/kernels "ggslam/cuda/kernels/$source.cu" 2>&1 | grep -E "Compiling|spill|Used" | { c++filt 2>/dev/null || cat; }
+  find ggslam/cuda/kernels -name '*.cu' ! -name sorting.cu -print0 | sort -z | xargs -0 -P "$(nproc)" -I{} sh -c '
+    nvcc -O3 -std=c++17 -ftz=true -Xptxas -v -gencode "arch=compute_$0,code=sm_$0" -c -o /dev/null \
+      -I ggslam/cuda/kernels "$1" >"$2/$(basename "$1").ptxas" 2>&1' "$arch" {} "$folder"
+  for source in "$folder"/*.ptxas; do
+    grep -E "Compiling|spill|Used|error|warning" "$source" | { c++filt 2>/dev/null || cat; }
+    rm "$source"
   done
 }
 
 tests() {
-  "$python" -m pytest -q -p no:cacheprovider tests/rendering -rs
+  "$python" -m pytest -q -p no:cacheprovider -rs -m "$PICK" --durations=15 tests/rendering tests/mapping tests/tracking \
+    tests/test_device_watch.py tests/test_slam*.py
 }
 
 sanitize() {
@@ -74,25 +111,38 @@ sanitize() {
   done
 }
 
+# run_slam PART ARGUMENT...: one part of the benchmark of whole runs.
+run_slam() {
+  local part=$1
+  shift
+  # shellcheck disable=SC2086
+  "$python" scripts/bench_cuda_slam.py --parts "$part" --json "$folder/slam_$part.json" --out "$folder" $SLAM "$@"
+}
+
+slam() { run_slam speed; }
+realtime() { run_slam realtime; }
+profile() { run_slam profile; }
+# shellcheck disable=SC2086
+loops() { run_slam loops $LOOPS; }
+
 bench() {
   # shellcheck disable=SC2086
-  "$python" scripts/bench_cuda_render.py ${BENCH:-}
+  "$python" scripts/bench_cuda_render.py $BENCH
 }
 
 training() {
   # shellcheck disable=SC2086
-  "$python" scripts/bench_cuda_training.py ${TRAINING:-}
+  "$python" scripts/bench_cuda_training.py $TRAINING
 }
 
-step machine machine
-step build build
-step compile compile
-step tests tests
-[ -z "${SANITIZE:-}" ] || STEPS="sanitize" step sanitize sanitize
-step bench bench
-step training training
+export -f machine build compile tests sanitize run_slam slam realtime profile loops bench training
+[ -z "${SANITIZE:-}" ] || wanted="$wanted sanitize"
+for name in machine build compile tests sanitize slam realtime profile loops bench training; do
+  step "$name" "$name"
+done
+echo "seconds:$times"
 if [ -n "$failed" ]; then
-  echo "failed:$failed"
+  echo "failed or left out:$failed"
   exit 1
 fi
 echo "all steps passed"

@@ -16,8 +16,13 @@ from ggslam.cuda.compiler import KERNELS
 from ggslam.cuda.library import CudaLibrary
 
 EMULATION = Path(__file__).parent
-FLAGS = ("-std=c++17", "-O2", "-march=native", "-fPIC", "-Wno-unknown-pragmas", "-DGGSLAM_CUDA_EMULATION")
-
+CHECKED = "alignment,bounds,float-cast-overflow,integer-divide-by-zero,shift,signed-integer-overflow"
+"""What ends the process if a kernel does it: above all vectors at addresses that are no multiple of their size, which
+a GPU refuses, and indices beyond an array in shared memory."""
+FLAGS = (
+    "-std=c++17", "-O2", "-march=native", "-fPIC", "-Wno-unknown-pragmas", "-DGGSLAM_CUDA_EMULATION",
+    f"-fsanitize={CHECKED}", "-fno-sanitize-recover=all",
+)  # fmt: skip
 
 KEPT = EMULATION.parents[1] / "build" / "cuda_emulation"
 """Compiled libraries of this checkout, by what they were compiled from."""
@@ -53,5 +58,5 @@ def _compile(compiler: str, folder: Path) -> Path:
         errors = compiling.communicate()[1]
         assert compiling.returncode == 0, errors
     library = folder / "emulated.so"
-    subprocess.run([compiler, "-shared", *map(str, objects), "-o", str(library)], check=True)
+    subprocess.run([compiler, "-shared", f"-fsanitize={CHECKED}", *map(str, objects), "-o", str(library)], check=True)
     return library

@@ -4,9 +4,9 @@
 //
 // Blocks run one after another. Each thread of a block is a fiber with a stack of its own, which runs until it reaches a
 // barrier or a warp collective and is resumed once all threads concerned have arrived: results that depend on a missing
-// barrier come out wrong here, too, above all as the order in which threads are resumed can be changed
-// (ggslam_emulation_order). Collectives insist on whole warps, barriers on whole blocks; a thread that never arrives ends
-// the process with a message.
+// barrier come out wrong here, too, above all as the order in which blocks run and threads are resumed can be changed
+// (ggslam_emulation_order) and shared memory is NaN when a block begins. Collectives insist on whole warps, barriers on
+// whole blocks; a thread that never arrives ends the process with a message.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -23,7 +23,9 @@
 #define __host__
 #define __align__(bytes) alignas(bytes)
 #define __launch_bounds__(...)
-#define GGSLAM_SHARED static  // blocks run one after another, so one copy serves all
+// Blocks run one after another, so one copy serves all. Nothing else here is thread_local: what is, is overwritten with
+// NaN before each block.
+#define GGSLAM_SHARED static thread_local
 
 // --- types ------------------------------------------------------------------------------------------------------------
 
@@ -121,7 +123,14 @@ constexpr unsigned cudaHostAllocDefault = 0, cudaEventDisableTiming = 0;
 
 inline const char* cudaGetErrorString(cudaError_t) { return "no error"; }
 inline cudaError_t cudaGetLastError() { return cudaSuccess; }
-inline cudaError_t cudaSetDevice(int) { return cudaSuccess; }
+inline cudaError_t cudaGetDevice(int* device) {
+  *device = emulation::current_device;
+  return cudaSuccess;
+}
+inline cudaError_t cudaSetDevice(int device) {
+  emulation::current_device = device;
+  return cudaSuccess;
+}
 inline cudaError_t cudaMemsetAsync(void* place, int value, std::size_t bytes, cudaStream_t) {
   std::memset(place, value, bytes);
   return cudaSuccess;
@@ -152,9 +161,7 @@ template <class Kernel, class... Arguments>
 void launch(Kernel kernel, std::int64_t blocks, int threads, cudaStream_t, const Arguments&... arguments) {
   const auto thread = [&] { kernel(arguments...); };
   using Thread = decltype(thread);
-  for (std::int64_t block = 0; block < blocks; ++block)
-    emulation::run_block(static_cast<unsigned>(block), static_cast<unsigned>(blocks), threads,
-                         [](const void* code) { (*static_cast<const Thread*>(code))(); }, &thread);
+  emulation::run_grid(blocks, threads, [](const void* code) { (*static_cast<const Thread*>(code))(); }, &thread);
 }
 
 }  // namespace ggslam::cuda

@@ -6,13 +6,18 @@
 #include <csetjmp>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
+#include <link.h>
 #include <memory>
+#include <numeric>
 #include <ucontext.h>
+#include <utility>
 #include <vector>
 
 namespace emulation {
 
 Index threadIdx, blockIdx, blockDim, gridDim;
+int current_device = 0;
 
 namespace {
 
@@ -85,6 +90,45 @@ int in_order(int i) {
   return i;
 }
 
+// The memory of this library's thread_local variables, which are the shared memory of all kernels.
+struct SharedMemory {
+  void* place = nullptr;
+  std::size_t bytes = 0;
+};
+
+int find_shared_memory(dl_phdr_info* library, std::size_t, void* found) {
+  const auto here = reinterpret_cast<ElfW(Addr)>(&find_shared_memory);
+  bool mine = false;
+  std::size_t bytes = 0;
+  for (int i = 0; i < library->dlpi_phnum; ++i) {
+    const ElfW(Phdr)& part = library->dlpi_phdr[i];
+    const ElfW(Addr) start = library->dlpi_addr + part.p_vaddr;
+    if (part.p_type == PT_LOAD && here >= start && here < start + part.p_memsz) mine = true;
+    if (part.p_type == PT_TLS) bytes = part.p_memsz;
+  }
+  if (!mine) return 0;
+  *static_cast<SharedMemory*>(found) = {library->dlpi_tls_data, bytes};
+  return 1;
+}
+
+// What was in shared memory before means nothing: as floats it is NaN.
+void spoil_shared_memory() {
+  SharedMemory shared;
+  dl_iterate_phdr(find_shared_memory, &shared);
+  if (shared.place != nullptr) std::memset(shared.place, 0xff, shared.bytes);
+}
+
+// The block to run as number i: upwards, downwards or in an order of jumps.
+std::int64_t block_in_order(std::int64_t i, std::int64_t blocks) {
+  if (order == 1) return blocks - 1 - i;
+  if (order != 2) return i;
+  std::int64_t jump = 37;
+  while (std::gcd(jump, blocks) != 1) jump += 2;
+  return i * jump % blocks;
+}
+
+void run_block(unsigned number, unsigned blocks, int threads, void (*code)(const void*), const void* argument);
+
 }  // namespace
 
 void fail(const char* what) {
@@ -92,12 +136,21 @@ void fail(const char* what) {
   std::abort();
 }
 
+void run_grid(std::int64_t blocks, int threads, void (*code)(const void*), const void* argument) {
+  if (blocks > 0x7fffffff) fail("more blocks than a grid can have");
+  for (std::int64_t i = 0; i < blocks; ++i)
+    run_block(static_cast<unsigned>(block_in_order(i, blocks)), static_cast<unsigned>(blocks), threads, code, argument);
+}
+
+namespace {
+
 void run_block(unsigned number, unsigned blocks, int threads, void (*code)(const void*), const void* argument) {
   if (threads > kMaxThreads || threads % kLanes != 0) fail("a block of an impossible size");
   blockIdx.x = number, gridDim.x = blocks, blockDim.x = static_cast<unsigned>(threads);
   block = Block{};
   block.threads = threads, block.code = code, block.argument = argument;
   for (int i = 0; i < threads; ++i) fibers[i].done = false;
+  spoil_shared_memory();
   for (Warp& warp : warps) warp.arrived = 0;
   for (int running = threads; running > 0;) {
     progress = false;
@@ -111,6 +164,8 @@ void run_block(unsigned number, unsigned blocks, int threads, void (*code)(const
   }
   if (block.arrived != 0) fail("a barrier that only some threads reached");
 }
+
+}  // namespace
 
 int meet_block(int value) {
   const unsigned meeting = block.meetings;
@@ -142,5 +197,8 @@ const std::uint64_t* meet_warp(Operation operation, std::uint64_t value) {
 
 }  // namespace emulation
 
-// Order in which the threads of a block are resumed: 0 upwards, 1 downwards, 2 jumping.
+// Order in which blocks are run and the threads of a block are resumed: 0 upwards, 1 downwards, 2 jumping.
 extern "C" void ggslam_emulation_order(int order) { emulation::order = order; }
+
+// The device that calls without a device mean; returns what it was.
+extern "C" int ggslam_emulation_device(int device) { return std::exchange(emulation::current_device, device); }

@@ -9,13 +9,14 @@ struct Index {
   unsigned x = 0;
 };
 extern Index threadIdx, blockIdx, blockDim, gridDim;
+extern int current_device;
 
 enum Operation { kShuffle, kShuffleXor, kBallot, kReduceAdd, kReduceMax, kSync };
 
 [[noreturn]] void fail(const char* what);
 
-// Runs `threads` threads of one block, each calling code(argument).
-void run_block(unsigned block, unsigned blocks, int threads, void (*code)(const void*), const void* argument);
+// Runs blocks of `threads` threads one after another, each thread calling code(argument).
+void run_grid(std::int64_t blocks, int threads, void (*code)(const void*), const void* argument);
 
 // Waits for all threads of the block; returns the sum of what they brought.
 int meet_block(int value);

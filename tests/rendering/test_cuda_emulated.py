@@ -241,3 +241,12 @@ def test_wrong_calls_are_refused(rasterizer: CudaRasterizer) -> None:
         rasterizer.backward(gradient, grad_features=gradient)
     with pytest.raises(RenderError, match="near_plane"):
         emulated_rasterizer(near_plane=0.0)
+
+
+def test_the_current_device_stays_what_it_was(rasterizer: CudaRasterizer) -> None:
+    exchange = rasterizer.library.functions.ggslam_emulation_device
+    exchange(3)
+    try:
+        rasterizer.forward(make_scene(20, 0), CAMERA, POSE)
+    finally:
+        assert exchange(0) == 3
