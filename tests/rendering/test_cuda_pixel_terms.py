@@ -3,68 +3,18 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 from cuda_contract import crowded_scene
-from rendering_scenes import CAMERA, POSE, make_scene
+from cuda_terms import ALL, RATES, Both, copied, make_map, on_cpu
+from rendering_scenes import CAMERA, make_scene
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
-from ggslam.rendering.cuda.rasterizer import CudaRasterizer
-from ggslam.rendering.pixel_terms import FeatureAdamSettings, PixelTerms
-from ggslam.rendering.types import GaussianTensors
-from ggslam.scene.gaussian_map import GaussianMap
-
-SIZE = CAMERA.width * CAMERA.height
-ALL = np.arange(SIZE, dtype=np.int32)
-RATES = FeatureAdamSettings()
-
-
-def make_map(scene: GaussianTensors, device: torch.device | str = "cpu") -> GaussianMap:
-    gaussians = GaussianMap(0, scene.features.shape[1], torch.device(device))
-    parameters = [getattr(scene, name) for name in ("means", "quaternions", "log_scales", "opacity_logits")]
-    gaussians.insert(*(p.to(device) for p in (*parameters, 0.5 + 0 * scene.means, scene.features)))
-    return gaussians
-
-
-def copied(gaussians: GaussianMap, device: torch.device | str) -> GaussianMap:
-    """The same parameters and votes, moments zero."""
-    parameters = {f.name: getattr(gaussians, f.name).cpu() for f in dataclasses.fields(GaussianTensors)}
-    copy = make_map(GaussianTensors(**parameters), device)
-    copy.vote_ids[:], copy.vote_weights[:] = gaussians.vote_ids.to(device), gaussians.vote_weights.to(device)
-    return copy
-
-
-class Both:
-    """The same scene rendered on the CPU and by the CUDA kernels."""
-
-    def __init__(self, library: CudaLibrary, scene: GaussianTensors) -> None:
-        self.device = library.whole_device(None)
-        self.map, self.device_map = make_map(scene), make_map(scene, self.device)
-        self.cpu, self.cuda = CpuRasterizer(1), CudaRasterizer(self.device, library=library)
-        self.cpu.forward(self.map, CAMERA, POSE, features=False)
-        self.view = self.cuda.forward(self.device_map, CAMERA, POSE, features=False)
-
-    def cuda_terms(self, pixels: np.ndarray, capacity: int, min_weight: float) -> CudaPixelTerms:
-        return self.cuda.pixel_terms(torch.from_numpy(pixels).to(self.device), capacity, min_weight)
-
-    def equal_terms(self, pixels: np.ndarray, capacity: int = 32) -> tuple[PixelTerms, CudaPixelTerms]:
-        """Terms of the CUDA kernels, and the same for the CPU."""
-        terms = self.cuda_terms(pixels, capacity, 1e-3)
-        return on_cpu(terms, self.cpu), terms
-
-    def given(self, values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(values).to(self.device)
-
-
-def on_cpu(terms: CudaPixelTerms, rasterizer: CpuRasterizer) -> PixelTerms:
-    arrays = [array.cpu().numpy().copy() for array in (terms.gaussians, terms.weights, terms.counts)]
-    return PixelTerms(*arrays, rasterizer.context)
+from ggslam.rendering.pixel_terms import PixelTerms
 
 
 def assert_terms_agree(found: PixelTerms, expected: PixelTerms) -> None:
@@ -158,6 +108,16 @@ def test_a_gaussian_seen_by_many_pixels_sums_them_all(cuda_library: CudaLibrary)
     assert torch.equal(found.feature_updates.cpu(), torch.tensor([1, 0, 1], dtype=torch.int32))
     assert torch.allclose(found.moments["features"][0].cpu(), gaussians.moments["features"][0], rtol=1e-5, atol=1e-6)
     assert torch.equal(terms.weight_sums(3).cpu(), torch.tensor([1.0, 0.0, 115.0]))
+
+
+def test_a_gradient_that_is_no_number_stays_with_its_gaussians(cuda_library: CudaLibrary) -> None:
+    device = cuda_library.whole_device(None)
+    gaussians = make_map(make_scene(3, 5), device)
+    terms = CudaPixelTerms.of_gaussians(torch.tensor([0, 1, 1, 1], device=device), 2, cuda_library)
+    gradient = torch.ones(4, 5, device=device)
+    gradient[0] = torch.nan
+    terms.step(gaussians, gradient, RATES)
+    assert torch.equal(gaussians.features.isfinite().all(1).cpu(), torch.tensor([False, True, True]))
 
 
 def check_votes(both: Both, pixels: np.ndarray) -> None:
@@ -256,77 +216,3 @@ def test_pseudo_pixels_follow_when_joined(cuda_library: CudaLibrary) -> None:
     assert torch.equal(joined.opacity()[40:].cpu(), torch.ones(3))
     with pytest.raises(RenderError, match="room for 8 and for 9"):
         terms.joined(CudaPixelTerms.of_gaussians(rows, 9, cuda_library))
-
-
-def test_pixels_outside_the_image_have_no_terms(cuda_library: CudaLibrary) -> None:
-    both = Both(cuda_library, make_scene(300, 2))
-    inside = int(both.view.alpha.argmax())
-    pixels = np.array([-1, SIZE, inside, 2**31 - 1, -(2**31)], np.int32)
-    terms = both.cuda_terms(pixels, 8, 1e-3)
-    assert torch.equal(terms.counts.cpu() > 0, torch.from_numpy(pixels == inside))
-    assert not terms.weights[3].any() and not terms.gaussians[3].any()
-
-
-def test_zero_pixels_and_an_empty_map(cuda_library: CudaLibrary) -> None:
-    for count, pixels in ((50, ALL[:0]), (0, ALL[:9])):
-        both = Both(cuda_library, make_scene(count, 2))
-        terms = both.cuda_terms(pixels.copy(), 8, 1e-3)
-        size = len(pixels)
-        assert not terms.counts.any() and terms.opacity().shape == (size,)
-        assert torch.equal(terms.features(both.device_map).cpu(), torch.zeros(size, 2))
-        terms.step(both.device_map, torch.ones(size, 2, device=both.device), RATES)
-        terms.vote(both.device_map, torch.ones(size, dtype=torch.int32, device=both.device))
-        ids, shares = terms.labels(torch.ones(count, dtype=torch.int32, device=both.device))
-        assert not ids.any() and not shares.any() and len(ids) == size
-        assert not both.device_map.feature_updates.any() and not terms.weight_sums(count).any()
-
-
-def test_gaussians_beyond_the_map_are_passed_over(cuda_library: CudaLibrary) -> None:
-    device = cuda_library.whole_device(None)
-    gaussians = make_map(make_scene(4, 2), device)
-    terms = CudaPixelTerms.of_gaussians(torch.tensor([-1, 1, 4, 2**31 - 1], device=device), 2, cuda_library)
-    terms.step(gaussians, torch.ones(4, 2, device=device), RATES)
-    terms.vote(gaussians, torch.ones(4, dtype=torch.int32, device=device))
-    assert gaussians.feature_updates.tolist() == [0, 1, 0, 0]
-    assert terms.features(gaussians).any(1).tolist() == [False, True, False, False]
-    assert terms.labels(torch.full((4,), 6, dtype=torch.int32, device=device))[0].tolist() == [0, 6, 0, 0]
-
-
-def test_terms_outlive_the_next_rendering_and_the_step_of_the_features(cuda_library: CudaLibrary) -> None:
-    both = Both(cuda_library, make_scene(200, 16))
-    before = both.cuda_terms(ALL, 32, 1e-3)
-    weights = before.weights.clone()
-    before.step(both.device_map, torch.ones(SIZE, 16, device=both.device), RATES)
-    assert torch.equal(both.cuda_terms(ALL, 32, 1e-3).weights, weights)
-    both.cuda.forward(both.device_map, CAMERA, np.eye(4), features=False)
-    assert torch.equal(before.weights, weights)
-    assert not torch.equal(both.cuda_terms(ALL, 32, 1e-3).weights, weights)
-
-
-def test_impossible_requests_are_refused(cuda_library: CudaLibrary) -> None:
-    device = cuda_library.whole_device(None)
-    gaussians, rasterizer = make_map(make_scene(50, 16), device), CudaRasterizer(device, library=cuda_library)
-    pixels = torch.arange(5, dtype=torch.int32, device=device)
-    with pytest.raises(RenderError, match="call forward first"):
-        rasterizer.pixel_terms(pixels)
-    rasterizer.forward(gaussians, CAMERA, POSE)
-    with pytest.raises(RenderError, match="capacity"):
-        rasterizer.pixel_terms(pixels, 0)
-    with pytest.raises(RenderError, match=r"torch.int32 \[P\], found torch.int64"):
-        rasterizer.pixel_terms(pixels.long())
-    with pytest.raises(RenderError, match="more than 2147483647"):
-        rasterizer.pixel_terms(pixels, 2**30)
-    terms = rasterizer.pixel_terms(pixels)
-    with pytest.raises(RenderError, match="gradient"):
-        terms.step(gaussians, torch.zeros(4, 16, device=device), RATES)
-    with pytest.raises(RenderError, match="contiguous"):
-        terms.step(gaussians, torch.zeros(16, 5, device=device).T, RATES)
-    with pytest.raises(RenderError, match="labels"):
-        terms.vote(gaussians, torch.zeros(5, dtype=torch.int64, device=device))
-    with pytest.raises(RenderError, match="labels"):
-        terms.vote(gaussians, torch.zeros(6, dtype=torch.int32, device=device))
-    plain = make_map(make_scene(50, 0), device)
-    with pytest.raises(RenderError, match="1 to 64 channels, found 0"):
-        terms.features(plain)
-    with pytest.raises(RenderError, match="vote_ids"):
-        terms.vote(plain, torch.zeros(5, dtype=torch.int32, device=device))

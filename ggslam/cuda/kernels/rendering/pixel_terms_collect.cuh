@@ -50,15 +50,20 @@ __device__ inline int list_contributors(const TermWalk& walk, const PairWorkspac
     const int k = first + i * kWarp + lane;
     concerned[i] = k <= walk.last && ((pairs.contributed[walk.begin + k] >> walk.part) & 1) != 0;
   }
-  __syncwarp();  // the rows listed before have been read
-  int found = 0;
+  // All loads first, then all stores, so that memory is waited for once.
+  int places[kRounds], found = 0;
+  std::uint32_t loaded[kRounds];
 #pragma unroll
   for (int i = 0; i < kRounds; ++i) {
     const unsigned lanes = __ballot_sync(kAllLanes, concerned[i]);
-    if (concerned[i])
-      rows[found + __popc(lanes & ((1u << lane) - 1))] = pairs.sorted_rows[walk.begin + first + i * kWarp + lane];
+    if (concerned[i]) loaded[i] = pairs.sorted_rows[walk.begin + first + i * kWarp + lane];
+    places[i] = found + __popc(lanes & ((1u << lane) - 1));
     found += __popc(lanes);
   }
+  __syncwarp();  // the rows listed before have been read
+#pragma unroll
+  for (int i = 0; i < kRounds; ++i)
+    if (concerned[i]) rows[places[i]] = loaded[i];
   __syncwarp();
   return found;
 }
@@ -107,6 +112,7 @@ collect_terms_kernel(Grid grid, const Splat* splats, PairWorkspace pairs, PixelW
   }
   const int size = min(walk.size, out.capacity);
   if (lane == 0) out.counts[p] = size;
+#pragma unroll 1
   for (int k = size + lane; k < out.capacity; k += kWarp) gaussians[k] = 0, weights[k] = 0.0f;
 }
 
