@@ -19,6 +19,7 @@ import torch
 from ggslam.cuda.library import CudaLibrary, library_for_device
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
+from ggslam.mapping.cuda.neighbours import device_neighbours
 from ggslam.mapping.cuda.pixel_pool import DevicePixelPool, PixelDrawer
 from ggslam.mapping.cuda.votes import merge_votes, vote_labels, vote_shares
 from ggslam.mapping.identity_objects import BIRTH_VOTE, IDS, MIN_WEIGHT, POOL_STEPS, TERMS, IdentityObjects
@@ -79,7 +80,7 @@ class CudaIdentityLearner(IdentityObjects):
         self.table: CudaClassTable = CudaClassTable(self._rng, self._kernels)
         drawn_from = int(np.random.default_rng([seed, 17]).integers(2**62))
         self._drawer = PixelDrawer(self.device, self.library, drawn_from)
-        self._neighbours = neighbours or _device_neighbours()
+        self._neighbours = neighbours or device_neighbours
         self._pools: dict[int, DevicePixelPool] = {}
         self._shown: torch.Tensor | None = None  # labels by votes, of the last keyframe's time
         self._shown_order = -1
@@ -277,9 +278,3 @@ class CudaIdentityLearner(IdentityObjects):
             ids = torch.where(sure, ids, torch.where(share > 0, learned, 0))
         gaussians.object_id.copy_(ids)
         self.times.labelling += time.perf_counter() - start
-
-
-def _device_neighbours() -> Neighbours:
-    from ggslam.mapping.cuda.neighbours import device_neighbours
-
-    return device_neighbours
