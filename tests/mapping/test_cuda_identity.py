@@ -249,7 +249,8 @@ def test_steps_are_due_where_there_are_masks_and_objects(cuda_library: CudaLibra
 
 @pytest.mark.parametrize("schedule", ["sampled", "dense", "votes"])
 def test_a_mask_without_objects_changes_nothing(cuda_library: CudaLibrary, schedule: str) -> None:
-    both = Both(cuda_library, schedule=schedule)
+    pull = NeighbourSettings(every=1, samples=20) if schedule == "sampled" else ALONE
+    both = Both(cuda_library, schedule=schedule, neighbours=pull)
     both.begin()
     both.step(1) if schedule != "dense" else None  # moments that would carry on by themselves
     features, rows = both.device_map.features.clone(), both.cuda.table.rows.clone()
@@ -265,7 +266,8 @@ def test_a_mask_without_objects_changes_nothing(cuda_library: CudaLibrary, sched
 
 
 def test_pixels_drawn_before_their_objects_were_forgotten_change_nothing(cuda_library: CudaLibrary) -> None:
-    both = Both(cuda_library, np.where(picture() == 300, 300, 0).astype(np.uint16))
+    pull = NeighbourSettings(every=1, samples=20)
+    both = Both(cuda_library, np.where(picture() == 300, 300, 0).astype(np.uint16), neighbours=pull)
     both.observe(picture())
     both.begin()
     both.step(2)
@@ -274,6 +276,14 @@ def test_pixels_drawn_before_their_objects_were_forgotten_change_nothing(cuda_li
     before, rows = both.device_map.features.clone(), both.cuda.table.rows.clone()
     both.cuda.step(both.device_map, both.view, both.keyframe, None)  # type: ignore[arg-type]
     assert torch.equal(both.device_map.features, before) and torch.equal(both.cuda.table.rows, rows)
+
+
+def test_new_gaussians_have_the_objects_of_their_pixels(cuda_library: CudaLibrary) -> None:
+    both = Both(cuda_library)
+    both.cuda.merge(both.device_map, 2, 300)
+    pixels = torch.tensor([5 * WIDTH + 16, 5 * WIDTH + 3, 0, 23], device=both.device)
+    assert both.cuda.labels_at(both.keyframe, pixels).tolist() == [2, 2, 1, 0]
+    assert both.cuda.labels_at(MaskedKeyframe(1, None, both.device), pixels).tolist() == [0] * 4
 
 
 def test_new_gaussians_may_begin_at_random(cuda_library: CudaLibrary) -> None:

@@ -148,6 +148,12 @@ class CudaIdentityLearner(IdentityObjects):
         shown, _ = terms.labels(self._shown)
         return torch.where((self._device_whole_of[shown.long()] == labels) & (shown > 0), shown, labels)
 
+    def labels_at(self, keyframe: MaskedKeyframe, pixels: torch.Tensor) -> torch.Tensor:
+        """Objects at pixels (integers [M], flat indices) of a keyframe, int32 [M], for `begin`; 0 = unknown."""
+        if keyframe.device_mask is None:
+            return torch.zeros(len(pixels), dtype=torch.int32, device=self.device)
+        return self._kernels.labels(keyframe.device_mask, pixels.to(torch.int32), self._device_alias)
+
     def begin(self, gaussians: GaussianMap, rows: slice, labels: torch.Tensor) -> None:
         """New Gaussians get their first identity vectors and votes.
 
