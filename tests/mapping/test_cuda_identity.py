@@ -19,7 +19,7 @@ from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.pixel_pool import DevicePixelPool, PixelDrawer
 from ggslam.mapping.cuda.votes import merge_votes, vote_labels
-from ggslam.mapping.identity import IdentityLearner, cross_entropy
+from ggslam.mapping.identity import IdentityLearner, by_parts, cross_entropy
 from ggslam.mapping.identity_objects import IDS
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
 from ggslam.mapping.neighbours import kl_gradient
@@ -249,7 +249,8 @@ def test_steps_are_due_where_there_are_masks_and_objects(cuda_library: CudaLibra
 
 @pytest.mark.parametrize("schedule", ["sampled", "dense", "votes"])
 def test_a_mask_without_objects_changes_nothing(cuda_library: CudaLibrary, schedule: str) -> None:
-    both = Both(cuda_library, schedule=schedule)
+    pull = NeighbourSettings(every=1, samples=20) if schedule == "sampled" else ALONE
+    both = Both(cuda_library, schedule=schedule, neighbours=pull)
     both.begin()
     both.step(1) if schedule != "dense" else None  # moments that would carry on by themselves
     features, rows = both.device_map.features.clone(), both.cuda.table.rows.clone()
@@ -265,7 +266,9 @@ def test_a_mask_without_objects_changes_nothing(cuda_library: CudaLibrary, sched
 
 
 def test_pixels_drawn_before_their_objects_were_forgotten_change_nothing(cuda_library: CudaLibrary) -> None:
-    both = Both(cuda_library, np.where(picture() == 300, 300, 0).astype(np.uint16))
+    pull = NeighbourSettings(every=1, samples=20)
+    both = Both(cuda_library, np.where(picture() == 300, 300, 0).astype(np.uint16), neighbours=pull)
+    both.observe(picture())
     both.begin()
     both.step(2)
     both.give_pool(1)
@@ -273,6 +276,14 @@ def test_pixels_drawn_before_their_objects_were_forgotten_change_nothing(cuda_li
     before, rows = both.device_map.features.clone(), both.cuda.table.rows.clone()
     both.cuda.step(both.device_map, both.view, both.keyframe, None)  # type: ignore[arg-type]
     assert torch.equal(both.device_map.features, before) and torch.equal(both.cuda.table.rows, rows)
+
+
+def test_new_gaussians_have_the_objects_of_their_pixels(cuda_library: CudaLibrary) -> None:
+    both = Both(cuda_library)
+    both.cuda.merge(both.device_map, 2, 300)
+    pixels = torch.tensor([5 * WIDTH + 16, 5 * WIDTH + 3, 0, 23], device=both.device)
+    assert both.cuda.labels_at(both.keyframe, pixels).tolist() == [2, 2, 1, 0]
+    assert both.cuda.labels_at(MaskedKeyframe(1, None, both.device), pixels).tolist() == [0] * 4
 
 
 def test_new_gaussians_may_begin_at_random(cuda_library: CudaLibrary) -> None:
@@ -290,9 +301,13 @@ def test_merges_removals_and_labels_are_those_of_the_cpu(cuda_library: CudaLibra
     both = Both(cuda_library)
     both.begin()
     both.step(3)
+    for gaussians in (both.map, both.device_map):
+        gaussians.features[:9] = torch.from_numpy(both.cpu.table.codes(np.full(9, 300))).to(gaussians.device)
+        gaussians.vote_weights[:6] = 0  # learned, but never seen
     both.cpu.merge(both.map, 2, 300)
     both.cuda.merge(both.device_map, 2, 300)
     both.check()
+    assert torch.allclose(both.map.features[:6], torch.from_numpy(both.cpu.table.codes(np.full(6, 2))))
     assert 300 not in both.cuda.classifier.class_ids and np.array_equal(both.cuda.current(np.array([300])), [2])
     both.step(2, seed=1)
     both.check()
@@ -389,6 +404,22 @@ def test_classes_grow_and_go_as_on_the_cpu(cuda_library: CudaLibrary) -> None:
     assert np.array_equal(cuda.ids.cpu(), cpu.classifier.class_ids)
 
 
+@pytest.mark.parametrize("at_once", [2**24, 50])
+def test_vectors_have_the_labels_of_the_cpu(
+    cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch, at_once: int
+) -> None:
+    monkeypatch.setattr("ggslam.mapping.cuda.class_table._LOGITS_AT_ONCE", at_once)
+    random, device = np.random.default_rng(0), cuda_library.whole_device(None)
+    table = CudaClassTable(random, ClassKernels(device, cuda_library))
+    vectors = (0.4 * random.normal(size=(500, 16))).astype(np.float32)
+    assert not table.labels(torch.from_numpy(vectors).to(device)).any()
+    table.add(np.arange(1, 8, dtype=np.uint16))
+    for confidence in (0.0, 0.5):
+        expected = by_parts(table.classifier, vectors, confidence)
+        assert np.array_equal(table.labels(torch.from_numpy(vectors).to(device), confidence).cpu(), expected)
+        assert 0.1 < (expected == 0).mean() < 0.9
+
+
 @pytest.mark.parametrize("classes", [1, 31, 70])
 def test_cross_entropy_has_the_gradients_of_the_cpu(cuda_library: CudaLibrary, classes: int) -> None:
     random, device = np.random.default_rng(0), cuda_library.whole_device(None)
@@ -448,6 +479,18 @@ def test_pixels_are_drawn_as_on_the_cpu(cuda_library: CudaLibrary, balance: floa
     assert found.vote_weights.mean() == pytest.approx(1, rel=1e-4)
 
 
+def test_the_draw_does_not_depend_on_the_order_of_threads(cuda_library: CudaLibrary) -> None:
+    if cuda_library.device_type == "cuda":
+        pytest.skip("the order cannot be chosen on a GPU")
+    expected = drawn(cuda_library, picture(), 500)
+    for order in (1, 2):
+        cuda_library.functions.ggslam_emulation_order(order)
+        found = drawn(cuda_library, picture(), 500)
+        cuda_library.functions.ggslam_emulation_order(0)
+        assert np.array_equal(found.pixels, expected.pixels)
+        assert np.array_equal(found.vote_weights, expected.vote_weights)
+
+
 def test_an_image_without_boundaries_is_drawn_from_anywhere(cuda_library: CudaLibrary) -> None:
     pool = drawn(cuda_library, np.full((HEIGHT, WIDTH), 9, np.uint16), 20000)
     assert np.bincount(pool.pixels, minlength=HEIGHT * WIDTH).min() > 10
@@ -493,7 +536,7 @@ def wall(device: torch.device | str) -> GaussianMap:
 def test_objects_are_learned(cuda_library: CudaLibrary) -> None:
     device = cuda_library.whole_device(None)
     settings = IdentitySettings(every=1, pixels=128, neighbours=NeighbourSettings(samples=40))
-    learner = CudaIdentityLearner(settings, 0, device, cuda_library, near)
+    learner = CudaIdentityLearner(settings, 0, device, cuda_library)
     gaussians, rasterizer = wall(device), CudaRasterizer(device, library=cuda_library)
     keyframe = MaskedKeyframe(0, picture(), device)
     learner.observe(picture())
@@ -518,7 +561,7 @@ def test_a_step_waits_for_nothing(schedule: str) -> None:
     with DeviceWatch() as watch:
         pull = NeighbourSettings(samples=20, every=2)
         settings = IdentitySettings(schedule=schedule, every=1, pixels=64, neighbours=pull)  # type: ignore[arg-type]
-        learner = CudaIdentityLearner(settings, library=watch.library, neighbours=near)
+        learner = CudaIdentityLearner(settings, library=watch.library)
         gaussians, rasterizer = wall("cuda"), CudaRasterizer(library=watch.library)
         keyframe = MaskedKeyframe(0, picture(), learner.device)
         learner.observe(picture())

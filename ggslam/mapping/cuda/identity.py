@@ -19,6 +19,7 @@ import torch
 from ggslam.cuda.library import CudaLibrary, library_for_device
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
+from ggslam.mapping.cuda.neighbours import device_neighbours
 from ggslam.mapping.cuda.pixel_pool import DevicePixelPool, PixelDrawer
 from ggslam.mapping.cuda.votes import merge_votes, vote_labels, vote_shares
 from ggslam.mapping.identity_objects import BIRTH_VOTE, IDS, MIN_WEIGHT, POOL_STEPS, TERMS, IdentityObjects
@@ -79,7 +80,7 @@ class CudaIdentityLearner(IdentityObjects):
         self.table: CudaClassTable = CudaClassTable(self._rng, self._kernels)
         drawn_from = int(np.random.default_rng([seed, 17]).integers(2**62))
         self._drawer = PixelDrawer(self.device, self.library, drawn_from)
-        self._neighbours = neighbours or _device_neighbours()
+        self._neighbours = neighbours or device_neighbours
         self._pools: dict[int, DevicePixelPool] = {}
         self._shown: torch.Tensor | None = None  # labels by votes, of the last keyframe's time
         self._shown_order = -1
@@ -147,6 +148,12 @@ class CudaIdentityLearner(IdentityObjects):
         shown, _ = terms.labels(self._shown)
         return torch.where((self._device_whole_of[shown.long()] == labels) & (shown > 0), shown, labels)
 
+    def labels_at(self, keyframe: MaskedKeyframe, pixels: torch.Tensor) -> torch.Tensor:
+        """Objects at pixels (integers [M], flat indices) of a keyframe, int32 [M], for `begin`; 0 = unknown."""
+        if keyframe.device_mask is None:
+            return torch.zeros(len(pixels), dtype=torch.int32, device=self.device)
+        return self._kernels.labels(keyframe.device_mask, pixels.to(torch.int32), self._device_alias)
+
     def begin(self, gaussians: GaussianMap, rows: slice, labels: torch.Tensor) -> None:
         """New Gaussians get their first identity vectors and votes.
 
@@ -199,8 +206,8 @@ class CudaIdentityLearner(IdentityObjects):
         s = self.settings
         classes, known = self._kernels.classes(labels, self.table.class_of)
         # Without a known pixel nothing may change; a Gaussian in no term makes no step.
-        counts = torch.where(known > 0, terms.counts, 0)
-        terms = CudaPixelTerms(terms.gaussians, terms.weights, counts, terms.library)
+        some = known > 0
+        terms = CudaPixelTerms(terms.gaussians, terms.weights, terms.counts * some, terms.library)
         terms.vote(gaussians, labels, vote_weights)
         losses = torch.empty(len(labels), device=self.device)
         gradient, rows = self.table.cross_entropy(terms.features(gaussians), classes, known, losses, s.weight)
@@ -208,9 +215,7 @@ class CudaIdentityLearner(IdentityObjects):
         if self._pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
             others = CudaPixelTerms.of_gaussians(pulled, terms.capacity, terms.library)
-            others = CudaPixelTerms(
-                others.gaussians, others.weights, torch.where(known > 0, others.counts, 0), others.library
-            )
+            others = CudaPixelTerms(others.gaussians, others.weights, others.counts * some, others.library)
             terms, gradient = terms.joined(others), torch.cat([gradient, pull])
         terms.step(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate))
         self.table.step(rows, known, rate_factor * s.classifier_rate)
@@ -279,9 +284,3 @@ class CudaIdentityLearner(IdentityObjects):
             ids = torch.where(sure, ids, torch.where(share > 0, learned, 0))
         gaussians.object_id.copy_(ids)
         self.times.labelling += time.perf_counter() - start
-
-
-def _device_neighbours() -> Neighbours:
-    from ggslam.mapping.cuda.neighbours import device_neighbours
-
-    return device_neighbours
