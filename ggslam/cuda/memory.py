@@ -41,6 +41,19 @@ def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:
     return tensor.pin_memory().to(device, non_blocking=True)
 
 
+def download(*tensors: torch.Tensor) -> list[np.ndarray]:
+    """Copies of device tensors on the host, for which it waits once."""
+    if tensors[0].device.type != "cuda":
+        return [tensor.numpy().copy() for tensor in tensors]
+    copies = [torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True) for tensor in tensors]
+    for copy, tensor in zip(copies, tensors, strict=True):
+        copy.copy_(tensor, non_blocking=True)
+    done = torch.cuda.Event()
+    done.record()
+    done.synchronize()
+    return [copy.numpy() for copy in copies]
+
+
 class HostMirror:
     """Numbers of a device tensor as they were some moments ago, at hand without waiting.
 

@@ -48,4 +48,6 @@ class Pace:
         end.record()
         self._ends.append(end)
         if len(self._ends) > self._ahead:
-            self._ends.popleft().synchronize()
+            before = self._ends.popleft()
+            if not before.query():
+                before.synchronize()

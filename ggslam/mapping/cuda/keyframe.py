@@ -41,7 +41,7 @@ class DeviceImages:
 
 
 class CudaKeyframe(Keyframe):
-    """A keyframe whose pose and exposure are optimised on a device. Reading them here waits for it.
+    """A keyframe whose pose and exposure are optimised on a device. Once it was trained, reading them waits for that.
 
     Args:
         keyframe: images, as the host keeps them, and the first pose and exposure.
@@ -60,11 +60,13 @@ class CudaKeyframe(Keyframe):
     @property
     def T_camera_world(self) -> np.ndarray:  # type: ignore[override]
         """float64 [4, 4], as refined so far."""
-        assert self._states is not None
+        if self._states is None or self.iterations == 0:
+            return self._given
         return self._states.read_poses()[self.index]
 
     @T_camera_world.setter
     def T_camera_world(self, T_camera_world: np.ndarray) -> None:
+        self._given = np.array(T_camera_world, np.float64)
         if self._states is not None:
             self._states.write_pose(self.index, T_camera_world)
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.cuda.memory import HostMirror
+from ggslam.cuda.memory import HostMirror, download
 from ggslam.cuda.streams import Pace, side_stream
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.insertion import DeviceInsertion
@@ -83,7 +83,8 @@ class CudaMapper(Mapper):
 
     def move_keyframes(self, T_new_old: np.ndarray) -> None:
         old = self._states.read_poses()
-        self._states.write_poses(np.stack([inverse(T @ inverse(pose)) for T, pose in zip(T_new_old, old, strict=True)]))
+        for keyframe, T, pose in zip(self.keyframes, T_new_old, old, strict=True):
+            keyframe.T_camera_world = inverse(T @ inverse(pose))
         move_with_keyframes(self.map, T_new_old)
 
     def run(self, iterations: int) -> None:
@@ -154,9 +155,8 @@ class CudaMapper(Mapper):
         grid = pixels[::stride, ::stride]
         ids, share = self._rasterizer.pixel_terms(grid.reshape(-1)).labels(vote_labels(self.map))
         share = share.view(grid.shape) * (alpha[::stride, ::stride] > 0.5)
-        return MapLabels.from_grid(
-            ids.view(grid.shape).cpu().numpy(), share.cpu().numpy(), depth.cpu().numpy(), stride
-        )
+        on_host = download(ids.view(grid.shape), share, depth)
+        return MapLabels.from_grid(on_host[0], on_host[1], on_host[2], stride)
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 
