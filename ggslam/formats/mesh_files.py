@@ -17,6 +17,8 @@ from ggslam.formats.atomic import write_bytes
 from ggslam.formats.ply import write_ply
 from ggslam.formats.triangle_mesh import majority_labels
 
+GLTF_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From the map's axes, those of the first camera (y down, z forward), to glTF's (y up, z towards the viewer)."""
 ENDINGS = (".ply", ".obj", ".glb")
 
 
@@ -42,7 +44,8 @@ def write_mesh(
 
     PLY: binary; x y z, and what is given of nx ny nz, red green blue, object_id (ushort). OBJ: one object with normals
     and colours (behind each vertex' position, as most programs read them), no object ids. GLB: with labels one node
-    for each object, called "ID NAME" or "object ID" ("unlabelled" for 0), else a single one.
+    for each object, called "ID NAME" or "object ID" ("unlabelled" for 0), else a single one; vertices are stored as they
+    are given, and the nodes turn them, see `GLTF_AXES`.
 
     Args:
         path: ends in one of `ENDINGS`.
@@ -120,7 +123,8 @@ def _write_trimesh(
         of_triangle = majority_labels(labels, triangles)
     for label in np.unique(of_triangle).tolist():
         name = _node_name(label, names) if labels is not None else "mesh"
-        scene.add_geometry(geometry(triangles[of_triangle == label]), node_name=name, geom_name=name)
+        part = geometry(triangles[of_triangle == label])
+        scene.add_geometry(part, node_name=name, geom_name=name, transform=GLTF_AXES)
     write_bytes(path, scene.export(file_type="glb", include_normals=normals is not None))
 
 

@@ -93,6 +93,8 @@ def test_glb_has_a_node_for_each_object(tmp_path: Path) -> None:
     assert scene.geometry["3 cup"].vertices[:, 0].max() < 0.55
     assert scene.geometry["object 500"].vertices[:, 0].min() > 0.75
     assert sum(len(g.faces) for g in scene.geometry.values()) == len(mesh["triangles"])
+    up = -mesh["vertices"][:, 1]  # glTF's y
+    assert np.allclose(scene.bounds[:, 1], [up.min(), up.max()], atol=1e-5)
     del mesh["labels"]
     write_mesh(tmp_path / "m.glb", **mesh)
     assert len(trimesh.load_scene(tmp_path / "m.glb").geometry) == 1
