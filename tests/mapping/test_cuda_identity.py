@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 import torch
-from identity_picture import HEIGHT, WIDTH, MaskedKeyframe, picture
+from identity_picture import COUNT, HEIGHT, WIDTH, MaskedKeyframe, make_map, picture
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.mapping.class_table import FIRST_CLASSES
@@ -23,9 +23,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.pixel_terms import PixelTerms
 from ggslam.rendering.types import RenderBuffers
-from ggslam.scene.gaussian_map import GaussianMap
 
-COUNT = 300
 ALONE = NeighbourSettings(weight=0)
 
 
@@ -62,14 +60,6 @@ class View:
         for name in ("gaussians", "weights", "counts"):
             getattr(on_device, name).copy_(torch.from_numpy(getattr(terms, name)))
         return on_device
-
-
-def make_map(device: torch.device | str, count: int = COUNT) -> GaussianMap:
-    gaussians = GaussianMap(0, 16, torch.device(device))
-    means = torch.from_numpy(np.random.default_rng(3).normal(size=(count, 3)).astype(np.float32)).to(device)
-    other = [torch.zeros(count, *shape, device=device) for shape in ((4,), (3,), (), (3,))]
-    gaussians.insert(means, *other)
-    return gaussians
 
 
 class Both:
@@ -337,7 +327,8 @@ def test_a_map_made_before_is_resumed(cuda_library: CudaLibrary) -> None:
     both.check()
 
 
-def test_consecutive_parts_of_a_pool_are_used(cuda_library: CudaLibrary) -> None:
+def test_consecutive_parts_of_a_pool_are_used(cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ggslam.mapping.cuda.identity.KEPT_POOLS", 2)
     both = Both(cuda_library)
     mask = both.keyframe.device_mask
     assert mask is not None
@@ -347,5 +338,7 @@ def test_consecutive_parts_of_a_pool_are_used(cuda_library: CudaLibrary) -> None
     both.cuda._draw(0, mask)
     assert both.cuda._pools[0] is not first
     both.cuda._draw(1, mask)
-    both.cuda.keep_pools([1])
-    assert list(both.cuda._pools) == [1]
+    both.cuda._draw(2, mask)
+    assert list(both.cuda._pools) == [1, 2]
+    both.cuda.keep_pools([0, 2])
+    assert list(both.cuda._pools) == [2]
