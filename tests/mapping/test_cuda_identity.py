@@ -10,39 +10,21 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 import torch
-from device_watch import DeviceWatch
+from identity_picture import COUNT, HEIGHT, WIDTH, MaskedKeyframe, make_map, picture
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.mapping.class_table import FIRST_CLASSES, ClassTable
-from ggslam.mapping.cuda.class_learning import ClassKernels
-from ggslam.mapping.cuda.class_table import CudaClassTable
+from ggslam.mapping.class_table import FIRST_CLASSES
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
-from ggslam.mapping.cuda.pixel_pool import DevicePixelPool, PixelDrawer
-from ggslam.mapping.cuda.votes import merge_votes, vote_labels
-from ggslam.mapping.identity import IdentityLearner, by_parts, cross_entropy
-from ggslam.mapping.identity_objects import IDS
+from ggslam.mapping.cuda.pixel_pool import DevicePixelPool
+from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
-from ggslam.mapping.neighbours import kl_gradient
-from ggslam.mapping.pixel_pool import PixelPool, at_boundary, draw_pool
+from ggslam.mapping.pixel_pool import draw_pool
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
-from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.pixel_terms import PixelTerms
 from ggslam.rendering.types import RenderBuffers
-from ggslam.scene.camera import Camera
-from ggslam.scene.gaussian_map import GaussianMap
 
-HEIGHT, WIDTH = 16, 24
-COUNT = 300
 ALONE = NeighbourSettings(weight=0)
-
-
-def picture() -> np.ndarray:
-    mask = np.ones((HEIGHT, WIDTH), np.uint16)
-    mask[3:12, 2:12] = 2
-    mask[5:8, 15:20] = 300
-    mask[:, 22:] = 0
-    return mask
 
 
 @dataclass
@@ -80,28 +62,6 @@ class View:
         return on_device
 
 
-@dataclass
-class MaskedKeyframe:
-    index: int
-    mask: np.ndarray | None
-    device: torch.device
-
-    def __post_init__(self) -> None:
-        self.device_mask = None if self.mask is None else torch.from_numpy(self.mask).to(self.device)
-
-
-def near(points: torch.Tensor, rows: torch.Tensor, k: int, library: CudaLibrary) -> torch.Tensor:
-    return torch.cdist(points[rows], points).topk(k + 1, largest=False).indices[:, 1:]
-
-
-def make_map(device: torch.device | str, count: int = COUNT) -> GaussianMap:
-    gaussians = GaussianMap(0, 16, torch.device(device))
-    means = torch.from_numpy(np.random.default_rng(3).normal(size=(count, 3)).astype(np.float32)).to(device)
-    other = [torch.zeros(count, *shape, device=device) for shape in ((4,), (3,), (), (3,))]
-    gaussians.insert(means, *other)
-    return gaussians
-
-
 class Both:
     """A learner on the CPU and one on the device, each with a map of the same Gaussians, given the same keyframe."""
 
@@ -109,7 +69,7 @@ class Both:
         self.settings = dataclasses.replace(IdentitySettings(every=1, pixels=64, neighbours=ALONE), **changes)  # type: ignore[arg-type]
         self.device = library.whole_device(None)
         self.cpu = IdentityLearner(self.settings, 3)
-        self.cuda = CudaIdentityLearner(self.settings, 3, self.device, library, near)
+        self.cuda = CudaIdentityLearner(self.settings, 3, self.device, library)
         self.map, self.device_map = make_map("cpu"), make_map(self.device)
         self.view = View(library, self.device)
         self.mask = picture() if mask is None else mask
@@ -226,7 +186,7 @@ def test_a_seed_repeats_and_another_does_not(cuda_library: CudaLibrary) -> None:
         both = Both(cuda_library)
         pull = NeighbourSettings(every=1, samples=20, neighbours=2)
         settings = dataclasses.replace(both.settings, neighbours=pull)
-        learner = CudaIdentityLearner(settings, seed, both.device, cuda_library, near)
+        learner = CudaIdentityLearner(settings, seed, both.device, cuda_library)
         learner.observe(both.mask)
         for _ in range(3):
             learner.step(both.device_map, both.view, both.keyframe, None)  # type: ignore[arg-type]
@@ -236,7 +196,7 @@ def test_a_seed_repeats_and_another_does_not(cuda_library: CudaLibrary) -> None:
 
 def test_steps_are_due_where_there_are_masks_and_objects(cuda_library: CudaLibrary) -> None:
     device = cuda_library.whole_device(None)
-    learner = CudaIdentityLearner(IdentitySettings(every=3), 0, device, cuda_library, near)
+    learner = CudaIdentityLearner(IdentitySettings(every=3), 0, device, cuda_library)
     masked, bare = MaskedKeyframe(0, picture(), device), MaskedKeyframe(1, None, device)
     assert not any(learner.due(masked) for _ in range(6))
     learner.observe(picture())
@@ -356,7 +316,7 @@ def test_a_map_made_before_is_resumed(cuda_library: CudaLibrary) -> None:
     both = Both(cuda_library)
     both.begin()
     both.step(2)
-    learner = CudaIdentityLearner(both.settings, 9, both.device, cuda_library, near)
+    learner = CudaIdentityLearner(both.settings, 9, both.device, cuda_library)
     learner.resume(both.cpu.classifier)
     assert np.array_equal(learner.classifier.class_ids, both.cpu.classifier.class_ids)
     assert np.array_equal(learner.classifier.weight, both.cpu.classifier.weight)
@@ -367,216 +327,18 @@ def test_a_map_made_before_is_resumed(cuda_library: CudaLibrary) -> None:
     both.check()
 
 
-def test_votes_that_name_one_object_after_a_merge_are_added(cuda_library: CudaLibrary) -> None:
-    device = cuda_library.whole_device(None)
-    gaussians = make_map(device, 2)
-    gaussians.vote_ids[:] = torch.tensor([[1, 2, 3, 0], [4, 3, 0, 0]])
-    gaussians.vote_weights[:] = torch.tensor([[3.0, 2.0, 2.0, 0.0], [1.0, 0.5, 0.0, 0.0]])
-    assert vote_labels(gaussians).tolist() == [1, 4]
-    alias = torch.arange(IDS, dtype=torch.int32, device=device)
-    alias[3], alias[4] = 2, 0
-    merge_votes(gaussians, alias)
-    assert vote_labels(gaussians).tolist() == [2, 2]
-    assert gaussians.vote_weights.sum(1).tolist() == [7.0, 0.5]
-
-
-# --- parts ------------------------------------------------------------------------------------------------------------
-
-
-def test_classes_grow_and_go_as_on_the_cpu(cuda_library: CudaLibrary) -> None:
-    device = cuda_library.whole_device(None)
-    cpu = ClassTable(np.random.default_rng(0))
-    cuda = CudaClassTable(np.random.default_rng(0), ClassKernels(device, cuda_library))
-    ids = np.arange(1, 2 * FIRST_CLASSES, dtype=np.uint16)
-    for table in (cpu, cuda):
-        table.add(ids)
-        table.add(np.array([0, 5, 60000], np.uint16))
-        table.remove(3)
-        table.remove(60000)
-        table.remove(12345)  # never was there
-    assert cuda.count == cpu.count == len(ids) - 1
-    assert np.array_equal(cuda.classifier.class_ids, cpu.classifier.class_ids)
-    assert np.array_equal(cuda.classifier.weight, cpu.classifier.weight)
-    asked = np.array([0, 3, 4, 199, 60000])
-    codes = cuda.codes(torch.from_numpy(asked.astype(np.int32)).to(device)).cpu()
-    assert np.allclose(codes, cpu.codes(asked), atol=1e-6) and codes[2].norm() > 1
-    assert np.array_equal(cuda.class_of.cpu()[asked], cpu.classes(asked))
-    assert np.array_equal(cuda.ids.cpu(), cpu.classifier.class_ids)
-
-
-@pytest.mark.parametrize("at_once", [2**24, 50])
-def test_vectors_have_the_labels_of_the_cpu(
-    cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch, at_once: int
-) -> None:
-    monkeypatch.setattr("ggslam.mapping.cuda.class_table._LOGITS_AT_ONCE", at_once)
-    random, device = np.random.default_rng(0), cuda_library.whole_device(None)
-    table = CudaClassTable(random, ClassKernels(device, cuda_library))
-    vectors = (0.4 * random.normal(size=(500, 16))).astype(np.float32)
-    assert not table.labels(torch.from_numpy(vectors).to(device)).any()
-    table.add(np.arange(1, 8, dtype=np.uint16))
-    for confidence in (0.0, 0.5):
-        expected = by_parts(table.classifier, vectors, confidence)
-        assert np.array_equal(table.labels(torch.from_numpy(vectors).to(device), confidence).cpu(), expected)
-        assert 0.1 < (expected == 0).mean() < 0.9
-
-
-@pytest.mark.parametrize("classes", [1, 31, 70])
-def test_cross_entropy_has_the_gradients_of_the_cpu(cuda_library: CudaLibrary, classes: int) -> None:
-    random, device = np.random.default_rng(0), cuda_library.whole_device(None)
-    table = CudaClassTable(random, ClassKernels(device, cuda_library))
-    table.add(np.arange(1, classes + 1, dtype=np.uint16))
-    features = random.normal(size=(45, 16)).astype(np.float32)
-    targets = random.integers(0, classes, 45).astype(np.int32)
-    targets[::5] = -1
-    known = targets >= 0
-    loss, gradient, rows = cross_entropy(features[known], table.classifier, targets[known], np.arange(classes))
-    losses = torch.empty(45, device=device)
-    count = torch.tensor([known.sum()], dtype=torch.int32, device=device)
-    on_device = torch.from_numpy(features).to(device), torch.from_numpy(targets).to(device)
-    found, found_rows = table.cross_entropy(*on_device, count, losses, 1.0)
-    assert float(losses.sum() / known.sum()) == pytest.approx(loss, rel=1e-5)
-    assert np.allclose(found.cpu()[known], gradient, atol=1e-6) and not found.cpu()[~known].any()
-    assert np.allclose(found_rows.cpu(), rows, atol=1e-6)
-
-
-@pytest.mark.parametrize("classes", [1, 40])
-def test_kl_has_the_gradients_of_the_cpu(cuda_library: CudaLibrary, classes: int) -> None:
-    random, device = np.random.default_rng(0), cuda_library.whole_device(None)
-    logits = random.normal(size=(13 * 4, classes)).astype(np.float32)
-    _, own, others = kl_gradient(logits[:13], logits[13:].reshape(13, 3, classes))
-    found = ClassKernels(device, cuda_library).neighbour_loss(torch.from_numpy(logits).to(device), 13, 2.0).cpu()
-    assert np.allclose(found[:13], 2 * own, atol=1e-6)
-    assert np.allclose(found[13:], 2 * others.reshape(-1, classes), atol=1e-6)
-
-
-# --- the draw ---------------------------------------------------------------------------------------------------------
-
-
-def drawn(library: CudaLibrary, mask: np.ndarray, wanted: int, **changes: float) -> PixelPool:
-    device = library.whole_device(None)
-    drawer = PixelDrawer(device, library, 7)
-    alias = torch.arange(IDS, dtype=torch.int32, device=device)
-    alias[301] = 300
-    settings = dataclasses.replace(IdentitySettings(), **changes)  # type: ignore[arg-type]
-    pool = drawer.draw(torch.from_numpy(mask).to(device), alias, wanted, settings)
-    return PixelPool(pool.pixels.cpu().numpy(), pool.vote_weights.cpu().numpy())
-
-
-@pytest.mark.parametrize("balance,boundary", [(0.5, 0.5), (0.0, 0.0), (1.0, 1.0), (0.8, 0.3)])
-def test_pixels_are_drawn_as_on_the_cpu(cuda_library: CudaLibrary, balance: float, boundary: float) -> None:
-    changes = {"balance": balance, "boundary": boundary}
-    mask, wanted = picture(), 60000
-    split = mask.copy()
-    split[5:8, 17:20] = np.where(split[5:8, 17:20] == 300, 301, split[5:8, 17:20])  # one object by the alias
-    found = drawn(cuda_library, split, wanted, **changes)
-    settings = dataclasses.replace(IdentitySettings(), **changes)
-    expected = draw_pool(mask, wanted, settings, np.random.default_rng(0))
-    often, expected_often = (np.bincount(pool.pixels, minlength=mask.size) for pool in (found, expected))
-    assert not often[mask.reshape(-1) == 0].any()
-    assert (np.abs(often - expected_often) < 6 * np.sqrt(often + expected_often + 1)).all()
-    weight = dict(zip(expected.pixels.tolist(), expected.vote_weights.tolist(), strict=True))
-    assert np.allclose(found.vote_weights, [weight[p] for p in found.pixels.tolist()], rtol=0.03)
-    assert found.vote_weights.mean() == pytest.approx(1, rel=1e-4)
-
-
-def test_the_draw_does_not_depend_on_the_order_of_threads(cuda_library: CudaLibrary) -> None:
-    if cuda_library.device_type == "cuda":
-        pytest.skip("the order cannot be chosen on a GPU")
-    expected = drawn(cuda_library, picture(), 500)
-    for order in (1, 2):
-        cuda_library.functions.ggslam_emulation_order(order)
-        found = drawn(cuda_library, picture(), 500)
-        cuda_library.functions.ggslam_emulation_order(0)
-        assert np.array_equal(found.pixels, expected.pixels)
-        assert np.array_equal(found.vote_weights, expected.vote_weights)
-
-
-def test_an_image_without_boundaries_is_drawn_from_anywhere(cuda_library: CudaLibrary) -> None:
-    pool = drawn(cuda_library, np.full((HEIGHT, WIDTH), 9, np.uint16), 20000)
-    assert np.bincount(pool.pixels, minlength=HEIGHT * WIDTH).min() > 10
-    assert np.allclose(pool.vote_weights, 1, atol=1e-5)
-
-
-def test_of_an_unlabelled_image_no_labelled_pixels_are_drawn(cuda_library: CudaLibrary) -> None:
-    pool = drawn(cuda_library, np.zeros((HEIGHT, WIDTH), np.uint16), 100)
-    assert (pool.pixels >= 0).all() and (pool.pixels < HEIGHT * WIDTH).all() and not pool.vote_weights.any()
-
-
-def test_consecutive_parts_of_a_pool_are_used(cuda_library: CudaLibrary) -> None:
+def test_consecutive_parts_of_a_pool_are_used(cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ggslam.mapping.cuda.identity.KEPT_POOLS", 2)
     both = Both(cuda_library)
     mask = both.keyframe.device_mask
-    assert mask is not None and not at_boundary(np.ones((3, 3))).any()
+    assert mask is not None
     parts = [both.cuda._draw(0, mask)[0] for _ in range(8)]
     assert torch.equal(torch.cat(parts), both.cuda._pools[0].pixels)
     first = both.cuda._pools[0]
     both.cuda._draw(0, mask)
     assert both.cuda._pools[0] is not first
     both.cuda._draw(1, mask)
-    both.cuda.keep_pools([1])
-    assert list(both.cuda._pools) == [1]
-
-
-# --- with a rasterizer ------------------------------------------------------------------------------------------------
-
-CAMERA = Camera(WIDTH, HEIGHT, 20.0, 20.0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)
-
-
-def wall(device: torch.device | str) -> GaussianMap:
-    """A Gaussian at every second pixel and row, 2 m away."""
-    u, v = np.meshgrid(np.arange(0.5, WIDTH, 2), np.arange(0.5, HEIGHT, 2))
-    z = np.full(u.size, 2.0)
-    means = np.stack([(u.reshape(-1) - CAMERA.cx) / 10, (v.reshape(-1) - CAMERA.cy) / 10, z], 1).astype(np.float32)
-    gaussians, count = GaussianMap(0, 16, torch.device(device)), len(means)
-    quaternions = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4)
-    parameters = [torch.from_numpy(means), quaternions, torch.full((count, 3), -2.3), torch.full((count,), 3.0)]
-    gaussians.insert(*(parameter.to(device) for parameter in parameters), torch.zeros(count, 3, device=device))
-    return gaussians
-
-
-def test_objects_are_learned(cuda_library: CudaLibrary) -> None:
-    device = cuda_library.whole_device(None)
-    settings = IdentitySettings(every=1, pixels=128, neighbours=NeighbourSettings(samples=40))
-    learner = CudaIdentityLearner(settings, 0, device, cuda_library)
-    gaussians, rasterizer = wall(device), CudaRasterizer(device, library=cuda_library)
-    keyframe = MaskedKeyframe(0, picture(), device)
-    learner.observe(picture())
-    unknown = torch.zeros(len(gaussians), dtype=torch.int32, device=device)
-    learner.begin(gaussians, slice(0, len(gaussians)), unknown)
-    view = rasterizer.forward(gaussians, CAMERA, np.eye(4), features=False)
-    for _ in range(25):
-        assert learner.due(keyframe)
-        learner.step(gaussians, rasterizer, keyframe, view)
-    learner.label(gaussians)
-    expected = picture()[::2, ::2].reshape(-1)
-    assert (gaussians.object_id.cpu().numpy() == expected).mean() > 0.8  # some stand at a boundary
-    shown = rasterizer.forward(gaussians, CAMERA, np.eye(4)).features
-    assert shown is not None
-    ids, _ = learner.classifier.labels(shown.cpu().numpy().transpose(1, 2, 0))
-    assert (ids == picture())[picture() > 0].mean() > 0.9
-    assert learner.last_loss < 0.7
-
-
-@pytest.mark.parametrize("schedule", ["sampled", "dense", "votes"])
-def test_a_step_waits_for_nothing(schedule: str) -> None:
-    with DeviceWatch() as watch:
-        pull = NeighbourSettings(samples=20, every=2)
-        settings = IdentitySettings(schedule=schedule, every=1, pixels=64, neighbours=pull)  # type: ignore[arg-type]
-        learner = CudaIdentityLearner(settings, library=watch.library)
-        gaussians, rasterizer = wall("cuda"), CudaRasterizer(library=watch.library)
-        keyframe = MaskedKeyframe(0, picture(), learner.device)
-        learner.observe(picture())
-        learner.begin(gaussians, slice(0, len(gaussians)), torch.ones(len(gaussians), dtype=torch.int32, device="cuda"))
-        view = rasterizer.forward(gaussians, CAMERA, np.eye(4), features=schedule == "dense")
-        learner.split(gaussians, rasterizer, picture(), 1, 300)
-        watch.forget()
-        for _ in range(4):
-            assert learner.due(keyframe)
-            learner.step(gaussians, rasterizer, keyframe, view)
-        assert watch.waits == [] and watch.uploads == [] and watch.downloads == []
-        names = {call.operation for call in watch.calls}
-        assert "draw_pixels" in names and ("cross_entropy" in names) == (schedule != "votes")
-        assert np.isfinite(learner.last_loss) == (schedule != "votes") and bool(watch.waits) == (schedule != "votes")
-        learner.merge(gaussians, 1, 2)
-        learner.forget(gaussians, [300])
-        learner.label(gaussians)
-        assert set(watch.read(gaussians.object_id).tolist()) == {1}
+    both.cuda._draw(2, mask)
+    assert list(both.cuda._pools) == [1, 2]
+    both.cuda.keep_pools([0, 2])
+    assert list(both.cuda._pools) == [2]

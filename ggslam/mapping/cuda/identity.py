@@ -35,6 +35,8 @@ Neighbours = Callable[[torch.Tensor, torch.Tensor, int, CudaLibrary], torch.Tens
 """Of points (float32 [N, 3]), rows (int64 [M]) and k: the k nearest other points of each of the rows, int64 [M, k]."""
 LOGITS_AT_ONCE = 2**24
 """The dense schedule takes as many pixels at a time as make so many logits; the 3-D loss no more than a tenth of it."""
+KEPT_POOLS = 256
+"""Keyframes whose pixels drawn ahead are kept, 128 KB for each with the settings' defaults. Those drawn first go."""
 SPLIT_PIXELS, SPLIT_TERMS, SPLIT_MIN_WEIGHT = 32768, 48, 1e-3
 """A split looks at so many pixels at a time, with so many contributions to each, none lighter."""
 
@@ -267,7 +269,10 @@ class CudaIdentityLearner(IdentityObjects):
         pool, wanted = self._pools.get(number), self.settings.pixels
         if pool is None or pool.used + wanted > len(pool.pixels):
             pool = self._drawer.draw(mask, self._device_alias, POOL_STEPS * wanted, self.settings)
+            self._pools.pop(number, None)
             self._pools[number] = pool
+            if len(self._pools) > KEPT_POOLS:
+                del self._pools[next(iter(self._pools))]
         part = slice(pool.used, pool.used + wanted)
         pool.used = part.stop
         return pool.pixels[part], pool.vote_weights[part]

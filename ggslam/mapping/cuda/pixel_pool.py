@@ -57,14 +57,10 @@ class PixelDrawer:
         library.check_size("pixel_pool_job", _Job)
         for name in ("pixel_odds", "draw_pixels"):
             library.declare(name, [ctypes.c_void_p])
-        self._generator = torch.Generator(device).manual_seed(seed)
+        self.generator = torch.Generator(device).manual_seed(seed)
+        """What random numbers come from."""
         self._counts = torch.empty(2, IDS, dtype=torch.int32, device=device)
         self._per_pixel = torch.empty(2, IDS, dtype=torch.float64, device=device)
-
-    @property
-    def generator(self) -> torch.Generator:
-        """What random numbers come from."""
-        return self._generator
 
     def draw(
         self, mask: torch.Tensor, alias: torch.Tensor, wanted: int, settings: IdentitySettings
@@ -88,7 +84,7 @@ class PixelDrawer:
         odds = torch.empty(mask.numel(), dtype=torch.int64, device=self._device)
         pixels = torch.empty(wanted, dtype=torch.int32, device=self._device)
         weights = torch.empty(wanted, dtype=torch.float32, device=self._device)
-        random = torch.rand(wanted, generator=self._generator, dtype=torch.float64, device=self._device)
+        random = torch.rand(wanted, generator=self.generator, dtype=torch.float64, device=self._device)
         job = _Job(
             mask=mask.data_ptr(), alias=alias.data_ptr(), counts=self._counts.data_ptr(),
             per_pixel=self._per_pixel.data_ptr(), odds=odds.data_ptr(), random=random.data_ptr(),

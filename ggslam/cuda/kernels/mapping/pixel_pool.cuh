@@ -62,7 +62,7 @@ __global__ void __launch_bounds__(kPoolThreads) count_objects_kernel(PixelPoolJo
 }
 
 // The sum of a value over a block of kTotalThreads, in a fixed order; the same for all its threads.
-__device__ inline double sum_over_block(double value) {
+__device__ inline double total_over_block(double value) {
   GGSLAM_SHARED double of_warps[kTotalThreads / kWarp];
   for (int bits = kWarp / 2; bits > 0; bits /= 2) value += __shfl_xor_sync(kAllLanes, value, bits);
   if (threadIdx.x % kWarp == 0) of_warps[threadIdx.x / kWarp] = value;
@@ -82,7 +82,7 @@ __global__ void __launch_bounds__(kTotalThreads) object_odds_kernel(PixelPoolJob
     double sum = 0.0;
     for (int id = threadIdx.x; id < kObjectIds; id += kTotalThreads)
       if (counts[id] > 0) sum += pow(static_cast<double>(counts[id]), 1.0 - job.balance);
-    totals[way] = sum_over_block(sum);
+    totals[way] = total_over_block(sum);
   }
   const double at_boundaries = totals[1] > 0.0 ? job.boundary : 0.0;  // where there are none, all are drawn anywhere
   const double shares[2] = {1.0 - at_boundaries, at_boundaries};
