@@ -213,6 +213,30 @@ def test_targets_take_turns(
         check_alignment(engine, native, frames[2].depth, aim, truth_of(frames[2]))
 
 
+@pytest.mark.parametrize("change", [{}, {"neighbour_weight": 0.0}, {"scatter_weight": 0.0, "max_elongation": 2.0}])
+def test_voxels_take_shape_on_the_device_as_in_the_core(
+    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], change: dict[str, float]
+) -> None:
+    settings = replace(TrackerSettings().target, **change)
+    targets = []
+    for finish in (False, True):
+        surface = MeasuredSurface(settings, native.context)
+        surface.finish = finish
+        for frame in (frames[0], frames[4]):
+            aim = surface.add(native.points(frame.depth, PointSettings(), NOISE), truth_of(frame))
+        targets.append(aim)
+    raw, ready = targets
+    assert len(raw) == len(ready)
+    points, guess = engine.points(frames[2].depth, POINTS, NOISE), truth_of(frames[2]) @ se3_exp(GUESSES[1])
+    found, expected = (engine.align(points, aim, guess, SETTINGS, NOISE) for aim in targets)
+    assert raw.settings_to_finish is not None  # the core was not asked
+    assert np.abs(se3_log(inverse(expected.T_world_camera) @ found.T_world_camera)).max() < 1e-5
+    assert found.cost == pytest.approx(expected.cost, rel=1e-3) and found.status is expected.status
+    assert (found.matches == expected.matches).mean() > 0.99
+    one, two = raw.voxels(), ready.voxels()  # now it is
+    assert raw.settings_to_finish is None and all(np.array_equal(one[name], two[name]) for name in two)
+
+
 def grey_part(view: Frame, reference: Frame, settings: PhotometricSettings) -> PhotometricPart:
     small, earlier = (GreyDepth.from_images(f.color, f.depth, f.camera, 2) for f in (view, reference))
     return PhotometricPart(

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from ggslam.tracking.cuda import contract
-from ggslam.tracking.gicp import AlignmentResult, PointSpread, about_point, judge
+from ggslam.tracking.gicp import AlignmentResult, judge
+from ggslam.tracking.observability import PointSpread, about_point
 from ggslam.tracking.settings import AlignSettings
 
 
