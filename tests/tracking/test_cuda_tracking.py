@@ -256,6 +256,19 @@ def test_grey_values_pull_as_they_do_in_the_core(
     check_alignment(engine, native, frames[2].depth, target, guess, photometric=weighty)
 
 
+def test_what_hides_a_point_in_the_reference_counts_as_in_the_core(
+    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget
+) -> None:
+    part = grey_part(frames[2], frames[0], PhotometricSettings(points=800))
+    pixels = part.reference.pixels.copy()
+    pixels[:, :40, 3] *= 0.5
+    hidden = replace(part, reference=replace(part.reference, pixels=pixels))
+    points, guess = engine.points(frames[2].depth, POINTS, NOISE), truth_of(frames[2])
+    shares = [engine.align(points, target, guess, SETTINGS, NOISE, p).photometric_share for p in (part, hidden)]
+    assert shares[1] < 0.8 * shares[0]
+    check_alignment(engine, native, frames[2].depth, target, guess, photometric=hidden)
+
+
 def track(tracker: Tracker, frames: list[Frame]) -> list[TrackingResult]:
     """Tracks the frames; each is a keyframe."""
     surface, results = MeasuredSurface(tracker.settings.target, tracker.context), []
