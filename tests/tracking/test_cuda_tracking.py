@@ -192,9 +192,15 @@ def test_an_empty_target_matches_nothing(engine: CudaTrackingEngine, native: Nat
     assert np.array_equal(found.T_world_camera, np.eye(4))
 
 
-def test_results_repeat_bit_for_bit(
-    engine: CudaTrackingEngine, frames: list[Frame], target: GicpTarget, other_order: None
+def test_threads_wait_for_one_another(
+    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget, other_order: None
 ) -> None:
+    part = grey_part(frames[2], frames[0], PhotometricSettings(points=800))
+    check_points(*(e.points(frames[2].depth, POINTS, NOISE) for e in (engine, native)))
+    check_alignment(engine, native, frames[2].depth, target, truth_of(frames[2]), photometric=part)
+
+
+def test_results_repeat_bit_for_bit(engine: CudaTrackingEngine, frames: list[Frame], target: GicpTarget) -> None:
     guess = truth_of(frames[2]) @ se3_exp(GUESSES[1])
     results = [
         engine.align(engine.points(frames[2].depth, POINTS, NOISE), target, guess, SETTINGS, NOISE) for _ in range(2)
