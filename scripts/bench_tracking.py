@@ -4,6 +4,7 @@
 
     python scripts/bench_tracking.py ../shared/data/livingroom ../shared/data/redkitchen
     python scripts/bench_tracking.py ../shared/data/livingroom --target trained --photometric always
+    python scripts/bench_tracking.py ../shared/data/livingroom --device cuda
 
 What frames are aligned to (--target):
     surface  the keyframes' points as measured (`MeasuredSurface`), gathered keyframe by keyframe
@@ -34,7 +35,8 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 from ggslam.sequences.factory import open_sequence
-from ggslam.tracking.gicp import GicpTarget, align
+from ggslam.tracking.cuda.engine import CudaTrackingEngine
+from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import extract_points
@@ -128,11 +130,15 @@ class Run:
     kinds: Counter = dataclasses.field(default_factory=Counter)
 
 
-def track_recording(path: Path, scale: float, target_kind: str, settings: TrackerSettings, threads: int | None) -> Run:
+def track_recording(
+    path: Path, scale: float, target_kind: str, settings: TrackerSettings, threads: int | None, device: str = "cpu"
+) -> Run:
     """Tracks every frame; keyframes (never the held-out frames) extend the target."""
     sequence, context = open_sequence(path, scale=scale), NativeContext(threads)
-    tracker, policy, run = Tracker(sequence.camera, settings, context), KeyframePolicy(), Run()
+    engine = CudaTrackingEngine(sequence.camera) if device == "cuda" else None
+    tracker, policy, run = Tracker(sequence.camera, settings, context, engine=engine), KeyframePolicy(), Run()
     surface, discs = MeasuredSurface(settings.target, context), None
+    surface.finish = engine is None
     previous: PhotometricReference | None = None
     frames = list(sequence.stream())  # read first, so that decoding does not take the cores
     for frame in frames:
@@ -144,7 +150,7 @@ def track_recording(path: Path, scale: float, target_kind: str, settings: Tracke
         if frame.T_world_camera is not None:
             run.truth.append(frame.T_world_camera)
         if target is not None and result.status is not TrackingStatus.LOST:
-            time_parts(run, frame, tracker, target, result, context)
+            time_parts(run, frame, tracker, target, result)
         previous = grey_residual(run, frame, result, previous, settings)
         lost = result.status is TrackingStatus.LOST
         if not lost and frame.index % HELD_OUT_EVERY != HELD_OUT_OFFSET and policy.decide(frame.index, result):
@@ -159,18 +165,17 @@ def track_recording(path: Path, scale: float, target_kind: str, settings: Tracke
     return run
 
 
-def time_parts(
-    run: Run, frame: Frame, tracker: Tracker, target: GicpTarget, result: TrackingResult, context: NativeContext
-) -> None:
+def time_parts(run: Run, frame: Frame, tracker: Tracker, target: GicpTarget, result: TrackingResult) -> None:
     """Times point extraction and one alignment by themselves (from the pose found, moved by half a centimetre)."""
     assert tracker.noise is not None
     s = tracker.settings
     start = time.perf_counter()
-    points = extract_points(frame.depth, frame.camera, s.points, tracker.noise, context)
+    points = tracker.engine.points(frame.depth, s.points, tracker.noise)
+    len(points)  # a GPU's number is known when it is done
     middle = time.perf_counter()
     guess = result.T_world_camera.copy()
     guess[:3, 3] += 0.003
-    align(points, target, guess, s.align, tracker.noise, context)
+    tracker.engine.align(points, target, guess, s.align, tracker.noise)
     run.extract_ms.append(1e3 * (middle - start))
     run.align_ms.append(1e3 * (time.perf_counter() - middle))
 
@@ -246,6 +251,7 @@ def main() -> None:
     parser.add_argument("--target", nargs="+", default=["surface"], choices=["surface", "birth", "trained"])
     parser.add_argument("--photometric", nargs="+", default=["auto"], choices=["never", "degenerate", "auto", "always"])
     parser.add_argument("--threads", type=int, default=None)
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="where points are taken and aligned")
     arguments = parser.parse_args()
     print("recording      target   frames  ATE cm   track extract   align  target   iter overlap   min   rmse   grey")
     print("                               RMSE     ms med. ms med. ms med. ms med.                       mm /255")
@@ -255,7 +261,8 @@ def main() -> None:
         print(f"grey values: {mode}")
         for path in arguments.recordings:
             for kind in arguments.target:
-                report(path.name, kind, track_recording(path, arguments.scale, kind, settings, arguments.threads))
+                run = track_recording(path, arguments.scale, kind, settings, arguments.threads, arguments.device)
+                report(path.name, kind, run)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from ggslam.scene.poses import turning_angle
 from ggslam.tracking.feature_map import FeatureMap
 from ggslam.tracking.feature_settings import FeatureAlignSettings
 from ggslam.tracking.features import ScanFeatures
-from ggslam.tracking.gicp import about_point
+from ggslam.tracking.observability import about_point
 
 _MARGIN = 1.3
 """Of what a step usually takes."""

@@ -18,9 +18,10 @@ from ggslam.tracking.feature_alignment import FeatureAlignment
 from ggslam.tracking.feature_scans import DepthImageFeatures
 from ggslam.tracking.feature_settings import FeatureTrackerSettings
 from ggslam.tracking.features import ScanFeatures
-from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, about_point
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus
 from ggslam.tracking.local_feature_map import LocalFeatureMap
 from ggslam.tracking.noise import estimate_noise
+from ggslam.tracking.observability import about_point
 from ggslam.tracking.points import FramePoints, extract_points
 from ggslam.tracking.settings import DepthNoise, TrackerSettings
 from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus

@@ -13,8 +13,8 @@ import torch
 
 from ggslam.native.loader import NativeContext
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import skew
 from ggslam.tracking import native
+from ggslam.tracking.observability import PointSpread, about_point, observability
 from ggslam.tracking.photometric import PhotometricPoints, PhotometricReference
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import AlignSettings, DepthNoise, PhotometricSettings, TargetSettings
@@ -30,6 +30,7 @@ class GicpTarget:
         """Edge of a fine voxel, metres."""
         self.composed_with: TargetSettings | None = None
         """Settings of the parts, if it was made by `target_parts.composed_target`."""
+        self._unfinished: tuple[NativeContext, native.TargetSettings] | None = None
 
     def __del__(self) -> None:
         if getattr(self, "_handle", None) is not None:
@@ -38,8 +39,23 @@ class GicpTarget:
     @property
     def handle(self) -> int:
         """Pointer for the core."""
+        if self._unfinished is not None:
+            context, settings = self._unfinished
+            self._library.ggslam_gicp_target_finish(context.handle, self.gathered, settings)
+            self._unfinished = None
+        return self.gathered
+
+    @property
+    def gathered(self) -> int:
+        """Pointer for those functions of the core that do not need the voxels' shapes."""
         assert self._handle is not None
         return self._handle
+
+    @property
+    def settings_to_finish(self) -> native.TargetSettings | None:
+        """What the voxels' shapes are still to be made with, if they are."""
+        unfinished = self._unfinished
+        return None if unfinished is None else unfinished[1]
 
     @classmethod
     def from_gaussians(
@@ -87,11 +103,15 @@ class GicpTarget:
         camera_positions: np.ndarray | None = None,
         voxel: float | None = None,
         base: GicpTarget | None = None,
+        finish: bool = True,
     ) -> GicpTarget:
         """As `from_gaussians`, from contiguous float32 arrays [n, 3], [n, 4] wxyz, [n, 3], [n]; `birth` int32 [n].
 
         With `base` the result holds what that target holds, too, as if built from both sets of Gaussians at once; it
         must have been made with the same settings. The cost then goes with the new Gaussians and the base's voxels.
+
+        With `finish` false the voxels' shapes, most of the work, are left to who needs them: a GPU makes its own, and
+        the core makes them in the thread that first aligns to the target, on the threads of `context`.
         """
         target = cls()
         cameras = 0 if camera_positions is None else len(camera_positions)
@@ -105,13 +125,15 @@ class GicpTarget:
             native.address(positions), len(means), cameras,
         )  # fmt: skip
         arguments = native_target_settings(settings, target.voxel)
-        earlier = None if base is None else base.handle
-        target._library.ggslam_gicp_target_build(context.handle, target.handle, earlier, given, arguments)
+        earlier = None if base is None else base.gathered
+        build = target._library.ggslam_gicp_target_build if finish else target._library.ggslam_gicp_target_gather
+        build(context.handle, target.gathered, earlier, given, arguments)
+        target._unfinished = None if finish else (context, arguments)
         return target
 
     def __len__(self) -> int:
         """Number of fine voxels."""
-        return self._library.ggslam_gicp_target_size(self.handle, 0)
+        return self._library.ggslam_gicp_target_size(self.gathered, 0)
 
     def voxels(self, level: int = 0) -> dict[str, np.ndarray]:
         """Copies of a level's (0 fine, 1 coarse) means [n, 3], normals [n, 3], covariances [n, 6], weights [n]."""
@@ -273,44 +295,6 @@ def _result(
     )  # fmt: skip
 
 
-def about_point(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Information of a twist about a centre turned into that of a twist about another point, [6, 6].
-
-    A twist (v, w) about the point moves the centre, which lies at `centre` [3] from it, by v + w x centre; so
-    v_centre = v - [centre]x w.
-    """
-    A = np.eye(6)
-    A[:3, 3:] = -skew(centre)
-    return A.T @ information @ A
-
-
-@dataclass(frozen=True)
-class PointSpread:
-    """Where a frame's points lie, each weighed by the inverse variance of its depth.
-
-    Attributes:
-        total: sum of the weights, one per square metre; 0: there are no points.
-        centroid: [3], camera frame, metres.
-        radius: root mean square distance from it, metres.
-    """
-
-    total: float
-    centroid: np.ndarray
-    radius: float
-
-    @classmethod
-    def of(cls, source: FramePoints, noise: DepthNoise) -> PointSpread:
-        """Of these points."""
-        if not len(source):
-            return cls(0.0, np.zeros(3), 0.0)
-        z = source.points[:, 2]
-        inverse_variance = 1.0 / (noise.constant + noise.square * z * z) ** 2
-        total = float(inverse_variance.sum())
-        centroid = inverse_variance @ source.points / total
-        radius = float(np.sqrt(inverse_variance @ ((source.points - centroid) ** 2).sum(1) / total))
-        return cls(total, centroid, radius)
-
-
 def judge(
     information: np.ndarray, R_world_camera: np.ndarray, spread: PointSpread, usable: bool, limit: float
 ) -> tuple[AlignmentStatus, np.ndarray, np.ndarray]:
@@ -325,22 +309,3 @@ def judge(
     if not usable:
         return AlignmentStatus.LOST, visibility, weak
     return AlignmentStatus.DEGENERATE if len(weak) else AlignmentStatus.OK, visibility, weak
-
-
-def observability(
-    information: np.ndarray, R_world_camera: np.ndarray, spread: PointSpread, limit: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """How well each direction of motion is seen: eigenvalues [6], ascending, and the eigenvectors [k, 6] of those
-    below `limit`.
-
-    The information (about the camera centre) is taken about the points' centroid, where turning and shifting hardly
-    mix; angles are measured by the motion they mean at the points' root mean square distance from it, and each
-    point's information by its own noise. An eigenvalue is then the mean of (normal . motion)^2: the share of points
-    that see the direction.
-    """
-    if not spread.total:
-        return np.zeros(6), np.eye(6)
-    about = about_point(information, -R_world_camera @ spread.centroid)
-    scale = np.array([1.0, 1.0, 1.0] + [1.0 / max(spread.radius, 1e-3)] * 3)
-    values, vectors = np.linalg.eigh(about * np.outer(scale, scale) / spread.total)
-    return values, vectors[:, values < limit].T

@@ -89,14 +89,13 @@ def library() -> ctypes.CDLL:
     core.ggslam_gicp_target_create.restype = c_void_p
     core.ggslam_gicp_target_destroy.argtypes = [c_void_p]
     core.ggslam_gicp_target_destroy.restype = None
-    core.ggslam_gicp_target_build.argtypes = [
-        c_void_p,
-        c_void_p,
-        c_void_p,
-        POINTER(TargetInput),
-        POINTER(TargetSettings),
-    ]
-    core.ggslam_gicp_target_build.restype = None
+    for build in (core.ggslam_gicp_target_build, core.ggslam_gicp_target_gather):
+        build.argtypes = [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]
+        build.restype = None
+    core.ggslam_gicp_target_finish.argtypes = [c_void_p, c_void_p, POINTER(TargetSettings)]
+    core.ggslam_gicp_target_finish.restype = None
+    core.ggslam_gicp_target_moments.argtypes = [c_void_p, ctypes.c_int, c_void_p]
+    core.ggslam_gicp_target_moments.restype = None
     core.ggslam_gicp_target_size.argtypes = [c_void_p, ctypes.c_int]
     core.ggslam_gicp_target_voxels.argtypes = [c_void_p, ctypes.c_int, c_void_p]
     core.ggslam_gicp_target_voxels.restype = None

@@ -69,6 +69,8 @@ class MeasuredSurface:
         """May be changed until the first keyframe is in."""
         self._context, self._archive = context, archive
         self._parts: list[_Part] = []
+        self.finish = True
+        """False: the targets' voxels are left without shapes; see `GicpTarget.from_arrays`."""
         self.active: set[int] = set()
         """Numbers of the keyframes that take part."""
         self.target: GicpTarget | None = None
@@ -161,7 +163,7 @@ class MeasuredSurface:
             begin += part.count
         return GicpTarget.from_arrays(
             points, quaternions, log_scales, np.full(count, _OPACITY_LOGIT, np.float32), self.settings, self._context,
-            base=base,
+            base=base, finish=self.finish,
         )  # fmt: skip
 
 

@@ -192,9 +192,15 @@ def test_an_empty_target_matches_nothing(engine: CudaTrackingEngine, native: Nat
     assert np.array_equal(found.T_world_camera, np.eye(4))
 
 
-def test_results_repeat_bit_for_bit(
-    engine: CudaTrackingEngine, frames: list[Frame], target: GicpTarget, other_order: None
+def test_threads_wait_for_one_another(
+    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget, other_order: None
 ) -> None:
+    part = grey_part(frames[2], frames[0], PhotometricSettings(points=800))
+    check_points(*(e.points(frames[2].depth, POINTS, NOISE) for e in (engine, native)))
+    check_alignment(engine, native, frames[2].depth, target, truth_of(frames[2]), photometric=part)
+
+
+def test_results_repeat_bit_for_bit(engine: CudaTrackingEngine, frames: list[Frame], target: GicpTarget) -> None:
     guess = truth_of(frames[2]) @ se3_exp(GUESSES[1])
     results = [
         engine.align(engine.points(frames[2].depth, POINTS, NOISE), target, guess, SETTINGS, NOISE) for _ in range(2)
@@ -211,6 +217,30 @@ def test_targets_take_turns(
     other = surface.add(native.points(frames[3].depth, PointSettings(), NOISE), truth_of(frames[3]))
     for aim in (target, other, target):
         check_alignment(engine, native, frames[2].depth, aim, truth_of(frames[2]))
+
+
+@pytest.mark.parametrize("change", [{}, {"neighbour_weight": 0.0}, {"scatter_weight": 0.0, "max_elongation": 2.0}])
+def test_voxels_take_shape_on_the_device_as_in_the_core(
+    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], change: dict[str, float]
+) -> None:
+    settings = replace(TrackerSettings().target, **change)
+    targets = []
+    for finish in (False, True):
+        surface = MeasuredSurface(settings, native.context)
+        surface.finish = finish
+        for frame in (frames[0], frames[4]):
+            aim = surface.add(native.points(frame.depth, PointSettings(), NOISE), truth_of(frame))
+        targets.append(aim)
+    raw, ready = targets
+    assert len(raw) == len(ready)
+    points, guess = engine.points(frames[2].depth, POINTS, NOISE), truth_of(frames[2]) @ se3_exp(GUESSES[1])
+    found, expected = (engine.align(points, aim, guess, SETTINGS, NOISE) for aim in targets)
+    assert raw.settings_to_finish is not None  # the core was not asked
+    assert np.abs(se3_log(inverse(expected.T_world_camera) @ found.T_world_camera)).max() < 1e-5
+    assert found.cost == pytest.approx(expected.cost, rel=1e-3) and found.status is expected.status
+    assert (found.matches == expected.matches).mean() > 0.99
+    one, two = raw.voxels(), ready.voxels()  # now it is
+    assert raw.settings_to_finish is None and all(np.array_equal(one[name], two[name]) for name in two)
 
 
 def grey_part(view: Frame, reference: Frame, settings: PhotometricSettings) -> PhotometricPart:
@@ -230,6 +260,19 @@ def test_grey_values_pull_as_they_do_in_the_core(
     check_alignment(engine, native, frames[2].depth, target, guess, photometric=part)
     weighty = replace(part, settings=replace(part.settings, weight=5.0))
     check_alignment(engine, native, frames[2].depth, target, guess, photometric=weighty)
+
+
+def test_what_hides_a_point_in_the_reference_counts_as_in_the_core(
+    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget
+) -> None:
+    part = grey_part(frames[2], frames[0], PhotometricSettings(points=800))
+    pixels = part.reference.pixels.copy()
+    pixels[:, :40, 3] *= 0.5
+    hidden = replace(part, reference=replace(part.reference, pixels=pixels))
+    points, guess = engine.points(frames[2].depth, POINTS, NOISE), truth_of(frames[2])
+    shares = [engine.align(points, target, guess, SETTINGS, NOISE, p).photometric_share for p in (part, hidden)]
+    assert shares[1] < 0.8 * shares[0]
+    check_alignment(engine, native, frames[2].depth, target, guess, photometric=hidden)
 
 
 def track(tracker: Tracker, frames: list[Frame]) -> list[TrackingResult]:

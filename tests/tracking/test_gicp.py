@@ -14,11 +14,11 @@ from ggslam.tracking.gicp import (
     PLANE_VARIANCE,
     AlignmentStatus,
     GicpTarget,
-    about_point,
     align,
     native_align_settings,
     native_points,
 )
+from ggslam.tracking.observability import about_point
 from ggslam.tracking.points import FramePoints, extract_points, grid_stride
 from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings, TargetSettings
 from ggslam.tracking.surface import quaternions_from_normals

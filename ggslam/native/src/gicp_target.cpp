@@ -202,6 +202,12 @@ VoxelLevelView VoxelLevel::view() const {
 
 void GicpTarget::build(Context& context, const GicpTarget* base, const TargetInput& input,
                        const TargetSettings& settings) {
+  gather(context, base, input, settings);
+  finish(context, settings);
+}
+
+void GicpTarget::gather(Context& context, const GicpTarget* base, const TargetInput& input,
+                        const TargetSettings& settings) {
   static const VoxelLevel nothing;
   const VoxelLevel& before = base ? base->fine : nothing;
   std::array<std::size_t, kPartitions + 1> base_begin{};
@@ -218,13 +224,16 @@ void GicpTarget::build(Context& context, const GicpTarget* base, const TargetInp
   fine.size = settings.voxel;
   concatenate(partitions, fine);
   coarsen(fine, GGSLAM_DISPATCH(context.isa, merge_moments), coarse);
-  const auto finish = GGSLAM_DISPATCH(context.isa, finish_voxels);
+}
+
+void GicpTarget::finish(Context& context, const TargetSettings& settings) {
+  const auto shape = GGSLAM_DISPATCH(context.isa, finish_voxels);
   for (VoxelLevel* level : {&fine, &coarse}) {
     level->index_blocks();
     level->voxels.resize(level->moments.size());
     const VoxelLevelView view = level->view();
     context.pool.parallel_for(level->voxels.size(), 512, [&](std::size_t begin, std::size_t end, int) {
-      finish(settings, view, level->moments.data(), begin, end, level->voxels.data());
+      shape(settings, view, level->moments.data(), begin, end, level->voxels.data());
     });
   }
 }
@@ -244,10 +253,32 @@ GGSLAM_EXPORT void ggslam_gicp_target_build(void* context, void* target, const v
                                                   static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
 }
 
+// As ggslam_gicp_target_build, but leaves the voxels without shapes. Until ggslam_gicp_target_finish has been called, the
+// target may be a base, and be asked for its size, its moments and its blocks.
+GGSLAM_EXPORT void ggslam_gicp_target_gather(void* context, void* target, const void* base,
+                                             const ggslam::TargetInput* input,
+                                             const ggslam::TargetSettings* settings) {
+  static_cast<ggslam::GicpTarget*>(target)->gather(*static_cast<ggslam::Context*>(context),
+                                                   static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
+}
+
+GGSLAM_EXPORT void ggslam_gicp_target_finish(void* context, void* target, const ggslam::TargetSettings* settings) {
+  static_cast<ggslam::GicpTarget*>(target)->finish(*static_cast<ggslam::Context*>(context), *settings);
+}
+
 // Number of voxels of a level (0 fine, 1 coarse).
-GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target_, int level) {
+GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target_, int level_) {
   const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
-  return static_cast<int>((level ? target.coarse : target.fine).voxels.size());
+  const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;
+  return static_cast<int>(std::max(level.voxels.size(), level.moments.size()));
+}
+
+// Copies the moments of a level's voxels, [n, 22] in the order of struct VoxelMoments.
+GGSLAM_EXPORT void ggslam_gicp_target_moments(const void* target_, int level, float* out) {
+  const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
+  const auto& moments = (level ? target.coarse : target.fine).moments;
+  static_assert(sizeof(ggslam::VoxelMoments) == 22 * sizeof(float), "moments are floats and nothing else");
+  std::copy_n(reinterpret_cast<const float*>(moments.data()), moments.size() * 22, out);
 }
 
 // Copies a level's voxels: [n, 16] mean(3) weight normal(3) 0 covariance(6) 0 0.

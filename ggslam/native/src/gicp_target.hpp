@@ -45,6 +45,10 @@ struct GicpTarget {
   // with the same settings. The result does not depend on the number of threads.
   void build(Context& context, const GicpTarget* base, const TargetInput& input, const TargetSettings& settings);
 
+  // The two halves of `build`: blocks and moments of the voxels, which is all that a `base` needs; then their shapes.
+  void gather(Context& context, const GicpTarget* base, const TargetInput& input, const TargetSettings& settings);
+  void finish(Context& context, const TargetSettings& settings);
+
   // Replaces the contents by the union of `parts`, all of the same settings and of different ranks. What of it is as in
   // `before` (composed, too, with the same settings; may be null) is copied from there. The result depends on the parts
   // alone: not on `before`, their order or the number of threads. Not to be used as `base`.

@@ -36,11 +36,12 @@ class VoxelLevel(Structure):
     _fields_ = [*_pointers("voxels", "slots"), ("slot_mask", c_uint64), ("size", c_float), ("inverse_size", c_float)]
 
 
-class VoxelTableJob(Structure):
-    """Mirror of struct VoxelTableJob."""
+class VoxelLevelJob(Structure):
+    """Mirror of struct VoxelLevelJob."""
 
     _fields_ = [
-        *_pointers("blocks"), ("level", VoxelLevel), *_pointers("stream"), ("device", c_int32), ("count", c_int32)
+        *_pointers("blocks", "moments"), ("level", VoxelLevel), *_pointers("voxels", "stream"),
+        ("settings", native.TargetSettings), ("device", c_int32), ("block_count", c_int32), ("voxel_count", c_int32),
     ]  # fmt: skip
 
 
@@ -64,7 +65,7 @@ RADIUS = 48
 RESULTS = 49
 """Places of the results of an alignment, as enum AlignResult has them, and their number."""
 
-VOXEL_BYTES, BLOCK_BYTES, SLOT_BYTES = 64, 24, 32
+VOXEL_BYTES, MOMENT_BYTES, BLOCK_BYTES, SLOT_BYTES = 64, 88, 24, 32
 HEADER_BYTES = 8
 
 
@@ -75,10 +76,10 @@ def declare_tracking(library: CudaLibrary) -> None:
         NativeCoreError: the compiled kernels do not fit this code.
     """
     for name, mirror in (
-        ("depth_points_job", DepthPointsJob), ("voxel_table_job", VoxelTableJob), ("align_job", AlignJob)
+        ("depth_points_job", DepthPointsJob), ("voxel_level_job", VoxelLevelJob), ("align_job", AlignJob)
     ):  # fmt: skip
         library.check_size(name, mirror)
-    for name in ("depth_points", "voxel_table", "align"):
+    for name in ("depth_points", "voxel_level", "align"):
         library.declare(name, [c_void_p])
     for name in ("depth_points_bytes", "align_bytes"):
         library.declare(name, [c_void_p], c_int64)

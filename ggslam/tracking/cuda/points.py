@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -25,20 +26,21 @@ class DevicePoints(FramePoints):
         device: where they are.
     """
 
+    room: int
     _block: torch.Tensor
+    _begins: dict[str, int]
     _header: tuple[int, float] | None
 
     def __init__(self, room: int, device: torch.device) -> None:
         words = torch.empty(_BEGIN + room * sum(_ROWS.values()), dtype=torch.float32, device=device)
-        for name, value in (("room", room), ("_block", words), ("_header", None)):
+        begins = dict(zip(_ROWS, accumulate((room * width for width in _ROWS.values()), initial=_BEGIN), strict=False))
+        for name, value in (("room", room), ("_block", words), ("_begins", begins), ("_header", None)):
             object.__setattr__(self, name, value)
-
-    room: int
 
     def arrays(self) -> PointArrays:
         """Addresses on the device; this object must stay alive."""
         begin = self._block.data_ptr()
-        return PointArrays(begin, *(begin + 4 * offset for offset in self._offsets().values()))
+        return PointArrays(begin, *(begin + 4 * offset for offset in self._begins.values()))
 
     def settle(self, count: int, median_depth: float) -> None:
         """Takes what the device says of the points, once it is known."""
@@ -63,7 +65,7 @@ class DevicePoints(FramePoints):
             raise AttributeError(name)
         words = self._block.cpu().numpy()
         count, _ = self._header_of(words)
-        for field, offset in self._offsets().items():
+        for field, offset in self._begins.items():
             width = _ROWS[field]
             rows = words[offset : offset + width * count]
             rows = rows.view(np.int32) if field == "pixels" else rows
@@ -79,8 +81,3 @@ class DevicePoints(FramePoints):
     @staticmethod
     def _header_of(words: np.ndarray) -> tuple[int, float]:
         return int(words[:1].view(np.int32)[0]), float(words[1])
-
-    def _offsets(self) -> dict[str, int]:
-        """First word of each array."""
-        ends = np.cumsum([_BEGIN, *(self.room * width for width in _ROWS.values())]).tolist()
-        return dict(zip(_ROWS, ends[:-1], strict=True))

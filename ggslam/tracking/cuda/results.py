@@ -9,8 +9,14 @@ import numpy as np
 import torch
 
 from ggslam.tracking.cuda import contract
-from ggslam.tracking.gicp import AlignmentResult, PointSpread, about_point, judge
+from ggslam.tracking.gicp import AlignmentResult, judge
+from ggslam.tracking.observability import PointSpread, about_point
 from ggslam.tracking.settings import AlignSettings
+
+_PLACES = np.zeros((6, 6), np.intp)
+"""Where entry (i, j) of a symmetric matrix is in its upper triangle, row by row."""
+_PLACES[np.triu_indices(6)] = range(21)
+_PLACES += np.triu(_PLACES, 1).T
 
 
 class DeviceAlignment(AlignmentResult):
@@ -39,12 +45,8 @@ def device_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSe
     """
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = found[contract.POSE][:9].reshape(3, 3), found[contract.POSE][9:]
-    upper = np.zeros((6, 6))
-    upper[np.triu_indices(6)] = found[contract.INFORMATION]
-    information = upper + np.triu(upper, 1).T
-    spread = PointSpread(
-        float(found[contract.SPREAD_TOTAL]), found[contract.CENTROID], float(found[contract.RADIUS])
-    )  # fmt: skip
+    information = found[contract.INFORMATION][_PLACES]
+    spread = PointSpread(float(found[contract.SPREAD_TOTAL]), found[contract.CENTROID], float(found[contract.RADIUS]))
     usable = bool(found[contract.USABLE])
     status, visibility, weak = judge(information, T[:3, :3], spread, usable, settings.degenerate_below)
     values = {

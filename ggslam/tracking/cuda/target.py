@@ -12,7 +12,7 @@ import torch
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.tracking import native
-from ggslam.tracking.cuda.contract import BLOCK_BYTES, SLOT_BYTES, VOXEL_BYTES, VoxelLevel, VoxelTableJob
+from ggslam.tracking.cuda.contract import BLOCK_BYTES, MOMENT_BYTES, SLOT_BYTES, VOXEL_BYTES, VoxelLevel, VoxelLevelJob
 from ggslam.tracking.cuda.transfers import Upload
 from ggslam.tracking.gicp import GicpTarget
 
@@ -45,32 +45,40 @@ class DeviceTarget:
         return self._levels
 
     def _sent(self, target: GicpTarget) -> tuple[VoxelLevel, VoxelLevel]:
-        core, handle = self._core, target.handle
+        """Sends blocks and voxels of both levels; of voxels without shapes the moments, for the device to finish."""
+        core, handle, settings = self._core, target.gathered, target.settings_to_finish
+        copy, size = core.ggslam_gicp_target_voxels, VOXEL_BYTES
+        if settings is not None:
+            copy, size = core.ggslam_gicp_target_moments, MOMENT_BYTES
         voxels = [core.ggslam_gicp_target_size(handle, level) for level in (0, 1)]
         blocks = [core.ggslam_gicp_target_blocks(handle, level, None) for level in (0, 1)]
-        sizes = [VOXEL_BYTES * n for n in voxels] + [BLOCK_BYTES * n for n in blocks]
-        begins = np.cumsum([0, *sizes]).tolist()
+        begins = np.cumsum([0, *(size * n for n in voxels), *(BLOCK_BYTES * n for n in blocks)]).tolist()
         host = native.address(self._upload.begin(begins[-1]))
         for level in (0, 1):
-            core.ggslam_gicp_target_voxels(handle, level, host + begins[level])
+            copy(handle, level, host + begins[level])
             core.ggslam_gicp_target_blocks(handle, level, host + begins[2 + level])
         sent = self._memory.block("target", begins[-1])
         self._upload.send(sent[: begins[-1]])
         first = sent.data_ptr()
-        fine, coarse = (
-            self._level(level, first + begins[level], first + begins[2 + level], blocks[level], target.voxel)
-            for level in (0, 1)
-        )
-        return fine, coarse
+        made = []
+        for level in (0, 1):
+            job = VoxelLevelJob(
+                blocks=first + begins[2 + level], voxels=first + begins[level], block_count=blocks[level],
+                voxel_count=voxels[level], stream=self._library.stream(self._device), device=self._device.index or 0,
+            )  # fmt: skip
+            if settings is not None:
+                job.moments, job.settings = first + begins[level], settings
+                job.voxels = self._memory.block(f"voxels {level}", VOXEL_BYTES * voxels[level]).data_ptr()
+            job.level = self._level(level, job, target.voxel)
+            self._library.call("voxel_level", ctypes.byref(job))
+            made.append(job.level)
+        return made[0], made[1]
 
-    def _level(self, level: int, voxels: int, blocks: int, count: int, voxel: float) -> VoxelLevel:
-        """Starts the making of a level's hash table."""
+    def _level(self, level: int, job: VoxelLevelJob, voxel: float) -> VoxelLevel:
+        """The level that the job is to make, with room for its hash table."""
         places = 64
-        while places < _PLACES_PER_BLOCK * count:
+        while places < _PLACES_PER_BLOCK * job.block_count:
             places *= 2
         slots = self._memory.block(f"slots {level}", SLOT_BYTES * places)
         size = np.float32(voxel) * np.float32(4 if level else 1)
-        found = VoxelLevel(voxels, slots.data_ptr(), places - 1, size, np.float32(1) / size)
-        job = VoxelTableJob(blocks, found, self._library.stream(self._device), self._device.index or 0, count)
-        self._library.call("voxel_table", ctypes.byref(job))
-        return found
+        return VoxelLevel(job.voxels, slots.data_ptr(), places - 1, size, np.float32(1) / size)

@@ -77,11 +77,32 @@ struct VoxelLevel {
   float size, inverse_size;  // of a voxel, metres
 };
 
-struct VoxelTableJob {
+struct TargetSettings {
+  float voxel;  // edge of a fine voxel, metres
+  float min_opacity_logit;
+  float min_thickness, max_thickness, max_elongation;  // of a voxel's regularised covariance
+  float scatter_weight;    // weight of the scatter of the means against the members' own covariances
+  float neighbour_weight;  // weight of the 26 neighbours in a voxel's scatter
+};
+
+// Sums over the members of a voxel, see the core.
+struct VoxelMoments {
+  float weight;
+  float offset[3];  // sum of w (mean - centre)
+  float outer[6];   // sum of w (mean - centre)(mean - centre)^T
+  float own[6];     // sum of w C with C the members' regularised covariances
+  float normal[3];
+  float centre[3];
+};
+
+struct VoxelLevelJob {
   const VoxelBlock* blocks;
+  const VoxelMoments* moments;  // null: the voxels are finished
   VoxelLevel level;
+  Voxel* voxels;  // those of the level, to be finished
   void* stream;
-  std::int32_t device, count;
+  TargetSettings settings;
+  std::int32_t device, block_count, voxel_count;
 };
 
 // --- alignment -------------------------------------------------------------------------------------------------------

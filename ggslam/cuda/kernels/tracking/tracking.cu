@@ -1,15 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-// The C interface of tracking: points of a depth image, the hash table of a target's voxels, alignment. Only starts work
+// The C interface of tracking: points of a depth image, the voxels of a target, alignment. Only starts work
 // on the caller's stream. Functions return 0 or a cudaError_t.
 #include "common/host.cuh"
 #include "tracking/alignment_kernels.cuh"
 #include "tracking/depth_points.cuh"
+#include "tracking/voxel_shapes.cuh"
 
 using namespace ggslam::cuda;
 
 // Sizes of the structures, so that a caller can check that its mirrors of them are the same.
 GGSLAM_EXPORT int ggslam_cuda_depth_points_job_size() { return static_cast<int>(sizeof(DepthPointsJob)); }
-GGSLAM_EXPORT int ggslam_cuda_voxel_table_job_size() { return static_cast<int>(sizeof(VoxelTableJob)); }
+GGSLAM_EXPORT int ggslam_cuda_voxel_level_job_size() { return static_cast<int>(sizeof(VoxelLevelJob)); }
 GGSLAM_EXPORT int ggslam_cuda_align_job_size() { return static_cast<int>(sizeof(AlignJob)); }
 
 // Bytes of memory that depth_points works in. Asks for columns and rows.
@@ -30,13 +31,16 @@ GGSLAM_EXPORT int ggslam_cuda_depth_points(const DepthPointsJob* job) {
   });
 }
 
-// Empties the hash table of a level and puts the level's blocks in. It has more places than there are blocks.
-GGSLAM_EXPORT int ggslam_cuda_voxel_table(const VoxelTableJob* job) {
+// Empties the hash table of a level, which has more places than there are blocks, and puts the level's blocks in; gives
+// the voxels their shapes if they have none yet.
+GGSLAM_EXPORT int ggslam_cuda_voxel_level(const VoxelLevelJob* job) {
   return on_device(job->device, [&] {
     const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);
     const std::size_t bytes = static_cast<std::size_t>(job->level.slot_mask + 1) * sizeof(VoxelSlot);
     const cudaError_t cleared = cudaMemsetAsync(job->level.slots, 0xff, bytes, stream);
-    launch(fill_table_kernel, blocks_for(job->count, kTableThreads), kTableThreads, stream, *job);
+    launch(fill_table_kernel, blocks_for(job->block_count, kTableThreads), kTableThreads, stream, *job);
+    if (job->moments != nullptr)
+      launch(finish_voxels_kernel, blocks_for(job->voxel_count, kFinishThreads), kFinishThreads, stream, *job);
     return cleared;
   });
 }

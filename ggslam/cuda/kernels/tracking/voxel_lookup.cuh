@@ -25,9 +25,9 @@ __device__ inline std::uint64_t hash_key(std::uint64_t key) {
 
 // Puts each block into a table whose keys are all kEmptyKey. Which of two blocks that meet comes first depends on
 // chance; what a look-up finds does not.
-__global__ void __launch_bounds__(kTableThreads) fill_table_kernel(VoxelTableJob job) {
+__global__ void __launch_bounds__(kTableThreads) fill_table_kernel(VoxelLevelJob job) {
   const int i = static_cast<int>(blockIdx.x * kTableThreads + threadIdx.x);
-  if (i >= job.count) return;
+  if (i >= job.block_count) return;
   const VoxelBlock block = job.blocks[i];
   std::uint64_t place = hash_key(block.key) & job.level.slot_mask;
   for (;; place = (place + 1) & job.level.slot_mask) {
@@ -62,13 +62,9 @@ __device__ inline std::uint64_t find_voxels(const VoxelLevel& level, std::uint64
   }
 }
 
-// Index of the voxel whose mean is nearest to p, not farther than a voxel's edge, and whose normal agrees; or -1.
-__device__ inline int nearest_voxel(const VoxelLevel& level, const float (&p)[3], const float (&normal)[3],
-                                    float min_dot) {
-  int best = -1, low[3];
-  float nearest = level.size * level.size;
-#pragma unroll
-  for (int a = 0; a < 3; ++a) low[a] = static_cast<int>(floorf(p[a] * level.inverse_size)) - 1;
+// Calls visit(index) for each occupied voxel among the 27 whose coordinates begin at `low`, in a fixed order.
+template <class Visit>
+__device__ inline void visit_neighbourhood(const VoxelLevel& level, const int (&low)[3], const Visit& visit) {
   for (int bz = low[2] >> 2; bz <= (low[2] + 2) >> 2; ++bz) {
     const std::uint64_t mask_z = bits_z(max(low[2] - 4 * bz, 0), min(low[2] + 2 - 4 * bz, 3));
     for (int by = low[1] >> 2; by <= (low[1] + 2) >> 2; ++by) {
@@ -78,16 +74,32 @@ __device__ inline int nearest_voxel(const VoxelLevel& level, const float (&p)[3]
         const std::uint64_t mask = mask_yz & bits_x(max(low[0] - 4 * bx, 0), min(low[0] + 2 - 4 * bx, 3));
         for (std::uint64_t rest = find_voxels(level, block_key(bx, by, bz), mask, &slot); rest; rest &= rest - 1) {
           const std::uint64_t below = (rest & (~rest + 1)) - 1;
-          const int index = static_cast<int>(slot.first) + __popcll(slot.occupied & below);
-          const Voxel& v = level.voxels[index];
-          const float dx = v.mean[0] - p[0], dy = v.mean[1] - p[1], dz = v.mean[2] - p[2];
-          const float distance = dx * dx + dy * dy + dz * dz;
-          const float dot = v.normal[0] * normal[0] + v.normal[1] * normal[1] + v.normal[2] * normal[2];
-          if (distance < nearest && dot > min_dot) nearest = distance, best = index;
+          visit(static_cast<int>(slot.first) + __popcll(slot.occupied & below));
         }
       }
     }
   }
+}
+
+// The least coordinates of the 27 voxels around a point.
+__device__ inline void neighbourhood_of(const VoxelLevel& level, const float (&p)[3], int (&low)[3]) {
+#pragma unroll
+  for (int a = 0; a < 3; ++a) low[a] = static_cast<int>(floorf(p[a] * level.inverse_size)) - 1;
+}
+
+// Index of the voxel whose mean is nearest to p, not farther than a voxel's edge, and whose normal agrees; or -1.
+__device__ inline int nearest_voxel(const VoxelLevel& level, const float (&p)[3], const float (&normal)[3],
+                                    float min_dot) {
+  int best = -1, low[3];
+  float nearest = level.size * level.size;
+  neighbourhood_of(level, p, low);
+  visit_neighbourhood(level, low, [&](int index) {
+    const Voxel& v = level.voxels[index];
+    const float dx = v.mean[0] - p[0], dy = v.mean[1] - p[1], dz = v.mean[2] - p[2];
+    const float distance = dx * dx + dy * dy + dz * dz;
+    const float dot = v.normal[0] * normal[0] + v.normal[1] * normal[1] + v.normal[2] * normal[2];
+    if (distance < nearest && dot > min_dot) nearest = distance, best = index;
+  });
   return best;
 }
 
