@@ -43,9 +43,9 @@ def write_mesh(
     """Writes a mesh in the format that the file's ending names, whole or not at all.
 
     PLY: binary; x y z, and what is given of nx ny nz, red green blue, object_id (ushort). OBJ: one object with normals
-    and colours (behind each vertex' position, as most programs read them), no object ids. GLB: with labels one node
-    for each object, called "ID NAME" or "object ID" ("unlabelled" for 0), else a single one; vertices are stored as they
-    are given, and the nodes turn them, see `GLTF_AXES`.
+    and colours (behind each vertex' position, as most programs read them), no object ids. GLB: with labels a node
+    for each object, called "ID NAME" or "object ID" ("unlabelled" for 0), else a single one; vertices are stored as given, and
+    the nodes turn them, see `GLTF_AXES`.
 
     Args:
         path: ends in one of `ENDINGS`.
