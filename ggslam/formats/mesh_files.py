@@ -44,8 +44,8 @@ def write_mesh(
 
     PLY: binary; x y z, and what is given of nx ny nz, red green blue, object_id (ushort). OBJ: one object with normals
     and colours (behind each vertex' position, as most programs read them), no object ids. GLB: with labels a node
-    for each object, called "ID NAME" or "object ID" ("unlabelled" for 0), else a single one; vertices are stored as given, and
-    the nodes turn them, see `GLTF_AXES`.
+    for each object, called "ID NAME" or "object ID" ("unlabelled" for 0), else a single one; vertices are stored as
+    given, and the nodes turn them, see `GLTF_AXES`.
 
     Args:
         path: ends in one of `ENDINGS`.
