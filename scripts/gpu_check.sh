@@ -7,14 +7,15 @@
 #   ARCHIVE=...    also puts all of that into one file .tar.gz at the end, whatever happened
 #   STEPS="..."    which steps to run, in this order whatever is said:
 #                    machine build compile tests slam realtime profile loops bench training
-#   SHORT=1        less of everything, for ten minutes in all; no step begins or goes on after LIMIT seconds
+#   SHORT=1        less of everything, for ten minutes in all (tests: those that need the GPU); no step begins or goes
+#                  on after LIMIT seconds
 #   LIMIT=...      seconds; 0: none (default: 0, with SHORT 540)
 #   DATA=...       folder with recordings (default: GGSLAM_DATA, else ../shared/data, shared/data or build/recordings,
 #                  whichever there is); without recordings a room is generated
 #   SLAM="..."     arguments of scripts/bench_cuda_slam.py, for the steps slam, realtime, profile and loops
 #   BENCH="..."    arguments of scripts/bench_cuda_render.py
 #   TRAINING="..." arguments of scripts/bench_cuda_training.py
-#   SANITIZE=1     runs a few tests under compute-sanitizer's memcheck and racecheck, too (minutes)
+#   SANITIZE=1     runs a few tests under compute-sanitizer's memcheck, racecheck and synccheck, too (minutes)
 set -u
 cd "$(dirname "$0")/.."
 export PYTHONPATH=$PWD:$PWD/scripts PYTHONUNBUFFERED=1 OMP_WAIT_POLICY=PASSIVE
@@ -98,16 +99,20 @@ CODE
 }
 
 tests() {
-  "$python" -m pytest -q -p no:cacheprovider -rs -m "$PICK" --durations=15 tests/rendering tests/mapping tests/tracking \
-    tests/test_device_watch.py tests/test_slam*.py
+  local whole
+  whole=$(ls tests/test_cuda*.py tests/test_device_watch.py tests/test_slam.py)
+  # shellcheck disable=SC2086
+  "$python" -m pytest -q -p no:cacheprovider -rs -m "$PICK" -k "not emulated" --durations=15 tests/rendering \
+    tests/mapping tests/tracking $whole
 }
 
 sanitize() {
   local tool
-  for tool in memcheck racecheck; do
+  for tool in memcheck racecheck synccheck; do
     compute-sanitizer --tool "$tool" --error-exitcode 1 "$python" -m pytest -q -p no:cacheprovider -m gpu \
-      tests/rendering/test_cuda_device.py tests/rendering/test_cuda_training.py \
-      -k "channels or crowded or every_size or every_age" || return 1
+      tests/rendering tests/mapping tests/tracking \
+      -k "channels or crowded or every_size or every_age or terms or neighbours or insertion or identity or tracking" ||
+      return 1
   done
 }
 

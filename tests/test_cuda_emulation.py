@@ -46,7 +46,8 @@ __global__ void last_block(float* out) { out[0] = static_cast<float>(blockIdx.x)
 __global__ void nothing(float*) {}
 
 extern "C" void run(int what, float* out, std::int64_t blocks) {
-  void (*kernels[])(float*) = {right, misaligned, beyond, unwritten, part_of_a_warp, part_of_a_block, last_block, nothing};
+  void (*kernels[])(float*) = {right,          misaligned,      beyond,     unwritten,
+                               part_of_a_warp, part_of_a_block, last_block, nothing};
   launch(kernels[what], blocks, 64, cudaStream_t{}, out);
 }
 """

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -222,6 +223,18 @@ def test_host_addresses_given_to_kernels_are_refused(watch: DeviceWatch) -> None
     del x
     with pytest.raises(DeviceMixing, match="values"):
         watch.check_addresses("test", Jobs(1, Job(freed, None)))
+
+
+def test_threads_are_watched(watch: DeviceWatch) -> None:
+    found: list[torch.Tensor] = []
+    thread = threading.Thread(target=lambda: found.append(torch.ones(3, device="cuda") + 1))
+    thread.start()
+    thread.join()
+    assert watch.read(found[0]).tolist() == [2, 2, 2]
+    thread = threading.Thread(target=lambda: found[0].tolist())
+    thread.start()
+    thread.join()
+    assert [wait.operation for wait in watch.waits] == ["tolist"]
 
 
 def test_nothing_is_left_behind() -> None:

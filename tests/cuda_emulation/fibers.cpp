@@ -9,6 +9,7 @@
 #include <cstring>
 #include <link.h>
 #include <memory>
+#include <mutex>
 #include <numeric>
 #include <ucontext.h>
 #include <utility>
@@ -137,6 +138,8 @@ void fail(const char* what) {
 }
 
 void run_grid(std::int64_t blocks, int threads, void (*code)(const void*), const void* argument) {
+  static std::mutex one_at_a_time;  // callers may be on several threads; there is one set of fibers
+  const std::lock_guard<std::mutex> alone(one_at_a_time);
   if (blocks > 0x7fffffff) fail("more blocks than a grid can have");
   for (std::int64_t i = 0; i < blocks; ++i)
     run_block(static_cast<unsigned>(block_in_order(i, blocks)), static_cast<unsigned>(blocks), threads, code, argument);

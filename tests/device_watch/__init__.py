@@ -18,7 +18,7 @@ run on the CPU, and kernels in their emulation. What is recorded:
 What raises: `DeviceMixing` as said; NotImplementedError for operations on uint16 that torch may not have on a device;
 whatever torch itself refuses for tensors there, such as `.numpy()`.
 Not modelled: the order of streams, CUDA graphs, memory that is used again too early, autograd, operations that torch
-has for one of both only. Factories such as torch.zeros know the device only in the thread that entered the watch.
+has for one of both only. Threads are watched if they are started within.
 """
 
 from device_watch.records import DeviceMixing, Record

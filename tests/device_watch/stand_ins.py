@@ -117,6 +117,7 @@ def replacements(watch: DeviceWatch) -> list[Any]:
         "empty_cache": lambda: None,
         "memory_allocated": lambda device=None: 0,
         "max_memory_allocated": lambda device=None: 0,
+        "memory_reserved": lambda device=None: 0,
         "reset_peak_memory_stats": lambda device=None: None,
         "stream": Device, "device": Device, "Stream": Stream, "Event": Event,
     }  # fmt: skip

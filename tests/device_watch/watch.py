@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import ctypes
+import threading
 import weakref
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from cuda_emulation import emulated_library
@@ -100,9 +103,19 @@ class DeviceWatch:
             self._stack.enter_context(replacement)
         _watches.append(weakref.ref(self))
         self._stack.callback(_watches.pop)
+        self._stack.enter_context(patch.object(threading.Thread, "run", self._watched(threading.Thread.run)))
         self._stack.enter_context(_Generators())
         self._stack.enter_context(_Operations(self))
         return self
+
+    def _watched(self, run: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
+        """What threads that are started within the watch do."""
+
+        def watched_run(thread: threading.Thread) -> None:
+            with _Generators(), _Operations(self):
+                run(thread)
+
+        return watched_run
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()

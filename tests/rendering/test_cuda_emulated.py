@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -250,3 +251,14 @@ def test_the_current_device_stays_what_it_was(rasterizer: CudaRasterizer) -> Non
         rasterizer.forward(make_scene(20, 0), CAMERA, POSE)
     finally:
         assert exchange(0) == 3
+
+
+def test_emulated_kernels_may_be_called_by_several_threads(rasterizer: CudaRasterizer) -> None:
+    scene = make_scene(100, 4)
+    expected = rasterizer.forward(scene, CAMERA, POSE).image.clone()
+
+    def render(_: int) -> torch.Tensor:
+        return CudaRasterizer(library=rasterizer.library).forward(scene, CAMERA, POSE).image
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(torch.equal(image, expected) for image in pool.map(render, range(8)))
