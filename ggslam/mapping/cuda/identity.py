@@ -207,18 +207,16 @@ class CudaIdentityLearner(IdentityObjects):
     ) -> None:  # fmt: skip
         s = self.settings
         classes, known = self._kernels.classes(labels, self.table.class_of)
-        # Without a known pixel nothing may change; a Gaussian in no term makes no step.
-        some = known > 0
-        terms = CudaPixelTerms(terms.gaussians, terms.weights, terms.counts * some, terms.library)
-        terms.vote(gaussians, labels, vote_weights)
         losses = torch.empty(len(labels), device=self.device)
         gradient, rows = self.table.cross_entropy(terms.features(gaussians), classes, known, losses, s.weight)
         self._last = losses, known
         if self._pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
             others = CudaPixelTerms.of_gaussians(pulled, terms.capacity, terms.library)
-            others = CudaPixelTerms(others.gaussians, others.weights, others.counts * some, others.library)
             terms, gradient = terms.joined(others), torch.cat([gradient, pull])
+        # Without a known pixel nothing may change; a Gaussian in no term makes no step.
+        terms = CudaPixelTerms(terms.gaussians, terms.weights, terms.counts * (known > 0), terms.library)
+        terms.vote(gaussians, labels, vote_weights)
         terms.step(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate))
         self.table.step(rows, known, rate_factor * s.classifier_rate)
 

@@ -124,7 +124,7 @@ class CudaMapper(Mapper):
             new.means, new.quaternions, new.log_scales, logit, new.rgb, birth_keyframe=keyframe.index
         )
         if self.identity is not None:
-            self.identity.begin(self.map, rows, _labels(keyframe.device_mask, new.pixels))
+            self.identity.begin(self.map, rows, self.identity.labels_at(keyframe, new.pixels))
 
     def _rendered_whole(self, keyframe: CudaKeyframe) -> RenderBuffers:
         """With room for everything: what seems to be missing is inserted."""
@@ -208,10 +208,3 @@ class CudaMapper(Mapper):
         view = self._rasterizer.forward(self.map, keyframe.camera, self._states.pose(keyframe.index), features=False)
         for _ in range(steps):
             self.identity.step(self.map, self._rasterizer, keyframe, view, rate_factor)
-
-
-def _labels(mask: torch.Tensor | None, pixels: torch.Tensor) -> torch.Tensor:
-    """Object under each pixel, int32 [M], 0 without a mask."""
-    if mask is None:
-        return torch.zeros(len(pixels), dtype=torch.int32, device=pixels.device)
-    return mask.view(torch.int16).reshape(-1)[pixels].int() & 0xFFFF

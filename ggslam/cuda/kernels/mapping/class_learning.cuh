@@ -11,8 +11,8 @@ constexpr int kClassWarps = kClassThreads / kWarp;
 constexpr float kNothingLogit = 1.0f;                                     // NOTHING_LOGIT of ggslam/scene/identity.py
 constexpr float kLogBeta1 = -0.1053605157f, kLogBeta2 = -0.001000500334f;  // of 0.9 and 0.999
 
-// Labels of pixels, and their classes. All pointers lead to device memory. ggslam/mapping/cuda/class_learning.py mirrors
-// these structs field by field.
+// Labels of pixels, and their classes. All pointers lead to device memory. ggslam/mapping/cuda/class_learning.py
+// mirrors these structs field by field.
 struct PixelClassJob {
   const std::uint16_t* mask;     // [H, W]
   const std::int32_t* pixels;    // [count], flat indices
