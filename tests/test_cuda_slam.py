@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +72,23 @@ def test_refinement_and_real_time(frames: list[Frame], cuda_library: CudaLibrary
     result = slam.finish()
     assert slam.mapper.times.iterations == done + 4 and result.refine_iterations == 4
     assert len(result.gaussians) > 1000 and np.isfinite(result.gaussians.means.numpy()).all()
+
+
+def test_in_real_time_the_tracker_is_beside_the_mapper(frames: list[Frame], cuda_library: CudaLibrary) -> None:
+    """Not the other way round: the mapper's tensors were made on the stream that the caller's thread began with."""
+    slam = Slam(frames[0].camera, config("identity.enabled=false"), has_masks=True, library=cuda_library)
+    within: list[str] = []
+
+    @contextmanager
+    def beside_others() -> Iterator[None]:
+        within.append(threading.current_thread().name)
+        yield
+        within.clear()
+
+    slam.mapper.beside_others = beside_others  # type: ignore[method-assign]
+    seen: list[list[str]] = []
+    RealtimeSlam(slam, 1.0).run(frames[:2], lambda frame, report: seen.append(list(within)))
+    assert seen == [[threading.current_thread().name]] * 2 and not within
 
 
 def test_a_closed_loop_moves_map_and_keyframes(frames: list[Frame], cuda_library: CudaLibrary) -> None:
