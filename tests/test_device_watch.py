@@ -12,6 +12,9 @@ import pytest
 import torch
 from device_watch import DEVICE, DeviceMixing, DeviceTensor, DeviceWatch
 
+from ggslam.mapping.cuda.class_learning import ClassKernels
+from ggslam.mapping.cuda.class_table import CudaClassTable
+from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages
 from ggslam.mapping.losses import LossSettings
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
@@ -204,6 +207,18 @@ def test_operations_on_uint16_are_refused(watch: DeviceWatch) -> None:
     ):  # fmt: skip
         with pytest.raises(NotImplementedError, match="uint16"):
             refused()
+
+
+def test_tables_that_grow_are_kept_for_the_work_that_reads_them(watch: DeviceWatch) -> None:
+    """They were made on another stream than the one on which they grow in real time."""
+    states = KeyframeStates(library=watch.library)
+    for _ in range(65):
+        states.append(np.eye(4), np.ones((3, 2)))
+    table = CudaClassTable(np.random.default_rng(0), ClassKernels(DEVICE, watch.library))
+    assert [record.where.split(":")[0] for record in watch.kept] == ["cuda/streams.py"]
+    table.add(np.arange(1, 300, dtype=np.uint16))
+    assert len(watch.kept) == 4
+    assert watch.read(states.pose(64)).tolist() == np.eye(4)[:3].ravel().tolist()
 
 
 class Job(ctypes.Structure):

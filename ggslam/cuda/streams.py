@@ -28,6 +28,14 @@ def side_stream(device: torch.device) -> Iterator[None]:
         stream.synchronize()  # memory of this stream may be used on others from now on
 
 
+def let_go(*tensors: torch.Tensor) -> None:
+    """Of tensors that nobody will use any more, while work on the current stream may still read them: without this,
+    memory that was allocated on another stream would be given to the next who asks there, before that work is done."""
+    for tensor in tensors:
+        if tensor.device.type == "cuda":
+            tensor.record_stream(torch.cuda.current_stream(tensor.device))
+
+
 class Pace:
     """Keeps the host from running far ahead of the device, so that what is urgent does not queue behind what is not.
 

@@ -14,6 +14,7 @@ run on the CPU, and kernels in their emulation. What is recorded:
     uploads    copies from host memory; `blocking` unless they are asynchronous and from page-locked memory
     downloads  asynchronous copies to page-locked memory, which holds garbage until the host has waited for them
     calls      functions of the kernels' library
+    kept       tensors whose memory is kept for work on a stream (record_stream)
 
 What raises: `DeviceMixing` as said; NotImplementedError for operations on uint16 that torch may not have on a device;
 whatever torch itself refuses for tensors there, such as `.numpy()`.

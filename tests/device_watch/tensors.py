@@ -48,7 +48,8 @@ class DeviceTensor(torch.Tensor):
         self.numpy()
 
     def record_stream(self, stream: object) -> None:
-        """Nothing: memory of the host is never used too early."""
+        """Only noted: memory of the host is never used too early."""
+        active_watch().note_kept()
 
 
 _watches: list[weakref.ref[DeviceWatch]] = []

@@ -78,7 +78,7 @@ class DeviceWatch:
     """See `device_watch`.
 
     Attributes:
-        waits, uploads, downloads, calls: what happened so far.
+        waits, uploads, downloads, calls, kept: what happened so far.
         library: kernels for tensors of the pretended device.
         started: number of asynchronous downloads so far.
     """
@@ -88,6 +88,7 @@ class DeviceWatch:
         self.uploads: list[Record] = []
         self.downloads: list[Record] = []
         self.calls: list[Record] = []
+        self.kept: list[Record] = []
         self.started = 0
         self.library = WatchedLibrary(self)
         self._memory = DeviceMemory()
@@ -122,7 +123,7 @@ class DeviceWatch:
 
     def forget(self) -> None:
         """Empties the records."""
-        for records in (self.waits, self.uploads, self.downloads, self.calls):
+        for records in (self.waits, self.uploads, self.downloads, self.calls, self.kept):
             records.clear()
 
     def read(self, tensor: torch.Tensor) -> torch.Tensor:
@@ -135,6 +136,10 @@ class DeviceWatch:
         """The host waits, and with that the first `before` asynchronous downloads have arrived; None: all."""
         self.waits.append(Record(operation, here()))
         self.finish(before)
+
+    def note_kept(self) -> None:
+        """A tensor was recorded on a stream."""
+        self.kept.append(Record("record_stream", here()))
 
     def finish(self, before: int | None = None) -> None:
         """The first `before` asynchronous downloads arrive; None: all."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from ggslam.cuda.streams import let_go
 from ggslam.mapping.class_table import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.identity_objects import IDS
@@ -73,6 +74,7 @@ class CudaClassTable:
         new = self._numbers.add(object_ids)
         if new.stop > len(self._rows):
             extra = max(new.stop, 2 * len(self._rows)) - len(self._rows)
+            let_go(self._rows, *self._moments)
             self._rows = torch.cat([self._rows, self._zeros(extra)])
             self._moments = (
                 torch.cat([self._moments[0], self._zeros(extra)]), torch.cat([self._moments[1], self._zeros(extra)])

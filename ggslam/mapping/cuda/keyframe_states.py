@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.cuda.streams import let_go
 from ggslam.errors import RenderError
 from ggslam.mapping.losses import LossValues
 from ggslam.mapping.settings import ExposureSettings
@@ -126,10 +127,9 @@ class KeyframeStates:
             RenderError: another shape.
         """
         if self._count == len(self._table):
-            # Kernels that were started may still read the old table. torch gives its memory away again in the order
-            # of the stream, so they are done by then.
             table = self._new_table(2 * self._count)
             table[: self._count] = self._table
+            let_go(self._table)
             self._use(table)
         self._write(self._count, T_camera_world, exposure)
         self._count += 1
