@@ -51,7 +51,7 @@ def download(*tensors: torch.Tensor) -> list[np.ndarray]:
     for copy, tensor in zip(copies, tensors, strict=True):
         copy.copy_(tensor, non_blocking=True)
     done = torch.cuda.Event()
-    done.record()
+    done.record(torch.cuda.current_stream(tensors[0].device))
     done.synchronize()
     return [copy.numpy() for copy in copies]
 
@@ -81,7 +81,7 @@ class HostMirror:
                 return
             self._arriving.copy_(self._source, non_blocking=True)
             if self._event is not None:
-                self._event.record()
+                self._event.record(torch.cuda.current_stream(self._source.device))
             self._under_way = True
 
     def newest(self) -> np.ndarray:

@@ -48,15 +48,15 @@ class Pace:
     """
 
     def __init__(self, device: torch.device, ahead: int = 2) -> None:
-        self._on_gpu, self._ahead = device.type == "cuda", ahead
+        self._device, self._ahead = device, ahead
         self._ends: deque[torch.cuda.Event] = deque()
 
     def piece_ends(self) -> None:
         """A piece of work has been started. Waits for the one `ahead` pieces before."""
-        if not self._on_gpu:
+        if self._device.type != "cuda":
             return
         end = torch.cuda.Event()
-        end.record()
+        end.record(torch.cuda.current_stream(self._device))  # a new thread may be on another device
         self._ends.append(end)
         if len(self._ends) > self._ahead:
             before = self._ends.popleft()
