@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,7 +14,6 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
-from ggslam.sequences.factory import open_sequence
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
 from ggslam.tracking.cuda.transfers import Download
 from ggslam.tracking.engine import NativeEngine
@@ -34,9 +31,6 @@ from ggslam.tracking.settings import (
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
 
-if TYPE_CHECKING:
-    from ggslam.cuda.library import CudaLibrary
-
 NOISE = DepthNoise()
 POINTS = PointSettings(count=1500)
 SETTINGS = AlignSettings(coarse_points=500)
@@ -45,33 +39,6 @@ GUESSES = [
     np.array([0.02, -0.01, 0.015, 0.01, -0.02, 0.005]),
     np.array([-0.05, 0.04, 0.03, -0.03, 0.02, 0.06]),
 ]
-
-
-@pytest.fixture(scope="module")
-def frames(room: Path) -> list[Frame]:
-    sequence = open_sequence(room)
-    return [sequence.frame(i) for i in range(10)]
-
-
-@pytest.fixture(scope="module")
-def native(frames: list[Frame]) -> NativeEngine:
-    return NativeEngine(frames[0].camera, NativeContext(2))
-
-
-@pytest.fixture(scope="module")
-def target(frames: list[Frame], native: NativeEngine) -> GicpTarget:
-    """The surface of two frames."""
-    surface = MeasuredSurface(TrackerSettings().target, native.context)
-    for frame in (frames[0], frames[4]):
-        assert frame.T_world_camera is not None
-        points = native.points(frame.depth, PointSettings(), NOISE)
-        found = surface.add(points, frame.T_world_camera)
-    return found
-
-
-@pytest.fixture
-def engine(frames: list[Frame], cuda_library: CudaLibrary) -> CudaTrackingEngine:
-    return CudaTrackingEngine(frames[0].camera, library=cuda_library)
 
 
 def truth_of(frame: Frame) -> np.ndarray:
