@@ -78,6 +78,7 @@ class Slam:
         self.pager = make_pager(camera, self.config, paging)
         archive = None if self.pager is None else self.pager.archive
         self.surface = MeasuredSurface(self.config.tracking.target, self.context, archive)
+        self.surface.finish = library is None  # a device makes the voxels' shapes itself
         self.loops: LoopCloser | None = None
         if self.config.loops.enabled:
             self.loops = LoopCloser(camera, self.config.loops, self.surface, self.tracker, self.context)
