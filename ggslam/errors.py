@@ -33,6 +33,12 @@ class RenderError(GgslamError):
     """The renderer was given arrays of wrong shape or type, or a backend that is not available."""
 
 
+class DeviceError(RenderError):
+    """The GPU reports an error, or its memory is full."""
+
+    exit_code = 1
+
+
 class MissingDependency(GgslamError):
     """An optional package or file is needed for what was asked; the message says how to get it."""
 

@@ -161,7 +161,8 @@ def _snapshot(slam: Slam, frame: Frame, report: StepReport, title: str) -> _Snap
     g = slam.map
     views = [g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh, g.features[:, :0]]
     count = min(len(view) for view in views)
-    copies = GaussianTensors(*(view[:count].to("cpu", copy=True) for view in views))
+    with slam.mapper.in_turn():
+        copies = GaussianTensors(*(view[:count].to("cpu", copy=True) for view in views))
     located = [f for f in slam.frames if f.status != "lost"]
     located = located[:: max(1, len(located) // MAX_PATH)]
     poses = np.stack([slam.pose_of(f) for f in located])

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ggslam.config import Config, load_config
-from ggslam.errors import ConfigError, GgslamError, SequenceError
+from ggslam.errors import ConfigError, DeviceError, GgslamError, SequenceError
 from ggslam.formats.staging import new_staging
 from ggslam.interrupts import uninterrupted
 from ggslam.progress import Observer, SilentObserver
@@ -201,17 +202,42 @@ def run_slam(
             observer.begin("refine", config.refine_iterations)
         return slam.finish(observer.advance), None
     except (Exception, KeyboardInterrupt) as stopped:  # whatever it is: finished work is saved, then it is raised
-        error = stopped
+        error = _named(stopped)
     try:
         with uninterrupted():
-            result = slam.result()
+            result = _what_there_is(slam)
     except KeyboardInterrupt as again:  # by now there is the result
         error = again
     except Exception as failure:  # the disk is full, and what is there goes to make room
         slam.close()
         if folder is not None and slam.frames:
             stamps = np.array([frame.timestamp for frame in slam.frames])
-            folder.save_trajectory(stamps, tracked_poses(slam.frames, slam.mapper.keyframes), repr(failure))
+            folder.save_trajectory(stamps, _last_poses(slam), repr(failure))
             observer.note(f"the map is lost; the trajectory of {len(stamps)} frames is in {folder.path}")
         raise
     return result, error
+
+
+def _named(stopped: BaseException) -> BaseException:
+    """The error as it is told to people."""
+    if isinstance(stopped, torch.cuda.OutOfMemoryError):
+        return DeviceError(f"the GPU's memory is full: {str(stopped).partition('. GPU')[0]}")
+    return stopped
+
+
+def _what_there_is(slam: Slam) -> SlamResult:
+    """Where the memory of a GPU is full there is none for the last identity steps either: then without them."""
+    try:
+        return slam.result()
+    except torch.cuda.OutOfMemoryError:
+        torch.cuda.empty_cache()
+        return slam.result()
+
+
+def _last_poses(slam: Slam) -> np.ndarray:
+    """T_world_camera of all frames; of keyframes that a GPU which failed will not tell, as they were tracked."""
+    try:
+        poses = [keyframe.T_world_camera for keyframe in slam.mapper.keyframes]
+    except Exception:
+        poses = list(slam.surface.poses)
+    return tracked_poses(slam.frames, poses)

@@ -3,7 +3,8 @@
 
 The tracker runs in the caller's thread and never waits for the mapper: it aligns to the newest target there is. The
 mapper runs in a thread of its own: it inserts keyframes as they come, publishes a new target after each, and otherwise
-optimises the map for as long as the recording lasts.
+optimises the map for as long as the recording lasts. On a GPU the mapper goes on with the stream that its tensors were
+made on; the tracker, which allocates little and shares none of it, gets another, whose work goes first.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ class RealtimeSlam:
         worker = threading.Thread(target=self._map, name="mapper", daemon=True)
         worker.start()
         try:
-            self._track(frames, report)
+            with self.slam.mapper.beside_others():
+                self._track(frames, report)
         finally:
             self._jobs.put(None)
             worker.join()
@@ -95,10 +97,9 @@ class RealtimeSlam:
 
     def _map(self) -> None:
         try:
-            with self.slam.mapper.beside_others():
-                while self._insert_next():
-                    if self.slam.mapper.keyframes and self.slam.growing:
-                        self.slam.mapper.run(1)
+            while self._insert_next():
+                if self.slam.mapper.keyframes and self.slam.growing:
+                    self.slam.mapper.run(1)
         except BaseException as error:  # handed to the caller's thread
             self._mapper_error = error
 

@@ -177,7 +177,7 @@ class SlamResult:
     def trajectory(self) -> np.ndarray:
         """T_world_camera of every frame, float64 [n, 4, 4], NaN for lost ones; the world is the first keyframe's
         camera."""
-        return tracked_poses(self.frames, self.keyframes)
+        return tracked_poses(self.frames, [keyframe.T_world_camera for keyframe in self.keyframes])
 
     def lost_stretches(self) -> list[LostStretch]:
         """When the camera was lost."""
@@ -202,11 +202,11 @@ class SlamResult:
         return len(self.frames) / self.times.wall if self.times.wall > 0 else float("nan")
 
 
-def tracked_poses(frames: Sequence[TrackedFrame], keyframes: Sequence[Keyframe]) -> np.ndarray:
-    """See `SlamResult.trajectory`."""
+def tracked_poses(frames: Sequence[TrackedFrame], T_world_keyframe: Sequence[np.ndarray]) -> np.ndarray:
+    """See `SlamResult.trajectory`; from the poses [4, 4] of the keyframes."""
     poses = np.full((len(frames), 4, 4), np.nan)
     for pose, f in zip(poses, frames, strict=True):
         # A keyframe may be missing if a real-time run stopped before its mapper had taken it in.
-        if f.status != TrackingStatus.LOST.value and f.keyframe < len(keyframes):
-            pose[:] = keyframes[f.keyframe].T_world_camera @ f.T_keyframe_camera
+        if f.status != TrackingStatus.LOST.value and f.keyframe < len(T_world_keyframe):
+            pose[:] = T_world_keyframe[f.keyframe] @ f.T_keyframe_camera
     return poses

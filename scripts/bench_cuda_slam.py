@@ -302,7 +302,7 @@ def parse_arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--loop-devices", nargs="+", choices=["cpu", "cuda"], default=["cuda"])
     parser.add_argument("--profile-frames", type=int, default=50)
     parser.add_argument("--profile-after", type=int, default=40, help="frames before those that are profiled")
-    parser.add_argument("--set", nargs="*", default=[], help="settings, name=value")
+    parser.add_argument("--set", nargs="*", default=[], action="extend", help="settings, name=value")
     parser.add_argument("--out", type=Path, help="folder for the tables of the profile")
     parser.add_argument("--json", type=Path, help="also write all figures here, after every part")
     return parser.parse_args(words)

@@ -3,16 +3,26 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ggslam.config import Config, load_config
 from ggslam.cuda.library import CudaLibrary
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, DeviceError
+from ggslam.formats.trajectory import read_tum
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.mapper import Mapper
+from ggslam.pipeline import RunRequest, execute
 from ggslam.realtime import RealtimeSlam
+from ggslam.recordings import SequenceRequest
 from ggslam.scene.frame import Frame
+from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import open_sequence
 from ggslam.slam import Slam
 from ggslam.slam_parts import run_library
@@ -71,6 +81,23 @@ def test_refinement_and_real_time(frames: list[Frame], cuda_library: CudaLibrary
     assert len(result.gaussians) > 1000 and np.isfinite(result.gaussians.means.numpy()).all()
 
 
+def test_in_real_time_the_tracker_is_beside_the_mapper(frames: list[Frame], cuda_library: CudaLibrary) -> None:
+    """Not the other way round: the mapper's tensors were made on the stream that the caller's thread began with."""
+    slam = Slam(frames[0].camera, config("identity.enabled=false"), has_masks=True, library=cuda_library)
+    within: list[str] = []
+
+    @contextmanager
+    def beside_others() -> Iterator[None]:
+        within.append(threading.current_thread().name)
+        yield
+        within.clear()
+
+    slam.mapper.beside_others = beside_others  # type: ignore[method-assign]
+    seen: list[list[str]] = []
+    RealtimeSlam(slam, 1.0).run(frames[:2], lambda frame, report: seen.append(list(within)))
+    assert seen == [[threading.current_thread().name]] * 2 and not within
+
+
 def test_a_closed_loop_moves_map_and_keyframes(frames: list[Frame], cuda_library: CudaLibrary) -> None:
     settings = config("keyframes.max_gap=1", "identity.enabled=false")
     slam = Slam(frames[0].camera, settings, has_masks=True, library=cuda_library)
@@ -88,6 +115,47 @@ def test_a_closed_loop_moves_map_and_keyframes(frames: list[Frame], cuda_library
     count = slam.map.count
     slam.mapper.mend([0], [len(before) - 1], 2)
     assert slam.map.count <= count
+
+
+@pytest.fixture
+def short_run(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunRequest:
+    """Of three frames; it stops at the second call of the mapper."""
+    runs: list[int] = []
+    real = Mapper.run
+
+    def run(mapper: Mapper, iterations: int) -> None:
+        runs.append(iterations)
+        if len(runs) == 2:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 MiB. GPU 0 has no more.")
+        real(mapper, iterations)
+
+    monkeypatch.setattr(Mapper, "run", run)
+    few = ["mapping.first_frame_iterations=1", "identity.final_passes=1", "keyframes.max_gap=1"]
+    return RunRequest(SequenceRequest(room, stop=3), tmp_path / "run", overrides=few, evaluate=False)
+
+
+def test_what_was_done_is_saved_when_memory_is_full(short_run: RunRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if none is left for the last identity steps."""
+    monkeypatch.setattr(Mapper, "finish_identity", full_memory)
+    outcome = execute(short_run)
+    assert isinstance(outcome.error, DeviceError) and outcome.error.exit_code == 1
+    assert str(outcome.error) == "the GPU's memory is full: CUDA out of memory. Tried to allocate 2.00 MiB"
+    assert len(outcome.folder.gaussians()) == outcome.result.gaussian_count > 1000 and outcome.result.objects is None
+
+
+def test_the_trajectory_outlives_a_gpu_that_failed(short_run: RunRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    def to(*_: object) -> None:
+        monkeypatch.setattr(Keyframe, "T_world_camera", property(full_memory))
+        full_memory()
+
+    monkeypatch.setattr(GaussianMap, "to", to)
+    with pytest.raises(torch.cuda.OutOfMemoryError):
+        execute(short_run)
+    assert short_run.out is not None and len(read_tum(short_run.out / "trajectory.txt")) == 2
+
+
+def full_memory(*_: object) -> None:
+    raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
 
 
 def test_devices_that_cannot_be_had_are_said_plainly(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from ggslam.cuda.compiler import compiled_library
-from ggslam.errors import MissingDependency, NativeCoreError, RenderError
+from ggslam.errors import DeviceError, MissingDependency, NativeCoreError
 
 VERSION = 3
 
@@ -57,12 +57,12 @@ class CudaLibrary:
         """Calls ggslam_cuda_<name>.
 
         Raises:
-            RenderError: it reports an error of the CUDA runtime.
+            DeviceError: it reports an error of the CUDA runtime.
         """
         status = getattr(self.functions, f"ggslam_cuda_{name}")(*arguments)
         if status != 0:
             text = self.functions.ggslam_cuda_error_text(status).decode()
-            raise RenderError(f"CUDA reports {text!r} in {name}")
+            raise DeviceError(f"CUDA reports {text!r} in {name}")
 
     def whole_device(self, device: torch.device | None) -> torch.device:
         """The device with its number; None: the current one."""

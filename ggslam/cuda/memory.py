@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import torch
 
@@ -55,7 +57,8 @@ def download(*tensors: torch.Tensor) -> list[np.ndarray]:
 
 
 class HostMirror:
-    """Numbers of a device tensor as they were some moments ago, at hand without waiting.
+    """Numbers of a device tensor as they were some moments ago, at hand without waiting; also in other threads than the
+    one that sends them.
 
     Args:
         source: the tensor.
@@ -67,24 +70,27 @@ class HostMirror:
         self._arriving = torch.zeros(source.shape, dtype=source.dtype, pin_memory=on_gpu)
         self._event = torch.cuda.Event() if on_gpu else None
         self._under_way = False
+        self._lock = threading.Lock()
         self._newest = self._arriving.numpy().copy()
 
     def send(self) -> None:
         """Starts a copy on the current stream, unless one is still under way."""
-        if self._under_way and not self._arrived():
-            return
-        self.newest()
-        self._arriving.copy_(self._source, non_blocking=True)
-        if self._event is not None:
-            self._event.record()
-        self._under_way = True
+        with self._lock:
+            self._take()
+            if self._under_way:
+                return
+            self._arriving.copy_(self._source, non_blocking=True)
+            if self._event is not None:
+                self._event.record()
+            self._under_way = True
 
     def newest(self) -> np.ndarray:
         """The numbers of the last copy that has arrived; zeros before the first."""
-        if self._under_way and self._arrived():
+        with self._lock:
+            self._take()
+            return self._newest
+
+    def _take(self) -> None:
+        if self._under_way and (self._event is None or self._event.query()):
             self._newest = self._arriving.numpy().copy()
             self._under_way = False
-        return self._newest
-
-    def _arrived(self) -> bool:
-        return self._event is None or self._event.query()

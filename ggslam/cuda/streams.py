@@ -13,13 +13,16 @@ import torch
 @contextmanager
 def side_stream(device: torch.device) -> Iterator[None]:
     """Within, this thread starts its work on a stream of its own: after what was started on the current one before,
-    beside what is started there meanwhile; what is started there afterwards comes after it. The host waits for all of
-    it at the end. Does nothing without a GPU."""
+    beside what is started there meanwhile, which it precedes where both wait for room on the device. The host waits for
+    all of it at the end. Does nothing without a GPU.
+
+    Memory goes with the stream that it was allocated on: what is made within must not be used elsewhere before the host
+    has waited for it, and what was made before must not be given back within; see `let_go`."""
     if device.type != "cuda":
         yield
         return
     before = torch.cuda.current_stream(device)
-    stream = torch.cuda.Stream(device)
+    stream = torch.cuda.Stream(device, priority=-1)
     stream.wait_stream(before)
     try:
         with torch.cuda.stream(stream):

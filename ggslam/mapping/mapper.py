@@ -101,8 +101,13 @@ class Mapper(ABC):
     def vote_labels(self) -> np.ndarray:
         """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none."""
 
-    def beside_others(self) -> AbstractContextManager[None]:
-        """Within, this thread's calls share the device with those of other threads."""
+    def beside_others(self) -> AbstractContextManager[object]:
+        """Within, this thread works on the device beside the mapper, which is in another thread, and before it."""
+        return nullcontext()
+
+    def in_turn(self) -> AbstractContextManager[object]:
+        """Within, this thread's work on the device takes turns with that of the mapper: what it reads of the map is
+        whole, also while the mapper works in another thread."""
         return nullcontext()
 
     # --- growth ------------------------------------------------------------------------------------------------------

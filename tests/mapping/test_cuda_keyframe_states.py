@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 import torch
@@ -226,3 +229,21 @@ def test_wrong_calls_are_refused(cuda_library: CudaLibrary) -> None:
         with pytest.raises(RenderError, match=message):
             states.step(0, *arguments)
     assert len(states) == 1 and states.read_sums().iterations == 0
+
+
+def test_what_changes_while_poses_are_read_is_read_the_next_time(
+    cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when the tracker's thread asks for poses while the mapper's thread goes on."""
+    states = KeyframeStates(library=cuda_library)
+    states.append(make_pose(0), np.tile([1.0, 0.0], (3, 1)))
+
+    @contextmanager
+    def meanwhile() -> Iterator[None]:
+        yield
+        monkeypatch.undo()
+        states.append(make_pose(1), np.tile([1.0, 0.0], (3, 1)))
+
+    monkeypatch.setattr(states, "in_turn", meanwhile)
+    assert np.array_equal(states.read_poses(), [make_pose(0)])
+    assert np.array_equal(states.read_poses(), [make_pose(0), make_pose(1)])

@@ -8,6 +8,7 @@ of `PoseAdam`, `ExposureAdam` and the sums of `Mapper.iterate`, in double precis
 from __future__ import annotations
 
 import ctypes
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,7 +82,8 @@ class IterationSums:
 
 class KeyframeStates:
     """A table on the device with one row for each keyframe. Work is only started, on torch's current stream, but for
-    the methods whose names begin with `read`. One instance serves one caller and one stream at a time.
+    the methods whose names begin with `read`. One instance serves one caller and one stream at a time; `read_poses`
+    and `read_exposures` may be called from other threads meanwhile.
 
     Args:
         device: CUDA device; None: the current one.
@@ -102,12 +104,14 @@ class KeyframeStates:
         for name in ("keyframe_step", "keyframe_write"):
             self.library.declare(name, [ctypes.c_void_p])
         self._count = 0
+        self._stream: torch.cuda.Stream | None = None  # that rows were written on last
         self._use(self._new_table(_FIRST_ROOM))
         self.totals = torch.zeros(6, dtype=torch.float64, device=self.device)
         """On the device, float64 [6]: the numbers of `IterationSums` in their order."""
         self.totals[4].fill_(torch.nan)
         self._step_job = _StepJob(device=self.device.index or 0, totals=self.totals.data_ptr())
-        self._read_table: np.ndarray | None = None
+        self._changes = 0
+        self._read_table: tuple[int, np.ndarray] = (-1, np.empty((0, 0), np.uint8))  # after so many changes
         self._read_sums: IterationSums | None = None
 
     def __len__(self) -> int:
@@ -178,9 +182,10 @@ class KeyframeStates:
         job.pose_rate, job.step_exposure = pose_rate, exposure is not None
         if exposure is not None:
             job.exposure_rate, job.exposure_regularization = exposure.rate, exposure.regularization
-        job.stream = self.library.stream(self.device)
+        job.stream = self._current_stream()
         self.library.call("keyframe_step", ctypes.byref(job))
-        self._read_table = self._read_sums = None
+        self._changes += 1
+        self._read_sums = None
 
     def write_pose(self, i: int, T_camera_world: np.ndarray) -> None:
         """Sets keyframe i's pose [4, 4]; the moments of its steps stay.
@@ -202,11 +207,11 @@ class KeyframeStates:
 
     def read_poses(self) -> np.ndarray:
         """T_camera_world of all keyframes, float64 [K, 4, 4]. Waits for the device, unless nothing changed since."""
-        return self._read_doubles(_State.pose).reshape(self._count, 4, 4)
+        return self._read_doubles(_State.pose).reshape(-1, 4, 4)
 
     def read_exposures(self) -> np.ndarray:
         """Exposures of all keyframes, float64 [K, 3, 2], as `read_poses`."""
-        return self._read_doubles(_State.exposure).reshape(self._count, 3, 2)
+        return self._read_doubles(_State.exposure).reshape(-1, 3, 2)
 
     def read_sums(self) -> IterationSums:
         """The sums so far. Waits for the device, unless nothing was added since."""
@@ -236,7 +241,7 @@ class KeyframeStates:
         return self._table.data_ptr() + self._checked_index(i) * ctypes.sizeof(_State)
 
     def _write(self, i: int, T_camera_world: np.ndarray, exposure: np.ndarray | None) -> None:
-        job = _WriteJob(stream=self.library.stream(self.device), device=self.device.index or 0)
+        job = _WriteJob(stream=self._current_stream(), device=self.device.index or 0)
         job.state = self._table.data_ptr() + i * ctypes.sizeof(_State)
         for name, array, shape in (("pose", T_camera_world, (4, 4)), ("exposure", exposure, (3, 2))):
             if array is None:
@@ -246,13 +251,26 @@ class KeyframeStates:
             getattr(job, name)[:] = np.asarray(array, np.float64).ravel().tolist()
         job.is_new = exposure is not None
         self.library.call("keyframe_write", ctypes.byref(job))
-        self._read_table = None
+        self._changes += 1
 
     def _read_doubles(self, field: ctypes._CField) -> np.ndarray:
-        if self._read_table is None:
-            self._read_table = self._table[: self._count].cpu().numpy().copy()
-        part = self._read_table[:, field.offset : field.offset + field.size]
+        after, table = self._read_table
+        changes = self._changes  # as of before the copy: another thread may go on meanwhile
+        if after != changes:
+            with self.in_turn():
+                table = self._table[: self._count].cpu().numpy().copy()
+            self._read_table = changes, table
+        part = table[:, field.offset : field.offset + field.size]
         return part.copy().view(np.float64)
+
+    def in_turn(self) -> AbstractContextManager[object]:
+        """Within, this thread works on the stream that the rows are written on: what it reads is between two steps."""
+        return nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
+
+    def _current_stream(self) -> int | None:
+        if self.library.device_type == "cuda":
+            self._stream = torch.cuda.current_stream(self.device)
+        return self.library.stream(self.device)
 
     def _checked(self, name: str, tensor: torch.Tensor, dtype: torch.dtype, shape: torch.Size) -> int:
         if tensor.dtype != dtype or tensor.shape != shape or tensor.device != self.device:

@@ -74,8 +74,11 @@ class CudaMapper(Mapper):
     def vote_labels(self) -> np.ndarray:
         return vote_labels(self.map).cpu().numpy().astype(np.uint16)
 
-    def beside_others(self) -> AbstractContextManager[None]:
+    def beside_others(self) -> AbstractContextManager[object]:
         return side_stream(self.device)
+
+    def in_turn(self) -> AbstractContextManager[object]:
+        return self._states.in_turn()
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         ours: list[Keyframe] = [CudaKeyframe(keyframe, self._states, self._images) for keyframe in keyframes]
