@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from ggslam.config import Config, load_config
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError
 from ggslam.realtime import RealtimeSlam
+from ggslam.run_folder import RunFolder
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
 from ggslam.slam import Slam
@@ -94,7 +96,21 @@ def test_devices_that_cannot_be_had_are_said_plainly(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(ConfigError, match="device: cuda: .*NVIDIA GPU"):
         run_library(Config(device="cuda"))
-    assert run_library(Config(device="auto")) is None and run_library(Config()) is None
+    assert run_library(Config()) == (None, None)
+    library, reason = run_library(Config(device="auto"))
+    assert library is None and reason is not None and "on the CPU" in reason and "NVIDIA GPU" in reason
     with pytest.raises(ConfigError, match="memory_limit_mb"):
         run_library(Config(device="cuda", memory_limit_mb=1000))
-    assert run_library(Config(device="auto", memory_limit_mb=1000)) is None
+    library, reason = run_library(Config(device="auto", memory_limit_mb=1000))
+    assert library is None and reason is not None and "memory_limit_mb" in reason
+
+
+def test_a_run_that_may_choose_tells_where_it_was(
+    frames: list[Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    settings = config("device=auto", "identity.enabled=false")
+    _, result = run(frames[:1], settings, None)
+    assert len(result.notes) == 1 and "NVIDIA GPU" in result.notes[0]
+    RunFolder.create(tmp_path / "run").save(settings, {}, result)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["environment"]["device"] == "cpu"
