@@ -52,7 +52,7 @@ EXTRAS = {
     "plots": Extra(("matplotlib",), "plots of rate-distortion studies"),
     "formats": Extra(("gsply",), "SPZ in scripts/bench_splats.py"),
     "bench": Extra(("pyoctomap", "open3d", "edt"), "what the benchmarks of volumes compare with"),
-    "gsplat": Extra(("gsplat",), "the renderer on an NVIDIA GPU"),
+    "gsplat": Extra(("gsplat",), "an alternative renderer on an NVIDIA GPU"),
     "viewer": Extra(("viser",), "maps in the browser: ggslam view, ggslam run --view"),
     "browser": Extra(("viser", "selenium"), "tests of the viewer in a browser (with chromium-driver)"),
     "rerun": Extra(("rerun",), "ggslam run --log: a run streamed to rerun"),
@@ -201,10 +201,21 @@ def _gpu() -> Iterator[Finding]:
         build = f"this torch is built for CUDA {torch.version.cuda}" if torch.version.cuda else "this torch has no CUDA"
         advice = "none is needed; for --device cuda install a CUDA build of torch and the driver"
         yield Finding("gpu", "CUDA", "missing", f"no GPU in use: {build}", advice)
-    compiler = shutil.which("nvcc")
-    if compiler is not None:
-        yield Finding("gpu", "nvcc", "ok", _last_line([compiler, "--version"]) or compiler)
+    yield from _cuda_compiler()
     yield _cuda_kernels()
+
+
+def _cuda_compiler() -> Iterator[Finding]:
+    from ggslam.cuda.compiler import find_nvcc
+
+    compiler, named = find_nvcc(), os.environ.get("GGSLAM_NVCC")
+    if compiler is not None:
+        version = _last_line([str(compiler), "--version"])
+        advice = "" if version else "only --device cuda needs it: reinstall the CUDA toolkit or set GGSLAM_NVCC"
+        detail = f"{version} ({compiler})" if version else f"{compiler} cannot be run"
+        yield Finding("gpu", "nvcc", "ok" if version else "warning", detail, advice)
+    elif named:
+        yield Finding("gpu", "nvcc", "warning", f"there is no {named}", "unset GGSLAM_NVCC, or let it name nvcc")
 
 
 def _cuda_kernels() -> Finding:

@@ -141,7 +141,7 @@ class RunFolder:
             names: of object ids, as far as the recording knows them.
         """
         mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish",
-                "environment": environment(config.threads)}  # fmt: skip
+                "environment": {**environment(config.threads), "device": result.device}}  # fmt: skip
         self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
         stale_files = ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", PLACES_FILE, MAP_INDEX,
                        STEPS_FILE, TRUTH_FILE, REPORT_FILE)  # fmt: skip

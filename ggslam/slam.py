@@ -33,7 +33,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.scene.poses import inverse
-from ggslam.slam_parts import make_mapper, make_pager, make_tracker, run_library
+from ggslam.slam_parts import device_name, make_mapper, make_pager, make_tracker, run_library
 from ggslam.slam_result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
 from ggslam.step_log import StepLog
 from ggslam.tracking.keyframes import KeyframePolicy
@@ -73,12 +73,16 @@ class Slam:
         self.config = config or Config()
         self.context = NativeContext(self.config.threads or None)
         self.masks = ObjectMasks(self.config.masks, has_masks)
-        library = run_library(self.config) if library is None else library
+        self._notes: list[str] = []
+        if library is None:
+            library, reason = run_library(self.config)
+            self._notes += [reason] if reason else []
         self.tracker = make_tracker(camera, self.config, self.context, library)
         self.pager = make_pager(camera, self.config, paging)
         archive = None if self.pager is None else self.pager.archive
         self.surface = MeasuredSurface(self.config.tracking.target, self.context, archive)
-        self.surface.finish = library is None or self.config.tracker != "gicp"  # else the GPU does, for itself
+        # A device makes the voxels' shapes itself; features are tracked on the CPU, which has them made here.
+        self.surface.finish = library is None or self.config.tracker != "gicp"
         self.loops: LoopCloser | None = None
         if self.config.loops.enabled:
             self.loops = LoopCloser(camera, self.config.loops, self.surface, self.tracker, self.context)
@@ -189,8 +193,8 @@ class Slam:
             gaussians, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
             self.refine_iterations, objects, self.loops.events if self.loops else [],
             places_to_bytes(self, gaussians, cells), cells, None if self.pager is None else self.pager.report(),
-            [] if self.pager is None else self.pager.budget.notes, None if self.pager is None else self.pager.close,
-            self.steps.to_csv(),
+            [*self._notes, *([] if self.pager is None else self.pager.budget.notes)],
+            None if self.pager is None else self.pager.close, self.steps.to_csv(), device_name(self.map.device),
         )  # fmt: skip
 
     def close(self) -> None:

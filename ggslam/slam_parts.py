@@ -8,6 +8,8 @@ import tempfile
 import weakref
 from pathlib import Path
 
+import torch
+
 from ggslam.config import Config
 from ggslam.cuda.library import CudaLibrary, library_for_device
 from ggslam.errors import ConfigError, MissingDependency
@@ -27,22 +29,28 @@ from ggslam.tracking.feature_tracker import FeatureTracker
 from ggslam.tracking.tracker import Tracker
 
 
-def run_library(config: Config) -> CudaLibrary | None:
-    """The CUDA kernels that a run computes with; None: it computes on the CPU.
+def run_library(config: Config) -> tuple[CudaLibrary | None, str | None]:
+    """The CUDA kernels that a run computes with; None: it computes on the CPU. And why it does, if the settings left
+    that open.
 
     Raises:
         ConfigError: the settings name a device that cannot be had, or one that does not go with other settings.
     """
-    if config.device == "cpu" or (config.device == "auto" and config.memory_limit_mb):
-        return None
-    if config.memory_limit_mb:
-        raise ConfigError("device: cuda: a run with a limit of memory (memory_limit_mb) needs cpu")
+    if config.device == "cpu":
+        return None, None
     try:
-        return library_for_device()
-    except MissingDependency as error:
+        if config.memory_limit_mb:
+            raise ConfigError("a run with a limit of memory (memory_limit_mb) needs cpu")
+        return library_for_device(), None
+    except (ConfigError, MissingDependency) as error:
         if config.device == "auto":
-            return None
+            return None, f"device: auto: on the CPU: {error}"
         raise ConfigError(f"device: cuda: {error}") from None
+
+
+def device_name(device: torch.device) -> str:
+    """What people call it: "cpu", or the GPU's name."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
 
 
 def make_mapper(config: Config, learns: bool, context: NativeContext, library: CudaLibrary | None) -> Mapper:

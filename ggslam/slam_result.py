@@ -139,6 +139,7 @@ class SlamResult:
         notes: what the user should know of it.
         release: removes its files.
         steps: what was noted of every step, content of `steps.csv`.
+        device: what it was computed on: "cpu", or the GPU's name.
     """
 
     gaussians: GaussianMap
@@ -156,6 +157,7 @@ class SlamResult:
     notes: list[str] = field(default_factory=list)
     release: Callable[[], None] | None = None
     steps: str | None = None
+    device: str = "cpu"
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, if anything is; it cannot be read any more."""

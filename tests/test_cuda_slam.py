@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from ggslam.mapping.mapper import Mapper
 from ggslam.pipeline import RunRequest, execute
 from ggslam.realtime import RealtimeSlam
 from ggslam.recordings import SequenceRequest
+from ggslam.run_folder import RunFolder
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import open_sequence
@@ -162,7 +164,21 @@ def test_devices_that_cannot_be_had_are_said_plainly(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(ConfigError, match="device: cuda: .*NVIDIA GPU"):
         run_library(Config(device="cuda"))
-    assert run_library(Config(device="auto")) is None and run_library(Config()) is None
+    assert run_library(Config()) == (None, None)
+    library, reason = run_library(Config(device="auto"))
+    assert library is None and reason is not None and "on the CPU" in reason and "NVIDIA GPU" in reason
     with pytest.raises(ConfigError, match="memory_limit_mb"):
         run_library(Config(device="cuda", memory_limit_mb=1000))
-    assert run_library(Config(device="auto", memory_limit_mb=1000)) is None
+    library, reason = run_library(Config(device="auto", memory_limit_mb=1000))
+    assert library is None and reason is not None and "memory_limit_mb" in reason
+
+
+def test_a_run_that_may_choose_tells_where_it_was(
+    frames: list[Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    settings = config("device=auto", "identity.enabled=false")
+    _, result = run(frames[:1], settings, None)
+    assert len(result.notes) == 1 and "NVIDIA GPU" in result.notes[0]
+    RunFolder.create(tmp_path / "run").save(settings, {}, result)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["environment"]["device"] == "cpu"

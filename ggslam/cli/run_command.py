@@ -163,5 +163,5 @@ def _print(outcome: RunOutcome) -> None:
         print_scores(outcome.metrics)
     if outcome.error is None:
         path = shlex.quote(str(outcome.folder.path))
-        hint = f"next: ggslam view {path} · ggslam export {path} --format mesh --out mesh.ply"
-        console.print(hint, highlight=False, markup=False)
+        for hint in (f"next: ggslam view {path}", f"      ggslam export {path} --format mesh --out mesh.ply"):
+            console.print(hint, highlight=False, markup=False, soft_wrap=True)  # commands are copied: no line breaks

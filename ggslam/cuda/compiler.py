@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -72,7 +73,7 @@ def compile_command(nvcc: Path, architecture: str, output: Path) -> list[str]:
 
 
 def compiled_library(architecture: str) -> Path:
-    """The compiled library; compiles it (some ten seconds) if it is not in the cache.
+    """The compiled library; compiles it (a minute) if it is not in the cache.
 
     Args:
         architecture: compute capability without the point, such as "90".
@@ -82,9 +83,10 @@ def compiled_library(architecture: str) -> Path:
     """
     nvcc = find_nvcc()
     if nvcc is None:
+        named = os.environ.get("GGSLAM_NVCC")
+        remedy = f"there is no {named} (GGSLAM_NVCC)" if named else "put it on PATH or set CUDA_HOME or GGSLAM_NVCC"
         raise MissingDependency(
-            "the cuda backend is compiled when first used and needs nvcc of the CUDA toolkit: "
-            "put it on PATH or set CUDA_HOME or GGSLAM_NVCC"
+            f"the cuda backend is compiled when first used and needs nvcc of the CUDA toolkit: {remedy}"
         )
     path = library_path(nvcc, architecture)
     if path.exists():
@@ -103,5 +105,6 @@ def compiled_library(architecture: str) -> Path:
 def _run(command: list[str]) -> None:
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     if run.returncode != 0:
-        lines = (run.stderr + run.stdout).strip().splitlines()[:_ERROR_LINES]
-        raise MissingDependency("\n".join([f"the cuda backend: compiling failed: {' '.join(command)}", *lines]))
+        lines = (run.stderr + run.stdout).strip().splitlines()[:_ERROR_LINES] or [f"exit status {run.returncode}"]
+        reason = "\n".join(lines)
+        raise MissingDependency(f"the cuda backend: compiling failed: {reason}\nthe command: {shlex.join(command)}")

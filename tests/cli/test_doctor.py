@@ -88,3 +88,15 @@ def test_every_extra_of_the_project_is_known() -> None:
     assert set(project["optional-dependencies"]) - {"test", "dev"} == set(doctor.EXTRAS)
     names = {requirement.split(">")[0].split("=")[0].strip() for requirement in project["dependencies"]}
     assert names == set(doctor.CORE_PACKAGES)
+
+
+def test_nvcc_is_the_one_that_would_compile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GGSLAM_NVCC", str(tmp_path / "absent"))
+    assert [(f.state, f.detail) for f in doctor._cuda_compiler()] == [("warning", f"there is no {tmp_path / 'absent'}")]
+    script = tmp_path / "nvcc"
+    script.write_text("#!/bin/sh\necho release 13.9\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("GGSLAM_NVCC", str(script))
+    assert [(f.state, f.detail) for f in doctor._cuda_compiler()] == [("ok", f"release 13.9 ({script})")]
+    script.write_text("#!/bin/sh\nexit 1\n")
+    assert [f.state for f in doctor._cuda_compiler()] == ["warning"]

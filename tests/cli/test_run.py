@@ -4,18 +4,23 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
 import pytest
 
+from ggslam.cli.run_command import _print
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.trajectory import read_tum
+from ggslam.pipeline import RunOutcome
 
 
 def ggslam(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -58,6 +63,16 @@ def test_the_keys_others_rely_on_hold_sensible_numbers(finished: Path) -> None:
     assert m["speed"]["mapping_iteration_ms"] > 0
     assert 4 <= m["speed"]["iterations_per_frame"] < 5  # 4 a frame, 10 on the first
     assert m["memory"]["peak_rss_mb"] > 50
+
+
+def test_the_commands_that_a_run_suggests_can_be_copied(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = SimpleNamespace(path=tmp_path / ("it's a long name " * 8))
+    outcome = SimpleNamespace(folder=folder, headline=lambda: "24 frames", metrics=None, error=None)
+    _print(cast(RunOutcome, outcome))
+    shown = capsys.readouterr().out.splitlines()[-2:]
+    view, export = (shlex.split(line.removeprefix("next:")) for line in shown)
+    assert view == ["ggslam", "view", str(folder.path)]
+    assert export == ["ggslam", "export", str(folder.path), "--format", "mesh", "--out", "mesh.ply"]
 
 
 def test_held_out_frames_are_never_keyframes(finished: Path) -> None:
