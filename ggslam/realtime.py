@@ -4,7 +4,7 @@
 The tracker runs in the caller's thread and never waits for the mapper: it aligns to the newest target there is. The
 mapper runs in a thread of its own: it inserts keyframes as they come, publishes a new target after each, and otherwise
 optimises the map for as long as the recording lasts. On a GPU the mapper goes on with the stream that its tensors were
-made on; the tracker, which allocates little and shares none of it, gets another, whose work goes first.
+made on; the tracker, which shares none of them, gets another, whose work goes first.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ class RealtimeSlam:
         self.period = 1.0 / frames_per_second
         self._jobs: queue.Queue[tuple[Frame, TrackingResult, int] | None] = queue.Queue()
         self._mapper_error: BaseException | None = None
+        self._beside_mapper = slam.mapper.beside_others()
         # The kernels of one context take turns; the tracker must not wait for the mapper's.
         slam.tracker.context = NativeContext(slam.context.threads, slam.context.instruction_set)
 
@@ -47,8 +48,7 @@ class RealtimeSlam:
         worker = threading.Thread(target=self._map, name="mapper", daemon=True)
         worker.start()
         try:
-            with self.slam.mapper.beside_others():
-                self._track(frames, report)
+            self._track(frames, report)
         finally:
             self._jobs.put(None)
             worker.join()
@@ -83,7 +83,8 @@ class RealtimeSlam:
     def _step(self, frame: Frame) -> StepReport:
         slam, start = self.slam, time.perf_counter()
         slam.times.start()
-        tracking = slam.track(frame)
+        with self._beside_mapper:
+            tracking = slam.track(frame)
         is_keyframe = self._jobs.qsize() < MAX_WAITING and slam.wants_keyframe(frame, tracking)
         if is_keyframe:
             slam.anchor_to(tracking.T_world_camera)

@@ -4,31 +4,40 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 
 
-@contextmanager
-def side_stream(device: torch.device) -> Iterator[None]:
-    """Within, this thread starts its work on a stream of its own: after what was started on the current one before,
-    beside what is started there meanwhile, which it precedes where both wait for room on the device. The host waits for
-    all of it at the end. Does nothing without a GPU.
+class SideStream(AbstractContextManager["SideStream"]):
+    """Within, as often as it is entered, a thread starts its work on a stream of its own: beside what others start on
+    the one that was current when this was made, and before that where both wait for room on the device. The host waits
+    for its work at each end. Does nothing without a GPU.
 
-    Memory goes with the stream that it was allocated on: what is made within must not be used elsewhere before the host
-    has waited for it, and what was made before must not be given back within; see `let_go`."""
-    if device.type != "cuda":
-        yield
-        return
-    before = torch.cuda.current_stream(device)
-    stream = torch.cuda.Stream(device, priority=-1)
-    stream.wait_stream(before)
-    try:
-        with torch.cuda.stream(stream):
-            yield
-    finally:
-        stream.synchronize()  # memory of this stream may be used on others from now on
+    Memory goes with the stream that it was allocated on: what was made elsewhere must not be given back within; see
+    `let_go`.
+
+    Args:
+        device: where. Of its work, what was started before this was made precedes what is started within.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._stream: torch.cuda.Stream | None = None
+        if device.type == "cuda":
+            self._stream = torch.cuda.Stream(device, priority=-1)
+            self._stream.wait_stream(torch.cuda.current_stream(device))
+        self._within: AbstractContextManager[object] = nullcontext()
+
+    def __enter__(self) -> SideStream:
+        self._within = nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
+        self._within.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._within.__exit__(*error)
+        if self._stream is not None:
+            self._stream.synchronize()  # memory of this stream may be used on others from now on
 
 
 def let_go(*tensors: torch.Tensor) -> None:

@@ -102,7 +102,8 @@ class Mapper(ABC):
         """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none."""
 
     def beside_others(self) -> AbstractContextManager[object]:
-        """Within, this thread works on the device beside the mapper, which is in another thread, and before it."""
+        """Within, which may be entered again and again, a thread works on the device beside the mapper, which is in
+        another thread, and goes first. Nothing of the mapper may be used there."""
         return nullcontext()
 
     def in_turn(self) -> AbstractContextManager[object]:

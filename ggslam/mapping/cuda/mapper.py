@@ -17,7 +17,7 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import HostMirror, download
-from ggslam.cuda.streams import Pace, side_stream
+from ggslam.cuda.streams import Pace, SideStream
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.insertion import DeviceInsertion
 from ggslam.mapping.cuda.keyframe import CudaKeyframe, ImageStore
@@ -75,7 +75,7 @@ class CudaMapper(Mapper):
         return vote_labels(self.map).cpu().numpy().astype(np.uint16)
 
     def beside_others(self) -> AbstractContextManager[object]:
-        return side_stream(self.device)
+        return SideStream(self.device)
 
     def in_turn(self) -> AbstractContextManager[object]:
         return self._states.in_turn()
