@@ -20,6 +20,7 @@ KERNELS = Path(__file__).parent / "kernels"
 
 _FLAGS = ("-O3", "-std=c++17", "-ftz=true", "-shared", "-Xcompiler", "-fPIC,-fvisibility=hidden", "--threads", "0")
 _ERROR_LINES = 12
+_USUAL_HOME = "/usr/local/cuda"
 
 
 def find_nvcc() -> Path | None:
@@ -31,7 +32,7 @@ def find_nvcc() -> Path | None:
     found = shutil.which("nvcc")
     if found:
         return Path(found)
-    homes = [os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH"), "/usr/local/cuda"]
+    homes = [os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH"), _USUAL_HOME]
     candidates = [Path(home) / "bin" / "nvcc" for home in homes if home]
     packages = importlib.util.find_spec("nvidia")  # a namespace that many packages share
     for folder in packages.submodule_search_locations or () if packages is not None else ():

@@ -89,8 +89,8 @@ def test_nvcc_of_python_packages_is_found_last(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setenv("PATH", str(tmp_path / "nowhere"))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "nvidia", raising=False)
-    if not Path("/usr/local/cuda/bin/nvcc").exists():
-        assert compiler.find_nvcc() == packaged
+    monkeypatch.setattr(compiler, "_USUAL_HOME", str(tmp_path / "absent"))
+    assert compiler.find_nvcc() == packaged
     home = tmp_path / "home" / "bin" / "nvcc"
     home.parent.mkdir(parents=True)
     home.write_text("")
