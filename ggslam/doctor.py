@@ -226,7 +226,8 @@ def _cuda_kernels() -> Finding:
         usable, detail = describe_cuda_backend()
     except ImportError as error:  # a package is missing, and said so above
         usable, detail = False, str(error)
-    advice = "" if usable else "none is needed; for run --device cuda install torch for CUDA and nvcc (CUDA toolkit, or the extra [cuda])"
+    needed = "torch for CUDA, and nvcc (CUDA toolkit, or pip install 'ggslam[cuda]')"
+    advice = "" if usable else f"none is needed; for run --device cuda install {needed}"
     return Finding("gpu", "kernels", "ok" if usable else "missing", detail, advice)
 
 

@@ -24,8 +24,8 @@ _USUAL_HOME = "/usr/local/cuda"
 
 
 def find_nvcc() -> Path | None:
-    """The compiler: `GGSLAM_NVCC` in the environment, then the search path, `CUDA_HOME`, `/usr/local/cuda`, the packages
-    of the extra [cuda]."""
+    """The compiler: `GGSLAM_NVCC` in the environment, then the search path, `CUDA_HOME`, `/usr/local/cuda`, and the
+    packages of the extra [cuda]."""
     chosen = os.environ.get("GGSLAM_NVCC")
     if chosen:
         return Path(chosen) if Path(chosen).exists() else None
