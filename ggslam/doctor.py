@@ -52,6 +52,7 @@ EXTRAS = {
     "plots": Extra(("matplotlib",), "plots of rate-distortion studies"),
     "formats": Extra(("gsply",), "SPZ in scripts/bench_splats.py"),
     "bench": Extra(("pyoctomap", "open3d", "edt"), "what the benchmarks of volumes compare with"),
+    "cuda": Extra(("nvidia.cu13.nvvm",), "nvcc for run --device cuda, where no CUDA toolkit is installed"),
     "gsplat": Extra(("gsplat",), "an alternative renderer on an NVIDIA GPU"),
     "viewer": Extra(("viser",), "maps in the browser: ggslam view, ggslam run --view"),
     "browser": Extra(("viser", "selenium"), "tests of the viewer in a browser (with chromium-driver)"),
@@ -225,7 +226,8 @@ def _cuda_kernels() -> Finding:
         usable, detail = describe_cuda_backend()
     except ImportError as error:  # a package is missing, and said so above
         usable, detail = False, str(error)
-    advice = "" if usable else "none is needed; for run --device cuda install nvcc (CUDA toolkit) and torch for CUDA"
+    needed = "torch for CUDA, and nvcc (CUDA toolkit, or pip install 'ggslam[cuda]')"
+    advice = "" if usable else f"none is needed; for run --device cuda install {needed}"
     return Finding("gpu", "kernels", "ok" if usable else "missing", detail, advice)
 
 
@@ -237,9 +239,16 @@ def _last_line(command: list[str]) -> str:
     return run.stdout.strip().splitlines()[-1] if run.stdout.strip() else ""
 
 
+def _is_installed(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # of the package that it is in
+        return False
+
+
 def _extras() -> Iterator[Finding]:
     for name, extra in EXTRAS.items():
-        lacking = [module for module in extra.modules if importlib.util.find_spec(module) is None]
+        lacking = [module for module in extra.modules if not _is_installed(module)]
         if lacking:
             advice = f"pip install 'ggslam[{name}]'"
             yield Finding("extras", name, "missing", f"for {extra.gives}: no {', '.join(lacking)}", advice)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import os
 import shlex
 import shutil
@@ -19,18 +20,23 @@ KERNELS = Path(__file__).parent / "kernels"
 
 _FLAGS = ("-O3", "-std=c++17", "-ftz=true", "-shared", "-Xcompiler", "-fPIC,-fvisibility=hidden", "--threads", "0")
 _ERROR_LINES = 12
+_USUAL_HOME = "/usr/local/cuda"
 
 
 def find_nvcc() -> Path | None:
-    """The compiler: `GGSLAM_NVCC` in the environment, then the search path, `CUDA_HOME`, `/usr/local/cuda`."""
+    """The compiler: `GGSLAM_NVCC` in the environment, then the search path, `CUDA_HOME`, `/usr/local/cuda`, and the
+    packages of the extra [cuda]."""
     chosen = os.environ.get("GGSLAM_NVCC")
     if chosen:
         return Path(chosen) if Path(chosen).exists() else None
     found = shutil.which("nvcc")
     if found:
         return Path(found)
-    homes = [os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH"), "/usr/local/cuda"]
+    homes = [os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH"), _USUAL_HOME]
     candidates = [Path(home) / "bin" / "nvcc" for home in homes if home]
+    packages = importlib.util.find_spec("nvidia")  # a namespace that many packages share
+    for folder in packages.submodule_search_locations or () if packages is not None else ():
+        candidates += sorted(Path(folder).glob("cu*/bin/nvcc"), reverse=True)
     return next((path for path in candidates if path.exists()), None)
 
 
@@ -84,7 +90,9 @@ def compiled_library(architecture: str) -> Path:
     nvcc = find_nvcc()
     if nvcc is None:
         named = os.environ.get("GGSLAM_NVCC")
-        remedy = f"there is no {named} (GGSLAM_NVCC)" if named else "put it on PATH or set CUDA_HOME or GGSLAM_NVCC"
+        remedy = "put it on PATH, set CUDA_HOME or GGSLAM_NVCC, or pip install 'ggslam[cuda]'"
+        if named:
+            remedy = f"there is no {named} (GGSLAM_NVCC)"
         raise MissingDependency(
             f"the cuda backend is compiled when first used and needs nvcc of the CUDA toolkit: {remedy}"
         )

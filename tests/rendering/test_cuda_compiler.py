@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -77,6 +78,24 @@ def test_no_compiler_is_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(MissingDependency, match=r"needs nvcc.*there is no .*absent \(GGSLAM_NVCC\)"):
         compiler.compiled_library("90")
     assert describe_cuda_backend() == (False, "no nvcc to compile it with")
+
+
+def test_nvcc_of_python_packages_is_found_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    packaged = tmp_path / "nvidia" / "cu13" / "bin" / "nvcc"
+    packaged.parent.mkdir(parents=True)
+    packaged.write_text("")
+    for name in ("GGSLAM_NVCC", "CUDA_HOME", "CUDA_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path / "nowhere"))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "nvidia", raising=False)
+    monkeypatch.setattr(compiler, "_USUAL_HOME", str(tmp_path / "absent"))
+    assert compiler.find_nvcc() == packaged
+    home = tmp_path / "home" / "bin" / "nvcc"
+    home.parent.mkdir(parents=True)
+    home.write_text("")
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path / "home"))
+    assert compiler.find_nvcc() == home
 
 
 def test_a_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
