@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -146,8 +147,25 @@ class LoopCloser:
         self._found_at: tuple[int, int] | None = None
         """Frame at which a lost camera was found, and the keyframe it was found at; until its first keyframe is in."""
         self._lock = threading.RLock()
+        self._helper: ThreadPoolExecutor | None = None
+        self._begun: tuple[int, Future[Place]] | None = None
+        """Of a frame that will be added: its index, and its place as soon as it is described."""
 
     # --- keyframes ---------------------------------------------------------------------------------------------------
+
+    def begin(self, frame: Frame) -> None:
+        """Starts to describe the frame that is added next, in another thread: for a caller that has other things to do
+        than to compute on the CPU until then."""
+        if self._helper is None:
+            self._helper = ThreadPoolExecutor(1, thread_name_prefix="places")
+        view = View(frame.color, frame.depth, np.eye(4))
+        self._begun = frame.index, self._helper.submit(self.places.describe, view)
+
+    def _described(self, frame: Frame, T_world_camera: np.ndarray) -> Place:
+        begun, self._begun = self._begun, None
+        if begun is not None and begun[0] == frame.index:
+            return begun[1].result()
+        return self.places.describe(View(frame.color, frame.depth, T_world_camera))
 
     def add(self, frame: Frame, tracking: TrackingResult) -> Correction | None:
         """A keyframe was made of a frame, and its points are in the surface. Puts aside and takes back keyframes.
@@ -158,8 +176,7 @@ class LoopCloser:
         start = time.perf_counter()
         with self._lock:
             T = tracking.T_world_camera
-            view = View(frame.color, frame.depth, T)
-            place = self.places.describe(view)
+            place = self._described(frame, T)
             # In real time, keyframes from before the camera was lost may still come after it was found.
             belated = self._found_at is not None and frame.index < self._found_at[0]
             self._connect(tracking, belated)

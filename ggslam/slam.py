@@ -22,7 +22,8 @@ import torch
 
 from ggslam.config import Config
 from ggslam.cuda.library import CudaLibrary
-from ggslam.errors import ConfigError, SequenceError
+from ggslam.errors import ConfigError
+from ggslam.frame_checks import check_frame
 from ggslam.loop_closing import Correction, LoopCloser
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.native.loader import NativeContext
@@ -77,6 +78,7 @@ class Slam:
         if library is None:
             library, reason = run_library(self.config)
             self._notes += [reason] if reason else []
+        self._on_device = library is not None
         self.tracker = make_tracker(camera, self.config, self.context, library)
         self.pager = make_pager(camera, self.config, paging)
         archive = None if self.pager is None else self.pager.archive
@@ -144,6 +146,8 @@ class Slam:
         is_keyframe = self.wants_keyframe(frame, tracking)
         if is_keyframe:
             self.tracker.target = None  # the surface may be made anew; the next frame gets what it is then
+            if self.loops is not None and self._on_device:
+                self.loops.begin(frame)  # beside what the host waits for
             self.insert(frame, tracking, self.moves_followed)
             self.anchor_to(tracking.T_world_camera)
         self.remember(frame, tracking)
@@ -336,20 +340,3 @@ class Slam:
                 tracking.overlap, tracking.rmse_m, tracking.status.value, tracking.reason,
             )
         )  # fmt: skip
-
-
-def check_frame(frame: Frame, camera: Camera) -> None:
-    """Raises SequenceError unless the frame's images have the camera's size and the types that `Frame` promises."""
-    size = (camera.height, camera.width)
-    for name, image, shape, kind in (("colour", frame.color, (*size, 3), "u1"), ("depth", frame.depth, size, "f4")):
-        if image.shape[:2] != size:
-            found = "x".join(str(n) for n in image.shape[1::-1])
-            expected = f"{camera.width}x{camera.height}"
-            raise SequenceError(f"frame {frame.source_index}: {name} is {found}, expected {expected}")
-        if image.shape != shape or image.dtype != np.dtype(kind):
-            found = f"{image.dtype} {list(image.shape)}"
-            raise SequenceError(
-                f"frame {frame.source_index}: {name} is {found}, expected {np.dtype(kind)} {list(shape)}"
-            )
-    if not (frame.depth >= 0).all() or not np.isfinite(frame.depth).all():
-        raise SequenceError(f"frame {frame.source_index}: depth has negative, infinite or NaN values; 0 means none")

@@ -212,12 +212,14 @@ def measure_loops(recording: Recording, options: argparse.Namespace, device: str
         wait(device)
         seconds = time.perf_counter() - begin
         row = {"loop": turn + 1, "fps": len(recording.frames) / seconds, "gaussians": slam.gaussian_count,
-               "keyframes": len(slam.mapper.keyframes), **memory(device)}  # fmt: skip
+               "keyframes": len(slam.mapper.keyframes), "image_mb": getattr(slam.mapper, "image_bytes", 0) / MB,
+               **memory(device)}  # fmt: skip
         rows.append(row)
         show(f"loop {turn + 1}", device, row)
     name = "gpu_mb" if device == "cuda" else "resident_mb"
     first, last = rows[min(1, len(rows) - 1)], rows[-1]
-    growth = {"growth_mb": last[name] - first[name], "growth_gaussians": last["gaussians"] - first["gaussians"],
+    growth = {"growth_mb": last[name] - first[name], "growth_image_mb": last["image_mb"] - first["image_mb"],
+              "growth_gaussians": last["gaussians"] - first["gaussians"],
               "growth_keyframes": last["keyframes"] - first["keyframes"]}  # fmt: skip
     slam.close()
     return {**growth, "rows": rows}

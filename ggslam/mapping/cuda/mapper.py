@@ -71,6 +71,11 @@ class CudaMapper(Mapper):
     def last_psnr(self) -> float:
         return float(self._totals.newest()[4])
 
+    @property
+    def image_bytes(self) -> int:
+        """Memory on the device that images of keyframes take at present; part of it for good, see `ImageStore`."""
+        return self._images.nbytes
+
     def vote_labels(self) -> np.ndarray:
         return vote_labels(self.map).cpu().numpy().astype(np.uint16)
 
