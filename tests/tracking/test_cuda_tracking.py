@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,7 +14,6 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
-from ggslam.sequences.factory import open_sequence
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
 from ggslam.tracking.cuda.transfers import Download
 from ggslam.tracking.engine import NativeEngine
@@ -34,9 +31,6 @@ from ggslam.tracking.settings import (
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
 
-if TYPE_CHECKING:
-    from ggslam.cuda.library import CudaLibrary
-
 NOISE = DepthNoise()
 POINTS = PointSettings(count=1500)
 SETTINGS = AlignSettings(coarse_points=500)
@@ -45,33 +39,6 @@ GUESSES = [
     np.array([0.02, -0.01, 0.015, 0.01, -0.02, 0.005]),
     np.array([-0.05, 0.04, 0.03, -0.03, 0.02, 0.06]),
 ]
-
-
-@pytest.fixture(scope="module")
-def frames(room: Path) -> list[Frame]:
-    sequence = open_sequence(room)
-    return [sequence.frame(i) for i in range(10)]
-
-
-@pytest.fixture(scope="module")
-def native(frames: list[Frame]) -> NativeEngine:
-    return NativeEngine(frames[0].camera, NativeContext(2))
-
-
-@pytest.fixture(scope="module")
-def target(frames: list[Frame], native: NativeEngine) -> GicpTarget:
-    """The surface of two frames."""
-    surface = MeasuredSurface(TrackerSettings().target, native.context)
-    for frame in (frames[0], frames[4]):
-        assert frame.T_world_camera is not None
-        points = native.points(frame.depth, PointSettings(), NOISE)
-        found = surface.add(points, frame.T_world_camera)
-    return found
-
-
-@pytest.fixture
-def engine(frames: list[Frame], cuda_library: CudaLibrary) -> CudaTrackingEngine:
-    return CudaTrackingEngine(frames[0].camera, library=cuda_library)
 
 
 def truth_of(frame: Frame) -> np.ndarray:
@@ -89,7 +56,9 @@ def check_points(found: FramePoints, expected: FramePoints) -> None:
     for name in ("points", "normals", "covariances", "weights"):
         one, two = getattr(found, name)[mine], getattr(expected, name)[theirs]
         assert one.dtype == np.float32 and one.shape == two.shape
-        assert np.allclose(one, two, rtol=1e-5, atol=1e-5), name
+        # Where two variances of a neighbourhood are nearly the same, rounding turns its axes.
+        assert (~np.isclose(one, two, rtol=1e-5, atol=1e-5)).sum() <= 0.005 * one.size, name
+        assert np.allclose(one, two, atol=1e-3), name
 
 
 @pytest.mark.parametrize("settings", [POINTS, PointSettings(), PointSettings(count=300, window=1, max_depth=2.5)])
@@ -173,7 +142,8 @@ def test_a_wall_leaves_directions_open(engine: CudaTrackingEngine, native: Nativ
     found, expected = (e.align(e.points(wall, POINTS, NOISE), target, guess, SETTINGS, NOISE) for e in (engine, native))
     assert found.status is expected.status is AlignmentStatus.DEGENERATE
     assert found.weak_directions.shape == expected.weak_directions.shape == (3, 6)
-    assert np.abs(found.weak_directions @ expected.weak_directions.T).max(1) == pytest.approx(1, abs=1e-2)
+    spanned = [result.weak_directions.T @ result.weak_directions for result in (found, expected)]
+    assert np.allclose(*spanned, atol=1e-2)  # the space that they span; which axes it has is left to rounding
 
 
 def test_far_away_the_frame_is_lost(

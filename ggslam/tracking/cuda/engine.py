@@ -4,6 +4,9 @@
 A frame's depth is sent once. Points, their number, the whole optimisation from the coarse voxels to the fine ones and
 its result stay on the device; the host gets the result in one copy, and waits for that alone. Sums have a fixed order:
 results repeat bit for bit.
+
+What grey values contribute is chosen on the host, from images at reduced resolution, while the device extracts points:
+the textured points of a frame are sent in one copy (80 kB at most), the reference image when it is another one.
 """
 
 from __future__ import annotations
