@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Copies between host and device that the host does not wait for, through page-locked memory."""
+"""Copies between host and device by way of page-locked memory, for which the host waits as little as can be: once
+(`upload`, `download`), or again and again through the same memory (`Upload`, `Download`, `HostMirror`)."""
 
 from __future__ import annotations
 
@@ -19,6 +20,10 @@ class _Marker:
         if self._event is not None:
             self._event.record(torch.cuda.current_stream(self._device))
 
+    def passed(self) -> bool:
+        """Whether the device has come here; true if the marker was never set."""
+        return self._event is None or self._event.query()
+
     def wait(self) -> None:
         """Until the device has come here; at once if the marker was never set."""
         if self._event is not None:
@@ -26,8 +31,8 @@ class _Marker:
 
     def wait_if_ahead(self) -> None:
         """As `wait`, for a place that the device has mostly passed long ago."""
-        if self._event is not None and not self._event.query():
-            self._event.synchronize()
+        if not self.passed():
+            self.wait()
 
 
 def _page_locked(size: int, device: torch.device) -> torch.Tensor:
@@ -79,3 +84,56 @@ class Download:
         self._done.set()
         self._done.wait()
         return self._copy.numpy().copy()
+
+
+def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:
+    """A copy of an array on the device, for which the host does not wait: it goes by way of page-locked memory, which
+    torch keeps for the next one."""
+    tensor = torch.from_numpy(np.ascontiguousarray(array))
+    if device.type != "cuda":
+        return tensor.clone()
+    return tensor.pin_memory().to(device, non_blocking=True)
+
+
+def download(*tensors: torch.Tensor) -> list[np.ndarray]:
+    """Copies of device tensors on the host, for which it waits once."""
+    if tensors[0].device.type != "cuda":
+        return [tensor.numpy().copy() for tensor in tensors]
+    copies = [torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True) for tensor in tensors]
+    for copy, tensor in zip(copies, tensors, strict=True):
+        copy.copy_(tensor, non_blocking=True)
+    done = _Marker(tensors[0].device)
+    done.set()
+    done.wait()
+    return [copy.numpy() for copy in copies]
+
+
+class HostMirror:
+    """Numbers of a device tensor as they were some moments ago, at hand without waiting.
+
+    Args:
+        source: the tensor.
+    """
+
+    def __init__(self, source: torch.Tensor) -> None:
+        self._source = source
+        self._arriving = torch.zeros(source.shape, dtype=source.dtype, pin_memory=source.device.type == "cuda")
+        self._sent = _Marker(source.device)
+        self._under_way = False
+        self._newest = self._arriving.numpy().copy()
+
+    def send(self) -> None:
+        """Starts a copy on the current stream, unless one is still under way."""
+        if self._under_way and not self._sent.passed():
+            return
+        self.newest()
+        self._arriving.copy_(self._source, non_blocking=True)
+        self._sent.set()
+        self._under_way = True
+
+    def newest(self) -> np.ndarray:
+        """The numbers of the last copy that has arrived; zeros before the first."""
+        if self._under_way and self._sent.passed():
+            self._newest = self._arriving.numpy().copy()
+            self._under_way = False
+        return self._newest
