@@ -141,6 +141,17 @@ def depth_files(folder: Path) -> list[Path]:
     return sorted((folder / "depth").iterdir())
 
 
+@pytest.mark.parametrize("more", [("--device", "cuda"), ("--set", "device=cuda"), ("--config", "DEVICE.yaml")])
+def test_a_device_that_cannot_be_had(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: tuple[str, str]
+) -> None:
+    monkeypatch.setenv("GGSLAM_NVCC", str(tmp_path / "absent"))  # so that it cannot on a machine with a GPU, either
+    (tmp_path / "DEVICE.yaml").write_text("device: cuda\n")
+    more = (more[0], str(tmp_path / more[1])) if more[0] == "--config" else more
+    one_error(ggslam("run", room, "--out", tmp_path / "run", *more), "error: device: cuda: the cuda backend")
+    assert not (tmp_path / "run").exists()
+
+
 def test_missing_depth_file(room: Path, tmp_path: Path) -> None:
     folder = copy_of(room, tmp_path / "room")
     victim = depth_files(folder)[3]
