@@ -87,6 +87,12 @@ def main() -> None:
     except OSError as error:
         errors.print(f"error: {error}", highlight=False, soft_wrap=True, markup=False)
         sys.exit(1)
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":  # torch's, of a GPU; by its name, for torch is loaded late
+            raise
+        text = f"the GPU's memory is full: {error}; smaller images (--scale 0.5) take less, --device cpu takes none"
+        errors.print(f"error: {text}", highlight=False, soft_wrap=True, markup=False)
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -97,3 +97,20 @@ def library_for_device(device: torch.device | int | None = None) -> CudaLibrary:
     if major < 8:  # sums over a warp in one instruction
         raise MissingDependency(f"the cuda backend needs a GPU of compute capability 8.0, found {major}.{minor}")
     return library_for(f"{major}{minor}")
+
+
+def library_and_device(
+    device: torch.device | str | None = None, library: CudaLibrary | None = None
+) -> tuple[CudaLibrary, torch.device]:
+    """What a part that runs on a device works with: the kernels, and the device with its number.
+
+    Args:
+        device: CUDA device; None: the current one.
+        library: the kernels; None: those of the device, compiled if need be.
+
+    Raises:
+        MissingDependency: as `library_for_device`.
+    """
+    chosen = None if device is None else torch.device(device)
+    library = library or library_for_device(chosen)
+    return library, library.whole_device(chosen)

@@ -16,7 +16,9 @@ from typing import cast
 import cv2
 import numpy as np
 import pytest
+import torch
 
+from ggslam.cli import main
 from ggslam.cli.run_command import _print
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.trajectory import read_tum
@@ -139,6 +141,28 @@ def copy_of(room: Path, to: Path) -> Path:
 
 def depth_files(folder: Path) -> list[Path]:
     return sorted((folder / "depth").iterdir())
+
+
+@pytest.mark.parametrize("more", [("--device", "cuda"), ("--set", "device=cuda"), ("--config", "DEVICE.yaml")])
+def test_a_device_that_cannot_be_had(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: tuple[str, str]
+) -> None:
+    monkeypatch.setenv("GGSLAM_NVCC", str(tmp_path / "absent"))  # so that it cannot on a machine with a GPU, either
+    (tmp_path / "DEVICE.yaml").write_text("device: cuda\n")
+    more = (more[0], str(tmp_path / more[1])) if more[0] == "--config" else more
+    one_error(ggslam("run", room, "--out", tmp_path / "run", *more), "error: device: cuda: the cuda backend")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_full_gpu_is_said_plainly(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def fails() -> None:
+        raise torch.cuda.OutOfMemoryError("tried to allocate 2 GiB")
+
+    monkeypatch.setattr(main, "app", fails)
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 1
+    assert capsys.readouterr().err.startswith("error: the GPU's memory is full: tried to allocate 2 GiB; ")
 
 
 def test_missing_depth_file(room: Path, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -19,7 +18,6 @@ from cuda_contract import (
     emulated_rasterizer,
     run,
 )
-from cuda_emulation import emulated_library
 from rendering_scenes import make_image_gradients, make_scene, relative_error
 from test_cpu_rules import bad_rows
 
@@ -35,15 +33,6 @@ from ggslam.scene.camera import Camera
 @pytest.fixture
 def rasterizer() -> CudaRasterizer:
     return emulated_rasterizer()
-
-
-@pytest.fixture(params=[1, 2], ids=["downwards", "jumping"])
-def other_order(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Threads of a block run in another order than upwards."""
-    functions = emulated_library().functions
-    functions.ggslam_emulation_order(request.param)
-    yield
-    functions.ggslam_emulation_order(0)
 
 
 @pytest.mark.parametrize("features", [0, 1, 2, 3, 5, 8, 9, 12, 16, 17, 33, 40])

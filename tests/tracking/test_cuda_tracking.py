@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from ggslam.cuda.transfers import Download
 from ggslam.features.orb import View
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
-from ggslam.tracking.cuda.transfers import Download
 from ggslam.tracking.engine import NativeEngine
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points

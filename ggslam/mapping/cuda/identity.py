@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.neighbours import device_neighbours
@@ -75,9 +75,7 @@ class CudaIdentityLearner(IdentityObjects):
         neighbours: Neighbours | None = None,
     ) -> None:
         super().__init__(settings, seed)
-        chosen = None if device is None else torch.device(device)
-        self.library = library or library_for_device(chosen)
-        self.device = self.library.whole_device(chosen)
+        self.library, self.device = library_and_device(device, library)
         self._kernels = ClassKernels(self.device, self.library)
         self.table: CudaClassTable = CudaClassTable(self._rng, self._kernels)
         drawn_from = int(np.random.default_rng([seed, 17]).integers(2**62))

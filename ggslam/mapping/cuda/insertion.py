@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory, address
 from ggslam.errors import RenderError
 from ggslam.mapping.settings import InsertionSettings
@@ -79,9 +79,7 @@ class DeviceInsertion:
     """
 
     def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
-        chosen = None if device is None else torch.device(device)
-        self.library = library or library_for_device(chosen)
-        self.device = self.library.whole_device(chosen)
+        self.library, self.device = library_and_device(device, library)
         self.library.check_size("insertion_job", _Job)
         for name in ("insertion_select", "insertion_build"):
             self.library.declare(name, [ctypes.c_void_p])

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
-from ggslam.cuda.memory import upload
+from ggslam.cuda.transfers import upload
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.keyframe import Keyframe
 

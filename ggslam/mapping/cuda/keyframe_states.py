@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.streams import let_go
 from ggslam.errors import RenderError
 from ggslam.mapping.losses import LossValues
@@ -95,9 +95,7 @@ class KeyframeStates:
     """
 
     def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
-        chosen = None if device is None else torch.device(device)
-        self.library = library or library_for_device(chosen)
-        self.device = self.library.whole_device(chosen)
+        self.library, self.device = library_and_device(device, library)
         mirrors = {"keyframe_state": _State, "keyframe_step_job": _StepJob, "keyframe_write_job": _WriteJob}
         for name, mirror in mirrors.items():
             self.library.check_size(name, mirror)

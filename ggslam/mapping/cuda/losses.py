@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
-from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
 from ggslam.mapping.losses import LossSettings, LossValues, RenderedImages
@@ -95,9 +95,7 @@ class CudaImageLoss:
     """
 
     def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
-        chosen = None if device is None else torch.device(device)
-        self.library = library or library_for_device(chosen)
-        self.device = self.library.whole_device(chosen)
+        self.library, self.device = library_and_device(device, library)
         self.library.check_size("image_loss_job", _Job)
         self.library.declare("image_loss", [ctypes.c_void_p])
         self.library.declare("image_loss_bytes", [ctypes.c_void_p], ctypes.c_int64)

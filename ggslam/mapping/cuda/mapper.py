@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.cuda.memory import HostMirror, download
 from ggslam.cuda.streams import Pace, SideStream
+from ggslam.cuda.transfers import HostMirror, download
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.insertion import DeviceInsertion
 from ggslam.mapping.cuda.keyframe import CudaKeyframe, ImageStore

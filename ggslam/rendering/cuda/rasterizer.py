@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
 from ggslam.rendering import _native
@@ -115,10 +115,8 @@ class CudaRasterizer:
         check_projection(near_plane, low_pass)
         self.near_plane = near_plane
         self.low_pass = low_pass
-        chosen = None if device is None else torch.device(device)
-        self.library = library or library_for_device(chosen)
+        self.library, self.device = library_and_device(device, library)
         declare_rasterizer(self.library)
-        self.device = self.library.whole_device(chosen)
         self.waits = waits
         self.last_overflowed = torch.zeros(1, dtype=torch.int32, device=self.device)
         self.overflows = torch.zeros(1, dtype=torch.int64, device=self.device)

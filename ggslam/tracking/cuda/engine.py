@@ -18,8 +18,9 @@ import weakref
 import numpy as np
 import torch
 
-from ggslam.cuda.library import CudaLibrary, library_for_device
+from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
+from ggslam.cuda.transfers import Download, Upload
 from ggslam.scene.camera import Camera
 from ggslam.tracking import native
 from ggslam.tracking.cuda import contract
@@ -27,7 +28,6 @@ from ggslam.tracking.cuda.contract import AlignJob, DepthPointsJob, declare_trac
 from ggslam.tracking.cuda.points import DevicePoints
 from ggslam.tracking.cuda.results import DeviceAlignment, device_alignment
 from ggslam.tracking.cuda.target import DeviceTarget
-from ggslam.tracking.cuda.transfers import Download, Upload
 from ggslam.tracking.gicp import GicpTarget, PhotometricPart, native_align_settings
 from ggslam.tracking.photometric import PhotometricReference
 from ggslam.tracking.points import FramePoints, check_depth, grid_stride, native_points_settings
@@ -50,11 +50,9 @@ class CudaTrackingEngine:
     def __init__(
         self, camera: Camera, device: torch.device | str | None = None, library: CudaLibrary | None = None
     ) -> None:
-        chosen = None if device is None else torch.device(device)
-        self.library = library or library_for_device(chosen)
+        self.library, self.device = library_and_device(device, library)
         declare_tracking(self.library)
         self.camera = camera
-        self.device = self.library.whole_device(chosen)
         self._memory = GrowingMemory(self.device)
         self._target = DeviceTarget(self.library, self.device)
         self._depth = torch.empty(4 * camera.width * camera.height, dtype=torch.uint8, device=self.device)

@@ -11,9 +11,9 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import GrowingMemory
+from ggslam.cuda.transfers import Upload
 from ggslam.tracking import native
 from ggslam.tracking.cuda.contract import BLOCK_BYTES, MOMENT_BYTES, SLOT_BYTES, VOXEL_BYTES, VoxelLevel, VoxelLevelJob
-from ggslam.tracking.cuda.transfers import Upload
 from ggslam.tracking.gicp import GicpTarget
 
 _PLACES_PER_BLOCK = 4

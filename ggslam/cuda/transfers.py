@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Copies between host and device by way of page-locked memory, for which the host waits as little as can be: once
+(`upload`, `download`), or again and again through the same memory (`Upload`, `Download`, `HostMirror`)."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import torch
+
+
+class _Marker:
+    """A point in the work of torch's current stream."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._event = torch.cuda.Event() if device.type == "cuda" else None
+
+    def set(self) -> None:
+        """Here."""
+        if self._event is not None:
+            self._event.record(torch.cuda.current_stream(self._device))
+
+    def passed(self) -> bool:
+        """Whether the device has come here; true if the marker was never set."""
+        return self._event is None or self._event.query()
+
+    def wait(self) -> None:
+        """Until the device has come here; at once if the marker was never set."""
+        if self._event is not None:
+            self._event.synchronize()
+
+    def wait_if_ahead(self) -> None:
+        """As `wait`, for a place that the device has mostly passed long ago."""
+        if not self.passed():
+            self.wait()
+
+
+def _page_locked(size: int, device: torch.device) -> torch.Tensor:
+    return torch.empty(size, dtype=torch.uint8, pin_memory=device.type == "cuda")
+
+
+class Upload:
+    """Sends bytes to the device, again and again. The host waits only if the last ones are still on their way.
+
+    Args:
+        device: where to.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._buffer = _page_locked(1, device)
+        self._sent = _Marker(device)
+
+    def begin(self, size: int) -> np.ndarray:
+        """uint8 [size] to be filled."""
+        self._sent.wait_if_ahead()
+        if self._buffer.numel() < size:
+            self._buffer = _page_locked(size + size // 4, self._device)
+        return self._buffer.numpy()[:size]
+
+    def send(self, out: torch.Tensor) -> None:
+        """Starts the copy of what was filled in to the beginning of it, as long as `out`, uint8 [n]."""
+        out.copy_(self._buffer[: out.numel()], non_blocking=True)
+        self._sent.set()
+
+
+class Download:
+    """Fetches float64 [count] from the device.
+
+    Args:
+        count: numbers.
+        device: where from.
+    """
+
+    def __init__(self, count: int, device: torch.device) -> None:
+        self.source = torch.zeros(count, dtype=torch.float64, device=device)
+        """On the device."""
+        self._copy = _page_locked(8 * count, device).view(torch.float64)
+        self._done = _Marker(device)
+
+    def wait(self) -> np.ndarray:
+        """What `source` is when everything started before is done: the host's one wait."""
+        self._copy.copy_(self.source, non_blocking=True)
+        self._done.set()
+        self._done.wait()
+        return self._copy.numpy().copy()
+
+
+def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:
+    """A copy of an array on the device, for which the host does not wait: it goes by way of page-locked memory, which
+    torch keeps for the next one."""
+    tensor = torch.from_numpy(np.ascontiguousarray(array))
+    if device.type != "cuda":
+        return tensor.clone()
+    return tensor.pin_memory().to(device, non_blocking=True)
+
+
+def download(*tensors: torch.Tensor) -> list[np.ndarray]:
+    """Copies of device tensors on the host, for which it waits once."""
+    if tensors[0].device.type != "cuda":
+        return [tensor.numpy().copy() for tensor in tensors]
+    copies = [torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True) for tensor in tensors]
+    for copy, tensor in zip(copies, tensors, strict=True):
+        copy.copy_(tensor, non_blocking=True)
+    done = _Marker(tensors[0].device)
+    done.set()
+    done.wait()
+    return [copy.numpy() for copy in copies]
+
+
+class HostMirror:
+    """Numbers of a device tensor as they were some moments ago, at hand without waiting; also in other threads than the
+    one that sends them.
+
+    Args:
+        source: the tensor.
+    """
+
+    def __init__(self, source: torch.Tensor) -> None:
+        self._source = source
+        self._arriving = torch.zeros(source.shape, dtype=source.dtype, pin_memory=source.device.type == "cuda")
+        self._sent = _Marker(source.device)
+        self._under_way = False
+        self._lock = threading.Lock()
+        self._newest = self._arriving.numpy().copy()
+
+    def send(self) -> None:
+        """Starts a copy on the current stream, unless one is still under way."""
+        with self._lock:
+            self._take()
+            if self._under_way:
+                return
+            self._arriving.copy_(self._source, non_blocking=True)
+            self._sent.set()
+            self._under_way = True
+
+    def newest(self) -> np.ndarray:
+        """The numbers of the last copy that has arrived; zeros before the first."""
+        with self._lock:
+            self._take()
+            return self._newest
+
+    def _take(self) -> None:
+        if self._under_way and self._sent.passed():
+            self._newest = self._arriving.numpy().copy()
+            self._under_way = False
