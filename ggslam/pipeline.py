@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from ggslam.config import Config, load_config
+from ggslam.cuda.availability import kernels_to_compile
 from ggslam.errors import ConfigError, DeviceError, GgslamError, SequenceError
 from ggslam.formats.staging import new_staging
 from ggslam.interrupts import uninterrupted
@@ -181,6 +182,8 @@ def run_slam(
     """
     error: BaseException | None = None
     paging = new_staging(folder.path) if config.memory_limit_mb and folder is not None else None
+    if config.device != "cpu" and kernels_to_compile():
+        observer.note("compiling the CUDA kernels, once: about a minute")
     slam = Slam(sequence.camera, config, sequence.has_masks, paging)
     if earlier is not None:
         start_in_map(slam, earlier, growing)

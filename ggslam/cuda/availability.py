@@ -11,6 +11,14 @@ from ggslam.cuda.compiler import find_nvcc, library_path
 from ggslam.cuda.library import library_for_device
 from ggslam.errors import MissingDependency
 
+_TO_COMPILE = "will be compiled at first use"
+
+
+def kernels_to_compile() -> bool:
+    """Whether the kernels can be used on the current device and have to be compiled first, which takes a minute."""
+    usable, state = describe_cuda_backend()
+    return usable and _TO_COMPILE in state
+
 
 @lru_cache(maxsize=1)
 def cuda_backend_problem() -> str | None:
@@ -37,5 +45,5 @@ def describe_cuda_backend() -> tuple[bool, str]:
         path = library_path(nvcc, f"{major}{minor}")
     except MissingDependency as error:
         return False, str(error)
-    state = "compiled" if path.exists() else "will be compiled at first use"
+    state = "compiled" if path.exists() else _TO_COMPILE
     return True, f"sm_{major}{minor}, {state}: {path}"

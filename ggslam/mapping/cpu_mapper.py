@@ -14,7 +14,7 @@ from ggslam.mapping.exposure import ExposureAdam
 from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.insertion import fill_gaussians, new_gaussians, unexplained
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
-from ggslam.mapping.labelling import KeyframeLabels, Labeller, MapLabels
+from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import ImageLoss, KeyframeImages
 from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.mapping.settings import MapperSettings
@@ -83,7 +83,7 @@ class CpuMapper(Mapper):
             where = unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
         if self.identity is not None and labeller is not None:
-            self._take_labels(self.identity, keyframe, labeller(keyframe, show))
+            self._take_labels(keyframe, labeller(keyframe, show))
         parts = [new_gaussians(keyframe.color, depth, keyframe.camera, T_world_camera, where, s)]
         if s.fill_stride:
             parts.append(fill_gaussians(keyframe.color, depth, alpha, keyframe.camera, T_world_camera, s))
@@ -98,16 +98,9 @@ class CpuMapper(Mapper):
                 labels = np.zeros(len(new.pixels), np.uint16) if mask is None else mask.reshape(-1)[new.pixels]
                 self.identity.begin(self.map, rows, labels)
 
-    def _take_labels(self, identity: IdentityLearner, keyframe: Keyframe, labels: KeyframeLabels) -> None:
-        """The rasterizer's last rendering is the map as the keyframe sees it (if there was a map)."""
-        keyframe.mask = labels.mask
-        if labels.mask is None:
-            return
-        for kept, dropped in labels.merges:
-            identity.merge(self.map, kept, dropped)
-        identity.observe(labels.mask)
-        for whole, part in labels.splits:
-            identity.split(self.map, self._rasterizer, labels.mask, whole, part)
+    def _split(self, mask: np.ndarray, whole: int, part: int) -> None:
+        assert self.identity is not None
+        self.identity.split(self.map, self._rasterizer, mask, whole, part)
 
     def _show_labels(self, alpha: np.ndarray, depth: np.ndarray, stride: int = 2) -> MapLabels:
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""

@@ -15,7 +15,7 @@ from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.identity_objects import IdentityObjects
 from ggslam.mapping.keyframe import Keyframe
-from ggslam.mapping.labelling import Labeller
+from ggslam.mapping.labelling import KeyframeLabels, Labeller
 from ggslam.mapping.pruning import prune
 from ggslam.mapping.residency import Residency
 from ggslam.mapping.sampling import KeyframeSampler
@@ -168,6 +168,22 @@ class Mapper(ABC):
     @abstractmethod
     def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None) -> None:
         """Inserts Gaussians for what the map lacks at a keyframe seen from `T_world_camera`, and takes its labels."""
+
+    def _take_labels(self, keyframe: Keyframe, labels: KeyframeLabels) -> None:
+        """The keyframe's objects become its mask. What was rendered last is the map as the keyframe sees it, if there was
+        one."""
+        keyframe.mask = labels.mask
+        if labels.mask is None or self.identity is None:
+            return
+        for kept, dropped in labels.merges:
+            self.identity.merge(self.map, kept, dropped)
+        self.identity.observe(labels.mask)
+        for whole, part in labels.splits:
+            self._split(labels.mask, whole, part)
+
+    @abstractmethod
+    def _split(self, mask: np.ndarray, whole: int, part: int) -> None:
+        """What the last rendering shows of `whole` where `mask` [H, W] has `part` becomes the part."""
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 

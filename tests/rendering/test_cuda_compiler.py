@@ -13,7 +13,7 @@ import torch
 from rendering_scenes import CAMERA, make_scene
 
 from ggslam.cuda import compiler
-from ggslam.cuda.availability import describe_cuda_backend
+from ggslam.cuda.availability import describe_cuda_backend, kernels_to_compile
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import MissingDependency, RenderError
 from ggslam.rendering import choose_backend, render
@@ -96,6 +96,16 @@ def test_nvcc_of_python_packages_is_found_last(tmp_path: Path, monkeypatch: pyte
     home.write_text("")
     monkeypatch.setenv("CUDA_HOME", str(tmp_path / "home"))
     assert compiler.find_nvcc() == home
+
+
+def test_compiling_is_announced_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, COMPILES, monkeypatch)
+    assert not kernels_to_compile() or torch.cuda.is_available()
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda: (9, 0))
+    assert kernels_to_compile()
+    compiler.compiled_library("90")
+    assert not kernels_to_compile()
 
 
 def test_a_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages, Devi
 from ggslam.mapping.cuda.votes import vote_labels
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, make_keyframe
-from ggslam.mapping.labelling import KeyframeLabels, Labeller, MapLabels
+from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.mapping.settings import MapperSettings
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer, CudaStepResult
@@ -144,17 +144,9 @@ class CudaMapper(Mapper):
         finally:
             self._rasterizer.waits = False
 
-    def _take_labels(self, keyframe: CudaKeyframe, labels: KeyframeLabels) -> None:
-        """The rasterizer's last rendering is the map as the keyframe sees it (if there was a map)."""
-        identity = self.identity
-        keyframe.mask = labels.mask
-        if labels.mask is None or identity is None:
-            return
-        for kept, dropped in labels.merges:
-            identity.merge(self.map, kept, dropped)
-        identity.observe(labels.mask)
-        for whole, part in labels.splits:
-            identity.split(self.map, self._rasterizer, labels.mask, whole, part)
+    def _split(self, mask: np.ndarray, whole: int, part: int) -> None:
+        assert self.identity is not None
+        self.identity.split(self.map, self._rasterizer, mask, whole, part)
 
     def _show_labels(self, alpha: torch.Tensor, depth: torch.Tensor, stride: int = 2) -> MapLabels:
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row; on the host."""
