@@ -170,8 +170,8 @@ class Mapper(ABC):
         """Inserts Gaussians for what the map lacks at a keyframe seen from `T_world_camera`, and takes its labels."""
 
     def _take_labels(self, keyframe: Keyframe, labels: KeyframeLabels) -> None:
-        """The keyframe's objects become its mask. What was rendered last is the map as the keyframe sees it, if there was
-        one."""
+        """The keyframe's objects become its mask. What was rendered last is the map as the keyframe sees it, if
+        there was one."""
         keyframe.mask = labels.mask
         if labels.mask is None or self.identity is None:
             return
