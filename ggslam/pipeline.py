@@ -57,8 +57,9 @@ class RunOutcome:
     def headline(self) -> str:
         """One line for people."""
         r = self.result
-        parts = [f"{len(r.frames)} frames", f"{r.frames_per_second():.1f} frames/s", f"{len(r.keyframes)} keyframes",
-                 f"{r.gaussian_count} Gaussians"]  # fmt: skip
+        rate = r.frames_per_second()
+        parts = [f"{len(r.frames)} frames", *([f"{rate:.1f} frames/s"] if np.isfinite(rate) else []),
+                 f"{len(r.keyframes)} keyframes", f"{r.gaussian_count} Gaussians"]  # fmt: skip
         counts = Counter(frame.status for frame in r.frames)
         parts += [f"{counts[status]} frames {status}" for status in ("recovered", "lost") if counts[status]]
         parts += [f"{len(r.dropped_frames)} frames dropped"] if r.dropped_frames else []

@@ -7,6 +7,7 @@ import json
 import threading
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,6 +102,31 @@ def test_in_real_time_the_tracker_is_beside_the_mapper(frames: list[Frame], cuda
     slam.tracker.track = lambda frame: (seen.append(list(within)), track(frame))[1]  # type: ignore[method-assign]
     RealtimeSlam(slam, 1.0).run(frames[:2], lambda frame, report: seen.append(list(within)))
     assert seen == [[threading.current_thread().name], []] * 2
+
+
+def test_iterations_without_room_are_made_again(
+    frames: list[Frame], cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slam = Slam(frames[0].camera, config("identity.enabled=false"), has_masks=True, library=cuda_library)
+    slam.step(frames[0])
+    mapper = slam.mapper
+    overflows = mapper._rasterizer.overflows  # type: ignore[attr-defined]
+    overflows += 2
+    mapper.run(0)
+    overflows.cpu()  # what was sent has arrived
+    done = mapper.times.iterations
+    mapper.run(1)
+    assert mapper.times.iterations == done + 3
+    iterate = mapper.iterate
+
+    def without_room(*arguments: Any) -> None:
+        iterate(*arguments)
+        if mapper.times.iterations == done + 4:
+            overflows.add_(1)
+
+    monkeypatch.setattr(mapper, "iterate", without_room)
+    mapper.refine(3)
+    assert mapper.times.iterations == done + 7
 
 
 def test_a_closed_loop_moves_map_and_keyframes(frames: list[Frame], cuda_library: CudaLibrary) -> None:

@@ -41,11 +41,18 @@ def find_nvcc() -> Path | None:
 
 
 def cache_folder() -> Path:
-    """Where compiled libraries are kept: `GGSLAM_CACHE` in the environment, else ggslam in the user's cache folder."""
+    """Where compiled libraries are kept: `GGSLAM_CACHE` in the environment, else ggslam in the user's cache folder.
+
+    Raises:
+        MissingDependency: the user has no home.
+    """
     if os.environ.get("GGSLAM_CACHE"):
         return Path(os.environ["GGSLAM_CACHE"])
     base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "ggslam"
+    try:
+        return (Path(base) if base else Path.home() / ".cache") / "ggslam"
+    except RuntimeError as error:  # nobody knows the user
+        raise MissingDependency(f"the cuda backend: {error} Set GGSLAM_CACHE to a folder for its kernels") from None
 
 
 @lru_cache(maxsize=4)

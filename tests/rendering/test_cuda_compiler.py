@@ -116,6 +116,17 @@ def test_a_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.Monk
         compiler.compiled_library("90")
 
 
+def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("GGSLAM_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", unknown)
+    with pytest.raises(MissingDependency, match=r"home directory\. Set GGSLAM_CACHE"):
+        compiler.cache_folder()
+
+
 def test_a_file_that_is_no_library(tmp_path: Path) -> None:
     (tmp_path / "broken.so").write_text("library\n")
     with pytest.raises(MissingDependency, match="cannot be loaded"):

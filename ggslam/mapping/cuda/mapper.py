@@ -9,6 +9,7 @@ to be matched), and when somebody asks for poses. What it tells of losses is wha
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import partial
 
@@ -101,9 +102,18 @@ class CudaMapper(Mapper):
         self._overflows.send()
         self._pace.piece_ends()
 
-    def _missed(self) -> int:
+    def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None) -> None:
+        self._repeated = int(download(self._rasterizer.overflows)[0][0])
+        super().refine(iterations, progress)
+        numbers = self._trainable()
+        for _ in range(self._missed(int(download(self._rasterizer.overflows)[0][0]))):
+            self.iterate(self._drawn(numbers), self.settings.refine_decay)
+        self._totals.send()
+
+    def _missed(self, overflows: int | None = None) -> int:
         """Iterations that did nothing, as far as is known, because their rendering found no room: to be made again."""
-        missed = int(self._overflows.newest()[0]) - self._repeated
+        overflows = int(self._overflows.newest()[0]) if overflows is None else overflows
+        missed = max(0, overflows - self._repeated)
         self._repeated += missed
         return missed
 
