@@ -158,10 +158,11 @@ class GaussianMap:
         return {name: array[:count] for name, array in self._storage.items()}
 
     def to(self, device: torch.device | str) -> GaussianMap:
-        """The map on a device: itself if it is there, else a copy with room for the used rows only: all arrays bit for
-        bit, moments, counters, settings."""
-        if torch.device(device) == self.device:
-            return self
+        """The map on a device: itself if it is there, else a copy."""
+        return self if torch.device(device) == self.device else self.copy(device)
+
+    def copy(self, device: torch.device | str) -> GaussianMap:
+        """A copy on a device, with room for the used rows only: all arrays bit for bit, moments, counters, settings."""
         out = GaussianMap(
             self.sh_degree, self.feature_channels, torch.device(device), self.with_moments, growth=self.growth
         )

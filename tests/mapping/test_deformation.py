@@ -91,7 +91,7 @@ def test_a_map_on_a_device_is_moved_and_cleaned_as_on_the_host(cuda_library: Cud
         sheet(z, birth, here)
     here.log_scales[3, 0], here.means[5, 1], here.opacity_logits[7] = 3.0, torch.nan, -9.0
     here.moments["quaternions"][0][:] = torch.rand(len(here), 4)
-    there = here.to(cuda_library.whole_device(None))
+    there = here.copy(cuda_library.whole_device(None))
     T = np.stack([np.eye(4), se3_exp(np.array([0.0, 0.0, 2e-3, 0.0, 0.0, 1e-3]))])
     for gaussians in (here, there):
         assert prune(gaussians, PruningSettings()) == 3

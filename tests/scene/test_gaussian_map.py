@@ -122,7 +122,7 @@ def test_a_copy_on_a_device_has_everything_and_is_its_own(cuda_library: CudaLibr
     mark_moments(original)
     original.keep(torch.arange(60) % 2 == 0)
     original.updates[:], original.vote_ids[:], original.vote_weights[:] = 3, 5, 0.5
-    there = original.to(cuda_library.whole_device(None))
+    there = original.copy(cuda_library.whole_device(None))
     assert there.device == there.means.device == cuda_library.whole_device(None)
     assert there.capacity == there.count == 30 and there.growth == 0.25
     there.means[0] = 77.0
@@ -134,14 +134,14 @@ def test_a_copy_on_a_device_has_everything_and_is_its_own(cuda_library: CudaLibr
     found, expected = back.take(rows), original.take(rows)
     assert found.keys() == expected.keys() and len(found) == 24
     assert all(torch.equal(found[name], array) for name, array in expected.items())
-    assert GaussianMap(with_moments=False).to("cpu").moments == {}
+    assert GaussianMap(with_moments=False).copy("cpu").moments == {} and original.to("cpu") is original
 
 
 def test_a_map_on_a_device_grows_and_shrinks_as_on_the_host(cuda_library: CudaLibrary) -> None:
     here = GaussianMap(feature_channels=1)
     insert(here, 100)
     mark_moments(here)
-    there = here.to(cuda_library.whole_device(None))
+    there = here.copy(cuda_library.whole_device(None))
     new = {"quaternions": torch.rand(20, 4), "log_scales": torch.rand(20, 3), "rgb": torch.rand(20, 3)}
     for out in (here, there):
         device = out.device
