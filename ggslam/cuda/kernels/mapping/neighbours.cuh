@@ -28,7 +28,7 @@ constexpr int kMostNeighbours = kWarp;
 constexpr int kRowsPerBlock = 16, kThreads = kRowsPerBlock * kWarp;
 constexpr int kTile = 1024;    // points in shared memory
 constexpr int kPerLane = 4;    // points that a lane measures before the list is looked at
-constexpr int kBlocks = 528;   // enough to fill a large GPU: 132 multiprocessors with 4 blocks each
+constexpr int kBlocks = 396;   // enough to fill a large GPU: 132 multiprocessors with 3 blocks each
 static_assert(kTile % (kPerLane * kWarp) == 0, "a tile is measured in whole steps");
 
 // How the work is cut: `tiles` of points make a part.
@@ -112,7 +112,7 @@ __device__ inline void search_tile(const float* tile, int first, int count, std:
 }
 
 // Nearest points of 16 rows among those of one part. Blocks: [row blocks][parts].
-__global__ void __launch_bounds__(kThreads, 4) search_kernel(NeighbourJob job, Parts parts, Workspace w) {
+__global__ void __launch_bounds__(kThreads, 3) search_kernel(NeighbourJob job, Parts parts, Workspace w) {
   GGSLAM_SHARED float tile[3 * kTile];
   const int lane = threadIdx.x % kWarp, part = static_cast<int>(blockIdx.x) % parts.count;
   const int entry = static_cast<int>(blockIdx.x) / parts.count * kRowsPerBlock + static_cast<int>(threadIdx.x) / kWarp;

@@ -260,7 +260,8 @@ __device__ inline void write_results(const AlignJob& job, const AlignState& s, c
 
 // What the matches at the pose found say.
 template <bool kGreys>
-__global__ void __launch_bounds__(kAlignThreads) report_kernel(AlignJob job, AlignWorkspace work, int point_blocks) {
+__global__ void __launch_bounds__(kAlignThreads, kAlignBlocksPerProcessor)
+    report_kernel(AlignJob job, AlignWorkspace work, int point_blocks) {
   GGSLAM_SHARED BlockView view;
   GGSLAM_SHARED float room[kAlignWarps][kWarp];
   GGSLAM_SHARED double parts[kAlignWarps][kSumStride], grey_parts[kAlignWarps][kSumStride];

@@ -56,7 +56,7 @@ __device__ inline void neighbourhood_scatter(const VoxelLevelJob& job, int i, co
 }
 
 // One voxel per thread. The hash table is full already.
-__global__ void __launch_bounds__(kFinishThreads) finish_voxels_kernel(VoxelLevelJob job) {
+__global__ void __launch_bounds__(kFinishThreads, 6) finish_voxels_kernel(VoxelLevelJob job) {
   const int i = static_cast<int>(blockIdx.x * kFinishThreads + threadIdx.x);
   if (i >= job.voxel_count) return;
   const TargetSettings& s = job.settings;
