@@ -129,6 +129,33 @@ def test_iterations_without_room_are_made_again(
     assert mapper.times.iterations == done + 7
 
 
+def test_a_keyframe_looks_again_if_its_rendering_found_no_room(
+    frames: list[Frame], cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[bool] = []
+
+    def run_three(short: bool) -> Slam:
+        slam = Slam(frames[0].camera, config("keyframes.max_gap=1"), has_masks=True, library=cuda_library)
+        mapper: Any = slam.mapper
+        rendered = mapper.rendered
+
+        def rendered_short(keyframe: Keyframe, with_room: bool) -> Any:
+            view = rendered(keyframe, with_room)
+            mapper.room_was_short.fill_(0 if with_room else 1)
+            looks.append(with_room)
+            return view
+
+        if short:
+            monkeypatch.setattr(mapper, "rendered", rendered_short)
+        for frame in frames[:3]:
+            slam.step(frame)
+        return slam
+
+    found, expected = run_three(True).map, run_three(False).map
+    assert looks == [False, True, False, True]
+    assert found.count == expected.count and np.allclose(found.means.cpu(), expected.means.cpu(), atol=1e-3)
+
+
 def test_a_closed_loop_moves_map_and_keyframes(frames: list[Frame], cuda_library: CudaLibrary) -> None:
     settings = config("keyframes.max_gap=1", "identity.enabled=false")
     slam = Slam(frames[0].camera, settings, has_masks=True, library=cuda_library)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,6 +66,19 @@ class _Job(ctypes.Structure):
     ]  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Selection:
+    """Pixels that get a Gaussian.
+
+    Attributes:
+        job: for `DeviceInsertion.build`.
+        total: their number, int32 [1] on the device.
+    """
+
+    job: _Job
+    total: torch.Tensor
+
+
 class DeviceInsertion:
     """Finds new Gaussians on torch's current stream; keeps scratch memory between keyframes. One instance serves one
     caller and one stream at a time.
@@ -87,7 +101,12 @@ class DeviceInsertion:
         self._memory = GrowingMemory(self.device)
         self._total = torch.empty(1, dtype=torch.int32, device=self.device)
 
-    def new_gaussians(
+    def new_gaussians(self, *arguments: Any, **named: Any) -> DeviceGaussians:
+        """`select` and `build`. Waits for the device once, for the number of Gaussians."""
+        selection = self.select(*arguments, **named)
+        return self.build(selection, int(selection.total.item()))
+
+    def select(
         self,
         color: torch.Tensor,
         depth: torch.Tensor,
@@ -97,9 +116,9 @@ class DeviceInsertion:
         camera: Camera,
         T_world_camera: np.ndarray,
         settings: InsertionSettings,
-    ) -> DeviceGaussians:
-        """The Gaussians that the map lacks: first those of `new_gaussians` at the pixels that are `unexplained`, then,
-        if holes are filled, those of `fill_gaussians`. Waits for the device once, for their number.
+    ) -> Selection:
+        """Starts to choose what the map lacks: first the pixels of `new_gaussians` that are `unexplained`, then, if
+        holes are filled, those of `fill_gaussians`. Valid until the next one; the images have to stay till `build`.
 
         Args:
             color: measured, uint8 [H, W, 3].
@@ -124,8 +143,13 @@ class DeviceInsertion:
         size = self.library.functions.ggslam_cuda_insertion_bytes(ctypes.byref(job))
         job.workspace = self._memory.block("insertion", size).data_ptr()
         self.library.call("insertion_select", ctypes.byref(job))
-        job.count = int(self._total.item())  # the one wait
-        new = self._empty(job.count)
+        return Selection(job, self._total)
+
+    def build(self, selection: Selection, count: int) -> DeviceGaussians:
+        """The Gaussians of a selection, `count` being the number in its `total`."""
+        job = selection.job
+        job.count = count
+        new = self._empty(count)
         for name in ("means", "quaternions", "log_scales", "rgb", "pixels"):
             setattr(job, name, getattr(new, name).data_ptr())
         self.library.call("insertion_build", ctypes.byref(job))

@@ -2,8 +2,8 @@
 """The mapper on an NVIDIA GPU: map, keyframes, losses, optimizers and identity learning are there, and the host only
 starts work.
 
-It waits at new keyframes (for the number of Gaussians to insert, and for what the map shows of objects, if masks have
-to be matched), and when somebody asks for poses. What it tells of losses is what has arrived of them without waiting.
+It waits at a new keyframe (once, for the number of Gaussians to insert and for what the map shows of objects), and when
+somebody asks for poses. What it tells of losses is what has arrived of them without waiting.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from functools import partial
 
 import numpy as np
 import torch
@@ -20,8 +19,8 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.streams import Pace, SideStream
 from ggslam.cuda.transfers import HostMirror, download
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
-from ggslam.mapping.cuda.insertion import DeviceInsertion
-from ggslam.mapping.cuda.keyframe import CudaKeyframe, ImageStore
+from ggslam.mapping.cuda.insertion import DeviceInsertion, Selection
+from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceImages, ImageStore
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages, DeviceLossResult
 from ggslam.mapping.cuda.votes import vote_labels
@@ -125,28 +124,21 @@ class CudaMapper(Mapper):
 
     def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None) -> None:
         assert isinstance(keyframe, CudaKeyframe)
-        images, s = keyframe.device_images, self.settings.insertion
-        alpha = expected_depth = show = None
-        if self.map.count:
-            view = self._rendered_whole(keyframe)
-            alpha, expected_depth = view.alpha, view.expected_depth
-            show = partial(self._show_labels, alpha, expected_depth)
+        look = _Look(self, keyframe, T_world_camera)
         if self.identity is not None and labeller is not None:
-            self._take_labels(keyframe, labeller(keyframe, show))
-        new = self._insertion.new_gaussians(
-            images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, alpha, expected_depth, keyframe.camera,
-            T_world_camera, s,
-        )  # fmt: skip
-        logit = torch.full_like(new.means[:, 0], float(np.log(s.opacity / (1 - s.opacity))))
+            self._take_labels(keyframe, labeller(keyframe, look.labels if self.map.count else None))
+        new = self._insertion.build(look.selection, look.count())
+        opacity = self.settings.insertion.opacity
+        logit = torch.full_like(new.means[:, 0], float(np.log(opacity / (1 - opacity))))
         rows = self.map.insert(
             new.means, new.quaternions, new.log_scales, logit, new.rgb, birth_keyframe=keyframe.index
         )
         if self.identity is not None:
             self.identity.begin(self.map, rows, self.identity.labels_at(keyframe, new.pixels))
 
-    def _rendered_whole(self, keyframe: CudaKeyframe) -> RenderBuffers:
-        """With room for everything: what seems to be missing is inserted."""
-        self._rasterizer.waits = True
+    def rendered(self, keyframe: CudaKeyframe, with_room: bool) -> RenderBuffers:
+        """The map as a keyframe sees it, without identities; `with_room`: waits for room for all that is in view."""
+        self._rasterizer.waits = with_room
         try:
             return self._rasterizer.forward(
                 self.map, keyframe.camera, self._states.pose(keyframe.index), features=False
@@ -154,19 +146,32 @@ class CudaMapper(Mapper):
         finally:
             self._rasterizer.waits = False
 
-    def _split(self, mask: np.ndarray, whole: int, part: int) -> None:
-        assert self.identity is not None
-        self.identity.split(self.map, self._rasterizer, mask, whole, part)
+    @property
+    def room_was_short(self) -> torch.Tensor:
+        """int32 [1] on the device: 1 if the last rendering lacks a part of what is in view."""
+        return self._rasterizer.last_overflowed
 
-    def _show_labels(self, alpha: torch.Tensor, depth: torch.Tensor, stride: int = 2) -> MapLabels:
-        """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row; on the host."""
+    def selection(
+        self, images: DeviceImages, keyframe: CudaKeyframe, alpha: torch.Tensor | None, depth: torch.Tensor | None,
+        T_world_camera: np.ndarray,
+    ) -> Selection:  # fmt: skip
+        """Starts to choose the pixels of a keyframe that the map, rendered as `alpha` and `depth`, does not explain."""
+        return self._insertion.select(
+            images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, alpha, depth, keyframe.camera, T_world_camera,
+            self.settings.insertion,
+        )  # fmt: skip
+
+    def labels_on_grid(self, alpha: torch.Tensor, stride: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Object that the last rendering shows on every `stride`-th pixel and row, int32 [h, w], and its share."""
         height, width = alpha.shape
         pixels = torch.arange(height * width, dtype=torch.int32, device=self.device).view(height, width)
         grid = pixels[::stride, ::stride]
         ids, share = self._rasterizer.pixel_terms(grid.reshape(-1)).labels(vote_labels(self.map))
-        share = share.view(grid.shape) * (alpha[::stride, ::stride] > 0.5)
-        on_host = download(ids.view(grid.shape), share, depth)
-        return MapLabels.from_grid(on_host[0], on_host[1], on_host[2], stride)
+        return ids.view(grid.shape), share.view(grid.shape) * (alpha[::stride, ::stride] > 0.5)
+
+    def _split(self, mask: np.ndarray, whole: int, part: int) -> None:
+        assert self.identity is not None
+        self.identity.split(self.map, self._rasterizer, mask, whole, part)
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 
@@ -218,3 +223,52 @@ class CudaMapper(Mapper):
         view = self._rasterizer.forward(self.map, keyframe.camera, self._states.pose(keyframe.index), features=False)
         for _ in range(steps):
             self.identity.step(self.map, self._rasterizer, keyframe, view, rate_factor)
+
+
+class _Look:
+    """At the map from a new keyframe, and at what it lacks there. Everything is started at once, and the host waits
+    once for what it has to know. If the rendering found no room for a part of the map, it is all done again with room.
+
+    Args:
+        mapper: whose map it is.
+        keyframe: the new one.
+        T_world_camera: [4, 4], its pose.
+    """
+
+    def __init__(self, mapper: CudaMapper, keyframe: CudaKeyframe, T_world_camera: np.ndarray) -> None:
+        self._mapper, self._keyframe, self._T = mapper, keyframe, T_world_camera
+        self._count: int | None = None
+        self._start(with_room=False)
+
+    def _start(self, with_room: bool) -> None:
+        mapper, keyframe, self._with_room = self._mapper, self._keyframe, with_room
+        self._alpha = self._depth = None
+        if mapper.map.count:
+            view = mapper.rendered(keyframe, with_room)
+            self._alpha, self._depth = view.alpha, view.expected_depth
+        images = keyframe.device_images
+        self.selection = mapper.selection(images, keyframe, self._alpha, self._depth, self._T)
+
+    def labels(self, stride: int = 2) -> MapLabels:
+        """What the map shows of the objects, looked at on every `stride`-th pixel and row; on the host."""
+        assert self._alpha is not None and self._depth is not None
+        ids, share = self._mapper.labels_on_grid(self._alpha, stride)
+        found = self._arrived(ids, share, self._depth)
+        if found is None:
+            return self.labels(stride)
+        return MapLabels.from_grid(found[0], found[1], found[2], stride)
+
+    def count(self) -> int:
+        """Of the Gaussians to insert."""
+        while self._count is None:
+            self._arrived()
+        return self._count
+
+    def _arrived(self, *tensors: torch.Tensor) -> list[np.ndarray] | None:
+        """These on the host, and the count known; None if all has to be done again, and was started."""
+        *found, total, short = download(*tensors, self.selection.total, self._mapper.room_was_short)
+        if short[0] and self._alpha is not None and not self._with_room:
+            self._start(with_room=True)
+            return None
+        self._count = int(total[0])
+        return found

@@ -115,6 +115,7 @@ class CudaTrackingEngine:
             self._add_photometric(job, photometric)
         job.workspace = self._aligning_memory(job).data_ptr()
         self.library.call("align", ctypes.byref(job))
+        source.send()  # some hundred kilobytes, so that a keyframe has them without another wait
         found = self._results.wait()
         source.settle(int(found[contract.POINT_COUNT]), float(found[contract.MEDIAN_DEPTH]))
         return device_alignment(found, matched, settings)

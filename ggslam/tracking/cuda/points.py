@@ -18,8 +18,9 @@ _BEGIN = 64
 
 
 class DevicePoints(FramePoints):
-    """`FramePoints` on a device. The arrays are copied to the host, all at once, when any of them is first asked for;
-    keyframes and loops need them. Their number and their median depth come with the frame's alignment.
+    """`FramePoints` on a device. The arrays, which keyframes and loops need, come to the host with the frame's
+    alignment; before it they are fetched, all at once, when any of them is first asked for. So are their number and
+    median depth.
 
     Args:
         room: points at most; their number is known to the device alone.
@@ -30,11 +31,15 @@ class DevicePoints(FramePoints):
     _block: torch.Tensor
     _begins: dict[str, int]
     _header: tuple[int, float] | None
+    _copy: torch.Tensor | None
+    """On the host; filled when the device has come to it."""
 
     def __init__(self, room: int, device: torch.device) -> None:
         words = torch.empty(_BEGIN + room * sum(_ROWS.values()), dtype=torch.float32, device=device)
         begins = dict(zip(_ROWS, accumulate((room * width for width in _ROWS.values()), initial=_BEGIN), strict=False))
-        for name, value in (("room", room), ("_block", words), ("_begins", begins), ("_header", None)):
+        for name, value in (
+            ("room", room), ("_block", words), ("_begins", begins), ("_header", None), ("_copy", None)
+        ):  # fmt: skip
             object.__setattr__(self, name, value)
 
     def arrays(self) -> PointArrays:
@@ -42,8 +47,14 @@ class DevicePoints(FramePoints):
         begin = self._block.data_ptr()
         return PointArrays(begin, *(begin + 4 * offset for offset in self._begins.values()))
 
+    def send(self) -> None:
+        """Starts to copy the arrays to the host."""
+        if self._copy is None and self._block.device.type == "cuda":
+            copy = torch.empty(self._block.shape, dtype=self._block.dtype, pin_memory=True)
+            object.__setattr__(self, "_copy", copy.copy_(self._block, non_blocking=True))
+
     def settle(self, count: int, median_depth: float) -> None:
-        """Takes what the device says of the points, once it is known."""
+        """Takes what the device says of the points, once it is known; what was sent has arrived then."""
         object.__setattr__(self, "_header", (count, median_depth))
 
     def __len__(self) -> int:
@@ -63,7 +74,8 @@ class DevicePoints(FramePoints):
         """The arrays, at the first look at any of them."""
         if name not in _ROWS:
             raise AttributeError(name)
-        words = self._block.cpu().numpy()
+        arrived = self._copy is not None and self._header is not None
+        words = (self._copy if self._copy is not None and arrived else self._block.cpu()).numpy()
         count, _ = self._header_of(words)
         for field, offset in self._begins.items():
             width = _ROWS[field]
