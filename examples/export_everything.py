@@ -11,11 +11,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ggslam.errors import MissingDependency
-from ggslam.exporting import export_objects, export_points, export_segmented, export_splats, export_trajectory
-from ggslam.mesh_exports import MeshRequest, export_mesh
-from ggslam.run_folder import RunFolder
-from ggslam.splat_exports import export_packed, export_pcd
-from ggslam.view_exports import export_colmap, export_nerfstudio
+from ggslam.jobs.export.map_files import (
+    export_objects,
+    export_points,
+    export_segmented,
+    export_splats,
+    export_trajectory,
+)
+from ggslam.jobs.export.meshes import MeshRequest, export_mesh
+from ggslam.jobs.export.splats import export_packed, export_pcd
+from ggslam.jobs.export.views import export_colmap, export_nerfstudio
+from ggslam.runs.folder import RunFolder
 
 
 def main(run: str, out: str) -> None:

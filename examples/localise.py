@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.pipeline import RunRequest, execute
-from ggslam.recordings import SequenceRequest
+from ggslam.jobs.run.pipeline import RunRequest, execute
+from ggslam.runs.recordings import SequenceRequest
 
 
 def main(run: str, recording: str, out: str, start: str = "0", stop: str = "30") -> None:

@@ -13,12 +13,12 @@ import sys
 import time
 from collections.abc import Iterator
 
-from ggslam.config import load_config
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.live import LiveSequence
-from ggslam.sequences.synthetic import RayCaster, camera_path, furnished_room
-from ggslam.slam import Slam
+from ggslam.slam.config import load_config
+from ggslam.slam.slam import Slam
+from ggslam.synthetic import RayCaster, camera_path, furnished_room
 
 
 class DrawnRoom:

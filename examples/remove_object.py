@@ -10,9 +10,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ggslam.editing_jobs import Edit, edit_run
-from ggslam.rendering_jobs import render_frames, select_frames
-from ggslam.run_folder import RunFolder
+from ggslam.jobs.edit.editing import Edit, edit_run
+from ggslam.jobs.render.rendering import render_frames, select_frames
+from ggslam.runs.folder import RunFolder
 
 
 def main(run: str, name: str, out: str) -> None:

@@ -10,11 +10,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ggslam.config import load_config
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.trajectory import write_tum
 from ggslam.sequences import open_sequence
-from ggslam.slam import Slam
+from ggslam.slam.config import load_config
+from ggslam.slam.slam import Slam
 
 
 def main(recording: str, out: str) -> None:

@@ -38,19 +38,19 @@ import numpy as np
 import torch
 from gpu_profile import profile_report
 
-from ggslam.config import Config, load_config
 from ggslam.evaluation.images import psnr, unit_range
 from ggslam.evaluation.trajectory import score_trajectory
-from ggslam.process_memory import resident_bytes
-from ggslam.realtime import RealtimeSlam
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import PARAMETERS, GaussianTensors
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences import open_sequence
-from ggslam.sequences.synthetic import write_synthetic_sequence
-from ggslam.slam import Slam
-from ggslam.slam_result import SlamResult
+from ggslam.slam.config import Config, load_config
+from ggslam.slam.realtime import RealtimeSlam
+from ggslam.slam.result import SlamResult
+from ggslam.slam.slam import Slam
+from ggslam.synthetic import write_synthetic_sequence
+from ggslam.system.process_memory import resident_bytes
 
 PARTS = ("speed", "realtime", "loops", "profile")
 MB = 1e6

@@ -22,8 +22,8 @@ from bench_cuda_render import SIZES, make_workload
 from bench_loss import View, make_view
 from timing import seconds
 
+from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
 from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages
-from ggslam.mapping.losses import ImageLoss, KeyframeImages, LossSettings
 from ggslam.mapping.losses_reference import ssim
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings

@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 from held_out import held_out_poses
 
-from ggslam.editing_jobs import Edit, edit_run
+from ggslam.jobs.edit.editing import Edit, edit_run
 from ggslam.objects.segmented_map import SegmentedMap
-from ggslam.recordings import open_recording_of
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import vote_label_image
-from ggslam.run_folder import RunFolder
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import open_recording_of
 from ggslam.scene.frame import Frame
 
 MARGIN = 2

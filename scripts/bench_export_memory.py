@@ -27,10 +27,10 @@ import torch
 from commands import Usage, usage
 
 from ggslam.formats.gaussian_ply import write_gaussian_parts
-from ggslam.map_index import MAP_INDEX, write_map_index
 from ggslam.objects.segmented_map import ObjectVotes
 from ggslam.objects.table import ObjectTable
-from ggslam.run_folder import RunFolder
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.map_index import MAP_INDEX, write_map_index
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings

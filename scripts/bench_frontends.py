@@ -36,13 +36,13 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, so3_log
 from ggslam.sequences.factory import open_sequence
-from ggslam.tracking.feature_scans import LidarFeatures, split_features
-from ggslam.tracking.feature_settings import LIDAR, FeatureTrackerSettings
-from ggslam.tracking.feature_tracker import FeatureTracker
-from ggslam.tracking.features import ScanFeatures
+from ggslam.tracking.edges_planes.extraction import ScanFeatures
+from ggslam.tracking.edges_planes.local_map import FeatureOdometry
+from ggslam.tracking.edges_planes.scans import LidarFeatures, split_features
+from ggslam.tracking.edges_planes.settings import LIDAR, FeatureTrackerSettings
+from ggslam.tracking.edges_planes.tracker import FeatureTracker
 from ggslam.tracking.gicp import GicpTarget, align
 from ggslam.tracking.keyframes import KeyframePolicy
-from ggslam.tracking.local_feature_map import FeatureOdometry
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise, TargetSettings, TrackerSettings
 from ggslam.tracking.surface import MeasuredSurface, quaternions_from_normals

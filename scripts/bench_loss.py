@@ -21,7 +21,7 @@ import torch
 from timing import seconds
 from torch.nn.functional import avg_pool2d
 
-from ggslam.mapping.losses import ImageLoss, KeyframeImages, LossSettings
+from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
 from ggslam.mapping.losses_reference import reference_loss
 from ggslam.native.loader import NativeContext, available_instruction_sets, available_processors
 

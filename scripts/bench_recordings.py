@@ -22,7 +22,7 @@ from typing import Any
 from commands import usage
 
 from ggslam.sequences import open_sequence, recognise_format
-from ggslam.sequences.synthetic import write_synthetic_sequence
+from ggslam.synthetic import write_synthetic_sequence
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.settings import DepthNoise
 

@@ -32,9 +32,9 @@ from ggslam.coding.splats import RATES, gaussians_of, splat_attributes, splat_se
 from ggslam.evaluation.image_sets import ImageScoreMean
 from ggslam.evaluation.images import score_image
 from ggslam.formats.gaussian_ply import write_gaussian_ply
-from ggslam.recordings import open_recording_of
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.run_folder import RunFolder
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import open_recording_of
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ggslam.rendering_jobs import frame_poses
-from ggslam.run_folder import RunFolder
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.frame_poses import frame_poses
 from ggslam.scene.poses import inverse
 
 

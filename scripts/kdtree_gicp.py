@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ggslam.localization import LocalizationStatus, Tracked
-from ggslam.map_surface import load_surface
+from ggslam.localization.localizer import LocalizationStatus, Tracked
+from ggslam.localization.surface import load_surface
 from ggslam.scene.poses import inverse, orthonormalized, se3_exp
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import CellArrays

@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.config import Config, load_config
 from ggslam.evaluation.trajectory import score_trajectory
-from ggslam.loop_closing import Correction, LoopCloser
 from ggslam.mapping.keyframe import Keyframe
-from ggslam.recordings import SequenceRequest, describe
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.reporting.pictures import color_to_uint8, write_picture
-from ggslam.run_folder import RunFolder
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import SequenceRequest, describe
+from ggslam.runs.starting import start_in_map
 from ggslam.scene.poses import inverse, se3_exp
 from ggslam.sequences import open_sequence
 from ggslam.sequences.sequence import Sequence
-from ggslam.slam import Slam
-from ggslam.starting import start_in_map
+from ggslam.slam.config import Config, load_config
+from ggslam.slam.loop_closing import Correction, LoopCloser
+from ggslam.slam.slam import Slam
 
 FIRST_FRAMES = 40
 """Keyframes of so many frames are the first room's views."""

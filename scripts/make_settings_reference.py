@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ggslam.config import Config, presets
+from ggslam.slam.config import Config, presets
 
 PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
 

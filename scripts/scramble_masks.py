@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 
 from ggslam.errors import GgslamError, SequenceError
-from ggslam.formats.atomic import make_folder, write_bytes
 from ggslam.sequences import open_sequence
 from ggslam.sequences.masks import MaskReader
+from ggslam.system.atomic import make_folder, write_bytes
 
 
 def scramble(mask: np.ndarray, rng: np.random.Generator, split: float, drop: float, dots: float) -> np.ndarray:

@@ -24,16 +24,16 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 from kdtree_gicp import TreeSurface, TreeTracker
 
-from ggslam.frame_localization import FrameTracker
-from ggslam.localization import Localization, Localizer, ScanTracker, ScanTrackerSettings
-from ggslam.localization_report import LocalizationReport
-from ggslam.map_stores import INDOORS
-from ggslam.map_surface import NORMAL, SCAN_TARGET, FullSurface, PartialSurface, packed_normals
-from ggslam.map_visits import FrameSights, record_visit
+from ggslam.jobs.localize.report import LocalizationReport
+from ggslam.jobs.submaps.stores import INDOORS
+from ggslam.localization.frames import FrameTracker
+from ggslam.localization.localizer import Localization, Localizer, ScanTracker, ScanTrackerSettings
+from ggslam.localization.scans import ScanSequence, scan_files
+from ggslam.localization.surface import NORMAL, SCAN_TARGET, FullSurface, PartialSurface, packed_normals
+from ggslam.localization.visits import FrameSights, record_visit
 from ggslam.native.loader import NativeContext
-from ggslam.run_folder import json_ready, peak_memory_mb
+from ggslam.runs.folder import json_ready, peak_memory_mb
 from ggslam.sequences import open_sequence
-from ggslam.sequences.scans import ScanSequence, scan_files
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
@@ -80,10 +80,10 @@ def main() -> None:
 def make_world(folder: Path, size: float, spacing: float, scans: int, seed: int) -> dict[str, Any]:
     """Writes the map of a generated world, and scans along a walk in it with the true poses."""
     from ggslam.formats.trajectory import write_tum
-    from ggslam.sequences.synthetic.world_cloud import cloud_tiles
-    from ggslam.sequences.synthetic.world_plan import make_world as planned
-    from ggslam.sequences.synthetic.world_scanner import Scanner
-    from ggslam.sequences.synthetic.world_walk import SPEED, walk
+    from ggslam.synthetic.world_cloud import cloud_tiles
+    from ggslam.synthetic.world_plan import make_world as planned
+    from ggslam.synthetic.world_scanner import Scanner
+    from ggslam.synthetic.world_walk import SPEED, walk
 
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "scans").mkdir(parents=True)

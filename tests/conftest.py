@@ -28,7 +28,7 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A generated recording: 24 frames of a furnished room, 160x120, with depth noise, exact poses and masks."""
-    from ggslam.sequences.synthetic import write_synthetic_sequence
+    from ggslam.synthetic import write_synthetic_sequence
 
     folder = tmp_path_factory.mktemp("recordings") / "room"
     write_synthetic_sequence(folder, frames=24, width=160, height=120, seed=0, noise=True)

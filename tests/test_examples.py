@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from ggslam.cli.main import app
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.trajectory import read_trajectory
-from ggslam.run_folder import RunFolder
+from ggslam.runs.folder import RunFolder
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"

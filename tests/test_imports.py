@@ -1,56 +1,148 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imports run downwards only, as the plan of the house says."""
+"""Imports run down the rooms only, as the plan of the house says, and nowhere in a circle."""
 
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1] / "ggslam"
-BOTTOM = {"scene", "native", "errors", "cuda"}
-LOWER = {"rendering", "sequences", "formats", "features"}
-MIDDLE = {"tracking", "mapping", "evaluation", "reporting", "loops", "objects", "volumes", "submaps", "coding"}
-MIDDLE |= {"viewer"}
+FLOORS = (
+    {"cli"},
+    {"jobs"},
+    {"runs"},
+    {"slam", "localization"},
+    {"tracking", "mapping", "loops", "objects", "volumes", "submaps", "coding", "evaluation", "viewer", "reporting"},
+    {"rendering", "sequences", "formats", "features", "synthetic", "geometry"},
+    {"scene", "native", "cuda"},
+    {"system"},
+    {"errors"},
+)
+"""From the top down. A room imports from floors below its own only."""
+JOBS = (
+    {"watch"},
+    {"view"},
+    {"export"},
+    {"volumes"},
+    {"run"},
+    {"report"},
+    {"score", "edit", "localize", "compare", "code", "render", "doctor"},
+    {"submaps"},
+    {"progress"},
+)
+"""The order inside `jobs`, likewise."""
+ROOT_MODULES = {"__init__", "__main__", "errors"}
 
 
-def room(path: Path) -> str:
-    name = path.relative_to(ROOT).parts[0].removesuffix(".py")
-    return "cli" if name == "__main__" else name
+@cache
+def modules() -> dict[str, Path]:
+    """Every module of the package by its dotted name."""
+    found = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT.parent).with_suffix("").parts
+        found[".".join(parts).removesuffix(".__init__")] = path
+    return found
 
 
-def imported_rooms(path: Path) -> set[str]:
-    rooms = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        names = []
-        if isinstance(node, ast.ImportFrom) and node.module:
-            names = [node.module]
+@cache
+def imports(name: str, at_loading_only: bool = False) -> dict[str, int]:
+    """Modules of the package that a module imports, with the line; those of functions and of type checking, too."""
+    tree = ast.parse(modules()[name].read_text())
+    found: dict[str, int] = {}
+    for node in top_level(tree) if at_loading_only else ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{name}:{node.lineno}: imports are written with the whole name"
+            whole = [f"{node.module}.{alias.name}" for alias in node.names]
+            found |= {n if n in modules() else str(node.module): node.lineno for n in whole}
         elif isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        rooms |= {name.split(".")[1] for name in names if name.startswith("ggslam.")}
-    return rooms
+            found |= {alias.name: node.lineno for alias in node.names}
+    return {n: line for n, line in found.items() if n.split(".")[0] == "ggslam" and n != name}
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT)))
-def test_imports_run_downwards(path: Path) -> None:
-    own = room(path)
-    others = imported_rooms(path) - {own}
-    if own in BOTTOM:
-        assert others <= BOTTOM, f"{own} imports {others}"
-    elif own in LOWER:
-        # formats hand out files that appear whole; sequences write some.
-        assert others <= BOTTOM | ({"formats"} if own == "sequences" else set()), f"{own} imports {others}"
-    elif own in MIDDLE:
-        assert others <= BOTTOM | LOWER, f"{own} imports {others}"
-    elif own != "cli":
-        assert "cli" not in others
+def top_level(tree: ast.Module) -> list[ast.AST]:
+    """Statements that run when a module is loaded."""
+    found: list[ast.AST] = []
+    pending: list[ast.AST] = list(tree.body)
+    while pending:
+        node = pending.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            continue
+        found.append(node)
+        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            pending += ast.iter_child_nodes(node)
+    return found
+
+
+def level(order: tuple[set[str], ...], name: str) -> int:
+    places = [i for i, names in enumerate(order) if name in names]
+    assert places, f"{name} has no place in the plan of the house"
+    return places[0]
+
+
+def refuse_upward(order: tuple[set[str], ...], depth: int, name: str) -> None:
+    """Every import of another room on one depth of the names has to lead down."""
+    own = name.split(".")[depth]
+    for other, line in imports(name).items():
+        parts = other.split(".")
+        if len(parts) <= depth or parts[:depth] != name.split(".")[:depth] or parts[depth] == own:
+            continue
+        up = level(order, parts[depth]) <= level(order, own)
+        assert not up, f"{name}:{line}: {own} may not import {other}"
+
+
+@pytest.mark.parametrize("name", [n for n in modules() if n.count(".") > 0])
+def test_imports_run_downwards(name: str) -> None:
+    if name.split(".")[1] != "__main__":
+        refuse_upward(FLOORS, 1, name)
+        if name.startswith("ggslam.jobs."):
+            refuse_upward(JOBS, 2, name)
+
+
+def test_no_circles() -> None:
+    """Not between modules of one room either, and not by imports inside functions."""
+    state: dict[str, int] = {}
+
+    def visit(name: str, path: list[str]) -> None:
+        if state.get(name) == 2:
+            return
+        assert state.get(name) != 1, "circle: " + " -> ".join([*path[path.index(name) :], name])
+        state[name] = 1
+        for other in imports(name):
+            if other in modules() and other != "ggslam":  # the public face loads what it is asked for
+                visit(other, [*path, name])
+        state[name] = 2
+
+    for name in modules():
+        if name != "ggslam":
+            visit(name, [])
+
+
+def test_nothing_stands_at_the_root() -> None:
+    assert {path.stem for path in ROOT.glob("*.py")} == ROOT_MODULES
+    rooms = {path.name for path in ROOT.iterdir() if (path / "__init__.py").is_file()}
+    assert rooms == set().union(*FLOORS) - {"errors"}
 
 
 def test_heavy_packages_are_not_imported_at_start() -> None:
-    """`ggslam --help` must not wait for torch."""
-    for path in [ROOT / "cli" / "main.py", ROOT / "errors.py", ROOT / "cli" / "run_command.py"]:
-        tree = ast.parse(path.read_text())
-        top = {n.names[0].name for n in tree.body if isinstance(n, ast.Import)}
-        top |= {n.module for n in tree.body if isinstance(n, ast.ImportFrom) and n.module}
-        assert not any(name.split(".")[0] in {"torch", "cv2", "kornia"} for name in top)
+    """`ggslam --help` must not wait for torch: neither the command line nor what it loads at once may import it."""
+    seen, pending = set(), ["ggslam.cli.main"]
+    while pending:
+        name = pending.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        tree = ast.parse(modules()[name].read_text())
+        heavy = {a.name.split(".")[0] for n in top_level(tree) if isinstance(n, ast.Import) for a in n.names}
+        heavy |= {(n.module or "").split(".")[0] for n in top_level(tree) if isinstance(n, ast.ImportFrom)}
+        assert not heavy & {"torch", "cv2", "kornia"}, f"{name} imports {heavy}"
+        pending += [n for n in imports(name, at_loading_only=True) if n in modules() and n != "ggslam"]
+
+
+def test_the_check_finds_what_it_looks_for(tmp_path: Path) -> None:
+    order = ({"above"}, {"below"})
+    assert level(order, "above") < level(order, "below")
+    with pytest.raises(AssertionError, match="no place"):
+        level(order, "elsewhere")

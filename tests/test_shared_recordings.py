@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 
-from ggslam.pipeline import RunRequest, execute
-from ggslam.progress import SilentObserver
-from ggslam.recordings import SequenceRequest, open_recording_of
-from ggslam.run_folder import RunFolder
-from ggslam.scoring import score_run
+from ggslam.jobs.progress import SilentObserver
+from ggslam.jobs.run.pipeline import RunRequest, execute
+from ggslam.jobs.score.scoring import score_run
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import SequenceRequest, open_recording_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from scramble_masks import scramble_recording  # noqa: E402

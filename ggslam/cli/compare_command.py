@@ -14,8 +14,8 @@ from ggslam.cli.console import console, table
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.comparison import Comparison
     from ggslam.evaluation.geometry import Overlap
+    from ggslam.jobs.compare.comparison import Comparison
 
 EPILOG = """
 [bold]Examples[/]
@@ -56,8 +56,8 @@ def compare(
     json_path: Annotated[Path | None, typer.Option("--json", help="File to write all numbers to.")] = None,
 ) -> None:  # fmt: skip
     """Compare two maps: how far apart trajectories and surfaces are, and scores side by side. B is the reference."""
-    from ggslam.comparison import compare as compare_sides
-    from ggslam.formats.atomic import write_text
+    from ggslam.jobs.compare.comparison import compare as compare_sides
+    from ggslam.system.atomic import write_text
 
     found = compare_sides(a, b, align.value, max_distance, _numbers(thresholds), seed)
     _print(found, max_distance)

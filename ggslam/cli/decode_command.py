@@ -32,7 +32,7 @@ def decode(
     workers: Annotated[int | None, typer.Option(help="Threads; default: one per processor.", min=1, max=1024)] = None,
 ) -> None:
     """Decode an MPEG G-PCC stream, or one slice or box of it."""
-    from ggslam.coding_jobs import decode_file
+    from ggslam.jobs.code.coding import decode_file
 
     corners = None if box is None else _corners(box)
     done = decode_file(source, out, slice_id, corners, workers)

@@ -28,7 +28,7 @@ def doctor(
     self_test: Annotated[bool, typer.Option("--self-test/--no-self-test", help="Render and track, a second.")] = True,
 ) -> None:
     """Check the installation: versions, compiled core, GPU, extras, weights. Exit code 1 if ggslam cannot work."""
-    from ggslam.doctor import examine, works
+    from ggslam.jobs.doctor.checkup import examine, works
 
     findings = examine(self_test)
     good = works(findings)

@@ -16,7 +16,7 @@ from ggslam.cli.console import console
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.editing_jobs import Edit
+    from ggslam.jobs.edit.editing import Edit
 
 EPILOG = """
 Objects are named by id or name, several separated by commas. Edits are done in the order given: a later one sees
@@ -99,8 +99,8 @@ def edit(
     ] = None,
 ) -> None:
     """Edit a run's map: remove, keep, move, duplicate, recolour, merge and rename objects."""
-    from ggslam.editing_jobs import edit_run
-    from ggslam.run_folder import RunFolder
+    from ggslam.jobs.edit.editing import edit_run
+    from ggslam.runs.folder import RunFolder
 
     edits = _edits(ctx.meta[_EDITS])
     if in_place and out is not None:
@@ -124,7 +124,7 @@ def _edits(words: list[tuple[str, list[str]]]) -> list[Edit]:
     Raises:
         ConfigError: `--rotate` follows no `--move`.
     """
-    from ggslam.editing_jobs import Edit
+    from ggslam.jobs.edit.editing import Edit
 
     edits: list[Edit] = []
     for kind, values in words:

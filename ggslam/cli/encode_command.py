@@ -92,7 +92,7 @@ def encode(
 ) -> None:
     """Encode a point cloud or a Gaussian map as an MPEG G-PCC stream (ISO/IEC 23090-9), in parallel slices."""
     from ggslam.coding import CodecSettings
-    from ggslam.coding_jobs import encode_file
+    from ggslam.jobs.code.coding import encode_file
 
     _refuse_ignored(context, preset, sweep)
     settings = CodecSettings(
@@ -146,8 +146,8 @@ def _rate(size: int, points: int) -> str:
 
 def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], plots: bool) -> None:
     from ggslam.coding.study import sweep_steps
-    from ggslam.coding_jobs import study_cloud
-    from ggslam.coding_study import write_study
+    from ggslam.jobs.code.coding import study_cloud
+    from ggslam.jobs.code.study import write_study
 
     steps = sweep_steps(kinds)
     cloud = study_cloud(source, settings)

@@ -34,10 +34,10 @@ def evaluate(
     ] = None,
 ) -> None:
     """Score a run against its recording: trajectory, images and objects of keyframes, held-out and all frames."""
-    from ggslam.recordings import open_recording_of
-    from ggslam.report_jobs import write_report
-    from ggslam.run_folder import RunFolder
-    from ggslam.scoring import score_run
+    from ggslam.jobs.report.pages import write_report
+    from ggslam.jobs.score.scoring import score_run
+    from ggslam.runs.folder import RunFolder
+    from ggslam.runs.recordings import open_recording_of
 
     folder = RunFolder.open(run)
     recording = open_recording_of(folder, sequence, masks)

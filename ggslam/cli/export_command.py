@@ -14,7 +14,7 @@ from ggslam.cli.console import console, progress_bar
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.run_folder import RunFolder
+    from ggslam.runs.folder import RunFolder
 
 EPILOG = """
 [bold]Examples[/]
@@ -101,7 +101,7 @@ def export(
     ] = False,
 ) -> None:  # fmt: skip
     """Export a run: Gaussians, single objects, coloured points, a mesh, trajectory, images with poses."""
-    from ggslam.run_folder import RunFolder
+    from ggslam.runs.folder import RunFolder
 
     folder = RunFolder.open(run)
     if objects is not None and kind not in _WITH_OBJECTS:
@@ -127,7 +127,7 @@ def export(
 def _export_gaussians(
     folder: RunFolder, out: Path, kind: ExportFormat, objects: str | None, min_opacity: float, plain: bool
 ) -> str:
-    from ggslam.exporting import export_objects, export_segmented, export_splats
+    from ggslam.jobs.export.map_files import export_objects, export_segmented, export_splats
 
     if kind is ExportFormat.segmented:
         return export_segmented(folder, out, objects, min_opacity, plain)
@@ -140,7 +140,7 @@ def _export_mesh(
     folder: RunFolder, out: Path, voxel: float | None, objects: str | None, rendered: bool, recording: Path | None
 ) -> str:
     from ggslam.cli.observer import ProgressObserver
-    from ggslam.mesh_exports import MeshRequest, export_mesh
+    from ggslam.jobs.export.meshes import MeshRequest, export_mesh
 
     with progress_bar() as bar:
         return export_mesh(folder, out, MeshRequest(voxel, objects, rendered, recording), ProgressObserver(bar))
@@ -149,15 +149,15 @@ def _export_mesh(
 def _export_views(
     folder: RunFolder, out: Path, kind: ExportFormat, voxel: float, keyframes: bool, recording: Path | None
 ) -> str:
-    from ggslam.view_exports import export_colmap, export_nerfstudio
+    from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 
     write = export_colmap if kind is ExportFormat.colmap else export_nerfstudio
     return write(folder, out, voxel, keyframes, recording)
 
 
 def _export_plain(folder: RunFolder, out: Path, kind: ExportFormat, voxel: float, min_opacity: float) -> str:
-    from ggslam.exporting import export_points, export_trajectory
-    from ggslam.splat_exports import export_packed, export_pcd
+    from ggslam.jobs.export.map_files import export_points, export_trajectory
+    from ggslam.jobs.export.splats import export_packed, export_pcd
 
     if kind is ExportFormat.points:
         return export_points(folder, out, voxel, min_opacity)

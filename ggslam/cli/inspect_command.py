@@ -86,7 +86,7 @@ def _print_formats() -> None:
 
 
 def _print_stream(path: Path) -> None:
-    from ggslam.coding_jobs import list_stream
+    from ggslam.jobs.code.coding import list_stream
 
     listing = list_stream(path)
     for unit in listing.units:

@@ -13,7 +13,7 @@ from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 
 if TYPE_CHECKING:
-    from ggslam.localization_report import LocalizationReport
+    from ggslam.jobs.localize.report import LocalizationReport
 
 EPILOG = """
 [bold]Examples[/]
@@ -71,9 +71,9 @@ def localize(
     threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.", min=1, max=1024)] = None,
 ) -> None:  # fmt: skip
     """Locate each frame or scan of a recording in a map, of which only the surroundings are in memory."""
-    from ggslam.localization_jobs import LocalizeRequest
-    from ggslam.localization_jobs import localize as locate_all
-    from ggslam.recordings import SequenceRequest
+    from ggslam.jobs.localize.localizing import LocalizeRequest
+    from ggslam.jobs.localize.localizing import localize as locate_all
+    from ggslam.runs.recordings import SequenceRequest
 
     request = LocalizeRequest(
         map=map_path,

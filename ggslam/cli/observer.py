@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress, TaskID
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
-    from ggslam.slam_result import StepReport
+    from ggslam.slam.result import StepReport
 
 
 _WIDE = 96

@@ -33,8 +33,8 @@ def render(
     ] = None,
 ) -> None:
     """Render a run's map from the poses of its frames."""
-    from ggslam.rendering_jobs import render_frames, select_frames
-    from ggslam.run_folder import RunFolder
+    from ggslam.jobs.render.rendering import render_frames, select_frames
+    from ggslam.runs.folder import RunFolder
 
     folder = RunFolder.open(run)
     numbers = select_frames(folder, frames, every)

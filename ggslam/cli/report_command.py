@@ -30,8 +30,8 @@ def report(
     plots: Annotated[Path | None, typer.Option(help="Folder to write the plots to, as SVG and PNG.")] = None,
 ) -> None:
     """Write RUN/report.html anew, or one page that compares several runs. Pages need no network and no server."""
-    from ggslam.report_jobs import write_comparison, write_report
-    from ggslam.run_folder import RunFolder
+    from ggslam.jobs.report.pages import write_comparison, write_report
+    from ggslam.runs.folder import RunFolder
 
     folders = [RunFolder.open(path) for path in runs]
     if len(folders) == 1:

@@ -17,7 +17,7 @@ from ggslam.cli.summary import print_scores
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
-    from ggslam.pipeline import RunOutcome, RunRequest
+    from ggslam.jobs.run.pipeline import RunOutcome, RunRequest
 
 EPILOG = """
 [bold]Examples[/]
@@ -109,8 +109,8 @@ def run(
     overwrite: Annotated[bool, typer.Option(help="Replace a finished run in the output folder.")] = False,
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
-    from ggslam.pipeline import RunRequest  # imports torch: only when needed
-    from ggslam.recordings import LiveRequest, SequenceRequest
+    from ggslam.jobs.run.pipeline import RunRequest  # imports torch: only when needed
+    from ggslam.runs.recordings import LiveRequest, SequenceRequest
     from ggslam.sequences.live import is_live
 
     shortcuts = {
@@ -138,9 +138,9 @@ def run(
 
 def _run_and_show(request: RunRequest, log: str | None, address: tuple[str, int] | None) -> None:
     """Runs, logged and shown on a page as asked; the page stays until Ctrl-C."""
-    from ggslam.pipeline import execute
-    from ggslam.viewing_jobs import wait_for_interrupt
-    from ggslam.watching import watching
+    from ggslam.jobs.run.pipeline import execute
+    from ggslam.jobs.view.viewing import wait_for_interrupt
+    from ggslam.jobs.watch.watching import watching
 
     with watching(log, address, request.sequence.path.resolve().name) as watchers:
         page = watchers.page

@@ -52,7 +52,7 @@ def synth(
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Depth noise of a Kinect-like sensor.")] = True,
 ) -> None:
     """Generate a recording: textured, furnished rooms with exact poses and instance masks."""
-    from ggslam.sequences.synthetic import SCENES, write_synthetic_sequence
+    from ggslam.synthetic import SCENES, write_synthetic_sequence
 
     frames = SCENES[scene.value].frames if frames is None else frames
     with progress_bar() as bar:

@@ -12,7 +12,7 @@ from ggslam.cli import options
 from ggslam.cli.console import console
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
-    from ggslam.viewed_run import ViewedRun
+    from ggslam.jobs.view.viewed_run import ViewedRun
 
 EPILOG = """
 [bold]Examples[/]
@@ -36,9 +36,9 @@ def view(
     sequence: Annotated[Path | None, typer.Option(help="Where the recording is now, if it was moved.")] = None,
 ) -> None:
     """Look at a run in the browser: map, camera, frames; select, name, move, delete and export objects."""
-    from ggslam.run_folder import RunFolder
+    from ggslam.jobs.view.viewing import serve_run, wait_for_interrupt, write_page
+    from ggslam.runs.folder import RunFolder
     from ggslam.viewer.server import address, close_server
-    from ggslam.viewing_jobs import serve_run, wait_for_interrupt, write_page
 
     folder = RunFolder.open(run)
     if page is not None:

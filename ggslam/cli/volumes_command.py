@@ -14,7 +14,7 @@ from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.volume_jobs import VolumesOutcome
+    from ggslam.jobs.volumes.fusing import VolumesOutcome
     from ggslam.volumes.safety import Braking
 
 EPILOG = """
@@ -95,8 +95,8 @@ def volumes(
     overwrite: Annotated[bool, typer.Option(help="With --live: replace a finished run in the output folder.")] = False,
 ) -> None:  # fmt: skip
     """Maps that planners read: TSDF with mesh, distance field, occupancy; each with a picture."""
-    from ggslam.recordings import SequenceRequest
-    from ggslam.volume_jobs import VolumesRequest, make_volumes
+    from ggslam.jobs.volumes.fusing import VolumesRequest, make_volumes
+    from ggslam.runs.recordings import SequenceRequest
     from ggslam.volumes.safety import Braking, Latencies
 
     wanted_speeds = _numbers("--speeds", speeds)

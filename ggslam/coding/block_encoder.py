@@ -28,7 +28,7 @@ from ggslam.coding.side_by_side import in_order
 from ggslam.coding.slice_encoder import CloudToCode, CodedSlice, encode_slice
 from ggslam.coding.slices import PlaneCuts, Points, slices_wanted
 from ggslam.errors import FormatError
-from ggslam.formats.atomic import atomic_write, write_failure
+from ggslam.system.atomic import atomic_write, write_failure
 
 Block = tuple[np.ndarray, Mapping[str, np.ndarray]]
 """Points [N, 3] and attributes by name, as `encode_cloud` takes them; all blocks of a cloud have the same types."""

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.formats.atomic import make_folder, write_bytes
 from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
+from ggslam.system.atomic import make_folder, write_bytes
 
 Arrays = Mapping[str, np.ndarray]
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.formats.atomic import write_bytes
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, matrix_to_quaternion
+from ggslam.system.atomic import write_bytes
 
 _PINHOLE = 1
 _CAMERA_ID = 1

@@ -13,9 +13,9 @@ from types import ModuleType
 import numpy as np
 
 from ggslam.errors import FormatError, MissingDependency
-from ggslam.formats.atomic import write_bytes
 from ggslam.formats.ply import write_ply
 from ggslam.formats.triangle_mesh import majority_labels
+from ggslam.system.atomic import write_bytes
 
 GLTF_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the map's axes, those of the first camera (y down, z forward), to glTF's (y up, z towards the viewer)."""

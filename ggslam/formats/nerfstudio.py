@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.formats.atomic import write_text
 from ggslam.scene.camera import Camera
+from ggslam.system.atomic import write_text
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MOST_DEPTH = 65.535

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from ggslam.errors import FormatError, MissingDependency, RunFolderError
-from ggslam.formats.atomic import write_bytes
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.atomic import write_bytes
 
 SPZ_REACH = 2048.0
 """Metres: positions in SPZ are 24 bits with 12 behind the point."""

@@ -15,8 +15,8 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats import lzf
-from ggslam.formats.atomic import write_bytes
 from ggslam.formats.text_numbers import fitted, parse_numbers
+from ggslam.system.atomic import write_bytes
 
 _MAXIMUM_HEADER_BYTES = 1 << 16
 _KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")

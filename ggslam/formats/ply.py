@@ -14,9 +14,9 @@ from typing import BinaryIO
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.formats.atomic import atomic_write
 from ggslam.formats.ply_header import FORMATS, PLY_NAMES, Element, Header, read_header
 from ggslam.formats.text_numbers import fitted, parse_numbers
+from ggslam.system.atomic import atomic_write
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def read_ply(path: str | Path) -> PlyFile:
 def write_ply(
     path: str | Path, elements: Mapping[str, np.ndarray], comments: Sequence[str] = (), fsync: bool = False
 ) -> None:
-    """Writes a binary little-endian PLY file, atomically (see `ggslam.formats.atomic.atomic_write`).
+    """Writes a binary little-endian PLY file, atomically (see `ggslam.system.atomic.atomic_write`).
 
     Args:
         path: the file to write.

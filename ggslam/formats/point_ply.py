@@ -16,9 +16,9 @@ from typing import IO
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.formats.atomic import write_failure
 from ggslam.formats.ply import read_ply, write_ply, write_ply_parts
 from ggslam.formats.point_sampling import VoxelCloud, sample_points
+from ggslam.system.atomic import write_failure
 
 __all__ = ["GRID_FILE", "METRIC_FILE", "VoxelCloud", "grid_positions", "read_points", "sample_points",
            "write_grid_points", "write_metric_points", "write_points", "write_points_in_parts"]  # fmt: skip

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ggslam.formats.atomic import atomic_write
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.atomic import atomic_write
 
 SPLAT_ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 """One Gaussian as it is stored."""

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.formats.atomic import write_text
 from ggslam.scene.poses import is_valid_pose, matrix_to_quaternion, orthonormalized, quaternion_to_matrix
+from ggslam.system.atomic import write_text
 
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, metres)\n"
 

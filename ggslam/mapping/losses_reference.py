@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch.nn.functional import conv2d
 
-from ggslam.mapping.losses import KeyframeImages, LossSettings
+from ggslam.mapping.cpu.losses import KeyframeImages, LossSettings
 
 
 def blur(images: torch.Tensor) -> torch.Tensor:

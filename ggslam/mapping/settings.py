@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ggslam.errors import check_ranges
-from ggslam.mapping.losses import LossSettings
+from ggslam.mapping.cpu.losses import LossSettings
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,11 @@ import numpy as np
 import pydantic
 
 from ggslam.errors import ConfigError, FormatError
-from ggslam.formats.atomic import write_text
 from ggslam.objects.boxes import OrientedBox, Vector, middle_of, oriented_box
 from ggslam.objects.colors import id_palette
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.system.atomic import write_text
 
 Supervision = Literal["masks", "associated masks", "geometry", "model"]
 """Where the ids came from: masks whose ids are constant in time; masks made consistent by association; the geometric

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ggslam.errors import MissingDependency
-from ggslam.formats.atomic import write_bytes
+from ggslam.system.atomic import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ggslam.errors import RunFolderError
-from ggslam.formats.atomic import write_bytes
+from ggslam.errors import RenderError, RunFolderError
+from ggslam.rendering.types import RenderBuffers
+from ggslam.system.atomic import write_bytes
 
 FITTED = 20_000
 """Identity vectors that principal components are fitted to, at most about twice as many."""
@@ -153,3 +154,10 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
     if not good:
         raise RunFolderError(f"{path}: cannot be encoded as an image; use .png or .jpg")
     write_bytes(path, data.tobytes())
+
+
+def identity_picture(view: RenderBuffers, colors: IdentityColors) -> np.ndarray:
+    """The rendered identity vectors as colours, uint8 [H, W, 3]."""
+    if view.features is None:
+        raise RenderError("the view was rendered without features")
+    return colors.picture(view.features.numpy(), view.alpha.numpy())

@@ -10,9 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ggslam.formats.atomic import write_text
 from ggslam.reporting.pictures import write_picture
 from ggslam.reporting.plots import Box, Drawing, Plot, Stroke, Word, draw
+from ggslam.system.atomic import write_text
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#6a3d9a", "#444444")
 """Told apart with all common kinds of colour blindness (after Okabe and Ito, made dark enough for lines on white)."""

@@ -10,25 +10,25 @@ from pathlib import Path
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.calibration import use_depth_camera
-from ggslam.sequences.folder import FolderFormat, SyntheticFormat
-from ggslam.sequences.icl_nuim import IclNuimFormat
+from ggslam.sequences.formats.folder import FolderFormat, SyntheticFormat
+from ggslam.sequences.formats.icl_nuim import IclNuimFormat
+from ggslam.sequences.formats.polycam import PolycamFormat
+from ggslam.sequences.formats.realsense import RealSenseFormat
+from ggslam.sequences.formats.record3d import Record3DFormat
+from ggslam.sequences.formats.replica import ReplicaFormat
+from ggslam.sequences.formats.ros_bag import Ros1Format, Ros2Format
+from ggslam.sequences.formats.ros_topics import ROLES
+from ggslam.sequences.formats.scannet import ScanNetFormat
+from ggslam.sequences.formats.scannetpp import ScanNetPlusFormat
+from ggslam.sequences.formats.seven_scenes import SevenScenesFormat
+from ggslam.sequences.formats.stray import StrayFormat
+from ggslam.sequences.formats.transforms_json import TransformsFormat
+from ggslam.sequences.formats.tum import TumFormat
+from ggslam.sequences.formats.vmap import VmapFormat
 from ggslam.sequences.masks import find_masks
-from ggslam.sequences.polycam import PolycamFormat
 from ggslam.sequences.pose_conventions import convert_poses
-from ggslam.sequences.realsense import RealSenseFormat
-from ggslam.sequences.record3d import Record3DFormat
 from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat
-from ggslam.sequences.replica import ReplicaFormat
-from ggslam.sequences.ros_bag import Ros1Format, Ros2Format
-from ggslam.sequences.ros_topics import ROLES
-from ggslam.sequences.scannet import ScanNetFormat
-from ggslam.sequences.scannetpp import ScanNetPlusFormat
 from ggslam.sequences.sequence import OnBadFrame, Sequence
-from ggslam.sequences.seven_scenes import SevenScenesFormat
-from ggslam.sequences.stray import StrayFormat
-from ggslam.sequences.transforms_json import TransformsFormat
-from ggslam.sequences.tum import TumFormat
-from ggslam.sequences.vmap import VmapFormat
 
 FORMATS: tuple[RecordingFormat, ...] = (
     SyntheticFormat(),

@@ -27,10 +27,10 @@ import numpy as np
 import yaml
 
 from ggslam.errors import SequenceError
-from ggslam.formats.atomic import make_folder, write_bytes, write_text
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.sequence import SkippedFrame
+from ggslam.system.atomic import make_folder, write_bytes, write_text
 
 SCHEMES = ("realsense", "python")
 DEPTH_SCALE = 1000.0
@@ -77,7 +77,7 @@ def open_live(place: str | Path, scale: float = 1.0) -> LiveSource:
     """
     scheme, _, rest = str(place).partition(":")
     if scheme == "realsense":
-        from ggslam.sequences.realsense import RealSenseCamera
+        from ggslam.sequences.formats.realsense import RealSenseCamera
 
         return RealSenseCamera(rest, scale)
     if scheme != "python":

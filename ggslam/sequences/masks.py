@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.geometry import Size, same_aspect
 from ggslam.sequences.mask_ids import IdTable, read_id_table
 from ggslam.sequences.mask_images import mask_kind, read_mask_image
+from ggslam.sequences.pixel_grid import Size, same_aspect
 from ggslam.sequences.recording import ImageFile, image_files, last_number
 
 USUAL_FOLDERS = ("semantic_instance", "Annotations", "instance-filt", "instance", "masks", "object_mask")

@@ -18,9 +18,9 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.sequences.geometry import ImageGeometry, image_size
 from ggslam.sequences.images import read_color, read_confidence, read_depth
 from ggslam.sequences.masks import MaskReader
+from ggslam.sequences.pixel_grid import ImageGeometry, image_size
 from ggslam.sequences.recording import FrameFiles, Recording
 from ggslam.sequences.stream import ReadAhead
 

@@ -18,8 +18,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from ggslam.errors import RunFolderError
-from ggslam.formats.atomic import write_failure
 from ggslam.submaps.cell_keys import CellKey
+from ggslam.system.atomic import write_failure
 
 _WAITING_THREADS = 8
 _CELL = re.compile(r"(-?\d+)_(-?\d+)_(-?\d+)")

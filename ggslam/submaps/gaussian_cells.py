@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ggslam.geometry.frustums import Frustums
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_records import CellWrite
-from ggslam.submaps.frustums import Frustums
 from ggslam.submaps.gaussian_rows import Rows, decode_rows, encode_rows, joined, map_like
 from ggslam.submaps.grid import GridStore
 

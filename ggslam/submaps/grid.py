@@ -27,12 +27,12 @@ from types import TracebackType
 import numpy as np
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
-from ggslam.formats.atomic import make_folder, write_failure
 from ggslam.submaps.cell_files import CellFiles, WriterLock, read_current, wait_for_disk
 from ggslam.submaps.cell_keys import CellKey, Grid
 from ggslam.submaps.cell_records import CellChange, CellRecord, CellWrite, PartRecord
 from ggslam.submaps.index import CellIndex
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.atomic import make_folder, write_failure
 
 _INDEX, _LOCK, _CELLS = "index.sqlite", "lock", "cells"
 

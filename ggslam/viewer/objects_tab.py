@@ -14,12 +14,11 @@ from ggslam.errors import ConfigError
 from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix
 from ggslam.viewer.cameras import upright_axes
 from ggslam.viewer.model import EditableMap, ListedObject
+from ggslam.viewer.stage import Stage
 from ggslam.viewer.words import plain
 
 if TYPE_CHECKING:
     import viser
-
-    from ggslam.viewer.page import Page
 
 NOTHING = "(none)"
 _LIST_HEIGHT = 260
@@ -29,9 +28,9 @@ _GIZMO_PIXELS = 110.0
 class ObjectsTab:
     """The list and what can be done to the object that is selected."""
 
-    def __init__(self, page: Page, model: EditableMap) -> None:
-        self._page, self._model = page, model
-        gui: Any = page.server.gui
+    def __init__(self, stage: Stage, model: EditableMap) -> None:
+        self._stage, self._model = stage, model
+        gui: Any = stage.server.gui
         self.selected: int | None = None
         self._records: dict[int, ListedObject] = {}
         self._gizmo: viser.TransformControlsHandle | None = None
@@ -63,8 +62,8 @@ class ObjectsTab:
         self._moving.on_update(alone(lambda event: self._set_gizmo()))
         self._keep.on_click(alone(lambda event: self._moved()))
         self._undo.on_click(alone(lambda event: self._edit(self._model.undo())))
-        self._save.on_click(self._page.guarded(lambda event: self._saved(event.client)))  # may take minutes
-        self._page.server.scene.on_click()(alone(self._clicked))
+        self._save.on_click(self._stage.guarded(lambda event: self._saved(event.client)))  # may take minutes
+        self._stage.server.scene.on_click()(alone(self._clicked))
 
     def _alone(self, action: Callable[[Any], str | None]) -> Callable[[Any], None]:
         """A callback that waits for those of other pages: what is selected and drawn is common to all."""
@@ -73,7 +72,7 @@ class ObjectsTab:
             with self._turn:
                 return action(event)
 
-        return self._page.guarded(in_turn)
+        return self._stage.guarded(in_turn)
 
     # --- selecting ---------------------------------------------------------------------------------------------------
 
@@ -100,12 +99,12 @@ class ObjectsTab:
         self._choice.value = NOTHING if record is None else record.label
         self._name.value = (record.name or "") if record else ""
         for control in (self._act, self._only, self._name, self._rename, self._moving):
-            control.visible = record is not None or (control is self._only and bool(self._page.hidden))
+            control.visible = record is not None or (control is self._only and bool(self._stage.hidden))
         if record is None:
-            self._page.nodes.drop_box()
+            self._stage.nodes.drop_box()
         else:
-            self._page.nodes.set_box(record.center, record.axes, record.size, self._model.up, record.label)
-        self._list.content = object_list(list(self._records.values()), self._page.hidden, self.selected)
+            self._stage.nodes.set_box(record.center, record.axes, record.size, self._model.up, record.label)
+        self._list.content = object_list(list(self._records.values()), self._stage.hidden, self.selected)
 
     def _one(self) -> int:
         if self.selected is None:  # another page was faster
@@ -120,7 +119,7 @@ class ObjectsTab:
         camera = event.client.camera
         focal = camera.image_height / 2 / np.tan(camera.fov / 2)
         origin, direction = np.array(event.ray_origin, float), np.array(event.ray_direction, float)
-        self.select(self._model.object_at(origin, direction, focal, self._page.hidden) or None)
+        self.select(self._model.object_at(origin, direction, focal, self._stage.hidden) or None)
 
     # --- doing -------------------------------------------------------------------------------------------------------
 
@@ -132,7 +131,7 @@ class ObjectsTab:
             name, content = self._model.exported(object_id)
             client.send_file_download(name, content, save_immediately=True)
             return f"{name}: {self._records[object_id].gaussians} Gaussians, {len(content):,} bytes"
-        self._hide(self._page.hidden ^ {object_id})
+        self._hide(self._stage.hidden ^ {object_id})
         return None
 
     def _shown(self) -> None:
@@ -142,20 +141,20 @@ class ObjectsTab:
             self._hide({0, *self._records} - {self.selected})
 
     def _hide(self, hidden: set[int]) -> None:
-        for object_id in hidden ^ self._page.hidden:
-            self._page.nodes.set_visible(object_id, object_id not in hidden)
-        self._page.hidden = hidden
+        for object_id in hidden ^ self._stage.hidden:
+            self._stage.nodes.set_visible(object_id, object_id not in hidden)
+        self._stage.hidden = hidden
         self._mark()
 
     def _edit(self, text: str) -> str:
         """After an edit: everything is drawn anew."""
-        self._page.hidden &= {0, *(record.id for record in self._model.objects())}
-        self._page.draw_map()
+        self._stage.hidden &= {0, *(record.id for record in self._model.objects())}
+        self._stage.draw_map()
         self._motion = np.eye(4)
         self.refresh()
         self._set_gizmo()
-        self._page.describe()
-        self._page.time.redraw()
+        self._stage.describe()
+        self._stage.edited()
         return text
 
     def _saved(self, client: viser.ClientHandle | None) -> str:
@@ -180,7 +179,7 @@ class ObjectsTab:
             return
         record = self._records[self._one()]
         upright = upright_axes(self._model.up)
-        gizmo = self._page.server.scene.add_transform_controls(
+        gizmo = self._stage.server.scene.add_transform_controls(
             "/selected/gizmo", scale=_GIZMO_PIXELS, fixed=True, position=record.centroid,
             wxyz=matrix_to_quaternion(upright),
         )  # fmt: skip
@@ -192,7 +191,7 @@ class ObjectsTab:
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = R, np.array(gizmo.position) - R @ record.centroid
             self._motion = T
-            self._page.nodes.displace(record.id, T)
+            self._stage.nodes.displace(record.id, T)
 
     def _moved(self) -> str | None:
         if self._keep.value == "Put back" or np.allclose(self._motion, np.eye(4)):
@@ -203,7 +202,7 @@ class ObjectsTab:
 
     def _put_back(self) -> None:
         if self.selected is not None and not np.allclose(self._motion, np.eye(4)):
-            self._page.nodes.displace(self.selected, np.eye(4))
+            self._stage.nodes.displace(self.selected, np.eye(4))
         self._motion = np.eye(4)
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from ggslam.viewer.page import Page
+from ggslam.viewer.stage import Stage
 
 FRAMES_PER_SECOND = 8.0
 """When playing."""
@@ -17,33 +16,33 @@ FRAMES_PER_SECOND = 8.0
 class TimeTab:
     """Slider, playing, following with the page's camera, pictures."""
 
-    def __init__(self, page: Page) -> None:
-        self._page = page
-        gui: Any = page.server.gui
-        self._frames = list(page.model.frame_poses)
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        gui: Any = stage.server.gui
+        self._frames = list(stage.model.frame_poses)
         last = max(1, len(self._frames) - 1)
         self.slider = gui.add_slider("Frame", 0, last, 1, 0, hint="Frames of the recording that were located")
         self._play = gui.add_checkbox("Play", False)
         self._follow = gui.add_checkbox("Camera follows", False, hint="Look from where the frame was taken")
         self._text = gui.add_markdown("")
-        picture, _ = page.model.frame_picture(self._frames[0])
+        picture, _ = stage.model.frame_picture(self._frames[0])
         self._image = gui.add_image(picture, format="jpeg", jpeg_quality=85)
         self._wanted = threading.Event()
         self._text.content = f"Frame {self._frames[0]}"
         threading.Thread(target=self._follow_slider, name="viewer-frames", daemon=True).start()
 
         @self.slider.on_update
-        @page.guarded
+        @stage.guarded
         def _moved(event: Any) -> None:
             self._wanted.set()
 
         @self._follow.on_update
-        @page.guarded
+        @stage.guarded
         def _followed(event: Any) -> None:
             self._look()
 
         @self._play.on_update
-        @page.guarded
+        @stage.guarded
         def _played(event: Any) -> None:
             if self._play.value:
                 threading.Thread(target=self._run, name="viewer-play", daemon=True).start()
@@ -58,22 +57,22 @@ class TimeTab:
             self._wanted.wait()
             self._wanted.clear()
             frame = self._frames[min(int(self.slider.value), len(self._frames) - 1)]
-            self._page.frame = frame
-            self._draw(frame, *self._page.model.frame_picture(frame))
+            self._stage.frame = frame
+            self._draw(frame, *self._stage.model.frame_picture(frame))
             self._look()
-            if self._page.coloring == "depth":
-                self._page.draw_map()
+            if self._stage.coloring == "depth":
+                self._stage.draw_map()
 
     def _draw(self, frame: int, picture: Any, recorded: Any) -> None:
         self._text.content = f"Frame {frame}"
         self._image.image = picture
-        page = self._page
-        page.nodes.set_frame(page.model.frame_poses[frame], page.model.camera, 2 * page.depth, recorded)
+        stage = self._stage
+        stage.nodes.set_frame(stage.model.frame_poses[frame], stage.model.camera, 2 * stage.depth, recorded)
 
     def _look(self) -> None:
         if self._follow.value:
-            for client in self._page.server.get_clients().values():
-                self._page.go(client, self._page.frame_view())
+            for client in self._stage.server.get_clients().values():
+                self._stage.go(client, self._stage.frame_view())
 
     def _run(self) -> None:
         while self._play.value:

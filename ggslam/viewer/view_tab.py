@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,9 +12,7 @@ import numpy as np
 from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.viewer.cameras import canvas_camera, shorter_fov
 from ggslam.viewer.model import COLORINGS
-
-if TYPE_CHECKING:
-    from ggslam.viewer.page import Page
+from ggslam.viewer.stage import Stage
 
 PICTURE_SIZE = 1920
 """Pixels of the longer side of a saved picture."""
@@ -24,10 +22,10 @@ _LINES = {"path": "Camera path", "keyframes": "Keyframes", "now": "Current frame
 class ViewTab:
     """Colours, lines, camera presets, saving a picture."""
 
-    def __init__(self, page: Page) -> None:
-        self._page = page
-        gui: Any = page.server.gui
-        names = {COLORINGS[c]: c for c in page.model.colorings}
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        gui: Any = stage.server.gui
+        names = {COLORINGS[c]: c for c in stage.model.colorings}
         coloring = gui.add_dropdown("Colour by", list(names), hint="What the splats are coloured by")
         places = gui.add_button_group("Camera", ["Start", "Frame", "Top"], hint="Where to look from")
         with gui.add_folder("Show"):
@@ -36,38 +34,38 @@ class ViewTab:
         save = gui.add_button("Save picture", icon="camera", hint=f"Rendered by ggslam, {PICTURE_SIZE} pixels wide")
 
         @coloring.on_update
-        @page.guarded
+        @stage.guarded
         def _recolor(event: Any) -> None:
-            page.coloring = names[coloring.value]
-            page.draw_map()
+            stage.coloring = names[coloring.value]
+            stage.draw_map()
 
         @places.on_click
-        @page.guarded
+        @stage.guarded
         def _go(event: Any) -> None:
             seen = event.client.camera
-            views = {"Start": page.start_view, "Frame": page.frame_view,
-                     "Top": lambda: page.top_view(shorter_fov(seen.fov, seen.aspect))}  # fmt: skip
-            page.go(event.client, views[places.value]())
+            views = {"Start": stage.start_view, "Frame": stage.frame_view,
+                     "Top": lambda: stage.top_view(shorter_fov(seen.fov, seen.aspect))}  # fmt: skip
+            stage.go(event.client, views[places.value]())
 
         @save.on_click
-        @page.guarded
+        @stage.guarded
         def _save(event: Any) -> str:
             return self._save(event.client)
 
     def _line_box(self, name: str, label: str) -> None:
-        box = self._page.server.gui.add_checkbox(label, True)
+        box = self._stage.server.gui.add_checkbox(label, True)
 
         @box.on_update
-        @self._page.guarded
+        @self._stage.guarded
         def _show(event: Any) -> None:
-            self._page.nodes.show_lines(name, box.value)
+            self._stage.nodes.show_lines(name, box.value)
 
     def _save(self, client: Any) -> str:
         camera = canvas_camera(client.camera.image_width, client.camera.image_height, client.camera.fov, PICTURE_SIZE)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = quaternion_to_matrix(client.camera.wxyz), client.camera.position
-        picture = self._page.model.picture(camera, T, self._page.hidden)
-        client.send_file_download(f"{self._page.title}.png", png(picture), save_immediately=True)
+        picture = self._stage.model.picture(camera, T, self._stage.hidden)
+        client.send_file_download(f"{self._stage.title}.png", png(picture), save_immediately=True)
         return f"rendered {camera.width}x{camera.height} pixels from here"
 
 

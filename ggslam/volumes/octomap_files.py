@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.formats.atomic import write_bytes
 from ggslam.native.loader import NativeContext
+from ggslam.system.atomic import write_bytes
 from ggslam.volumes import occupancy_native as native
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ggslam.formats.atomic import write_bytes, write_text
+from ggslam.system.atomic import write_bytes, write_text
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.tsdf import SIDE
 

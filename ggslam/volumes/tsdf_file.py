@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import ConfigError, FormatError
-from ggslam.formats.atomic import write_bytes
 from ggslam.native.loader import NativeContext
 from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
+from ggslam.system.atomic import write_bytes
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import VOXELS, TsdfMap
 

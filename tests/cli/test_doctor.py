@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from ggslam import doctor, self_test
 from ggslam.cli.main import app
 from ggslam.errors import NativeCoreError
+from ggslam.jobs.doctor import checkup as doctor
+from ggslam.jobs.doctor import self_test
 from ggslam.native import loader
 
 PROJECT = Path(__file__).parents[2] / "pyproject.toml"

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from ggslam import edited_run
 from ggslam.cli.main import app
 from ggslam.errors import GgslamError, RunFolderError
-from ggslam.run_folder import RunFolder
+from ggslam.jobs.edit import edited_run
+from ggslam.runs.folder import RunFolder
 
 
 def ggslam(*arguments: object) -> Result:

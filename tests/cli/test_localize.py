@@ -15,13 +15,13 @@ from typer.testing import CliRunner, Result
 from ggslam.cli.main import app
 from ggslam.errors import GgslamError
 from ggslam.formats.trajectory import read_tum, write_tum
-from ggslam.map_stores import GAUSSIANS
-from ggslam.run_folder import RunFolder
-from ggslam.sequences.synthetic.world_cloud import cloud_tiles
-from ggslam.sequences.synthetic.world_plan import make_world
-from ggslam.sequences.synthetic.world_scanner import Scanner
-from ggslam.sequences.synthetic.world_walk import walk
+from ggslam.jobs.submaps.stores import GAUSSIANS
+from ggslam.runs.folder import RunFolder
 from ggslam.submaps.grid import GridStore
+from ggslam.synthetic.world_cloud import cloud_tiles
+from ggslam.synthetic.world_plan import make_world
+from ggslam.synthetic.world_scanner import Scanner
+from ggslam.synthetic.world_walk import walk
 
 ORIGIN = "0 0 0 0 0 0 1"
 

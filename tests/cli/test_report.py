@@ -13,14 +13,14 @@ from typer.testing import CliRunner
 
 from ggslam.cli.main import app
 from ggslam.errors import FormatError, RunFolderError
-from ggslam.pipeline import RunRequest, execute
-from ggslam.progress import SilentObserver
-from ggslam.recordings import SequenceRequest, open_recording_of
-from ggslam.report_data import load_run
-from ggslam.report_jobs import write_comparison, write_report
-from ggslam.run_folder import RunFolder
-from ggslam.scoring import score_run
-from ggslam.step_log import COLUMNS, read_table
+from ggslam.jobs.progress import SilentObserver
+from ggslam.jobs.report.data import load_run
+from ggslam.jobs.report.pages import write_comparison, write_report
+from ggslam.jobs.run.pipeline import RunRequest, execute
+from ggslam.jobs.score.scoring import score_run
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import SequenceRequest, open_recording_of
+from ggslam.slam.step_log import COLUMNS, read_table
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "reporting"))
 from test_run_page import checked  # noqa: E402

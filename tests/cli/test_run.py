@@ -22,7 +22,7 @@ from ggslam.cli import main
 from ggslam.cli.run_command import _print
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.trajectory import read_tum
-from ggslam.pipeline import RunOutcome
+from ggslam.jobs.run.pipeline import RunOutcome
 
 
 def ggslam(*arguments: object) -> subprocess.CompletedProcess[str]:

@@ -188,7 +188,7 @@ def test_what_was_there_stays_if_anything_goes_wrong(
 
     few = ["--stop", 3, *QUICK]
     with monkeypatch.context() as patched:
-        patched.setattr("ggslam.volume_outputs.write_octomap", interrupted)
+        patched.setattr("ggslam.jobs.volumes.outputs.write_octomap", interrupted)
         assert ggslam("volumes", room, "--out", out, *few, "--occupancy", 0.1).exit_code == 130
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     update, calls = DistanceField.update, []

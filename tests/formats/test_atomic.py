@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ggslam.errors import RunFolderError
-from ggslam.formats.atomic import atomic_write, write_text
+from ggslam.system.atomic import atomic_write, write_text
 
 
 def test_replaces_the_old_file_and_leaves_nothing_else(tmp_path: Path) -> None:

@@ -13,12 +13,12 @@ import torch
 from identity_picture import COUNT, HEIGHT, WIDTH, MaskedKeyframe, make_map, picture
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.mapping.class_table import FIRST_CLASSES
+from ggslam.mapping.cpu.class_table import FIRST_CLASSES
+from ggslam.mapping.cpu.identity import IdentityLearner
+from ggslam.mapping.cpu.pixel_pool import draw_pool
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.pixel_pool import DevicePixelPool
-from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
-from ggslam.mapping.pixel_pool import draw_pool
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.pixel_terms import PixelTerms

@@ -11,16 +11,16 @@ import torch
 from identity_picture import HEIGHT, WIDTH, picture
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.mapping.class_table import FIRST_CLASSES, ClassTable
+from ggslam.mapping.cpu.class_table import FIRST_CLASSES, ClassTable
+from ggslam.mapping.cpu.identity import by_parts, cross_entropy
+from ggslam.mapping.cpu.neighbours import kl_gradient
+from ggslam.mapping.cpu.pixel_pool import PixelPool, draw_pool
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.pixel_pool import PixelDrawer
 from ggslam.mapping.cuda.votes import merge_votes, vote_labels
-from ggslam.mapping.identity import by_parts, cross_entropy
 from ggslam.mapping.identity_objects import IDS
 from ggslam.mapping.identity_settings import IdentitySettings
-from ggslam.mapping.neighbours import kl_gradient
-from ggslam.mapping.pixel_pool import PixelPool, draw_pool
 from ggslam.scene.gaussian_map import GaussianMap
 
 

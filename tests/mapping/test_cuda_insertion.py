@@ -13,8 +13,8 @@ from scipy.ndimage import distance_transform_edt
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
+from ggslam.mapping.cpu.insertion import NewGaussians, fill_gaussians, new_gaussians, unexplained
 from ggslam.mapping.cuda.insertion import DeviceGaussians, DeviceInsertion
-from ggslam.mapping.insertion import NewGaussians, fill_gaussians, new_gaussians, unexplained
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.scene.camera import Camera

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from ggslam.errors import RenderError
-from ggslam.mapping.exposure import ExposureAdam, identity_exposure
-from ggslam.mapping.losses import ImageLoss, KeyframeImages, LossSettings
+from ggslam.mapping.cpu.exposure import ExposureAdam, identity_exposure
+from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
 from ggslam.mapping.settings import ExposureSettings
 from ggslam.native.loader import NativeContext
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.mapping.class_table import CODE_LENGTH, FIRST_CLASSES, ClassTable
-from ggslam.mapping.cpu_mapper import CpuMapper
-from ggslam.mapping.identity import IdentityLearner, cross_entropy
+from ggslam.mapping.cpu.class_table import CODE_LENGTH, FIRST_CLASSES, ClassTable
+from ggslam.mapping.cpu.identity import IdentityLearner, cross_entropy
+from ggslam.mapping.cpu.mapper import CpuMapper
+from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
+from ggslam.mapping.cpu.pixel_pool import at_boundary, draw_pool
+from ggslam.mapping.cpu.votes import merge_votes, vote_labels
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
 from ggslam.mapping.labelling import KeyframeLabels
 from ggslam.mapping.mapper import Mapper
-from ggslam.mapping.neighbours import NeighbourIndex, kl_gradient
-from ggslam.mapping.pixel_pool import at_boundary, draw_pool
 from ggslam.mapping.settings import MapperSettings
-from ggslam.mapping.votes import merge_votes, vote_labels
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import render_labels

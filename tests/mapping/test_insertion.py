@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ggslam.mapping.insertion import grid_selection, new_gaussians, surface_normals, unexplained
+from ggslam.mapping.cpu.insertion import grid_selection, new_gaussians, surface_normals, unexplained
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import quaternion_to_matrix, se3_exp

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ggslam.errors import ConfigError, RenderError
-from ggslam.mapping.losses import ImageLoss, KeyframeImages, LossResult, LossSettings
+from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossResult, LossSettings
 from ggslam.mapping.losses_reference import reference_loss
 from ggslam.native.loader import NativeContext, available_instruction_sets
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.mapping.cpu_mapper import CpuMapper
-from ggslam.mapping.insertion import fill_gaussians
+from ggslam.mapping.cpu.insertion import fill_gaussians
+from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.keyframe import PoseAdam, make_keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.pruning import prune

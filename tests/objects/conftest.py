@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.mapping.insertion import new_gaussians
+from ggslam.mapping.cpu.insertion import new_gaussians
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap

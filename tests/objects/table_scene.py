@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ggslam.mapping.insertion import new_gaussians, unexplained
+from ggslam.mapping.cpu.insertion import new_gaussians, unexplained
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.objects.hole_views import View
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
@@ -18,9 +18,9 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
 from ggslam.scene.poses import inverse
-from ggslam.sequences.synthetic.palette import Palette
-from ggslam.sequences.synthetic.raycast import RayCaster, RayImages
-from ggslam.sequences.synthetic.scene import Scene, SceneBuilder
+from ggslam.synthetic.palette import Palette
+from ggslam.synthetic.raycast import RayCaster, RayImages
+from ggslam.synthetic.scene import Scene, SceneBuilder
 
 TABLE, WALL, CYLINDER = 1, 2, 3
 CAMERA = Camera(128, 96, 110.0, 110.0, 63.5, 47.5)

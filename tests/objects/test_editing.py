@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.editing_jobs import Edit, apply_edit
 from ggslam.errors import ConfigError
+from ggslam.jobs.edit.editing import Edit, apply_edit
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.editing import (
     duplicate_objects,

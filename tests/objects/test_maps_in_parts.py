@@ -16,17 +16,17 @@ import torch
 from test_segmented_runs import done, refused, votes_for, write_run
 
 from ggslam.errors import FormatError
-from ggslam.exporting import OBJECT_EXTRAS
 from ggslam.formats import gaussian_rows
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_parts, write_gaussian_ply
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_ply import read_points
-from ggslam.map_index import MAP_INDEX, MapInParts, write_map_index
+from ggslam.jobs.export.map_files import OBJECT_EXTRAS
 from ggslam.objects import segmented_map
 from ggslam.objects.segmented_map import ObjectVotes
-from ggslam.objects_in_parts import ObjectsInParts
 from ggslam.reporting.pictures import IdentityColors
-from ggslam.run_folder import RunFolder
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.map_index import MAP_INDEX, MapInParts, write_map_index
+from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
@@ -188,7 +188,7 @@ def test_votes_and_colors_of_parts(pair: tuple[RunFolder, RunFolder], monkeypatc
     folder, _ = pair
     path = folder.path / "votes.npz"
     assert np.array_equal(ObjectVotes.labels_in_file(path), ObjectVotes.from_file(path).labels())
-    monkeypatch.setattr("ggslam.objects_in_parts.FITTED", 300)
+    monkeypatch.setattr("ggslam.runs.objects_in_parts.FITTED", 300)
     monkeypatch.setattr("ggslam.reporting.pictures.FITTED", 300)
     gaussians = folder.gaussians()
     whole = IdentityColors(gaussians.features.numpy()[gaussians.object_id.numpy() > 0])

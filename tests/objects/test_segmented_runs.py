@@ -15,20 +15,20 @@ import torch
 from typer.testing import CliRunner, Result
 
 from ggslam.cli.main import app
-from ggslam.config import Config
 from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
-from ggslam.exporting import object_file_name
 from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.jobs.export.map_files import object_file_name
 from ggslam.mapping.keyframe import make_keyframe
 from ggslam.mapping.mapper import MapperTimes
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
-from ggslam.recordings import SequenceRequest, describe
-from ggslam.run_folder import RunFolder
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import SequenceRequest, describe
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
-from ggslam.slam_result import SlamResult, SlamTimes, TrackedFrame
+from ggslam.slam.config import Config
+from ggslam.slam.result import SlamResult, SlamTimes, TrackedFrame
 
 
 def votes_for(labels: np.ndarray) -> ObjectVotes:
@@ -131,7 +131,7 @@ def test_a_save_that_fails_leaves_a_map_without_objects(run: RunFolder, monkeypa
         raise RunFolderError("cannot write: No space left on device")
 
     segmented = run.segmented_map()
-    monkeypatch.setattr("ggslam.run_folder.write_bytes", full)
+    monkeypatch.setattr("ggslam.runs.folder.write_bytes", full)
     with pytest.raises(RunFolderError, match="No space"):
         run.save_objects(segmented)
     assert not run.has_objects() and len(run.gaussians()) == len(segmented.gaussians)

@@ -19,8 +19,8 @@ from test_fused_adam import make_map
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
+from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
 from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages, DeviceLossResult
-from ggslam.mapping.losses import ImageLoss, KeyframeImages, LossSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.cpu import CpuRasterizer

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from ggslam.errors import ConfigError, MissingDependency
-from ggslam.live_log import MAP_EVERY, LiveLog
+from ggslam.jobs.watch.rerun_follower import MAP_EVERY, LiveLog
 from ggslam.reporting.rerun_log import RerunLog
 from ggslam.scene.camera import Camera
-from ggslam.slam_result import StepReport, TrackedFrame
+from ggslam.slam.result import StepReport, TrackedFrame
 
 CAMERA = Camera(8, 6, 5.0, 5.0, 3.5, 2.5)
 

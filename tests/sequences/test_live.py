@@ -17,8 +17,8 @@ from ggslam.errors import MissingDependency, SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence, recognise_format
+from ggslam.sequences.formats.realsense import _inverted
 from ggslam.sequences.live import LiveSequence, LiveSource, is_live, open_live
-from ggslam.sequences.realsense import _inverted
 
 
 @pytest.fixture

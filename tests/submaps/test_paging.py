@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from ggslam.errors import FormatError, RunFolderError
+from ggslam.geometry.frustums import Frustums
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, se3_exp
-from ggslam.submaps.frustums import Frustums
 from ggslam.submaps.gaussian_cells import PART, GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from ggslam.errors import ConfigError
-from ggslam.tracking.feature_map import FeatureMap, principal_axis
-from ggslam.tracking.feature_settings import FeatureMapSettings
+from ggslam.tracking.edges_planes.settings import FeatureMapSettings
+from ggslam.tracking.edges_planes.voxels import FeatureMap, principal_axis
 
 SETTINGS = FeatureMapSettings(plane_voxel=0.1, edge_voxel=0.2, slots=1 << 14)
 

@@ -14,11 +14,11 @@ from ggslam.formats.raw_points import read_pose_graph, read_raw_points
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.sequences.factory import open_sequence
-from ggslam.tracking.feature_scans import LidarFeatures, split_features
-from ggslam.tracking.feature_settings import LIDAR, FeatureAlignSettings, FeatureTrackerSettings
-from ggslam.tracking.feature_tracker import DeferredPoints, FeatureTracker
+from ggslam.tracking.edges_planes.local_map import FeatureOdometry
+from ggslam.tracking.edges_planes.scans import LidarFeatures, split_features
+from ggslam.tracking.edges_planes.settings import LIDAR, FeatureAlignSettings, FeatureTrackerSettings
+from ggslam.tracking.edges_planes.tracker import DeferredPoints, FeatureTracker
 from ggslam.tracking.gicp import align
-from ggslam.tracking.local_feature_map import FeatureOdometry
 from ggslam.tracking.points import extract_points
 from ggslam.tracking.settings import DepthNoise, PointSettings, TrackerSettings
 from ggslam.tracking.surface import MeasuredSurface

@@ -9,9 +9,9 @@ import torch
 from feature_scenes import CAMERA, lidar_scan, room_view
 
 from ggslam.scene.camera import Camera
-from ggslam.tracking.feature_scans import DepthImageFeatures, LidarFeatures
-from ggslam.tracking.feature_settings import LIDAR, ExtractionSettings
-from ggslam.tracking.features import HALF, LineScanner, ScanLines
+from ggslam.tracking.edges_planes.extraction import HALF, LineScanner, ScanLines
+from ggslam.tracking.edges_planes.scans import DepthImageFeatures, LidarFeatures
+from ggslam.tracking.edges_planes.settings import LIDAR, ExtractionSettings
 from ggslam.tracking.settings import DepthNoise
 
 NOISE = DepthNoise(0.002, 0.0)

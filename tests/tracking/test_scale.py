@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ggslam.config import load_config
 from ggslam.scene.poses import inverse
 from ggslam.sequences import open_sequence
-from ggslam.slam import Slam
+from ggslam.slam.config import load_config
+from ggslam.slam.slam import Slam
 from ggslam.tracking.scale import scaled, scene_scale
 from ggslam.tracking.settings import TrackerSettings
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from ggslam.pipeline import RunRequest, execute
-from ggslam.recordings import SequenceRequest
-from ggslam.run_folder import RunFolder
+from ggslam.jobs.run.pipeline import RunRequest, execute
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import SequenceRequest
 
 
 @pytest.fixture(scope="session")

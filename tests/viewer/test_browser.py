@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from ggslam.formats.gaussian_ply import read_gaussian_ply
-from ggslam.run_folder import RunFolder
-from ggslam.viewed_run import ViewedRun
+from ggslam.jobs.view.viewed_run import ViewedRun
+from ggslam.jobs.view.viewing import serve_run, show_run, write_page
+from ggslam.runs.folder import RunFolder
 from ggslam.viewer.model import ListedObject
 from ggslam.viewer.server import address, close_server
-from ggslam.viewing_jobs import serve_run, show_run, write_page
 
 from . import browser as b
 

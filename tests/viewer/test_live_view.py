@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from ggslam.live_viewing import LiveView
+from ggslam.jobs.view.live import LiveView
 from ggslam.sequences import open_sequence
-from ggslam.slam import Slam
+from ggslam.slam.slam import Slam
 from ggslam.viewer.server import close_server, open_server
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from ggslam.errors import ConfigError, MissingDependency
-from ggslam.run_folder import RunFolder
-from ggslam.viewed_run import ViewedRun
+from ggslam.jobs.view.viewed_run import ViewedRun
+from ggslam.runs.folder import RunFolder
 from ggslam.viewer.objects_tab import object_list
 from ggslam.viewer.page import Page
 from ggslam.viewer.server import address, close_server, open_server

@@ -10,7 +10,7 @@ import numpy as np
 from typer.testing import CliRunner
 
 from ggslam.cli.main import app
-from ggslam.run_folder import RunFolder
+from ggslam.runs.folder import RunFolder
 from ggslam.viewer.static_page import SCALES, STATIC, pack_splats
 
 from .test_splats import some

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ggslam.editing_jobs import Edit, edit_run
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.jobs.edit.editing import Edit, edit_run
+from ggslam.jobs.view.viewed_run import ViewedRun
+from ggslam.jobs.view.viewing import serve_run, write_page
 from ggslam.objects.editing import remove_objects
 from ggslam.objects.segmented_rows import keep_rows
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import vote_label_image
-from ggslam.run_folder import RunFolder
+from ggslam.runs.folder import RunFolder
 from ggslam.scene.poses import inverse, quaternion_to_matrix
-from ggslam.viewed_run import ViewedRun
 from ggslam.viewer.server import close_server
-from ggslam.viewing_jobs import serve_run, write_page
 
 
 @pytest.fixture

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The classifier while it is trained on an NVIDIA GPU: `ggslam.mapping.class_table` with its rows on the device.
+"""The classifier while it is trained on an NVIDIA GPU: `ggslam.mapping.cpu.class_table` with its rows on the device.
 
 Which id has which class is known on the host as well: ids appear and go with keyframes, not with steps.
 """
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ggslam.cuda.streams import let_go
-from ggslam.mapping.class_table import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
+from ggslam.mapping.cpu.class_table import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.identity_objects import IDS
 from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier

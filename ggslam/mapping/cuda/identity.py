@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identity learning on an NVIDIA GPU: `ggslam.mapping.identity` with map, masks, samples, classifier and votes on the
-device.
+"""Identity learning on an NVIDIA GPU: `ggslam.mapping.cpu.identity` with map, masks, samples, classifier and votes on
+a device.
 
 A step is only started, on torch's current stream: nothing in it waits for the device. What comes with keyframes (new
 ids, merges, splits, removals) and the results may wait. Otherwise than on the CPU the softmax always runs over all

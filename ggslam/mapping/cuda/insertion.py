@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""New Gaussians for a keyframe on an NVIDIA GPU: what `ggslam.mapping.insertion` does, by kernels.
+"""New Gaussians for a keyframe on an NVIDIA GPU: what `ggslam.mapping.cpu.insertion` does, by kernels.
 
 The same Gaussians in the same order, to rounding, with two differences where holes are filled. The nearest pixel with
 depth is found exactly, where the CPU takes the nearest by an approximate distance; among equally near ones either may

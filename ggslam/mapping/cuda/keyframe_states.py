@@ -17,7 +17,7 @@ import torch
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.streams import let_go
 from ggslam.errors import RenderError
-from ggslam.mapping.losses import LossValues
+from ggslam.mapping.cpu.losses import LossValues
 from ggslam.mapping.settings import ExposureSettings
 
 _RESULTS = torch.Size([len(LossValues.__dataclass_fields__) + 6])

@@ -16,7 +16,7 @@ import torch
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
-from ggslam.mapping.losses import LossSettings, LossValues, RenderedImages
+from ggslam.mapping.cpu.losses import LossSettings, LossValues, RenderedImages
 
 _VALUES = len(fields(LossValues))
 _POINTERS = ("image", "depth", "alpha", "target_color", "target_depth", "exposure", "d_image", "d_depth", "d_alpha",

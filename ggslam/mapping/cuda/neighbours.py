@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nearest neighbours on an NVIDIA GPU for the identity loss, by comparing with all points: unlike the tree of
-`ggslam.mapping.neighbours` there is nothing to build or to go stale."""
+`ggslam.mapping.cpu.neighbours` there is nothing to build or to go stale."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pixels of a keyframe's mask identity learning looks at: `ggslam.mapping.pixel_pool` on an NVIDIA GPU, by
+"""Which pixels of a keyframe's mask identity learning looks at: `ggslam.mapping.cpu.pixel_pool` on an NVIDIA GPU, by
 kernels that are only started here."""
 
 from __future__ import annotations

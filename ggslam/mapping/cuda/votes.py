@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ggslam.mapping.votes` on the map's device. Nothing waits for it."""
+"""`ggslam.mapping.cpu.votes` on the map's device. Nothing waits for it."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@
 
 namespace ggslam {
 
-// One evaluation. ggslam/mapping/losses.py mirrors this struct field by field. H = height, W = width.
+// One evaluation. ggslam/mapping/cpu/losses.py mirrors this struct field by field. H = height, W = width.
 struct ImageLossJob {
   // Rendered: colour [3, H, W] planar, accumulated depth [H, W] in metres, alpha [H, W].
   const float* image;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Softmax losses of identity learning and their gradients, as in ggslam/mapping/identity.py and neighbours.py. Products
+// Softmax losses of identity learning and their gradients, as in ggslam/mapping/cpu/identity.py and neighbours.py. Products
 // with the classifier's matrix are left to the caller: what is here turns logits into gradients, a warp for each row.
 #pragma once
 #include "common/platform.cuh"

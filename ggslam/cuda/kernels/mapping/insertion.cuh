@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The arguments of inserting Gaussians from a keyframe, and the memory that it works in. What is inserted where is
-// stated in ggslam/mapping/insertion.py.
+// stated in ggslam/mapping/cpu/insertion.py.
 #pragma once
 #include "common/carver.cuh"
 #include "common/sorting.cuh"

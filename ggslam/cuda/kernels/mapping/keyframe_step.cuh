@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What is optimised of a keyframe besides the map, its pose and its exposure, and one step of Adam (Kingma and Ba 2015)
-// on them. The arithmetic is that of PoseAdam (ggslam/mapping/keyframe.py), ExposureAdam (ggslam/mapping/exposure.py) and
+// on them. The arithmetic is that of PoseAdam (ggslam/mapping/keyframe.py), ExposureAdam (ggslam/mapping/cpu/exposure.py) and
 // se3_exp (ggslam/scene/poses.py). ggslam/mapping/cuda/keyframe_states.py mirrors the structures field by field.
 #pragma once
 #include "common/platform.cuh"

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which pixels of a keyframe's mask identity learning looks at: ggslam/mapping/pixel_pool.py on the device.
+// Which pixels of a keyframe's mask identity learning looks at: ggslam/mapping/cpu/pixel_pool.py on the device.
 //
 // There, a share of the pixels is drawn at the boundaries of objects, the rest anywhere, in both cases first an object,
 // then a pixel of it. Drawn one by one, that is one distribution over the pixels. Here it is written down as whole

@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files and runs to G-PCC streams and back: what `ggslam encode`, `decode` and `inspect` do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.coding import (
+    AttributeSettings,
+    CodecSettings,
+    CodingReport,
+    PointCloud,
+    decode_box,
+    decode_cloud,
+    decode_slice,
+    encode_cloud,
+)
+from ggslam.coding.block_encoder import encode_blocks
+from ggslam.coding.decoder import CloudInParts, decode_in_parts
+from ggslam.coding.listing import StreamListing, list_units
+from ggslam.coding.splats import gaussians_of, is_splat_cloud, splat_attributes, splat_settings
+from ggslam.coding.study import GridCloud, on_grid
+from ggslam.errors import ConfigError, FormatError
+from ggslam.formats.gaussian_ply import write_gaussian_parts
+from ggslam.formats.gaussian_rows import GaussianRows
+from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_point_cloud
+from ggslam.runs.folder import RunFolder
+from ggslam.system.atomic import make_folder, write_bytes
+
+PRESETS = ("pointcloud", "splat")
+Box = tuple[Sequence[float], Sequence[float]]
+"""Lowest and highest corner, metres."""
+_MOST_IDS = 1 << 16
+_SAMPLED = 1 << 18
+"""Gaussians that tell where most of them lie."""
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A written stream: what became of the cloud, and what the reader should know."""
+
+    path: Path
+    report: CodingReport
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """A written cloud or map."""
+
+    path: Path
+    count: int
+    what: str
+
+
+def encode_file(
+    source: Path, out: Path, settings: CodecSettings, preset: str = "pointcloud", rate: str = "r03"
+) -> Encoded:
+    """Codes a cloud or a Gaussian map.
+
+    Args:
+        source: a PLY or PCD file, or a run folder: its points.ply (pointcloud) or map.ply (splat).
+        out: the stream to write.
+        settings: every choice of the codec; the preset adds what is coded and how.
+        preset: "pointcloud": positions and colours, labels lossless; "splat": whole Gaussians of a 3DGS PLY.
+        rate: of the splat preset, r01 to r04.
+
+    Raises:
+        FormatError: the input is damaged or has nothing to code.
+        ConfigError: impossible settings.
+        RunFolderError: the output cannot be written, or the folder is not a run.
+    """
+    notes: list[str] = []
+    path = _input_file(source, preset)
+    _refuse_itself(path, out)
+    try:
+        if preset == "splat":
+            report = _encode_splats(path, out, settings, rate, notes)
+        else:
+            report = _encode_points(path, out, settings, notes)
+    except (ConfigError, FormatError) as error:
+        raise (error if str(path) in str(error) else type(error)(f"{path}: {error}")) from None
+    return Encoded(out, report, notes)
+
+
+def _encode_points(path: Path, out: Path, settings: CodecSettings, notes: list[str]) -> CodingReport:
+    cloud = read_point_cloud(path)
+    points, settings, metadata = coded_points(cloud, settings)
+    attributes, labels = _coded_attributes(cloud, notes)
+    own = {name: AttributeSettings(lossless=True) for name in labels}
+    metadata |= {"preset": "pointcloud"} | ({"label_offsets": labels} if any(labels.values()) else {})
+    settings = replace(settings, attributes={**settings.attributes, **own}, metadata=metadata)
+    encoded = encode_cloud(points, attributes, settings)
+    make_folder(out.parent)
+    write_bytes(out, encoded.data)
+    return encoded.report
+
+
+def _encode_splats(path: Path, out: Path, settings: CodecSettings, rate: str, notes: list[str]) -> CodingReport:
+    """Codes a 3DGS PLY that need not fit into memory."""
+    rows = GaussianRows(path)
+    if not len(rows):
+        raise FormatError(f"{path}: no Gaussians")
+    step, with_ids, sample = max(1, len(rows) // _SAMPLED), False, []
+    for block in rows.blocks():
+        sample.append(block.means.numpy()[::step].astype(np.float64))
+        with_ids = with_ids or bool(block.object_id.any())
+    settings = splat_settings(settings, rate, splat_attributes(rows.like, with_ids))
+    outliers = _Outliers(np.concatenate(sample))
+
+    def blocks() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        for block in rows.blocks():
+            points = block.means.numpy().astype(np.float64)
+            outliers.add(points)
+            yield points, splat_attributes(block, with_ids)
+
+    make_folder(out.parent)
+    report = encode_blocks(blocks(), settings, out)
+    notes += outliers.notes()
+    return report
+
+
+def study_cloud(source: Path, settings: CodecSettings) -> GridCloud:
+    """The cloud of a file or run on its grid, for sweeps.
+
+    Raises:
+        FormatError: the input is damaged or has no colours.
+    """
+    path = _input_file(source, "pointcloud")
+    cloud = read_point_cloud(path)
+    if cloud.colors is None:
+        raise FormatError(f"{path}: no colours, which a sweep needs")
+    if cloud.voxel_size is not None:  # in metres, as the pictures and tables are
+        settings = replace(settings, voxel_size=settings.voxel_size or cloud.voxel_size)
+        return on_grid(cloud.points, cloud.colors, settings)
+    points, settings, _ = coded_points(cloud, settings)
+    return on_grid(points, cloud.colors, settings)
+
+
+def decode_file(
+    source: Path, out: Path, slice_id: int | None = None, box: Box | None = None, workers: int | None = None
+) -> Decoded:
+    """Decodes a stream, or one slice or box of it, into a PLY (or PCD) file; a stream of Gaussians into a 3DGS PLY.
+
+    Raises:
+        FormatError: the stream is damaged, uses a tool that is not supported, has no such slice, or no point in the
+            box.
+        ConfigError: both a slice and a box are asked for.
+        RunFolderError: the output cannot be written.
+    """
+    if slice_id is not None and box is not None:
+        raise ConfigError("choose a slice or a box, not both")
+    if out.suffix.lower() not in (".ply", ".pcd"):
+        raise ConfigError(f"{out}: expected a name that ends in .ply or .pcd")
+    _refuse_itself(source, out)
+    data = read_bytes(source)
+    try:
+        if slice_id is None and box is None and (splats := _splats_in_parts(data, workers)) is not None:
+            return _write_splats(splats, out)
+        cloud = _decoded(data, slice_id, box, workers)
+        if is_splat_cloud(cloud):
+            if not len(cloud):
+                raise FormatError("no Gaussians in the box")
+            return _write_splats(CloudInParts(len(cloud), cloud, iter([cloud])), out)
+        if not len(cloud):
+            raise FormatError("no points in the box")
+        labels = _labels_restored(cloud)
+    except FormatError as error:
+        raise FormatError(f"{source}: {error}") from None
+    make_folder(out.parent)
+    points, comments = _placed(cloud)
+    write_point_cloud(out, points, labels, comments if out.suffix.lower() != ".pcd" else ())
+    return Decoded(out, len(cloud), "points")
+
+
+def _splats_in_parts(data: bytes, workers: int | None) -> CloudInParts | None:
+    """The Gaussians of a stream; None if it is one of points."""
+    cloud = decode_in_parts(data, workers)
+    return cloud if is_splat_cloud(cloud.like) else None
+
+
+def _write_splats(cloud: CloudInParts, out: Path) -> Decoded:
+    """Writes Gaussians as they are decoded."""
+    like = gaussians_of(cloud.like)
+    if out.suffix.lower() != ".ply":
+        raise ConfigError(f"{out}: Gaussians are written as .ply")
+    make_folder(out.parent)
+    extra = ("object_id",) if "object_id" in cloud.like.attributes else ()
+    write_gaussian_parts(out, cloud.count, map(gaussians_of, cloud.parts), like, extra)
+    return Decoded(out, cloud.count, "Gaussians")
+
+
+def list_stream(path: Path) -> StreamListing:
+    """All units of a stream file.
+
+    Raises:
+        FormatError: the file cannot be read or is no G-PCC stream at all.
+    """
+    listing = list_units(read_bytes(path))
+    if not listing.units:
+        raise FormatError(f"{path}: not a G-PCC stream: {listing.problems[0] if listing.problems else 'it is empty'}")
+    return listing
+
+
+def read_bytes(path: Path) -> bytes:
+    """A whole file; FormatError if it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def _input_file(source: Path, preset: str) -> Path:
+    if preset not in PRESETS:
+        raise ConfigError(f"preset: expected one of {', '.join(PRESETS)}, found '{preset}'")
+    if not source.is_dir():
+        return source
+    return RunFolder.open(source).path / ("map.ply" if preset == "splat" else "points.ply")
+
+
+def coded_points(cloud: ColoredCloud, settings: CodecSettings) -> tuple[np.ndarray, CodecSettings, dict[str, Any]]:
+    """Positions as the encoder shall see them, the settings that fit them, and what the decoder needs to know to place
+    them.
+
+    Clouds on a grid are coded as whole voxels, so that lossless geometry gives back exactly their points: those that
+    ggslam voxelised (the grid's place goes into the metadata), and those whose coordinates are whole numbers, as of
+    the usual test clouds. Others are metres; the settings choose their voxels. So do they where they name a voxel size.
+    """
+    if settings.box is None and settings.voxel_size in (None, cloud.voxel_size):
+        if cloud.grid is not None and cloud.voxel_size is not None and cloud.origin is not None:
+            place = {"grid": {"voxel_size": cloud.voxel_size, "origin": cloud.origin.tolist()}}
+            return cloud.grid, replace(settings, voxel_size=None), place
+        small = settings.voxel_size is None and np.abs(cloud.points).max() < 1 << 30
+        if small and (cloud.points == np.rint(cloud.points)).all():
+            return cloud.points.astype(np.int32), settings, {}
+    return cloud.points, settings, {}
+
+
+def _coded_attributes(cloud: ColoredCloud, notes: list[str]) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Attributes by name, and of each label the number to add to what is coded."""
+    attributes: dict[str, np.ndarray] = {}
+    offsets: dict[str, int] = {}
+    if cloud.colors is None:
+        notes.append("the cloud has no colours")
+    else:
+        attributes["color"] = cloud.colors
+    for name, values in cloud.labels.items():
+        low, high = int(values.min()), int(values.max())
+        offset = 0 if low >= 0 and high < _MOST_IDS else low
+        if high - offset >= _MOST_IDS:
+            notes.append(f"left out '{name}': it reaches from {low} to {high}, more than 16 bits")
+            continue
+        offsets[name] = offset
+        attributes[name] = (values.astype(np.int64) - offset).astype(np.uint16)
+    if cloud.left_out:
+        names = cloud.left_out if len(cloud.left_out) < 6 else (*cloud.left_out[:4], "...", cloud.left_out[-1])
+        notes.append(f"left out {', '.join(names)}: neither position nor colour nor whole numbers")
+        if {"opacity", "scale_0", "rot_0"} <= set(cloud.left_out):
+            notes.append("these are Gaussians: --preset splat codes them whole")
+    if cloud.nowhere:
+        notes.append(f"left out {cloud.nowhere} points that have no position (not a number)")
+    return attributes, offsets
+
+
+def _decoded(data: bytes, slice_id: int | None, box: Box | None, workers: int | None) -> PointCloud:
+    if slice_id is not None:
+        return decode_slice(data, slice_id)
+    if box is None:
+        return decode_cloud(data, workers)
+    return decode_box(data, *box)
+
+
+def _placed(cloud: PointCloud) -> tuple[np.ndarray, list[str]]:
+    """Positions to write, and the header comments of a cloud that is on its grid still."""
+    quantization, grid = cloud.quantization, cloud.world_grid
+    if grid is None:
+        if not quantization.metres and quantization.scale == 1 and quantization.centre == 0:
+            return np.rint(cloud.points).astype(np.int32), []
+        return _narrowed(cloud.points, 1 / quantization.scale), []
+    voxel_size, origin, comments = grid.voxel_size, grid.origin, []
+    if quantization.scale == 1:
+        place = " ".join(repr(float(value)) for value in origin)
+        comments = ["x y z are metres", f"voxel_size {voxel_size!r}", f"origin {place}"]
+    return _narrowed(cloud.points, voxel_size / quantization.scale), comments
+
+
+def _narrowed(points: np.ndarray, voxel_size: float) -> np.ndarray:
+    """float32 unless that moves a point by more than a hundredth of a voxel."""
+    narrow = points.astype(np.float32)
+    return narrow if np.abs(points - narrow).max(initial=0) < 0.01 * voxel_size else points
+
+
+def _refuse_itself(source: Path, out: Path) -> None:
+    if source.exists() and out.exists() and out.samefile(source):
+        raise ConfigError(f"{out}: is the input itself")
+
+
+class _Outliers:
+    """Counts Gaussians far outside the others.
+
+    Args:
+        sample: of their means, float64 [N, 3].
+    """
+
+    def __init__(self, sample: np.ndarray) -> None:
+        low, high = np.quantile(sample, [0.001, 0.999], axis=0)
+        self._bulk = float((high - low).max())
+        self._low, self._high = low - 10 * self._bulk, high + 10 * self._bulk
+        self._far = 0
+
+    def add(self, points: np.ndarray) -> None:
+        """Means float64 [M, 3]."""
+        self._far += int(((points < self._low) | (points > self._high)).any(1).sum())
+
+    def notes(self) -> list[str]:
+        """A note if a few Gaussians cost the others their precision."""
+        if not self._far or self._bulk == 0:
+            return []
+        return [f"{self._far} Gaussians lie far outside the others; the grid spans them too and is coarser for it"]
+
+
+def _labels_restored(cloud: PointCloud) -> dict[str, np.ndarray]:
+    """The attributes to write: labels as int32 with their offsets."""
+    offsets = cloud.metadata.get("label_offsets")
+    out: dict[str, np.ndarray] = {}
+    for name, values in cloud.attributes.items():
+        offset = offsets.get(name) if isinstance(offsets, dict) else None
+        if name == "color" and values.ndim == 2 and values.dtype == np.uint8:
+            out[name] = values
+        else:
+            if offset is not None and (not isinstance(offset, int) or abs(offset) >= 1 << 40):
+                raise FormatError(f"the metadata's offset of '{name}' is damaged")
+            out[name] = values.astype(np.int64) + (offset or 0)
+    return out

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sweep over the codec's quantisers as files: tables, plots and pictures of the decoded cloud.
+
+    study.csv, study.json        one row per step: settings, sizes, rates, PSNR, D1, D2, times, energy
+    rate_distortion_*.png, .svg  quality over bits per point;  time_*.png, .svg: seconds over the quantiser
+    cloud_*.png                  the decoded cloud at each step, seen from one place;  clouds_*.png: all on one sheet
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.coding.cloud import PointCloud
+from ggslam.coding.energy import EnergyMeter
+from ggslam.coding.settings import CodecSettings
+from ggslam.coding.study import GridCloud, StudyRow, SweepStep, run_sweep
+from ggslam.reporting.cloud_pictures import View, contact_sheet, draw_cloud, view_of
+from ggslam.reporting.curves import Curve, Panel, draw_panels, require_plotting
+from ggslam.reporting.pictures import write_picture
+from ggslam.runs.folder import json_ready
+from ggslam.system.atomic import make_folder, write_text
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a sweep gave: its rows, the files written, and what the reader should know."""
+
+    rows: list[StudyRow]
+    files: list[Path]
+    notes: list[str]
+
+
+def write_study(
+    cloud: GridCloud,
+    steps: Sequence[SweepStep],
+    settings: CodecSettings,
+    folder: Path,
+    plots: bool = True,
+    progress: Callable[[StudyRow], None] | None = None,
+) -> Study:
+    """Runs the sweep and writes its files into `folder` (made if it is not there).
+
+    Args:
+        cloud: from `on_grid`.
+        steps: from `sweep_steps`.
+        settings: slices, workers and tools.
+        folder: where to.
+        plots: whether to draw the plots, which needs matplotlib.
+        progress: is given each row when it is there.
+
+    Raises:
+        MissingDependency: plots are wanted and matplotlib is not installed; before anything is coded.
+        RunFolderError: a file cannot be written.
+    """
+    if plots:
+        require_plotting()
+    meter = EnergyMeter()
+    pictures = _Pictures(cloud, folder)
+    rows = []
+    for row, decoded in run_sweep(cloud, steps, settings, meter):
+        rows.append(row)
+        make_folder(folder)  # now that there is something for it
+        pictures.draw(row, decoded)
+        if progress is not None:
+            progress(row)
+    files = [*write_tables(folder, cloud, settings, rows, meter.note), *pictures.sheets()]
+    if plots:
+        files += _draw_plots(folder, rows)
+    return Study(rows, files, [meter.note] if meter.note else [])
+
+
+def write_tables(
+    folder: Path, cloud: GridCloud, settings: CodecSettings, rows: Sequence[StudyRow], note: str
+) -> list[Path]:
+    """Writes study.csv and study.json; in the latter, and empty in the former, what is infinite or unknown is null."""
+    table = [row.values() for row in rows]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(table[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    write_text(folder / "study.csv", text.getvalue())
+    about = {
+        "points": len(cloud.grid), "peak": cloud.peak, "voxels_per_unit": cloud.quantization.scale,
+        "workers": settings.workers, "slices": settings.slices, "split": settings.split, "note": note or None,
+    }  # fmt: skip
+    write_text(folder / "study.json", json.dumps(json_ready({**about, "rows": table}), indent=1) + "\n")
+    return [folder / "study.csv", folder / "study.json"]
+
+
+def step_name(step: SweepStep) -> str:
+    """`qp_22` or `scale_0.5`."""
+    return f"qp_{step.qp:02d}" if step.sweep == "qp" else f"scale_{step.geometry_scale:.4g}"
+
+
+class _Pictures:
+    """Draws decoded clouds, all from one place, and collects them by sweep."""
+
+    def __init__(self, cloud: GridCloud, folder: Path) -> None:
+        self._folder, self._cloud = folder, cloud
+        points = self._placed(cloud.grid)
+        self._view: View = view_of(points)
+        original = draw_cloud(points, cloud.colors, self._view, 1 / cloud.quantization.scale)
+        self._original = (original, f"original, {len(cloud.grid)} points")
+        self._drawn: dict[str, list[tuple[np.ndarray, str]]] = {}
+
+    def _placed(self, voxels: np.ndarray) -> np.ndarray:
+        return self._cloud.quantization.restore(voxels)
+
+    def draw(self, row: StudyRow, decoded: PointCloud) -> None:
+        """Draws and writes one picture."""
+        step = row.step
+        size = 1 / (self._cloud.quantization.scale * step.geometry_scale)
+        picture = draw_cloud(self._placed(decoded.points), decoded.attributes["color"], self._view, size)
+        write_picture(self._folder / f"cloud_{step_name(step)}.png", picture)
+        setting = f"QP {step.qp}" if step.sweep == "qp" else f"scale {step.geometry_scale:g}"
+        quality = f"Y {row.color.y:.1f} dB" if step.sweep == "qp" else f"D1 {row.d1:.1f} dB"
+        caption = f"{setting}: {8 * row.total_bytes / row.input_points:.2f} bits a point, {quality}"
+        self._drawn.setdefault(step.sweep, [self._original]).append((picture, caption))
+
+    def sheets(self) -> list[Path]:
+        """Writes the contact sheets."""
+        written = []
+        for sweep, drawn in self._drawn.items():
+            pictures, captions = zip(*drawn, strict=True)
+            written.append(self._folder / f"clouds_{sweep}.png")
+            write_picture(written[-1], contact_sheet(pictures, captions))
+        return written
+
+
+def _draw_plots(folder: Path, rows: Sequence[StudyRow]) -> list[Path]:
+    written = []
+    for sweep in ("qp", "geometry"):
+        table = [row.values() for row in rows if row.step.sweep == sweep]
+        if table:
+            written += draw_panels(folder / f"rate_distortion_{sweep}", _rate_panels(table, sweep))
+            written += draw_panels(folder / f"time_{sweep}", [_time_panel(table, sweep)])
+    return written
+
+
+def _rate_panels(table: list[dict[str, Any]], sweep: str) -> list[Panel]:
+    groups = [("colour, Y U V", ["psnr_y", "psnr_u", "psnr_v"]), ("colour, R G B", ["psnr_r", "psnr_g", "psnr_b"])]
+    if sweep == "geometry":
+        groups = [("geometry", ["d1", "d2"]), *groups]
+    rate = "geometry_bpp" if sweep == "geometry" else "color_bpp"
+    panels = []
+    for title, names in groups:
+        used = rate if title == "geometry" or sweep == "qp" else "total_bpp"
+        x = [row[used] for row in table]
+        curves = [Curve(name.removeprefix("psnr_").upper(), x, [row[name] for row in table]) for name in names]
+        panels.append(Panel(title, f"bits per point ({used.removesuffix('_bpp')})", "PSNR, dB", curves))
+    return panels
+
+
+def _time_panel(table: list[dict[str, Any]], sweep: str) -> Panel:
+    key, label = ("qp", "QP") if sweep == "qp" else ("geometry_scale", "geometry scale")
+    x = [row[key] for row in table]
+    curves = [Curve(name, x, [row[f"{name}_s"] for row in table]) for name in ("encode", "decode")]
+    return Panel("time", label, "seconds", curves, from_zero=True)

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two runs side by side, or a run against a cloud or mesh: what `ggslam compare` prints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ggslam.errors import ConfigError, FormatError, RunFolderError
+from ggslam.evaluation.geometry import (
+    THRESHOLDS_M,
+    Cloud,
+    CloudScores,
+    Overlap,
+    Registration,
+    overlap,
+    register,
+    score_cloud,
+)
+from ggslam.evaluation.trajectory import FEWEST_POSES, TrajectoryScores, align_points, associate, score_trajectory
+from ggslam.formats.point_cloud import read_point_cloud
+from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.trajectory import Trajectory
+from ggslam.formats.triangle_mesh import read_mesh
+from ggslam.runs.folder import RunFolder, json_ready
+from ggslam.scene.poses import inverse
+
+Alignment = Literal["none", "icp", "trajectory"]
+MESH_SPACING = 0.01
+"""Metres: a mesh is sampled with one point per square of this side..."""
+MOST_SAMPLES = 2_000_000
+"""...but with no more points than this."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """One of the two things compared.
+
+    Attributes:
+        path: a run's folder or a file.
+        points: float64 [N, 3] metres. Of a run: its map sampled on a grid of 1 cm (points.ply).
+        trajectory: of a run.
+        metrics: of a run that was scored.
+    """
+
+    path: Path
+    points: np.ndarray
+    trajectory: Trajectory | None = None
+    metrics: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What was found.
+
+    Attributes:
+        a, b: the two sides.
+        align: how A was brought into the frame of B.
+        T_b_a: float64 [4, 4], what that moved A by.
+        trajectory: the poses of A against those of B at the same times; None unless both are runs with common times.
+        common_poses: their number.
+        a_on_b, b_on_a: overlap of the clouds as aligned.
+        icp: registration of the aligned A upon B; None if too little of it lies near B to begin with.
+        b_on_a_after_icp: the overlap the other way after that.
+        scores: of A with B as the reference, as aligned.
+    """
+
+    a: Side
+    b: Side
+    align: Alignment
+    T_b_a: np.ndarray
+    trajectory: TrajectoryScores | None
+    common_poses: int
+    a_on_b: Overlap
+    b_on_a: Overlap
+    icp: Registration | None
+    b_on_a_after_icp: Overlap | None
+    scores: CloudScores
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        sides = {
+            name: {"path": str(side.path), "points": len(side.points), "metrics": side.metrics}
+            for name, side in (("a", self.a), ("b", self.b))
+        }
+        icp = None
+        if self.icp is not None and self.b_on_a_after_icp is not None:
+            icp = {**asdict(self.icp), "a_on_b": asdict(self.icp.overlap), "b_on_a": asdict(self.b_on_a_after_icp)}
+            del icp["overlap"]
+        return json_ready({
+            **sides, "align": self.align, "T_b_a": self.T_b_a,
+            "trajectory": None if self.trajectory is None else self.trajectory.to_dict(),
+            "common_poses": self.common_poses,
+            "overlap": {"a_on_b": asdict(self.a_on_b), "b_on_a": asdict(self.b_on_a)}, "icp": icp,
+            "geometry": asdict(self.scores),
+        })  # fmt: skip
+
+
+def compare(
+    a: Path, b: Path, align: Alignment = "none", max_distance: float = 0.05, thresholds: Sequence[float] = THRESHOLDS_M,
+    seed: int = 0,
+) -> Comparison:  # fmt: skip
+    """Compares A with B, B being the reference. Each is the folder of a run, or a PLY or PCD file with a cloud or mesh.
+
+    Args:
+        a, b: what to compare.
+        align: "none": both are in one frame already, as runs of one recording are (the first camera's); "icp": A is
+            registered upon B; "trajectory": the positions at common times are laid upon one another (Umeyama, without
+            scale).
+        max_distance: metres up to which points are partners, for fitness, inlier RMSE and the last stage of ICP.
+        thresholds: metres, for precision, recall and F1.
+        seed: of the samples of meshes and of ICP.
+
+    Raises:
+        ConfigError: a distance that is none, or an alignment that the two do not allow.
+        RunFolderError, FormatError: a side cannot be read or has no points.
+    """
+    if not all(0 < d < np.inf for d in (max_distance, *thresholds)):
+        raise ConfigError(f"expected positive distances in metres, found {max_distance} and {list(thresholds)}")
+    one, other = read_side(a, seed), read_side(b, seed)
+    pairs = _common(one, other)
+    T_b_a = np.eye(4)
+    if align == "trajectory":
+        T_b_a = _by_trajectory(one, other, pairs)
+    cloud_a, cloud_b = Cloud(one.points), Cloud(other.points)
+    distances = [max(max_distance, d) for d in (0.25, 0.10)] + [max_distance]
+    icp = None
+    try:
+        icp = register(cloud_a, cloud_b, max_distances=distances, T_start=T_b_a, seed=seed)
+    except ValueError as error:
+        if align == "icp":
+            raise ConfigError(f"{a} cannot be registered upon {b} by ICP: {error}") from None
+    if align == "icp" and icp is not None:
+        T_b_a = icp.T_target_source
+    after = None
+    if icp is not None:
+        after = overlap(cloud_b, cloud_a, max_distance, inverse(icp.T_target_source), seed)
+    return Comparison(
+        a=one, b=other, align=align, T_b_a=T_b_a, trajectory=_trajectory_scores(one, other, pairs),
+        common_poses=len(pairs), a_on_b=overlap(cloud_a, cloud_b, max_distance, T_b_a, seed),
+        b_on_a=overlap(cloud_b, cloud_a, max_distance, inverse(T_b_a), seed), icp=icp, b_on_a_after_icp=after,
+        scores=score_cloud(cloud_a, cloud_b, thresholds, T_b_a, seed=seed),
+    )  # fmt: skip
+
+
+def read_side(path: Path, seed: int = 0) -> Side:
+    """Reads a run's folder, or a PLY or PCD file.
+
+    Raises:
+        RunFolderError: a folder that is no run, or whose map has no points.
+        FormatError: a file that cannot be read or has no points.
+    """
+    if path.is_dir():
+        return _read_run(path)
+    try:
+        mesh = read_mesh(path) if path.suffix.lower() == ".ply" else None
+        if mesh is None:
+            return Side(path, read_point_cloud(path).points)
+        count = int(np.clip(mesh.area() / MESH_SPACING**2, 1000, MOST_SAMPLES))
+        return Side(path, mesh.sample(count, seed)[0])
+    except ValueError as error:
+        raise FormatError(f"{path}: {error}") from None
+
+
+def _read_run(path: Path) -> Side:
+    folder = RunFolder.open(path)
+    cloud = path / "points.ply"
+    points = read_point_cloud(cloud).points if cloud.is_file() else sample_points(folder.gaussians()).points
+    if not len(points):
+        raise RunFolderError(f"{path}: the map has no points to compare")
+    metrics = folder.read_json("metrics.json") if (path / "metrics.json").is_file() else None
+    if metrics is not None and not isinstance(metrics, dict):
+        raise RunFolderError(f"{path / 'metrics.json'}: damaged: expected an object")
+    return Side(path, np.asarray(points, np.float64), folder.trajectory(), metrics)
+
+
+def _common(a: Side, b: Side) -> np.ndarray:
+    """Rows [M, 2] of poses at the same times."""
+    if a.trajectory is None or b.trajectory is None:
+        return np.empty((0, 2), np.int64)
+    return associate(a.trajectory.timestamps, b.trajectory.timestamps)
+
+
+def _by_trajectory(a: Side, b: Side, pairs: np.ndarray) -> np.ndarray:
+    if a.trajectory is None or b.trajectory is None:
+        lacking = a if a.trajectory is None else b
+        raise ConfigError(f"--align trajectory: {lacking.path} is a file and has no trajectory; use icp or none")
+    if len(pairs) < FEWEST_POSES:
+        raise ConfigError(
+            f"--align trajectory: {a.path} and {b.path} have {len(pairs)} poses at common times, expected at least "
+            f"{FEWEST_POSES}"
+        )
+    source, target = a.trajectory.T_world_camera[pairs[:, 0]], b.trajectory.T_world_camera[pairs[:, 1]]
+    return align_points(source[:, :3, 3], target[:, :3, 3])[0]
+
+
+def _trajectory_scores(a: Side, b: Side, pairs: np.ndarray) -> TrajectoryScores | None:
+    if a.trajectory is None or b.trajectory is None:
+        return None
+    return score_trajectory(a.trajectory.T_world_camera[pairs[:, 0]], b.trajectory.T_world_camera[pairs[:, 1]])

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of what an edit did."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ggslam.objects.editing import Change
+from ggslam.objects.hole_views import COVERED, View, marked
+from ggslam.objects.segmented_rows import joined
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.types import Gaussians
+from ggslam.reporting.pictures import color_to_uint8, compare
+from ggslam.runs.frame_poses import frame_poses
+from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import inverse
+
+PICTURES = 4
+_LOOKED_AT = 60
+"""Frames, at most, among which those are chosen that show an edit best."""
+
+
+def before_and_after(
+    original: GaussianMap, edited: GaussianMap, changes: Sequence[Change], camera: Camera, record: dict[str, Any]
+) -> dict[str, np.ndarray]:
+    """Before, after and difference (colour, and depth below) from the frames that show the edits best.
+
+    Args:
+        original: the map before.
+        edited: the map after.
+        changes: what was done; changes that cannot be seen make no pictures.
+        camera: of the run.
+        record: content of the run's keyframes.json.
+
+    Returns:
+        Pictures uint8 [H, W, 3] by file name.
+    """
+    visible = [change for change in changes if len(change.before.means) or len(change.after.means)]
+    if not visible:
+        return {}
+    poses = frame_poses(record)
+    numbers = np.array(sorted(poses))
+    looked_at = numbers[np.unique(np.linspace(0, len(numbers) - 1, _LOOKED_AT).round().astype(int))]
+    views = [View(camera, inverse(poses[frame]), frame) for frame in looked_at.tolist()]
+    before, after = (joined([getattr(c, name) for c in visible]) for name in ("before", "after"))
+    areas = _areas(original, before, views) + _areas(edited, after, views)
+    pictures, rasterizer = {}, CpuRasterizer()
+    for number in _best(areas, PICTURES):
+        images = []
+        for gaussians in (original, edited):
+            out = rasterizer.forward(gaussians, camera, views[number].T_camera_world, features=False)
+            depth = np.where(out.alpha.numpy() > 0.5, out.expected_depth.numpy(), 0)
+            images.append((color_to_uint8(out.image.numpy()), depth))
+        (color, depth), (new_color, new_depth) = images
+        pictures[f"edit{looked_at[number]:06d}.png"] = compare(color, new_color, depth, new_depth)
+    return pictures
+
+
+def _areas(gaussians: Gaussians, part: Gaussians, views: Sequence[View]) -> np.ndarray:
+    """Pixels of each view in which `part` of a map is seen."""
+    if not len(part.means):
+        return np.zeros(len(views), int)
+    rasterizer, both, out = CpuRasterizer(), marked(gaussians, part), []
+    for view in views:
+        image = rasterizer.forward(both, view.camera, view.T_camera_world).features
+        out.append(0 if image is None else int((image[0].numpy() > COVERED / 2).sum()))
+    return np.array(out)
+
+
+def _best(areas: np.ndarray, count: int) -> list[int]:
+    """Numbers of views with large areas, apart from each other: the best view of each stretch of the recording."""
+    apart = max(1, len(areas) // (2 * count))
+    chosen: list[int] = []
+    for number in np.argsort(-areas, kind="stable").tolist():
+        good = areas[number] > 0.3 * areas.max() and all(abs(number - other) >= apart for other in chosen)
+        if good and len(chosen) < count:
+            chosen.append(number)
+    return sorted(chosen)

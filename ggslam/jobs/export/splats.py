@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run's map for viewers and point cloud tools: packed splats, `.splat`, PCD."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+from ggslam.errors import ConfigError, FormatError, RunFolderError
+from ggslam.formats.packed_splats import check_gaussforge, write_compressed_ply, write_spz
+from ggslam.formats.point_cloud import write_point_cloud
+from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.splat_file import write_splat
+from ggslam.runs.folder import RunFolder
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.atomic import make_folder
+
+ENDINGS = {"compressed-ply": ".ply", "spz": ".spz", "splat": ".splat", "pcd": ".pcd"}
+"""How a file of each kind is named, so that other programs know it."""
+
+
+def export_packed(folder: RunFolder, path: Path, kind: str, min_opacity: float = 0.0) -> str:
+    """Writes the Gaussians that are at least this opaque; returns a line that says so.
+
+    Args:
+        folder: of the run.
+        path: file to write; its ending must be that of the kind.
+        kind: "compressed-ply", "spz" or "splat".
+        min_opacity: leave out fainter Gaussians.
+
+    Raises:
+        FormatError: another ending.
+        MissingDependency: the package that writes the format is not installed.
+        RunFolderError: nothing to write, or the file cannot be written.
+    """
+    _check_ending(path, kind)
+    if kind != "splat":
+        check_gaussforge(path)
+    make_folder(path.parent)
+    parts = _some(_parts(folder, min_opacity, whole=kind != "splat"), folder, min_opacity)
+    if kind == "splat":
+        count = write_splat(path, parts)
+    else:
+        gaussians = next(parts)
+        count = len(gaussians)
+        (write_spz if kind == "spz" else write_compressed_ply)(path, gaussians)
+    return f"wrote {path}: {count} Gaussians, {path.stat().st_size / 1e6:.1f} MB"
+
+
+def export_pcd(folder: RunFolder, path: Path, voxel_size: float, min_opacity: float = 0.0) -> str:
+    """Writes a coloured cloud sampled from the map, in metres, with object ids if there are any, as PCD.
+
+    Raises:
+        ConfigError: impossible voxel size or opacity.
+        FormatError: another ending than .pcd.
+        RunFolderError: nothing to write, or the file cannot be written.
+    """
+    _check_ending(path, "pcd")
+    try:
+        opacity = min_opacity if min_opacity > 0 else 0.3
+        cloud = sample_points(folder.gaussians(), voxel_size, opacity, with_object_id=folder.has_objects())
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    if not len(cloud):
+        raise RunFolderError(f"{folder.path}: the map has no points to export")
+    attributes = {"color": cloud.colors}
+    if cloud.object_id is not None:
+        attributes["object_id"] = cloud.object_id
+    make_folder(path.parent)
+    write_point_cloud(path, cloud.points.astype("f4"), attributes)
+    return f"wrote {path}: {len(cloud)} points on a {voxel_size} m grid"
+
+
+def _check_ending(path: Path, kind: str) -> None:
+    if path.suffix.lower() != ENDINGS[kind]:
+        raise FormatError(f"{path}: a file of the format {kind} ends in {ENDINGS[kind]}")
+
+
+def _parts(folder: RunFolder, min_opacity: float, whole: bool) -> Iterator[GaussianMap]:
+    """The Gaussians that are opaque enough; unless `whole`, cell by cell where the map was written so."""
+    stored = None if whole else folder.map_in_parts()
+    maps = iter([folder.gaussians()]) if stored is None else (stored.read([cell]) for cell in stored.cells())
+    for part in maps:
+        if min_opacity > 0:
+            part.keep(part.opacities >= min_opacity)
+        if len(part):
+            yield part
+
+
+def _some(parts: Iterator[GaussianMap], folder: RunFolder, min_opacity: float) -> Iterator[GaussianMap]:
+    """The same parts; raises RunFolderError if there are none."""
+    first = next(parts, None)
+    if first is None:
+        raise RunFolderError(f"{folder.path}: no Gaussian is at least {min_opacity} opaque; nothing to export")
+    return chain([first], parts)

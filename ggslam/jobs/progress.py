@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How long work tells how it goes on."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from ggslam.slam.result import StepReport
+
+
+class Observer(Protocol):
+    """Is told how a run goes on."""
+
+    def begin(self, stage: str, total: int) -> None:
+        """A stage of `total` steps begins."""
+
+    def frame(self, report: StepReport) -> None:
+        """A frame was processed."""
+
+    def advance(self, done: int, total: int) -> None:
+        """`done` of `total` steps of the current stage are done."""
+
+    def note(self, text: str) -> None:
+        """Something the user should know."""
+
+
+class SilentObserver:
+    """Listens to nothing."""
+
+    def begin(self, stage: str, total: int) -> None:
+        """Ignored."""
+
+    def frame(self, report: StepReport) -> None:
+        """Ignored."""
+
+    def advance(self, done: int, total: int) -> None:
+        """Ignored."""
+
+    def note(self, text: str) -> None:
+        """Ignored."""

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Grid stores made of what there is: a run, a cloud, or a recording whose poses are known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import FormatError, RunFolderError
+from ggslam.formats.point_cloud import read_point_cloud
+from ggslam.formats.raw_points import read_raw_points
+from ggslam.localization.places import PLACES, StoredView, places_to_bytes
+from ggslam.localization.surface import NORMAL
+from ggslam.loops.places import Place, PlaceIndex
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import fingerprint
+from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
+from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import transformed
+from ggslam.slam.saved_places import PLACES_FILE
+from ggslam.submaps.cell_keys import partition
+from ggslam.submaps.cell_records import CellWrite
+from ggslam.submaps.grid import GridStore
+from ggslam.submaps.recorder import store_cloud
+from ggslam.submaps.settings import SubmapSettings
+
+INDOORS = SubmapSettings(voxel=0.02)
+"""For maps of depth cameras."""
+GAUSSIANS = "gaussians.npz"
+"""The part of a cell with the Gaussians whose means lie in it: the arrays of `GaussianMap`."""
+_GAUSSIAN_ARRAYS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features", "object_id")
+_CELLS_AT_ONCE = 64
+_CLOUDS = (".ply", ".pcd", ".npy", ".bin")
+
+
+def is_store(path: Path) -> bool:
+    """Whether a folder is a grid store."""
+    return (path / "index.sqlite").is_file()
+
+
+def is_cloud(path: Path) -> bool:
+    """Whether a path names a cloud, by its suffix."""
+    return path.suffix.lower() in _CLOUDS and not path.is_dir()
+
+
+def open_or_create(path: Path, settings: SubmapSettings) -> GridStore:
+    """The store of a folder, open for writing; a new one if there is none.
+
+    Raises:
+        ConfigError: the store has another grid.
+        RunFolderError: another process writes to it, or the folder is something else.
+    """
+    return GridStore.open(path, write=True, settings=settings) if is_store(path) else GridStore.create(path, settings)
+
+
+def store_of_run(run: Path, store: GridStore, visit: str | None = None, at: float | None = None) -> None:
+    """Writes what a run knows into the cells of a store: the surface that its keyframes measured (or, of a run without
+    places, the cloud sampled from its map), its Gaussians, and its places.
+
+    Cells that were recorded less than T before are left alone.
+
+    Args:
+        run: folder of the run; the store's world is the run's.
+        store: open for writing.
+        visit: name of the visit; None: a name made of the run's content.
+        at: time of the visit in seconds; None: that of the run's last frame.
+
+    Raises:
+        RunFolderError: no run, or files of it are damaged.
+    """
+    folder = RunFolder.open(run)
+    time = float(folder.trajectory().timestamps[-1]) if at is None else at
+    store.begin_visit(visit or visit_of(folder))
+    arrays: dict[str, Any] = {}
+    if (folder.path / PLACES_FILE).is_file():
+        arrays = read_all_arrays(folder.path / PLACES_FILE, "the places of a run")
+    try:
+        points, attributes = _surface(arrays) if arrays else _cloud(folder.path / "points.ply")
+        views, camera = _views(arrays) if arrays else ([], None)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise RunFolderError(f"{folder.path / PLACES_FILE}: not the places of a run: {error}") from None
+    others = list(_gaussian_parts(store, folder.gaussians()))
+    if camera is not None:
+        others += _place_parts(store, views, camera)
+    due = _Due(store, time)
+    others, kept = [write for write in others if due[write.key]], due.of(points)
+    # The points come last: they make a cell new, and one that was cut off before is written again by the next attempt.
+    for begin in range(0, len(others), _CELLS_AT_ONCE):
+        _put(store, others[begin : begin + _CELLS_AT_ONCE])
+    store_cloud(store, points[kept], {name: values[kept] for name, values in attributes.items()}, time)
+
+
+def visit_of(folder: RunFolder) -> str:
+    """The visit that the content of a run is stored under."""
+    return f"run {fingerprint(folder)[:16]}"
+
+
+def store_of_cloud(path: Path, store: GridStore, visit: str | None = None, at: float | None = None) -> None:
+    """Cuts a cloud (.ply, .pcd; .npy [n, 3 or more]; .bin, float32 x y z intensity) into the cells of a store.
+
+    Raises:
+        FormatError: the file is missing or damaged.
+    """
+    store.begin_visit(visit or path.name)
+    points, attributes = _cloud(path)
+    due = _Due(store, at or 0.0).of(points)
+    store_cloud(store, points[due], {name: values[due] for name, values in attributes.items()}, at or 0.0)
+
+
+class _Due(dict[tuple[int, int, int], bool]):
+    """Which cells are to be recorded now; asks the store once a cell."""
+
+    def __init__(self, store: GridStore, time: float) -> None:
+        super().__init__()
+        self._store, self._time = store, time
+
+    def __missing__(self, key: tuple[int, int, int]) -> bool:
+        self[key] = self._store.due(key, self._time)
+        return self[key]
+
+    def of(self, points: np.ndarray) -> np.ndarray:
+        """Whether the cells of points [n, 3] are, bool [n]; false for those that are not finite."""
+        finite = np.nonzero(np.isfinite(points).all(1))[0]
+        keys, which = np.unique(self._store.grid.keys_of(points[finite]), axis=0, return_inverse=True)
+        due = np.zeros(len(points), bool)
+        due[finite] = np.array([self[x, y, z] for x, y, z in keys.tolist()], bool)[which.reshape(-1)]
+        return due
+
+
+def _put(store: GridStore, writes: list[CellWrite]) -> None:
+    """Writes parts of cells, each cell's together."""
+    merged: dict[tuple[int, int, int], CellWrite] = {}
+    for write in writes:
+        before = merged.get(write.key)
+        if before is not None:
+            write = replace(write, parts={**before.parts, **write.parts}, counts={**before.counts, **write.counts})
+        merged[write.key] = write
+    store.put_cells(list(merged.values()))
+
+
+def _cloud(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    if path.suffix.lower() == ".bin":
+        return read_raw_points(path, 4)[:, :3], {}
+    if path.suffix.lower() == ".npy":
+        try:
+            points = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise FormatError(f"{path}: cannot be read: {error}") from None
+        if getattr(points, "ndim", 0) != 2 or points.shape[1] < 3 or points.dtype.kind != "f":
+            raise FormatError(f"{path}: expected floating-point numbers [n, 3 or more], found {list(np.shape(points))}")
+        return points[:, :3], {}
+    cloud = read_point_cloud(path)
+    return cloud.points, {} if cloud.colors is None else {"color": cloud.colors}
+
+
+def _surface(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """World points [n, 3] of the keyframes' surface as places.npz has it, with normals."""
+    ends = np.cumsum(arrays["surface_counts"])[:-1]
+    parts = zip(
+        np.split(arrays["surface_points"], ends), np.split(arrays["surface_normals"], ends), arrays["surface_reach"],
+        arrays["surface_poses"], strict=True,
+    )  # fmt: skip
+    points, normals = [np.zeros((0, 3))], [np.zeros((0, 3), np.int8)]
+    for steps, turned, reach, T in parts:
+        points.append(transformed(steps * (float(reach) / 32767), T))
+        normals.append(np.rint(turned @ T[:3, :3].T).astype(np.int8))
+    return np.concatenate(points), {NORMAL: np.concatenate(normals)}
+
+
+def _views(arrays: Mapping[str, np.ndarray]) -> tuple[list[StoredView], Camera]:
+    row = arrays["camera"]
+    camera = Camera(int(row[0]), int(row[1]), *(float(value) for value in row[2:]))
+    prefix = "loops_places_"
+    index = PlaceIndex.from_arrays(camera, {n.removeprefix(prefix): a for n, a in arrays.items() if prefix in n})
+    numbers = arrays[prefix + "numbers"].tolist()
+    places: list[Place] = [index[number] for number in numbers]
+    return [StoredView(place, arrays["loops_poses"][n]) for place, n in zip(places, numbers, strict=True)], camera
+
+
+def _place_parts(store: GridStore, views: list[StoredView], camera: Camera) -> Iterator[CellWrite]:
+    positions = np.array([view.T_world_camera[:3, 3] for view in views]).reshape(-1, 3)
+    for key, indices in partition(positions, store.grid):
+        data = places_to_bytes([views[i] for i in indices.tolist()], camera)
+        yield CellWrite(key, {PLACES: data}, counts={PLACES: len(indices)})
+
+
+def _gaussian_parts(store: GridStore, gaussians: GaussianMap) -> Iterator[CellWrite]:
+    arrays = {name: getattr(gaussians, name).detach().numpy() for name in _GAUSSIAN_ARRAYS}
+    for key, indices in partition(arrays["means"], store.grid):
+        data = arrays_to_bytes(**{name: values[indices] for name, values in arrays.items()})
+        yield CellWrite(key, {GAUSSIANS: data}, counts={GAUSSIANS: len(indices)})

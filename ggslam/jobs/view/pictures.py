@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures for the viewer: recorded beside rendered, a view from anywhere, the object under a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from ggslam.objects.rendered_ids import object_ids
+from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.labels import vote_label_image
+from ggslam.rendering.types import GaussianTensors
+from ggslam.reporting.pictures import (
+    FITTED,
+    IdentityColors,
+    color_of_depth,
+    color_of_ids,
+    color_to_uint8,
+    depth_range,
+)
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import inverse
+from ggslam.viewer.cameras import pose_along
+
+CELL_WIDTH = 320
+"""Pixels of each picture in the comparison of a frame."""
+_GAP, _BAR = 6, 26
+_PATCH = 5
+"""Pixels that are rendered to find the object under the one in their middle."""
+
+
+class ViewPictures:
+    """Renders a map; one caller at a time.
+
+    Args:
+        gaussians: the map.
+        segmented: the same with its objects, if it has any.
+        camera: of the recording.
+        recorded: gives a frame's images, None if the recording is not there.
+    """
+
+    def __init__(
+        self, gaussians: GaussianMap, segmented: SegmentedMap | None, camera: Camera,
+        recorded: Callable[[int], Frame | None],
+    ) -> None:  # fmt: skip
+        self._gaussians, self._segmented, self._camera, self._recorded = gaussians, segmented, camera, recorded
+        self._rasterizer = CpuRasterizer()
+        self.identity: IdentityColors | None = None if segmented is None else _identity_colors(segmented)
+
+    def compared(self, frame: int, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `ViewedMap.frame_picture`."""
+        segmented = self._segmented
+        camera = self._camera.resized(CELL_WIDTH, round(self._camera.height * CELL_WIDTH / self._camera.width))
+        view = self._rasterizer.forward(
+            self._gaussians, camera, inverse(T_world_camera), features=segmented is not None
+        )
+        rendered, alpha = color_to_uint8(view.image.numpy()), view.alpha.numpy()
+        depth = np.where(alpha > 0.5, view.expected_depth.numpy(), 0)
+        found = self._recorded(frame)
+        near, far = depth_range(depth if found is None or not found.depth.any() else found.depth)
+        cells = [("rendered", rendered), ("depth, rendered", color_of_depth(depth, near, far))]
+        if found is not None:
+            measured = color_of_depth(found.depth, near, far)
+            cells = [("recorded", found.color), cells[0], ("depth, recorded", measured), cells[1]]
+        if segmented is not None and self.identity is not None and view.features is not None:
+            colors = self.identity.picture(view.features.numpy(), alpha)
+            ids = object_ids(self._rasterizer, view, segmented)
+            cells.append(("objects", color_of_ids(ids, segmented.table.palette(), outlines=True)))
+            cells.append(("identity (PCA)", colors))
+        return table_of(cells, (camera.width, camera.height)), rendered if found is None else found.color
+
+    def object_at(self, origin: np.ndarray, direction: np.ndarray, focal: float, hidden: set[int]) -> int:
+        """See `ViewedMap.object_at`: of the Gaussians at that pixel, whose object has the largest rendering weight."""
+        middle = (_PATCH - 1) / 2
+        camera = Camera(_PATCH, _PATCH, focal, focal, middle, middle)
+        part, labels = self._visible(hidden)
+        view = self._rasterizer.forward(part, camera, inverse(pose_along(origin, direction)), features=False)
+        return int(vote_label_image(self._rasterizer, view, labels)[_PATCH // 2, _PATCH // 2])
+
+    def picture(self, camera: Camera, T_world_camera: np.ndarray, hidden: set[int]) -> np.ndarray:
+        """See `ViewedMap.picture`."""
+        part, _ = self._visible(hidden)
+        view = self._rasterizer.forward(part, camera, inverse(T_world_camera), features=False)
+        return color_to_uint8(view.image.numpy())
+
+    def _visible(self, hidden: set[int]) -> tuple[GaussianMap | GaussianTensors, np.ndarray]:
+        """The Gaussians that are not hidden, and their object ids uint16."""
+        g, labels = self._gaussians, self._gaussians.object_id.numpy()
+        if not hidden:
+            return g, labels.astype(np.uint16)
+        kept = np.flatnonzero(~np.isin(labels, list(hidden)))
+        part = GaussianTensors(
+            g.means[kept], g.quaternions[kept], g.log_scales[kept], g.opacity_logits[kept], g.sh[kept],
+            g.features[kept],
+        )  # fmt: skip
+        return part, labels[kept].astype(np.uint16)
+
+
+def table_of(cells: list[tuple[str, np.ndarray]], size: tuple[int, int]) -> np.ndarray:
+    """Pictures of one size (width, height), two a row, each with its name above; uint8 [H, W, 3] on dark grey."""
+    width, height = size
+    rows = -(-len(cells) // 2)
+    sheet = np.full((rows * (height + _BAR + _GAP) - _GAP, 2 * width + _GAP, 3), 36, np.uint8)
+    for number, (name, picture) in enumerate(cells):
+        left, top = number % 2 * (width + _GAP), number // 2 * (height + _BAR + _GAP)
+        cv2.putText(sheet, name, (left + 2, top + 18), cv2.FONT_HERSHEY_SIMPLEX, 0.62, (225, 225, 225), 1, cv2.LINE_AA)
+        shown = picture
+        if picture.shape[:2] != (height, width):
+            shown = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        sheet[top + _BAR : top + _BAR + height, left : left + width] = shown
+    return sheet
+
+
+def _identity_colors(segmented: SegmentedMap) -> IdentityColors | None:
+    """Colours of identity vectors, fitted to those of the labelled Gaussians; None if there are none."""
+    labelled = np.flatnonzero(segmented.gaussians.object_id.numpy() > 0)
+    if not len(labelled):
+        return None
+    return IdentityColors(segmented.gaussians.features.numpy()[labelled[:: max(1, len(labelled) // FITTED)]])

@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run as the viewer shows it: map, poses, recording, and edits that wait to be saved."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.jobs.edit.editing import Edit, apply_edit, edit_run
+from ggslam.jobs.export.map_files import OBJECT_EXTRAS, object_file_name
+from ggslam.jobs.view.pictures import ViewPictures
+from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.objects.table import ObjectRecord
+from ggslam.reporting.pictures import color_of_depth, depth_range
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.frame_poses import frame_poses, run_camera
+from ggslam.runs.recordings import open_recording_of
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.sequences import Sequence
+from ggslam.viewer.model import Coloring, ListedObject
+from ggslam.viewer.splats import Splats, most_visible, splats_of
+from ggslam.viewer.static_page import static_page
+from ggslam.volumes.map_upright import upright_of
+
+DEFAULT_SPLATS = 400_000
+"""As many are shown, at most, unless asked otherwise."""
+_DIGITS = 4
+"""Decimals of a shift in metres and a turn in degrees; what is shown is what is saved."""
+
+
+class ViewedRun:
+    """A run for the viewer; an `EditableMap`. The run itself is never changed: edits are done to what is shown, and
+    done again, as `ggslam edit` does them, to the run's files when they are saved to another folder.
+
+    Args:
+        folder: the run.
+        max_splats: show no more, the most visible ones.
+        sequence: where the recording is now, if it was moved.
+
+    Raises:
+        RunFolderError, FormatError: the run is damaged, or none of its frames was located.
+        SequenceError: the recording is not at `sequence`.
+    """
+
+    def __init__(self, folder: RunFolder, max_splats: int = DEFAULT_SPLATS, sequence: Path | None = None) -> None:
+        self.folder, self._max_splats, self._sequence_path = folder, max_splats, sequence
+        self._lock = threading.RLock()
+        self._edits: list[Edit] = []
+        self._texts: list[str] = []
+        record = folder.read_json("keyframes.json")
+        self.camera: Camera = run_camera(folder)
+        self.frame_poses: dict[int, np.ndarray] = dict(sorted(frame_poses(record).items()))
+        self.keyframe_poses = np.array([k["T_world_camera"] for k in record["keyframes"]], float).reshape(-1, 4, 4)
+        if not self.frame_poses:
+            raise RunFolderError(f"{folder.path}: no frame of this run was located, so there is nowhere to look from")
+        self.notes: list[str] = []
+        self._recording = self._open_recording(sequence)
+        self._read_map()
+        self.up = upright_of(self._gaussians, np.stack(list(self.frame_poses.values()))).up
+
+    def _open_recording(self, path: Path | None) -> Sequence | None:
+        try:
+            return open_recording_of(self.folder, path)
+        except GgslamError as error:
+            if path is not None:
+                raise
+            self.notes.append(f"shown without the recorded images: {error}")
+            return None
+
+    def _read_map(self) -> None:
+        self._segmented: SegmentedMap | None = self.folder.segmented_map() if self.folder.has_objects() else None
+        self._gaussians: GaussianMap = self.folder.gaussians() if self._segmented is None else self._segmented.gaussians
+        self._map_changed()
+
+    def _map_changed(self) -> None:
+        """What was worked out of the map before an edit holds no more."""
+        self._pictures = ViewPictures(self._gaussians, self._segmented, self.camera, self._recorded)
+        self._shown: tuple[np.ndarray, Splats] | None = None
+
+    def _recorded(self, frame: int) -> Frame | None:
+        if self._recording is None:
+            return None
+        try:
+            return self._recording.frame(frame, masks=False)
+        except GgslamError:  # one damaged frame is no reason to stop
+            return None
+
+    # --- to be looked at ---------------------------------------------------------------------------------------------
+
+    @property
+    def has_objects(self) -> bool:
+        """Whether there are objects to select."""
+        return self._segmented is not None
+
+    @property
+    def colorings(self) -> tuple[Coloring, ...]:
+        """See `ViewedMap`."""
+        return ("colour", "objects", "identity", "depth") if self.has_objects else ("colour", "depth")
+
+    def describe(self) -> str:
+        """See `ViewedMap`."""
+        with self._lock:
+            shown = min(len(self._gaussians), self._max_splats)
+            parts = [f"{len(self._gaussians):,} Gaussians" + (f" ({shown:,} shown)" if shown < len(self._gaussians)
+                                                              else "")]  # fmt: skip
+            parts.append(f"{len(self.frame_poses)} frames")
+            parts.append(f"{len(self.keyframe_poses)} keyframes")
+            if self._segmented is not None:
+                parts.append(f"{len(self._segmented.table)} objects")
+            return " · ".join(parts)
+
+    def splats(self, coloring: Coloring, frame: int) -> dict[int, Splats]:
+        """See `ViewedMap`."""
+        with self._lock:
+            if self._shown is None:
+                rows = self._most_visible()
+                self._shown = rows, splats_of(self._gaussians, rows)
+            rows, splats = self._shown
+            splats = replace(splats, colors=self._colors(coloring, frame, rows, splats))
+            owner = self._gaussians.object_id.numpy()[rows]
+            return {int(i): splats.rows(owner == i) for i in np.unique(owner)}
+
+    def _most_visible(self) -> np.ndarray:
+        return most_visible(self._gaussians, self._max_splats, self._gaussians.object_id.numpy())
+
+    def _colors(self, coloring: Coloring, frame: int, rows: np.ndarray, splats: Splats) -> np.ndarray:
+        """uint8 [N, 3]."""
+        g = self._gaussians
+        if coloring == "objects" and self._segmented is not None:
+            return self._segmented.table.palette()[g.object_id.numpy()[rows]]
+        if coloring == "identity":
+            found = self._identity_colors(rows)
+            return splats.colors if found is None else found
+        if coloring == "depth":
+            T = self.frame_poses[frame]
+            distance = np.linalg.norm(splats.centers - T[:3, 3], axis=1)
+            return color_of_depth(distance[:, None], *depth_range(distance))[:, 0]
+        return splats.colors
+
+    def objects(self) -> list[ListedObject]:
+        """See `ViewedMap`."""
+        with self._lock:
+            return [] if self._segmented is None else [_listed(record) for record in self._segmented.table.objects]
+
+    def frame_picture(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """See `ViewedMap`."""
+        with self._lock:
+            return self._pictures.compared(frame, self.frame_poses[frame])
+
+    def object_at(self, origin: np.ndarray, direction: np.ndarray, focal: float, hidden: set[int]) -> int:
+        """See `ViewedMap`."""
+        with self._lock:
+            return self._pictures.object_at(origin, direction, focal, hidden)
+
+    def picture(self, camera: Camera, T_world_camera: np.ndarray, hidden: set[int]) -> np.ndarray:
+        """See `ViewedMap`."""
+        with self._lock:
+            return self._pictures.picture(camera, T_world_camera, hidden)
+
+    def static_page(self, title: str) -> str:
+        """The map, up to the limit of splats, as one HTML file that needs neither server nor network."""
+        with self._lock:
+            rows = self._most_visible()
+            owners = self._gaussians.object_id.numpy()[rows].astype(np.uint16)
+            identity = self._identity_colors(rows)
+            return static_page(self, title, self._gaussians, rows, identity, owners)
+
+    def _identity_colors(self, rows: np.ndarray) -> np.ndarray | None:
+        """uint8 [N, 3] of the Gaussians' identity vectors; None if they have none."""
+        if self._pictures.identity is None:
+            return None
+        features = np.ascontiguousarray(self._gaussians.features.numpy()[rows].T)[:, :, None]
+        return self._pictures.identity.picture(features, np.ones(features.shape[1:], np.float32))[:, 0]
+
+    # --- to be edited ------------------------------------------------------------------------------------------------
+
+    def rename(self, object_id: int, name: str) -> str:
+        """See `EditableMap`."""
+        return self._do(Edit("rename", str(object_id), name))
+
+    def remove(self, object_id: int) -> str:
+        """See `EditableMap`."""
+        return self._do(Edit("remove", str(object_id)))
+
+    def move(self, object_id: int, T: np.ndarray) -> str:
+        """See `EditableMap`."""
+        with self._lock:
+            center = np.array(self._scene().table.record(object_id).centroid)
+        shift = T[:3, :3] @ center + T[:3, 3] - center
+        turn = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)  # about fixed x, then y, then z
+        rotation = _numbers(turn) if np.abs(turn).max() > 10.0**-_DIGITS else ""
+        return self._do(Edit("move", str(object_id), _numbers(shift), rotation))
+
+    def _do(self, edit: Edit) -> str:
+        with self._lock:
+            change = apply_edit(self._scene(), edit)
+            self._edits.append(edit)
+            self._texts.append(change.text)
+            self._gaussians = self._scene().gaussians
+            self._map_changed()
+            return change.text
+
+    def undo(self) -> str:
+        """See `EditableMap`."""
+        with self._lock:
+            if not self._edits:
+                raise ConfigError("there is no edit to take back")
+            kept, text = self._edits[:-1], self._texts[-1]
+            self._edits, self._texts = [], []
+            self._read_map()
+            for edit in kept:
+                self._do(edit)
+            return f"taken back: {text}"
+
+    def edits(self) -> list[str]:
+        """See `EditableMap`."""
+        with self._lock:
+            return list(self._texts)
+
+    def exported(self, object_id: int) -> tuple[str, bytes]:
+        """See `EditableMap`."""
+        with self._lock, TemporaryDirectory() as folder:
+            record = self._scene().table.record(object_id)
+            g = self._gaussians
+            part = GaussianMap(g.sh_degree, g.feature_channels, with_moments=False)
+            part.append({k: v for k, v in g.take(torch.nonzero(g.object_id == object_id)[:, 0]).items()
+                         if "." not in k})  # fmt: skip
+            path = Path(folder) / object_file_name(record)
+            write_gaussian_ply(path, part, OBJECT_EXTRAS)
+            return path.name, path.read_bytes()
+
+    def default_target(self) -> str:
+        """See `EditableMap`."""
+        path = self.folder.path.resolve()  # "." has no name
+        return str(path.with_name(path.name + "-edited"))
+
+    def save(self, target: str, inpaint: bool) -> str:
+        """See `EditableMap`; an earlier run at `target` is not replaced."""
+        with self._lock:
+            if not self._edits:
+                raise ConfigError("nothing was edited, so there is nothing to save")
+            if not target.strip():
+                raise ConfigError("a folder is needed to save to")
+            sequence = self._sequence_path if inpaint else None
+            edits = list(self._edits)
+        try:
+            out = Path(target).expanduser()
+        except RuntimeError as error:  # "~nobody"
+            raise ConfigError(f"{target}: cannot be saved to: {error}") from None
+        outcome = edit_run(self.folder, edits, out, inpainting=inpaint, sequence=sequence)
+        return "\n".join([f"saved to {outcome.folder.path}", *outcome.notes])
+
+    def _scene(self) -> SegmentedMap:
+        if self._segmented is None:
+            raise ConfigError("this run has no objects to edit")
+        return self._segmented
+
+
+def _listed(record: ObjectRecord) -> ListedObject:
+    box = record.box
+    return ListedObject(
+        record.id, record.name, record.color, record.gaussians, np.array(box.center), np.array(box.axes),
+        np.array(box.size), np.array(record.centroid),
+    )  # fmt: skip
+
+
+def _numbers(values: np.ndarray) -> str:
+    return " ".join(f"{value:.{_DIGITS}f}" for value in values)

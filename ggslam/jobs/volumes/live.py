@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Volumes that grow while a run goes on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.scene.frame import Frame
+from ggslam.slam.result import StepReport
+from ggslam.slam.slam import Slam
+from ggslam.tracking.tracker import TrackingStatus
+from ggslam.volumes.maps import PosedView, VolumeMaps
+
+
+class LiveVolumes:
+    """Fuses frames as a `Slam` locates them, and follows its loop closures.
+
+    Args:
+        maps: to fuse into.
+        saw: is told of every frame that was fused, and its T_world_camera.
+        objects: whether object ids are voted for.
+    """
+
+    def __init__(self, maps: VolumeMaps, saw: Callable[[Frame, np.ndarray], None], objects: bool = True) -> None:
+        self.maps = maps
+        self._saw, self._objects = saw, objects
+        self._corrections = 0
+        self._current: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def __call__(self, slam: Slam, frame: Frame, report: StepReport) -> None:
+        """A frame went through `slam.step`, or its real-time counterpart."""
+        if slam.mapper.identity is not None:
+            self._current = slam.mapper.identity.current
+        start = time.perf_counter()
+        if slam.corrections > self._corrections:
+            self._corrections = slam.corrections
+            self.maps.rebuild(_views(slam.mapper.keyframes, self._objects))
+        if report.frame.status == TrackingStatus.LOST.value:
+            return
+        T = slam.pose_of(report.frame)
+        newest = slam.mapper.keyframes[-1] if slam.mapper.keyframes else None
+        known = self._objects and newest is not None and newest.frame_index == frame.index
+        labels = newest.mask if known and newest is not None else None
+        self.maps.add(frame, T, labels, report.seconds + time.perf_counter() - start)
+        self._saw(frame, T)
+
+    def settle(self, known_ids: list[int]) -> None:
+        """At the end: what became one object later is one, and what is not among `known_ids` is none."""
+        if self._current is None:
+            return
+        ids = self._current(np.arange(65536, dtype=np.uint16))
+        known = np.zeros(65536, bool)
+        known[known_ids] = True
+        self.maps.relabel(np.where(known[ids], ids, 0).astype(np.uint16))
+
+
+def _views(keyframes: list[Keyframe], objects: bool) -> Iterator[PosedView]:
+    for keyframe in list(keyframes):
+        labels = keyframe.mask if objects else None
+        yield PosedView(keyframe.depth_m(), keyframe.camera, keyframe.T_world_camera, keyframe.color, labels)

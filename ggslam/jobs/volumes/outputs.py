@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files and pictures of a recording's volumes.
+
+    tsdf.npz                   the signed distances, to go on in
+    mesh.ply, mesh.png         the surface, with colours and object ids; the picture from where the camera was and above
+    objects.png, object_*.ply  the same in colours of objects; a mesh of each of them
+    esdf.png                   the distance field at one height
+    map.pgm, map.yaml          obstacles between two heights, as ROS's map_server reads them
+    occupancy.bt, .ot, .png    the occupancy map, as OctoMap reads it
+    volumes.json               where all this is from, sizes and times
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import RunFolderError
+from ggslam.formats.mesh_files import write_mesh
+from ggslam.jobs.progress import Observer
+from ggslam.jobs.volumes.pictures import mesh_picture, occupancy_picture
+from ggslam.reporting.pictures import write_picture
+from ggslam.runs.folder import RunFolder, json_ready
+from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.staging import finish_saving, new_staging, publish
+from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.maps import VolumeMaps
+from ggslam.volumes.mesh import Mesh, extract_mesh
+from ggslam.volumes.occupancy import OccupancyMap
+from ggslam.volumes.octomap_files import write_octomap
+from ggslam.volumes.slices import FieldSlice, plane_at_height, slice_field, slice_picture, write_ros_map
+from ggslam.volumes.tsdf import SIDE
+from ggslam.volumes.tsdf_file import save_tsdf
+from ggslam.volumes.upright import Upright, estimate_up
+
+RECORD = "volumes.json"
+"""Is there if and only if a folder holds volumes."""
+_FILES = (
+    "tsdf.npz", "mesh.ply", "mesh.png", "objects.png", "esdf.png", "map.pgm", "map.yaml", "occupancy.bt",
+    "occupancy.ot", "occupancy.png",
+)  # fmt: skip
+MOST_CELLS = 20_000_000
+"""Of a slice."""
+SMALLEST_PIECE = 50
+"""Triangles; smaller pieces of the mesh, specks of noise in the air, are left out."""
+
+
+@dataclass(frozen=True)
+class OutputRequest:
+    """What is written, beside what there always is.
+
+    Attributes:
+        mesh: file of the mesh; None: mesh.ply beside the rest.
+        object_meshes: whether each object gets a mesh of its own.
+        slice_height: metres above the floor; None: as high as the camera was.
+        band: lowest and highest obstacle of the ROS map, metres above the floor.
+        names: of object ids.
+    """
+
+    mesh: Path | None
+    object_meshes: bool
+    slice_height: float | None
+    band: tuple[float, float]
+    names: dict[int, str]
+
+
+@dataclass
+class Outputs:
+    """What was written.
+
+    Attributes:
+        files: all of them.
+        lines: facts for people.
+        record: content of volumes.json.
+    """
+
+    files: list[Path] = field(default_factory=list)
+    lines: list[str] = field(default_factory=list)
+    record: dict[str, Any] = field(default_factory=dict)
+
+
+class _Writer:
+    """Writes into a hidden folder, from which all files go to `out` together."""
+
+    def __init__(self, out: Path, request: OutputRequest, poses: np.ndarray) -> None:
+        self.out, self.request, self.poses = out, request, poses
+        self.staged = new_staging(out)
+        self.outputs = Outputs()
+        make_folder(self.staged)
+
+    def path(self, name: str) -> Path:
+        """Where to write a file of the folder; it is noted as written."""
+        self.outputs.files.append(self.out / name)
+        return self.staged / name
+
+    def tell(self, line: str, **facts: Any) -> None:
+        """A line for people, and the same for the record."""
+        self.outputs.lines.append(line)
+        self.outputs.record |= facts
+
+    # --- the parts ---------------------------------------------------------------------------------------------------
+
+    def tsdf(self, maps: VolumeMaps) -> None:
+        """The signed distances."""
+        tsdf = maps.tsdf
+        save_tsdf(self.path("tsdf.npz"), tsdf)
+        held = tsdf.memory_bytes / 1e6
+        self.tell(
+            f"TSDF: {len(tsdf)} blocks of 8^3 voxels, {tsdf.dense_blocks} near surfaces, {held:.0f} MB",
+            tsdf={"blocks": len(tsdf), "dense_blocks": tsdf.dense_blocks, "memory_mb": held},
+        )
+
+    def mesh(self, maps: VolumeMaps) -> Mesh:
+        """The surface."""
+        mesh = extract_mesh(maps.tsdf, min_triangles=SMALLEST_PIECE)
+        path = self.request.mesh or self.path("mesh.ply")
+        if self.request.mesh is not None:
+            self.outputs.files.append(path)
+        objects = mesh.objects()
+        labels = mesh.labels if objects else None
+        arrays = (mesh.vertices, mesh.triangles, mesh.normals, mesh.colors)
+        write_mesh(path, *arrays, labels, self.request.names)
+        facts = {"vertices": len(mesh.vertices), "triangles": len(mesh.triangles), "objects": objects}
+        none = "" if facts["triangles"] else "; no surface was found: voxels may be too large, or depth seen too rarely"
+        self.tell(f"mesh: {facts['vertices']} vertices, {facts['triangles']} triangles{none}", mesh=facts)
+        if self.request.object_meshes:
+            self._object_meshes(mesh, objects)
+        return mesh
+
+    def _object_meshes(self, mesh: Mesh, objects: list[int]) -> None:
+        labels = mesh.triangle_labels()
+        for number in objects:
+            part, name = mesh.part(labels == number), self.request.names.get(number, "object")
+            safe = "".join(c if c.isalnum() else "_" for c in name)
+            path = self.path(f"object_{number}_{safe}.ply")
+            write_mesh(path, part.vertices, part.triangles, part.normals, part.colors, part.labels)
+        self.tell(f"{len(objects)} objects have a mesh of their own: {self.out / 'object_*.ply'}")
+
+    def upright(self, mesh: Mesh) -> Upright:
+        """Which way is up, and where the floor is."""
+        # Marching cubes' vertices are spread evenly enough over surfaces to stand for their area.
+        found = estimate_up(self.poses, mesh.vertices, mesh.normals)
+        floor = "no floor was found" if found.floor is None else f"the floor is at {found.floor:.2f} m along it"
+        self.tell(
+            f"up is ({', '.join(f'{v:.3f}' for v in found.up)}) in the world's frame, {found.support:.0%} of the "
+            f"surfaces agree; {floor}", up=asdict(found)
+        )  # fmt: skip
+        return found
+
+    def field(self, field_: DistanceField, upright: Upright, seconds: float) -> None:
+        """A slice of the distance field, whose last update took `seconds`, and the ROS map."""
+        heights = self.poses[:, :3, 3] @ upright.up
+        base = upright.floor if upright.floor is not None else float(heights.min()) - 1.0
+        wanted = self.request.slice_height
+        height = float(np.median(heights)) if wanted is None else base + wanted
+        cut = _slice(field_, upright.up, height, field_.voxel)
+        write_picture(self.path("esdf.png"), slice_picture(cut, _full_scale(cut.distance[cut.known])))
+        if not cut.known.any():
+            self.outputs.lines.append(f"note: nothing is known {height - base:.2f} m up: esdf.png is empty")
+        # No farther than the field reaches.
+        edge = SIDE * field_.voxel
+        reached = (field_.coordinates() + 0.5) @ upright.up * edge - base
+        low = max(self.request.band[0], float(reached.min()) - edge)
+        high = max(low, min(self.request.band[1], float(reached.max()) + edge))
+        plan = _slice(field_, upright.up, base, max(0.05, field_.voxel), (low, high))
+        image, description = write_ros_map(plan, self.staged / "map")
+        self.outputs.files += [self.out / image.name, self.out / description.name]
+        axes = {"origin": plan.plane.origin, "x_axis": plan.plane.x_axis, "y_axis": plan.plane.y_axis}
+        held = field_.memory_bytes / 1e6
+        ground = "the floor" if upright.floor is not None else "a metre below the camera"
+        self.tell(
+            f"distance field: {len(field_)} blocks, {held:.0f} MB, last update {1e3 * seconds:.0f} ms; slice "
+            f"{height - base:.2f} m above {ground}",
+            esdf={"blocks": len(field_), "memory_mb": held, "last_update_ms": 1e3 * seconds,
+                  "slice_height": height - base, "band": [low, high], "map_frame": axes},
+        )  # fmt: skip
+
+    def occupancy(self, occupancy: OccupancyMap, upright: Upright) -> None:
+        """The occupancy map."""
+        for ending in (".bt", ".ot"):
+            write_octomap(occupancy, self.path("occupancy" + ending))
+        write_picture(self.path("occupancy.png"), occupancy_picture(occupancy, self.poses, upright.up))
+        found = occupancy.summary()
+        self.tell(
+            f"occupancy: {found.occupied} occupied and {found.free} free voxels of {100 * occupancy.resolution:g} cm, "
+            f"{found.memory_bytes / 1e6:.1f} MB",
+            occupancy={"occupied": found.occupied, "free": found.free, "memory_mb": found.memory_bytes / 1e6},
+        )  # fmt: skip
+
+
+def _slice(
+    field_: DistanceField, up: np.ndarray, height: float, resolution: float, band: tuple[float, float] | None = None
+) -> FieldSlice:
+    """A slice, coarser than `resolution` where that would be too many cells."""
+    plane = plane_at_height(field_, up, height)
+    area = (plane.high[0] - plane.low[0]) * (plane.high[1] - plane.low[1])
+    return slice_field(field_, plane, max(resolution, math.sqrt(area / MOST_CELLS)), band)
+
+
+def _full_scale(distances: np.ndarray) -> float:
+    """A round number of metres above nearly all of the distances."""
+    return max(0.25, math.ceil(4 * float(np.percentile(distances, 99))) / 4) if len(distances) else 1.0
+
+
+def write_outputs(
+    maps: VolumeMaps, out: Path, request: OutputRequest, poses: Sequence[np.ndarray], record: dict[str, Any],
+    observer: Observer,
+) -> Outputs:  # fmt: skip
+    """Writes everything; when all of it is on the disk, it takes the place of earlier volumes in the folder.
+
+    Args:
+        maps: what was made.
+        out: the folder, see `prepare_folder`.
+        request: what is wanted.
+        poses: T_world_camera of the frames that were fused.
+        record: for volumes.json, where the volumes are from.
+        observer: is told how it goes on.
+    """
+    earlier = _earlier_files(out)
+    writer = _Writer(out, request, np.array(poses))
+    try:
+        _write_all(writer, maps, record, observer)
+    except BaseException:
+        shutil.rmtree(writer.staged, ignore_errors=True)
+        raise
+    publish(writer.staged, out, RECORD, earlier, {"complete": False})
+    return writer.outputs
+
+
+def prepare_folder(out: Path) -> None:
+    """Finds out before the work whether volumes can be written to a folder, and finishes a writing that was
+    interrupted.
+
+    Raises:
+        RunFolderError: they cannot.
+    """
+    RunFolder(out).check_writable()
+    for name in _FILES:
+        if (out / name).is_dir():
+            raise RunFolderError(f"{out / name}: is a folder; a file of this name is to be written")
+    finish_saving(out, RECORD)
+
+
+def _earlier_files(out: Path) -> list[str]:
+    """Names of the files that earlier volumes left in the folder, and that later ones replace."""
+    try:
+        names = json.loads((out / RECORD).read_text())["files"]
+        return [name for name in names if Path(name).name == name and name != RECORD and (out / name).is_file()]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def _write_all(writer: _Writer, maps: VolumeMaps, record: dict[str, Any], observer: Observer) -> None:
+    observer.begin("mesh, pictures, files", 4)
+    writer.tsdf(maps)
+    observer.advance(1, 4)
+    mesh = writer.mesh(maps)
+    upright = writer.upright(mesh)
+    if len(mesh.triangles):
+        write_picture(writer.path("mesh.png"), mesh_picture(mesh, writer.poses, upright.up))
+        if writer.outputs.record["mesh"]["objects"]:
+            write_picture(writer.path("objects.png"), mesh_picture(mesh, writer.poses, upright.up, by_object=True))
+    observer.advance(2, 4)
+    if maps.field is not None:
+        writer.field(maps.field, upright, maps.times.last_update)
+    observer.advance(3, 4)
+    if maps.occupancy is not None:
+        writer.occupancy(maps.occupancy, upright)
+    observer.advance(4, 4)
+    names = [path.name for path in writer.outputs.files if path.parent == writer.out]
+    writer.outputs.record = {"complete": True, **record, **writer.outputs.record, "files": names}
+    write_text(writer.path(RECORD), json.dumps(json_ready(writer.outputs.record), indent=1) + "\n")

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Follows a run and sends it to rerun: poses, images and numbers of every frame, the map now and then."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.reporting.rerun_log import RerunLog
+from ggslam.scene.frame import Frame
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.slam.result import SlamResult, StepReport
+from ggslam.slam.slam import Slam
+from ggslam.tracking.tracker import TrackingStatus
+
+MOST_POINTS = 30_000
+"""Gaussians that are sent at a time, evenly drawn from all."""
+MAP_EVERY = 5
+"""Keyframes from one sending of the map to the next."""
+_MOST_POSITIONS = 1000
+
+
+class LiveLog:
+    """A follower of a run, see `ggslam.jobs.run.pipeline.execute`.
+
+    Args:
+        log: where to.
+    """
+
+    def __init__(self, log: RerunLog) -> None:
+        self._log = log
+        self._keyframes = 0
+        self._positions: list[np.ndarray] = []
+
+    def __call__(self, slam: Slam, frame: Frame, report: StepReport) -> None:
+        """Sends what a step brought."""
+        if not self._positions and not self._keyframes:
+            self._log.camera(slam.camera)
+        self._log.moment(frame.index, frame.timestamp)
+        self._log.image(frame.color)
+        self._log.scalars({
+            "overlap": report.frame.overlap, "loss": report.loss, "psnr": report.psnr,
+            "gaussians": report.gaussians, "step_ms": 1e3 * report.seconds,
+        })  # fmt: skip
+        if report.frame.status != TrackingStatus.LOST.value:
+            pose = slam.pose_of(report.frame)
+            self._positions.append(pose[:3, 3])
+            self._log.pose(pose)
+        if report.is_keyframe:
+            self._log.depth(frame.depth)
+            self._send_path()
+            if self._keyframes % MAP_EVERY == 0:
+                self._send_map(slam.map)
+            self._keyframes += 1
+
+    def finish(self, result: SlamResult) -> None:
+        """Sends path and map as they came out.
+
+        Args:
+            result: of the run. Of a map that is on disk what was sent last remains.
+        """
+        poses = result.trajectory()
+        self._positions = list(poses[np.isfinite(poses).all((1, 2))][:, :3, 3])
+        self._send_path()
+        if len(result.gaussians):
+            self._send_map(result.gaussians)
+
+    def close(self) -> None:
+        """Nothing more comes."""
+        self._log.close()
+
+    def _send_path(self) -> None:
+        stride = max(1, len(self._positions) // _MOST_POSITIONS)
+        self._log.path(np.array(self._positions[::stride] + self._positions[-1:]))
+
+    def _send_map(self, gaussians: GaussianMap) -> None:
+        """In a real-time run the mapper works on the map meanwhile: arrays are cut to one length."""
+        stride = max(1, -(-gaussians.count // MOST_POINTS))
+        arrays = [a[::stride].cpu().numpy().copy() for a in (gaussians.means, gaussians.rgb, gaussians.scales)]
+        count = min(map(len, arrays))
+        means, rgb, scales = (a[:count] for a in arrays)
+        colors = (255 * np.clip(rgb, 0, 1) + 0.5).astype(np.uint8)
+        radii = np.median(scales, axis=1) * np.sqrt(stride)  # fewer, so larger, that surfaces stay closed
+        self._log.points(means, colors, radii)

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Locates frames or scans in a stored map of which only the surroundings of the sensor are in memory (SRT-PM).
+
+Each frame or scan is aligned by G-ICP, from where constant velocity leads, to the surface that `map_surface` holds
+ready around that place. `frame_localization` has what is different for images.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from ggslam.errors import check_ranges
+from ggslam.localization.surface import Surface
+from ggslam.native.loader import NativeContext
+from ggslam.scene.poses import inverse, orthonormalized
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
+from ggslam.tracking.scan_points import ScanSettings, scan_points
+from ggslam.tracking.settings import AlignSettings, DepthNoise
+
+ANY_NORMAL = -2.0
+"""A cosine that any two normals exceed."""
+
+Item = TypeVar("Item", contravariant=True)
+
+
+class LocalizationStatus(Enum):
+    """How a frame or scan was located."""
+
+    OK = "ok"
+    DEGENERATE = "degenerate"
+    """Located, but some direction of motion is not seen by the geometry."""
+    FOUND = "found"
+    """Located after being lost, or without a start pose."""
+    LOST = "lost"
+    """There is a map here, but it does not match."""
+    OUTSIDE = "outside"
+    """The map has nothing within reach of where the sensor is believed to be."""
+
+    @property
+    def located(self) -> bool:
+        """Whether the pose is one that was measured."""
+        return self not in (LocalizationStatus.LOST, LocalizationStatus.OUTSIDE)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What a front-end says of one frame or scan.
+
+    Attributes:
+        T_world_sensor: float64 [4, 4]; when it is lost, the last known pose.
+        status: OK, DEGENERATE, FOUND or LOST.
+        overlap: share of its points with a match near enough.
+        rmse_m: root mean square point-to-plane distance of those, metres.
+        reason: why it was lost or how it was found, else empty.
+    """
+
+    T_world_sensor: np.ndarray
+    status: LocalizationStatus
+    overlap: float
+    rmse_m: float
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Localization(Tracked):
+    """Where a frame or scan is, and what that took.
+
+    Attributes:
+        map_points: points of the map that was aligned to.
+        map_changed: whether the target was made anew.
+        map_seconds: spent on the map: reading cells, making the target.
+        align_seconds: spent on the frame or scan.
+    """
+
+    map_points: int = 0
+    map_changed: bool = False
+    map_seconds: float = 0.0
+    align_seconds: float = 0.0
+
+    @property
+    def seconds(self) -> float:
+        """Localisation time."""
+        return self.map_seconds + self.align_seconds
+
+
+class FrontEnd(Protocol[Item]):
+    """Locates one frame or scan after another against the target of the moment."""
+
+    def track(self, item: Item, surface: Surface, target: GicpTarget) -> Tracked:
+        """Locates the next one."""
+
+    def look_up(self, item: Item, surface: Surface) -> Tracked | None:
+        """Looks for a lost one in the whole map; None: it was not found, or there is nothing to look it up by. Moves
+        the surface."""
+
+
+class Localizer(Generic[Item]):
+    """Asks for the map around the place where constant velocity leads, then locates the frame or scan in it.
+
+    Where nothing is near, or nothing matches, it stays at the last pose, standing still, and goes on from there if the
+    sensor comes back, or from wherever the front-end finds it.
+
+    Args:
+        surface: of the map.
+        front_end: for what is to be located.
+        T_world_sensor: pose of the first one, float64 [4, 4]; None: it is looked up.
+    """
+
+    def __init__(self, surface: Surface, front_end: FrontEnd[Item], T_world_sensor: np.ndarray | None) -> None:
+        self.surface, self.front_end = surface, front_end
+        self._pose = None if T_world_sensor is None else np.array(T_world_sensor, float)
+        self._velocity = np.eye(4)
+        self._lost = T_world_sensor is None
+
+    def locate(self, item: Item) -> Localization:
+        """Locates the next frame or scan.
+
+        Raises:
+            FormatError: the index of the store is damaged. (Damaged cells are left out; see `Surface.damaged`.)
+        """
+        began = time.perf_counter()
+        changed, map_seconds = self._move(), time.perf_counter() - began
+        target = self.surface.target if self._pose is not None else None
+        found = None if target is None else self.front_end.track(item, self.surface, target)
+        if found is None or not found.status.located:
+            found = self.front_end.look_up(item, self.surface) or found or self._outside()
+        self._follow(found)
+        spent = time.perf_counter() - began
+        return Localization(
+            found.T_world_sensor, found.status, found.overlap, found.rmse_m, found.reason, self.surface.points,
+            changed, map_seconds, spent - map_seconds,
+        )  # fmt: skip
+
+    def _move(self) -> bool:
+        """Brings the map to where the sensor is expected."""
+        if self._pose is None:
+            return False
+        expected = self._pose @ self._velocity
+        return self.surface.move_to(expected[:3, 3], expected[:3, 3] - self._pose[:3, 3])
+
+    def _outside(self) -> Tracked:
+        if self._pose is None:
+            reason = "no start pose, and nothing to look the place up by or nothing that looks like it"
+            return Tracked(np.full((4, 4), np.nan), LocalizationStatus.LOST, 0.0, 0.0, reason)
+        x, y, z = self._pose[:3, 3]
+        reason = f"the map has nothing around ({x:.2f}, {y:.2f}, {z:.2f})"
+        return Tracked(self._pose.copy(), LocalizationStatus.OUTSIDE, 0.0, 0.0, reason)
+
+    def _follow(self, found: Tracked) -> None:
+        if not found.status.located:
+            self._velocity, self._lost = np.eye(4), True
+            return
+        T = found.T_world_sensor
+        known = self._pose is not None and not self._lost and found.status is not LocalizationStatus.FOUND
+        self._velocity = inverse(self._pose) @ T if known and self._pose is not None else np.eye(4)
+        self._pose, self._lost = T.copy(), False
+
+
+@dataclass(frozen=True)
+class ScanTrackerSettings:
+    """How scans are located."""
+
+    scan: ScanSettings = field(default_factory=ScanSettings)
+    """Which of their points are used."""
+    sigma: float = 0.02
+    """Standard deviation of a range, metres."""
+    align: AlignSettings = field(default_factory=lambda: AlignSettings(min_normal_dot=0.0, coarse_iterations=8))
+    """The points' "normals" point to the sensor, hence the cosine."""
+    min_overlap: float = 0.5
+    """Under this share of points that match, the scan is lost."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, {"sigma": (1e-4, 10), "min_overlap": (0, 1)})
+
+
+class ScanTracker:
+    """Locates laser scans, float [n, 3] in metres in the sensor's frame. They show no places to look up.
+
+    Args:
+        settings: see `ScanTrackerSettings`.
+        context: threads.
+        T_world_sensor: pose of the first scan.
+    """
+
+    def __init__(self, settings: ScanTrackerSettings, context: NativeContext, T_world_sensor: np.ndarray) -> None:
+        self.settings = settings
+        self._context = context
+        self._pose = np.array(T_world_sensor, float)
+        self._velocity = np.eye(4)
+
+    def track(self, item: np.ndarray, surface: Surface, target: GicpTarget) -> Tracked:
+        """See `FrontEnd`. Tries constant velocity, and if that does not convince, standing still."""
+        best: AlignmentResult | None = None
+        source = scan_points(item, self.settings.scan)
+        dot = self.settings.align.min_normal_dot if surface.sided else ANY_NORMAL
+        settings = replace(self.settings.align, min_normal_dot=dot)
+        noise = DepthNoise(self.settings.sigma, 0.0)
+        for guess in (self._pose @ self._velocity, self._pose):
+            found = align(source, target, guess, settings, noise, self._context)
+            if best is None or (found.status is not AlignmentStatus.LOST and found.overlap > best.overlap):
+                best = found
+            if self._convincing(best):
+                break
+        assert best is not None
+        return self._outcome(best, len(source))
+
+    def look_up(self, item: np.ndarray, surface: Surface) -> Tracked | None:
+        """See `FrontEnd`."""
+        return None
+
+    def _convincing(self, found: AlignmentResult) -> bool:
+        return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.min_overlap
+
+    def _outcome(self, found: AlignmentResult, count: int) -> Tracked:
+        if not self._convincing(found):
+            self._velocity = np.eye(4)
+            reason = f"{found.overlap:.0%} of {count} points match the map, {self.settings.min_overlap:.0%} needed"
+            return Tracked(self._pose.copy(), LocalizationStatus.LOST, found.overlap, found.rmse, reason)
+        T = orthonormalized(found.T_world_camera)
+        self._velocity, self._pose = inverse(self._pose) @ T, T
+        status = LocalizationStatus.DEGENERATE if found.degenerate else LocalizationStatus.OK
+        return Tracked(T.copy(), status, found.overlap, found.rmse)

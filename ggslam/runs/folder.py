@@ -1,0 +1,371 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run leaves on disk. Every file is written to a temporary name and renamed: none is ever half there.
+
+    loops.json       closures and what became of other candidates, stretches in which the camera was lost
+    trajectory.txt   TUM: timestamp tx ty tz qx qy qz qw, camera to world, the world being the first camera
+    keyframes.json   poses, exposures and frame numbers of the keyframes; how each frame was tracked
+    map.ply          Gaussians in the fields of 3DGS
+    map_cells.json   of a run whose memory was limited: which rows of map.ply lie in which cell
+    points.ply       coloured cloud sampled from the map, metres; points_grid.ply: the same in integer grid cells
+    places.npz       what another recording needs to start in this map
+    config.yaml      all settings; sequence.json: where the recording was and how it was read
+    timing.json      seconds by part; steps.csv: the same, memory, Gaussians and losses step by step
+    metrics.json     scores; renders/: pictures; report.html: all of it to look at; ground_truth.txt: true poses for it
+    volumes/         by `ggslam volumes`; plots/: by `ggslam report --plots`
+of a run with objects, whose map.ply also holds each Gaussian's object id and identity vector:
+    objects.json     the objects: ids, names, boxes, ...; there if and only if the other files of the objects are whole
+    classifier.npz   turns identity vectors into objects; votes.npz: mask ids that each Gaussian was seen under
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ggslam import __version__
+from ggslam.errors import RunFolderError
+from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
+from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
+from ggslam.objects.table import ObjectTable
+from ggslam.runs.environment import environment
+from ggslam.runs.map_index import MAP_INDEX, MapIndex, MapInParts
+from ggslam.runs.saving_parts import save_map_in_parts, save_points
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IdentityClassifier
+from ggslam.slam.config import Config, config_from_dict, save_config
+from ggslam.slam.result import SlamResult
+from ggslam.slam.saved_places import PLACES_FILE
+from ggslam.slam.step_log import STEPS_FILE
+from ggslam.system.atomic import write_bytes, write_text
+from ggslam.system.process_memory import peak_memory_bytes
+from ggslam.system.staging import finish_saving, leftovers
+
+MARKER = "run.json"
+"""Is there if and only if a folder is a run of ggslam."""
+TRUTH_FILE = "ground_truth.txt"
+"""True poses of the frames that have both, with the times of trajectory.txt; written by the report."""
+REPORT_FILE = "report.html"
+OBJECT_FILES = ("objects.json", "classifier.npz", "votes.npz")
+"""Files of a run with objects, in the order in which they are removed; they are written in the opposite one."""
+
+
+class RunFolder:
+    """A run on disk.
+
+    Args:
+        path: the folder. Use `create` for a new one and `open` for one that is there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self._made_here = False
+
+    @staticmethod
+    def create(path: Path, overwrite: bool = False) -> RunFolder:
+        """Makes the folder, or takes an empty one, or with `overwrite` an earlier run's.
+
+        Raises:
+            RunFolderError: it holds something else, or a run that was not to be replaced, or cannot be written to.
+        """
+        folder = RunFolder(path)
+        try:
+            if folder.path.is_dir() and set(folder.path.iterdir()) - set(leftovers(folder.path)):
+                if not (folder.path / MARKER).exists():
+                    raise RunFolderError(f"{path}: not empty and not a run of ggslam; choose another folder with --out")
+                if not overwrite:
+                    raise RunFolderError(f"{path}: there is a run already; use --overwrite or another --out")
+            else:
+                folder.path.mkdir(parents=True, exist_ok=True)
+                folder._made_here = True
+        except OSError as error:
+            raise RunFolderError(f"{path}: cannot be written to: {error.strerror or error}") from None
+        folder.check_writable()
+        return folder
+
+    @staticmethod
+    def open(path: Path) -> RunFolder:
+        """A run that is there. If saving it was interrupted while files changed places, that is finished.
+
+        Raises:
+            RunFolderError: no such folder, or not a run, or one whose saving cannot be finished.
+        """
+        if not (Path(path) / MARKER).is_file():
+            reason = "is not a run of ggslam (no run.json)" if Path(path).is_dir() else "no such folder"
+            raise RunFolderError(f"{path}: {reason}")
+        finish_saving(Path(path), MARKER)
+        return RunFolder(path)
+
+    def check_writable(self) -> None:
+        """Raises RunFolderError if files cannot be written to the folder."""
+        try:
+            self._probe()
+        except OSError as error:
+            raise RunFolderError(f"{self.path}: cannot be written to: {error.strerror or error}") from None
+
+    def _probe(self) -> None:
+        """Finds out now, not after hours of work, whether files can be written."""
+        probe = self.path / f".probe-{os.getpid()}"
+        try:
+            probe.write_bytes(b"x")
+        finally:
+            probe.unlink(missing_ok=True)
+
+    def discard(self) -> None:
+        """Removes the folder if it was made by `create` and is still empty."""
+        if self._made_here and not any(self.path.iterdir()):
+            self.path.rmdir()
+
+    # --- writing -----------------------------------------------------------------------------------------------------
+
+    def save(
+        self, config: Config, sequence: dict[str, Any], result: SlamResult, error: str | None = None,
+        names: Mapping[int, str] | None = None,
+    ) -> None:  # fmt: skip
+        """Writes everything but scores and pictures.
+
+        Args:
+            config: all settings.
+            sequence: how the recording was read, as keyword arguments of `open_sequence`, for scoring later.
+            result: of the run.
+            error: why the run stopped early, if it did.
+            names: of object ids, as far as the recording knows them.
+        """
+        mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish",
+                "environment": {**environment(config.threads), "device": result.device}}  # fmt: skip
+        self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
+        stale_files = ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", PLACES_FILE, MAP_INDEX,
+                       STEPS_FILE, TRUTH_FILE, REPORT_FILE)  # fmt: skip
+        for stale in (*stale_files, *OBJECT_FILES):
+            (self.path / stale).unlink(missing_ok=True)
+        for stale in ("renders", "volumes", "plots"):
+            shutil.rmtree(self.path / stale, ignore_errors=True)
+        save_config(config, self.path / "config.yaml")
+        self.write_json("sequence.json", sequence)
+        self.write_json("timing.json", timing(result))
+        self.write_json("keyframes.json", _keyframes(result))
+        self.write_json("loops.json", _loops(result))
+        write_tum(self.path / "trajectory.txt", result.timestamps(), result.trajectory())
+        if result.steps is not None:
+            write_text(self.path / STEPS_FILE, result.steps)
+        if result.cells is not None:
+            save_map_in_parts(self.path, result, names)
+        elif result.objects is None:
+            write_gaussian_ply(self.path / "map.ply", result.gaussians)
+        else:
+            self.save_objects(segmented(result, names))
+        if result.places is not None:
+            write_bytes(self.path / PLACES_FILE, result.places)
+        self.write_json(MARKER, {**mark, "complete": error is None, "stopped_by": error})
+        # Last and largest; `ggslam export --format points` makes them again from the map.
+        save_points(self.path, result)
+        self.write_json("timing.json", timing(result))  # once more: peak memory is that of the whole run
+
+    def save_trajectory(self, timestamps: np.ndarray, poses: np.ndarray, error: str) -> None:
+        """Writes what is left of a run whose map is lost: trajectory.txt, and why it stopped.
+
+        Args:
+            timestamps: seconds, [n].
+            poses: T_world_camera [n, 4, 4], NaN where lost.
+            error: why it stopped.
+        """
+        for name in (*OBJECT_FILES, "map.ply", "metrics.json", REPORT_FILE):  # of a run that this one replaces
+            (self.path / name).unlink(missing_ok=True)
+        write_tum(self.path / "trajectory.txt", timestamps, poses)
+        self.write_json(MARKER, {"ggslam": __version__, "complete": False, "stopped_by": error})
+
+    def save_objects(self, segmented: SegmentedMap) -> None:
+        """Writes a map with its objects: map.ply with object ids and identity vectors, and the files beside it."""
+        for stale in OBJECT_FILES:
+            (self.path / stale).unlink(missing_ok=True)
+        write_gaussian_ply(self.path / "map.ply", segmented.gaussians, extra=("object_id", "identity"))
+        if segmented.votes is not None:
+            write_bytes(self.path / "votes.npz", segmented.votes.to_bytes())
+        write_bytes(self.path / "classifier.npz", segmented.classifier.to_bytes())
+        segmented.table.save(self.path / "objects.json")
+
+    def write_json(self, name: str, values: Any) -> Path:
+        """Writes `values` as JSON; numbers that are not finite become null."""
+        write_text(self.path / name, json.dumps(json_ready(values), indent=1) + "\n")
+        return self.path / name
+
+    # --- reading -----------------------------------------------------------------------------------------------------
+
+    def read_json(self, name: str) -> Any:
+        """Content of a JSON file of the run.
+
+        Raises:
+            RunFolderError: it is missing or damaged.
+        """
+        path = self.path / name
+        try:
+            return json.loads(path.read_text())
+        except FileNotFoundError:
+            raise RunFolderError(f"{path}: missing") from None
+        except (OSError, ValueError, RecursionError) as error:
+            raise RunFolderError(f"{path}: cannot be read: {error}") from None
+
+    def config(self) -> Config:
+        """The settings of the run."""
+        path = self.path / "config.yaml"
+        try:
+            return config_from_dict(yaml.safe_load(path.read_text()), str(path))
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise RunFolderError(f"{path}: cannot be read: {error}") from None
+
+    def gaussians(self, with_moments: bool = False) -> GaussianMap:
+        """The map; optimizer state, if there is room for it, begins anew."""
+        return read_gaussian_ply(self.path / "map.ply", with_moments=with_moments)
+
+    def map_in_parts(self) -> MapInParts:
+        """The map, to be read in blocks of rows, or as far as a view needs it if it was written cell by cell.
+
+        Raises:
+            FormatError: map or index are damaged or do not belong together.
+        """
+        index = self.path / MAP_INDEX
+        return MapInParts(self.path / "map.ply", MapIndex.read(index) if index.is_file() else None)
+
+    def trajectory(self) -> Trajectory:
+        """Camera poses of all frames."""
+        return read_tum(self.path / "trajectory.txt")
+
+    def has_objects(self) -> bool:
+        """Whether the run has objects."""
+        return (self.path / "objects.json").is_file()
+
+    def object_table(self) -> ObjectTable:
+        """The objects alone, without the map.
+
+        Raises:
+            RunFolderError: the run has no objects.
+            FormatError: objects.json is damaged.
+        """
+        if not self.has_objects():
+            raise RunFolderError(f"{self.path}: this run has no objects: it learned none, its map is not segmented")
+        return ObjectTable.load(self.path / "objects.json")
+
+    def segmented_map(self) -> SegmentedMap:
+        """The map with its objects, without optimizer state.
+
+        Raises:
+            RunFolderError: the run has no objects, or its files do not belong together.
+            FormatError: a file is missing or damaged.
+        """
+        table, gaussians = self.object_table(), self.gaussians()
+        classifier = IdentityClassifier.from_file(self.path / "classifier.npz")
+        self.check_objects(table, classifier, gaussians, set(np.unique(gaussians.object_id.numpy()).tolist()))
+        votes = self.votes()
+        if votes is not None:
+            self.check_votes(len(votes), len(gaussians))
+        return SegmentedMap(gaussians, classifier, table, votes)
+
+    def check_objects(
+        self, table: ObjectTable, classifier: IdentityClassifier, like: GaussianMap, present: Collection[int]
+    ) -> None:
+        """Raises RunFolderError if a map with the channels of `like` and Gaussians of the objects `present` is not
+        what table and classifier speak of."""
+        channels, found = classifier.weight.shape[1], like.features.shape[1]
+        if found != channels:
+            raise RunFolderError(f"{self.path / 'map.ply'}: expected {channels} properties identity_*, found {found}")
+        lacking = sorted(set(table.ids()) - set(present))
+        if lacking:
+            named = f"object {lacking[0]}" + (f" and {len(lacking) - 1} more" if lacking[1:] else "")
+            raise RunFolderError(f"{self.path / 'map.ply'}: no Gaussian is of {named}, which objects.json lists")
+
+    def check_votes(self, votes: int, gaussians: int) -> None:
+        """Raises RunFolderError if there are votes of another number of Gaussians."""
+        if votes != gaussians:
+            raise RunFolderError(f"{self.path / 'votes.npz'}: expected votes of {gaussians} Gaussians, found {votes}")
+
+    def votes(self) -> ObjectVotes | None:
+        """Votes of the Gaussians of map.ply, None if they were not counted.
+
+        Raises:
+            FormatError: the file is damaged.
+        """
+        path = self.path / "votes.npz"
+        return ObjectVotes.from_file(path) if path.is_file() else None
+
+
+@contextmanager
+def as_written(path: Path) -> Iterator[None]:
+    """What goes wrong in the block is the fault of a file, or of files in a folder: RunFolderError says so."""
+    try:
+        yield
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
+        raise RunFolderError(f"{path}: not as ggslam writes it: {error!r}") from error
+
+
+def segmented(result: SlamResult, names: Mapping[int, str] | None = None) -> SegmentedMap:
+    """A run's map with its objects. Names are taken only where ids are the masks' own."""
+    assert result.objects is not None
+    found = result.objects
+    known = names if found.supervision == "masks" else None
+    table = ObjectTable.build(result.gaussians, found.classifier, found.supervision, known, found.observations)
+    return SegmentedMap(result.gaussians, found.classifier, table, ObjectVotes.of(result.gaussians))
+
+
+def json_ready(value: Any) -> Any:
+    """Plain Python values: numpy numbers converted, NaN and infinity as None (JSON has no word for them)."""
+    if isinstance(value, dict):
+        return {str(key): json_ready(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return json_ready(value.tolist())
+    if isinstance(value, np.generic):
+        return json_ready(value.item())
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def timing(result: SlamResult) -> dict[str, Any]:
+    """Where the time went, by part."""
+    frames, t, m = max(1, len(result.frames)), result.times, result.mapper_times
+    return {
+        "frames": len(result.frames), "dropped_frames": result.dropped_frames,
+        "frames_per_s": result.frames_per_second(),
+        "wall_s": t.wall, "tracking_s": t.tracking, "loops_s": t.loops, "refinement_s": t.refinement,
+        "tracking_ms_per_frame": 1e3 * t.tracking / frames, "tracking_ms_per_100_frames": t.tracking_ms_by_window(),
+        "mapping_ms_per_iteration": m.iteration_ms,
+        "refine_iterations": result.refine_iterations, "mapping": asdict(m), "gaussians": result.gaussian_count,
+        "peak_rss_mb": peak_memory_mb(), "paging": result.paging,
+    }  # fmt: skip
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, in MB (10^6 bytes)."""
+    return peak_memory_bytes() / 1e6
+
+
+def _loops(result: SlamResult) -> dict[str, Any]:
+    return {
+        "seconds": result.times.loops, "events": [asdict(event) for event in result.loop_events],
+        "lost": [asdict(stretch) for stretch in result.lost_stretches()],
+    }  # fmt: skip
+
+
+def _keyframes(result: SlamResult) -> dict[str, Any]:
+    keyframes = [
+        {"index": k.index, "frame": k.frame_index, "timestamp": k.timestamp, "T_world_camera": k.T_world_camera,
+         "exposure": k.exposure, "iterations": k.iterations} for k in result.keyframes
+    ]  # fmt: skip
+    frames = [
+        {"frame": f.frame_index, "source": f.source_index, "timestamp": f.timestamp, "keyframe": f.keyframe,
+         "T_keyframe_camera": f.T_keyframe_camera, "overlap": f.overlap, "rmse_m": f.rmse_m, "status": f.status,
+         "reason": f.reason} for f in result.frames
+    ]  # fmt: skip
+    return {"keyframes": keyframes, "frames": frames}

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which recording a run reads, and how to open it again later."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ggslam.errors import RunFolderError, SequenceError
+from ggslam.runs.folder import RunFolder, json_ready
+from ggslam.sequences import Sequence, open_sequence
+from ggslam.sequences.live import LiveSequence, is_live, open_live
+
+
+@dataclass(frozen=True)
+class SequenceRequest:
+    """Which part of which recording, and how to read it; see `open_sequence`."""
+
+    path: Path
+    format: str | None = None
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+    scale: float = 1.0
+    masks: Path | None = None
+    depth_scale: float | None = None
+    on_bad_frame: str = "error"
+    depth_camera: Path | None = None
+    min_confidence: int | None = None
+    topics: tuple[str, ...] = ()
+    pose_convention: str | None = None
+
+    def open(self) -> Sequence:
+        """Opens the recording.
+
+        Raises:
+            SequenceError: it cannot be read.
+            MissingDependency: a package is needed to read it.
+        """
+        return open_sequence(
+            self.path, format=self.format, start=self.start, stop=self.stop, stride=self.stride, scale=self.scale,
+            masks=self.masks, depth_scale=self.depth_scale, on_bad_frame=self.on_bad_frame,  # type: ignore[arg-type]
+            depth_camera=self.depth_camera, min_confidence=self.min_confidence, topics=self.topics,
+            pose_convention=self.pose_convention,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LiveRequest(SequenceRequest):
+    """A live camera as the recording of a run; `record`: folder that its frames are kept in."""
+
+    record: Path | None = None
+
+    def open(self) -> LiveSequence:  # type: ignore[override]
+        """Starts the camera; what comes back has what a run needs of a sequence.
+
+        Raises:
+            SequenceError: it cannot be started, or options are for recordings only.
+            MissingDependency: a package is needed for it.
+        """
+        plain = SequenceRequest(self.path, stop=self.stop, scale=self.scale, on_bad_frame=self.on_bad_frame)
+        if replace(self, record=None) != LiveRequest(**asdict(plain)):
+            raise SequenceError(f"{self.path}: of a live camera only --stop and --scale can be chosen")
+        source = open_live(str(self.path), self.scale)
+        return LiveSequence(source, self.stop, self.record)
+
+
+def describe(
+    request: SequenceRequest, sequence: Sequence | LiveSequence, earlier: RunFolder | None = None
+) -> dict[str, Any]:
+    """What `sequence.json` holds: how to open the recording again, its camera, and the run whose map this one began
+    with, if any."""
+    values = asdict(request)
+    values.pop("record", None)
+    if isinstance(sequence, LiveSequence):  # what was recorded is a plain folder, scaled already
+        values |= {"path": sequence.path if sequence.record else request.path, "scale": 1.0, "stop": None}
+    for name in ("path", "masks", "depth_camera"):
+        if values[name] is not None and not is_live(values[name]):
+            values[name] = Path(values[name]).absolute()
+    return {
+        "open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence),
+        "warnings": sequence.warnings, "skipped": [asdict(skipped) for skipped in sequence.skipped],
+        "mask_problems": sequence.mask_problems, "map": None if earlier is None else earlier.path.absolute(),
+        "map_fingerprint": None if earlier is None else fingerprint(earlier),
+    }  # fmt: skip
+
+
+def fingerprint(folder: RunFolder) -> str:
+    """Tells a run from another one in the same folder."""
+    try:
+        return hashlib.sha256((folder.path / "keyframes.json").read_bytes()).hexdigest()
+    except OSError as error:
+        raise RunFolderError(f"{folder.path / 'keyframes.json'}: cannot be read: {error.strerror}") from None
+
+
+def open_recording_of(
+    folder: RunFolder, path: Path | None = None, masks: Path | None = None, scale: float | None = None
+) -> Sequence:
+    """Opens the recording of a run again, as the run did.
+
+    Args:
+        folder: of the run.
+        path: where the recording is now, if it was moved.
+        masks: folder of masks to use instead of those that the run had.
+        scale: of the images; None: the run's.
+
+    Raises:
+        SequenceError: it is not there any more.
+        RunFolderError: the run does not say which it was.
+    """
+    try:
+        record = folder.read_json("sequence.json")
+        values = dict(record["open"])
+        values["path"] = Path(path if path is not None else values["path"])
+        used = masks if masks is not None else values["masks"]
+        values["masks"] = None if used is None else Path(used)
+        values["depth_camera"] = None if values.get("depth_camera") is None else Path(values["depth_camera"])
+        request = SequenceRequest(**values)
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunFolderError(f"{folder.path / 'sequence.json'}: not as ggslam writes it: {error!r}") from None
+    if is_live(request.path):
+        raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (--record)")
+    sequence = replace(request, scale=request.scale if scale is None else scale).open()
+    found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scaled(request.scale))}
+    expected = {name: record.get(name) for name in found}
+    if json_ready(found) != expected:
+        raise RunFolderError(f"{sequence.path}: not the recording of {folder.path}: expected {expected}, found {found}")
+    return sequence

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starting in the map of an earlier run instead of an empty one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ggslam.errors import ConfigError, FormatError, RunFolderError, SequenceError
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
+from ggslam.objects.table import Observation
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import fingerprint, open_recording_of
+from ggslam.scene.arrays import read_all_arrays
+from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import inverse
+from ggslam.slam.loop_closing import LoopCloser
+from ggslam.slam.result import LearnedObjects
+from ggslam.slam.saved_places import PLACES_FILE
+from ggslam.slam.slam import Slam
+from ggslam.tracking.settings import DepthNoise
+
+_NEEDED = "to grow its map, the images of its keyframes are needed"
+_INSTEAD = "--localize-only does without its images"
+
+
+class OtherImagesError(Exception):
+    """The map was made with images of another size."""
+
+
+def _camera(row: np.ndarray) -> Camera:
+    return Camera(int(row[0]), int(row[1]), *(float(value) for value in row[2:]))
+
+
+def start_in_map(slam: Slam, folder: RunFolder, growing: bool) -> None:
+    """Makes a fresh `Slam` start in the map of a run: lost, until a frame shows a known place.
+
+    Args:
+        slam: no frame was tracked yet.
+        folder: of the run.
+        growing: whether the map is to grow; needs the recording it was made from.
+
+    Raises:
+        RunFolderError: the run has no places, or its files do not belong together.
+    """
+    path = folder.path / PLACES_FILE
+    if not path.is_file():
+        raise RunFolderError(f"{path}: missing: the run was made without loops, or its map was edited since")
+    if slam.loops is None:
+        raise ConfigError("--map: to start in a map, loops.enabled must not be off")
+    arrays: dict[str, Any] = read_all_arrays(path, "the places of a run")
+    try:
+        gaussians, keyframes = _load(slam, slam.loops, folder, arrays)
+    except OtherImagesError as error:
+        raise ConfigError(f"{folder.path}: {error}; see --scale") from None
+    except (KeyError, ValueError, IndexError, TypeError, RuntimeError, ConfigError, FormatError) as error:
+        reason = f"lacks {error}" if isinstance(error, KeyError) else error
+        raise RunFolderError(f"{path}: not the places of this run: {reason}") from None
+    objects = _objects(folder, gaussians)
+    if growing:
+        keyframes = _with_images(folder, keyframes, objects is not None and objects.supervision == "masks")
+    slam.growing = growing
+    slam.adopt(gaussians, keyframes, objects)
+
+
+def _load(
+    slam: Slam, loops: LoopCloser, folder: RunFolder, arrays: dict[str, Any]
+) -> tuple[GaussianMap, list[Keyframe]]:
+    """Fills surface and loops; gives the map and its keyframes without images."""
+    gaussians, birth, poses = folder.gaussians(with_moments=True), arrays["birth"], arrays["keyframe_poses"]
+    if birth.shape != (len(gaussians),):
+        raise ValueError(f"expected {len(gaussians)} Gaussians as in map.ply, found {len(birth)}")
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+        raise ValueError(f"keyframe_poses: expected numbers [K, 4, 4], found {list(poses.shape)}")
+    if birth.max(initial=-1) >= len(poses) or birth.min(initial=0) < -1:
+        raise ValueError(f"birth: expected keyframes up to {len(poses) - 1}, found {birth.min()} to {birth.max()}")
+    camera, (constant, square) = _camera(arrays["camera"]), arrays["noise"].tolist()
+    if (camera.width, camera.height) != (slam.camera.width, slam.camera.height):
+        raise OtherImagesError(
+            f"it was made with images of {camera.width}x{camera.height}, these are "
+            f"{slam.camera.width}x{slam.camera.height}"
+        )
+    gaussians.birth_keyframe[:] = torch.from_numpy(birth.astype(np.int32))
+    slam.use_scale(_scale(arrays))
+    slam.surface.load(_part(arrays, "surface_"))
+    loops.load(_part(arrays, "loops_"))
+    if len(loops.poses) != len(poses) or not np.isfinite(np.array(loops.poses)).all():
+        raise ValueError(f"expected numbers for the poses of {len(poses)} keyframes")
+    slam.tracker.noise = DepthNoise(constant, square)
+    return gaussians, [_bare_keyframe(k, T, slam.camera) for k, T in enumerate(poses)]
+
+
+def _scale(arrays: dict[str, Any]) -> float:
+    """Size of the scene; runs of before it was measured lack it."""
+    scale = float(arrays.get("scale", 1.0))
+    if not 1e-3 <= scale <= 1e3:
+        raise ValueError(f"scale: expected 0.001 to 1000, found {scale:g}")
+    return scale
+
+
+def _objects(folder: RunFolder, gaussians: GaussianMap) -> LearnedObjects | None:
+    """The objects of a run; its Gaussians get their votes."""
+    if not folder.has_objects():
+        return None
+    segmented = folder.segmented_map()
+    if segmented.votes is not None:
+        slots = segmented.votes.ids.shape[1]
+        gaussians.vote_ids[:, :slots] = torch.from_numpy(segmented.votes.ids.astype(np.int32))
+        gaussians.vote_weights[:, :slots] = torch.from_numpy(segmented.votes.weights)
+    seen = {
+        o.id: Observation(o.first_frame, o.last_frame, o.views)
+        for o in segmented.table.objects
+        if o.first_frame is not None and o.last_frame is not None
+    }
+    return LearnedObjects(segmented.classifier, segmented.table.supervision, seen)
+
+
+def _bare_keyframe(number: int, T_world_camera: np.ndarray, camera: Camera) -> Keyframe:
+    """A keyframe of another recording: its pose alone."""
+    color, depth = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.uint16)
+    return Keyframe(number, ELSEWHERE, float("nan"), camera, color, depth, inverse(T_world_camera))
+
+
+def _with_images(folder: RunFolder, keyframes: list[Keyframe], with_masks: bool) -> list[Keyframe]:
+    """The same keyframes with their images, read again from the recordings they came from.
+
+    Raises:
+        RunFolderError: a recording is not there any more.
+    """
+    record = folder.read_json("sequence.json")
+    if record.get("map") is not None:
+        earlier = parent(folder, record)
+        first = len(earlier.read_json("keyframes.json")["keyframes"])
+        keyframes = _with_images(earlier, keyframes[:first], with_masks) + keyframes[first:]
+    else:
+        first = 0
+    records = folder.read_json("keyframes.json")["keyframes"][first:]
+    try:
+        sequence = open_recording_of(folder)
+    except SequenceError as error:
+        raise RunFolderError(f"{folder.path}: {_NEEDED} ({error}); {_INSTEAD}") from None
+    out = keyframes[:first]
+    for keyframe, record in zip(keyframes[first:], records, strict=True):
+        frame = sequence.frame(record["frame"], masks=with_masks)
+        made = make_keyframe(keyframe.index, frame, keyframe.T_world_camera)
+        out.append(replace(made, frame_index=ELSEWHERE, iterations=record["iterations"]))
+    return out
+
+
+def parent(folder: RunFolder, record: dict[str, Any]) -> RunFolder:
+    """The run whose map a run began with.
+
+    Args:
+        folder: of the run.
+        record: content of its sequence.json.
+
+    Raises:
+        RunFolderError: it is not there any more, or is another one now.
+    """
+    path = Path(record["map"])
+    try:
+        earlier = RunFolder.open(path)
+    except RunFolderError as error:
+        raise RunFolderError(f"{folder.path} began with the map of another run: {error}; {_INSTEAD}") from None
+    if fingerprint(earlier) != record.get("map_fingerprint"):
+        raise RunFolderError(
+            f"{path}: not the run any more whose map {folder.path} began with (it was made anew); {_INSTEAD}"
+        )
+    return earlier
+
+
+def ancestors(folder: RunFolder) -> list[Path]:
+    """Folders of the runs that a run's map comes from, its own first."""
+    paths = [folder.path.resolve()]
+    while (earlier := RunFolder(paths[-1]).read_json("sequence.json").get("map")) is not None:
+        if Path(earlier).resolve() in paths or not Path(earlier).is_dir():
+            break
+        paths.append(Path(earlier).resolve())
+    return paths
+
+
+def _part(arrays: dict[str, Any], prefix: str) -> dict[str, np.ndarray]:
+    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}

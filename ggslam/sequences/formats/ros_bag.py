@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 1 bags (one file) and ROS 2 bags (a folder with metadata.yaml, or one .db3 or .mcap): colour, depth, camera_info.
+
+Needs the package rosbags, no ROS. The bag is read through once for the times of its images; images are decoded when
+their frame comes. Depth of a camera beside the colour camera is registered by /tf_static.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import is_valid_pose
+from ggslam.sequences.association import pair_images, poses_at
+from ggslam.sequences.formats.ros_images import color_image, depth_image, in_metres
+from ggslam.sequences.formats.ros_messages import Bag, BagImage
+from ggslam.sequences.formats.ros_topics import REGISTERED, Topics, find_topics, poses_of, static_transform
+from ggslam.sequences.json_files import camera_of
+from ggslam.sequences.recording import (
+    NO_OPTIONS,
+    DepthCamera,
+    FrameFiles,
+    ReadOptions,
+    Recording,
+)
+
+FISHEYE = ("equidistant", "fisheye")
+BAG_START = b"#ROSBAG V2.0"
+
+
+class Ros1Format:
+    """One .bag file."""
+
+    name = "ros1"
+    layout = "one file .bag of ROS 1 with colour and depth images and camera_info (needs rosbags)"
+
+    def matches(self, path: Path) -> bool:
+        if not path.is_file() or path.suffix.lower() != ".bag":
+            return False
+        with path.open("rb") as file:
+            return file.read(len(BAG_START)) == BAG_START
+
+    def read(self, path: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
+        return _read(self.name, path, Bag(path), options)
+
+
+class Ros2Format:
+    """A folder that `ros2 bag record` wrote, or the one storage file in it."""
+
+    name = "ros2"
+    layout = "folder with metadata.yaml and *.db3 or *.mcap of ROS 2, or one such file (needs rosbags)"
+
+    def matches(self, path: Path) -> bool:
+        if path.is_file():
+            return path.suffix.lower() in (".mcap", ".db3")
+        return (path / "metadata.yaml").is_file() and (any(path.glob("*.db3*")) or any(path.glob("*.mcap*")))
+
+    def read(self, path: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
+        return _read(self.name, path, Bag(path), options)
+
+
+def _read(name: str, path: Path, bag: Bag, options: ReadOptions) -> Recording:
+    topics = find_topics(bag, options.topics)
+    color_times, depth_times = bag.stamps(topics.color), bag.stamps(topics.depth)
+    pairs, warnings = pair_images(path, color_times, depth_times, (topics.color, topics.depth))
+    pairs.sort(key=lambda pair: color_times[pair[0]])
+    files = [
+        FrameFiles(
+            BagImage(bag, topics.color, i, float(color_times[i]), color_image),
+            BagImage(bag, topics.depth, j, float(depth_times[j]), depth_image),
+        )
+        for i, j in pairs
+    ]
+    info = bag.message(topics.color_info, 0)
+    rectified = "rect" in topics.color
+    camera = _camera(f"{path}, {topics.color_info}", info, rectified)
+    recording = Recording(
+        name, path, files, color_times[[i for i, _ in pairs]],
+        1.0 if in_metres(bag.message(topics.depth, 0)) else 1000.0, camera,
+        time_source=f"headers of {topics.color}", warnings=warnings,
+    )  # fmt: skip
+    if not rectified:
+        recording.distortion, recording.fisheye = _distortion(f"{path}, {topics.color_info}", info)
+    if options.depth_camera is None:
+        _place_depth(recording, bag, topics, camera)
+    if topics.pose is not None:
+        _add_poses(recording, bag, topics.pose)
+    return recording
+
+
+def _value(info: Any, name: str) -> Any:
+    """Field of a camera_info: ROS 1 writes K, D, P in capitals."""
+    return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
+
+
+def _camera(place: str, info: Any, rectified: bool) -> Camera:
+    K = np.asarray(_value(info, "p" if rectified else "k"), float).reshape(3, -1)
+    numbers = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    return camera_of(place, int(info.width), int(info.height), *numbers)
+
+
+def _distortion(place: str, info: Any) -> tuple[np.ndarray | None, bool]:
+    values, fisheye = np.asarray(_value(info, "d"), float).reshape(-1), info.distortion_model in FISHEYE
+    if not values.size or not np.any(values):
+        return None, False
+    if not np.isfinite(values).all() or len(values) not in ((4,) if fisheye else (4, 5, 8, 12, 14)):
+        raise SequenceError(f"{place}: {len(values)} distortion coefficients of '{info.distortion_model}' are unknown")
+    return values, fisheye
+
+
+def _place_depth(recording: Recording, bag: Bag, topics: Topics, camera: Camera) -> None:
+    """Tells whether depth is registered, or how the depth camera stands to the colour camera, or warns."""
+    if topics.depth_info is None or any(word in topics.depth for word in REGISTERED):
+        return
+    place = f"{bag.path}, {topics.depth_info}"
+    info = bag.message(topics.depth_info, 0)
+    depth_camera = _camera(place, info, "rect" in topics.depth)
+    depth_frame = bag.message(topics.depth, 0).header.frame_id
+    color_frame = bag.message(topics.color, 0).header.frame_id
+    if depth_frame == color_frame and np.allclose(
+        depth_camera.resized(camera.width, camera.height).matrix(), camera.matrix(), atol=0.5
+    ):
+        return
+    T = np.eye(4) if depth_frame == color_frame else static_transform(bag, color_frame, depth_frame)
+    if T is not None and is_valid_pose(T):
+        distortion, fisheye = (None, False) if "rect" in topics.depth else _distortion(place, info)
+        recording.depth_camera = DepthCamera(depth_camera, T, distortion, fisheye)
+        return
+    recording.warnings.append(
+        f"depth ({depth_frame}) is of another camera than colour ({color_frame}), and /tf_static does not tell where "
+        "it is: taken as if both stood at one place (--depth-camera FILE tells it)"
+    )
+    recording.depth_camera = DepthCamera(depth_camera, np.eye(4))
+
+
+def _add_poses(recording: Recording, bag: Bag, topic: str) -> None:
+    times, poses = poses_of(bag, topic)
+    recording.poses = poses_at(recording.timestamps, times, poses)
+    recording.pose_source = topic
+    without = int(np.isnan(recording.poses[:, 0, 0]).sum())
+    if without == len(recording.files):
+        raise SequenceError(f"{bag.path}, {topic}: no pose is near in time to any image")
+    if without:
+        recording.warnings.append(f"{without} of {len(recording.files)} frames have no pose near in time in {topic}")

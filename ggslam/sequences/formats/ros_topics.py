@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which topics of a bag hold colour, depth and their calibration, and where the two cameras are to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.scene.poses import inverse, quaternion_to_matrix
+from ggslam.sequences.formats.ros_images import is_depth
+from ggslam.sequences.formats.ros_messages import Bag
+
+ROLES = ("color", "depth", "color_info", "depth_info", "pose")
+"""What a topic can be given for by name; the poses are of the colour camera (optical axes), to the world."""
+IMAGE_TYPES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
+INFO_TYPE = "sensor_msgs/CameraInfo"
+STATIC_FRAMES = "/tf_static"
+REGISTERED = ("aligned_depth", "depth_registered", "depth_to_color", "depth_to_rgb")
+"""Parts of names of topics whose depth images are registered to colour already."""
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Topics by role; `depth_info` and `pose` may be absent."""
+
+    color: str
+    depth: str
+    color_info: str
+    depth_info: str | None
+    pose: str | None
+
+
+def find_topics(bag: Bag, given: Mapping[str, str]) -> Topics:
+    """The topics of a recording: those given by name, the others by the type and encoding of their messages.
+
+    Raises:
+        SequenceError: a given topic is not there, or none or several fit a role.
+    """
+    for role, topic in given.items():
+        if topic not in bag.types:
+            raise SequenceError(f"{bag.path}: no topic {topic} (for {role}); it holds {', '.join(sorted(bag.types))}")
+    kinds = {}
+    if not {"color", "depth"} <= set(given):
+        kinds = {topic: _kind(bag, topic) for topic, name in bag.types.items() if name in IMAGE_TYPES}
+    colors = {topic: _color_score(topic) for topic, holds_depth in kinds.items() if holds_depth is False}
+    depths = {topic: _depth_score(topic) for topic, holds_depth in kinds.items() if holds_depth}
+    color = given.get("color") or _best(bag, "color", colors)
+    depth = given.get("depth") or _best(bag, "depth", depths)
+    color_info = given.get("color_info") or _info(bag, color)
+    if color_info is None:
+        raise SequenceError(f"{bag.path}: no camera_info belongs to {color}; give it with --topic color_info=TOPIC")
+    return Topics(color, depth, color_info, given.get("depth_info") or _info(bag, depth), given.get("pose"))
+
+
+def _kind(bag: Bag, topic: str) -> bool | None:
+    try:
+        return is_depth(bag.message(topic, 0))
+    except SequenceError:
+        return None  # an empty or damaged topic is none to choose
+
+
+def _color_score(topic: str) -> float:
+    score = 2.0 * any(word in topic for word in ("color", "rgb")) - 2.0 * any(
+        word in topic for word in ("depth", "infra", "ir/", "confidence", "mask", "left", "right", "fisheye")
+    )
+    return score + 0.5 * ("rect" in topic) - 0.25 * topic.endswith("compressed")
+
+
+def _depth_score(topic: str) -> float:
+    score = 2.0 * ("depth" in topic) + any(word in topic for word in REGISTERED)
+    return score - 4.0 * ("confidence" in topic or "infra" in topic) - 0.25 * topic.endswith("compressedDepth")
+
+
+def _best(bag: Bag, role: str, scores: dict[str, float]) -> str:
+    if not scores:
+        held = ", ".join(f"{topic} ({name})" for topic, name in sorted(bag.types.items()))
+        raise SequenceError(f"{bag.path}: no topic of {role} images; it holds {held}")
+    ranked = sorted(scores, key=lambda topic: (-scores[topic], topic))
+    if len(ranked) > 1 and scores[ranked[0]] == scores[ranked[1]]:
+        raise SequenceError(
+            f"{bag.path}: several topics may be {role}: {', '.join(ranked[:4])}; choose with --topic {role}=TOPIC"
+        )
+    return ranked[0]
+
+
+def _info(bag: Bag, topic: str) -> str | None:
+    """The camera_info nearest above an image topic: /camera/color/image_raw -> /camera/color/camera_info."""
+    parts = topic.split("/")
+    for end in range(len(parts) - 1, 0, -1):
+        base = "/".join(parts[:end])
+        for name in (f"{base}/camera_info", f"{base}/info/camera_info"):
+            if bag.types.get(name) == INFO_TYPE:
+                return name
+    return None
+
+
+def pose_of(transform: Any) -> np.ndarray:
+    """Pose [4, 4] of a geometry_msgs Pose or Transform; NaN if it is none."""
+    place = transform.position if hasattr(transform, "position") else transform.translation
+    turn = transform.orientation if hasattr(transform, "orientation") else transform.rotation
+    quaternion = np.array([turn.w, turn.x, turn.y, turn.z])
+    T = np.full((4, 4), np.nan)
+    if np.isfinite(quaternion).all() and np.linalg.norm(quaternion) > 0.5:
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = quaternion_to_matrix(quaternion), (place.x, place.y, place.z)
+    return T
+
+
+def poses_of(bag: Bag, topic: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times float64 [n] and poses float64 [n, 4, 4] of PoseStamped, Odometry or TransformStamped messages.
+
+    Raises:
+        SequenceError: the topic holds messages of another type.
+    """
+    times, poses = [], []
+    for message in bag.messages(topic):
+        held = message
+        while hasattr(held, "pose"):  # PoseStamped holds one, Odometry and PoseWithCovarianceStamped two
+            held = held.pose
+        held = getattr(held, "transform", held)
+        if not hasattr(message, "header") or not (hasattr(held, "orientation") or hasattr(held, "rotation")):
+            raise SequenceError(f"{bag.path}, {topic}: {bag.types[topic]} holds no pose")
+        stamp = message.header.stamp
+        times.append(float(stamp.sec + 1e-9 * stamp.nanosec))
+        poses.append(pose_of(held))
+    return np.array(times), np.array(poses).reshape(-1, 4, 4)
+
+
+def static_transform(bag: Bag, to_frame: str, from_frame: str) -> np.ndarray | None:
+    """T_to_from [4, 4] by the fixed frames of the bag; None if they do not connect the two."""
+    if STATIC_FRAMES not in bag.types:
+        return None
+    steps: dict[str, list[tuple[str, np.ndarray]]] = {}
+    for message in bag.messages(STATIC_FRAMES):
+        for link in message.transforms:
+            parent, child = link.header.frame_id.lstrip("/"), link.child_frame_id.lstrip("/")
+            T = pose_of(link.transform)
+            steps.setdefault(child, []).append((parent, T))
+            steps.setdefault(parent, []).append((child, inverse(T)))
+    reached = {from_frame.lstrip("/"): np.eye(4)}
+    waiting = list(reached)
+    while waiting:
+        frame = waiting.pop()
+        for other, T in steps.get(frame, []):
+            if other not in reached:
+                reached[other] = T @ reached[frame]
+                waiting.append(other)
+    return reached.get(to_frame.lstrip("/"))

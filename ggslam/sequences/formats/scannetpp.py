@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ScanNet++: the undistorted DSLR images with rendered depth, or the iPhone's colour and LiDAR depth.
+
+Both parts may be in one scene: the given folder is the scene (then the DSLR part is read when its depth is there, else
+the iPhone's), or its `dslr` or `iphone`. The iPhone's images are those that the data set's own tools extract (rgb/,
+depth/), or its video rgb.mkv together with an extracted depth/. Poses: OpenGL axes in the DSLR part; `aligned_pose`
+with OpenCV axes of the iPhone.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.scene.camera import Camera
+from ggslam.sequences.formats.transforms_json import frames_of, read_transforms
+from ggslam.sequences.json_files import camera_of, number_of, numbers_of, read_object
+from ggslam.sequences.pose_files import invalid_pose_reason
+from ggslam.sequences.recording import (
+    NO_OPTIONS,
+    FrameFiles,
+    ImageFile,
+    ReadOptions,
+    Recording,
+    missing_depth_problems,
+    natural_key,
+    nominal_timestamps,
+)
+from ggslam.sequences.video import Video, VideoFrame
+
+DSLR_FILE = Path("nerfstudio") / "transforms_undistorted.json"
+IPHONE_FILE = "pose_intrinsic_imu.json"
+IPHONE_SIZE = (1920, 1440)
+"""Of the iPhone's colour images, for which its intrinsics hold."""
+
+
+class ScanNetPlusFormat:
+    """Depth in millimetres; DSLR frames marked is_bad are left out."""
+
+    name = "scannet++"
+    layout = (
+        f"dslr/ with {DSLR_FILE}, undistorted_images/, undistorted_depths/; or iphone/ with {IPHONE_FILE}, rgb/ or "
+        "rgb.mkv, depth/"
+    )
+
+    def matches(self, folder: Path) -> bool:
+        return _dslr(folder) is not None or _iphone(folder) is not None
+
+    def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
+        dslr, iphone = _dslr(folder), _iphone(folder)
+        if dslr is not None and ((dslr / "undistorted_depths").is_dir() or iphone is None):
+            return self._read_dslr(folder, dslr)
+        if iphone is None:
+            raise SequenceError(f"{folder}: expected {self.layout}")
+        return self._read_iphone(folder, iphone)
+
+    def _read_dslr(self, folder: Path, root: Path) -> Recording:
+        path = root / DSLR_FILE
+        content = read_object(path)
+        frames = frames_of(path, content)
+        if "test_frames" in content:
+            frames = frames_of(path, {"frames": frames + frames_of(path, content, "test_frames")})
+        frames = [frame for frame in frames if not frame.get("is_bad")]
+        images = next(
+            (p for p in (root / "undistorted_images", root / "resized_undistorted_images") if p.is_dir()),
+            root / "undistorted_images",
+        )
+        depths = root / "undistorted_depths"
+        if not depths.is_dir():
+            raise SequenceError(f"{depths}: folder is missing; render the depth images with the data set's own tools")
+        return read_transforms(self.name, path, content, frames, folder, images, depths)
+
+    def _read_iphone(self, folder: Path, root: Path) -> Recording:
+        path = root / IPHONE_FILE
+        content = read_object(path)
+        names = sorted((name for name in content if isinstance(content[name], dict)), key=natural_key)
+        depths = root / "depth"
+        if not depths.is_dir():
+            raise SequenceError(f"{depths}: folder is missing; extract depth.bin with the data set's own tools")
+        numbered = [(i, name) for i, name in enumerate(names) if (depths / f"{name}.png").is_file()]
+        if not numbered:
+            raise SequenceError(f"{depths}: no image has the name of a frame in {path.name}")
+        colors = _iphone_colors(root)
+        cameras = [_iphone_camera(path, name, content[name]) for _, name in numbered]
+        files = [
+            FrameFiles(colors(i, name), depths / f"{name}.png", camera=camera)
+            for (i, name), camera in zip(numbered, cameras, strict=True)
+        ]
+        recording = Recording(
+            self.name, folder, files, nominal_timestamps(len(files)), 1000.0, cameras[0],
+            problems=missing_depth_problems(files), pose_source=f"{path.name} (aligned_pose)",
+        )  # fmt: skip
+        _add_iphone_poses(recording, path, [(name, content[name]) for _, name in numbered])
+        return recording
+
+
+def _iphone_colors(root: Path) -> Any:
+    """Function (frame number, frame name) -> colour image."""
+    videos = [root / name for name in ("rgb.mkv", "rgb.mp4") if (root / name).is_file()]
+    if (root / "rgb").is_dir() or not videos:
+        return lambda i, name: root / "rgb" / f"{name}.jpg"
+    video = Video(videos[0])
+
+    def frame(i: int, name: str) -> ImageFile:
+        return VideoFrame(video, i)
+
+    return frame
+
+
+def _iphone_camera(path: Path, name: str, frame: dict[str, Any]) -> Camera:
+    K = numbers_of(f"{path}, {name}", frame, "intrinsic", 9)
+    return camera_of(f"{path}, {name}", *IPHONE_SIZE, K[0], K[4], K[2], K[5])
+
+
+def _add_iphone_poses(recording: Recording, path: Path, frames: list[tuple[str, dict[str, Any]]]) -> None:
+    poses, times = np.full((len(frames), 4, 4), np.nan), []
+    for i, (name, frame) in enumerate(frames):
+        key = "aligned_pose" if "aligned_pose" in frame else "pose"
+        T = numbers_of(f"{path}, {name}", frame, key, 16).reshape(4, 4)
+        reason = invalid_pose_reason(T)
+        if reason is None:
+            poses[i] = T
+        else:
+            recording.problems.setdefault(i, f"{path}, {name}: {reason}")
+        times.append(number_of(f"{path}, {name}", frame, "timestamp") if "timestamp" in frame else np.nan)
+    recording.poses = poses
+    if np.isfinite(times).all() and len(times) > 1 and (np.diff(times) > 0).all():
+        recording.timestamps, recording.time_source = np.array(times), path.name
+
+
+def _dslr(folder: Path) -> Path | None:
+    return next((root for root in (folder, folder / "dslr") if (root / DSLR_FILE).is_file()), None)
+
+
+def _iphone(folder: Path) -> Path | None:
+    return next((root for root in (folder, folder / "iphone") if (root / IPHONE_FILE).is_file()), None)

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every setting in one typed tree. Presets are YAML files in configs/; unknown names and impossible values are refused.
+
+The settings of a part live beside the part (`ggslam/tracking`, `ggslam/mapping`) as frozen dataclasses whose fields
+are documented there; `Config` puts them together.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import typing
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import pydantic
+import yaml
+
+from ggslam.errors import ConfigError, check_ranges
+from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.mapping.settings import MapperSettings
+from ggslam.slam.loop_closing import LoopSettings
+from ggslam.slam.object_masks import MaskSettings
+from ggslam.submaps.paging_settings import PagingSettings
+from ggslam.system.atomic import write_text
+from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
+from ggslam.tracking.keyframes import KeyframeSettings
+from ggslam.tracking.tracker import TrackerSettings
+from ggslam.volumes.volume_settings import VolumeSettings
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What is kept away from training, so that it can be scored honestly."""
+
+    held_out_every: int = 8
+    """Every n-th frame is tracked but never a keyframe and never trained on; 0: none."""
+    held_out_offset: int = 4
+    """The first frame held out, modulo `held_out_every`. (The first keyframe is never held out.)"""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, {"held_out_every": (0, 1e9), "held_out_offset": (0, 1e9)})
+
+    def is_held_out(self, frame_index: int) -> bool:
+        """Whether the frame is kept for scoring."""
+        every = self.held_out_every
+        return every > 0 and frame_index % every == self.held_out_offset % every
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of a run."""
+
+    seed: int = 0
+    """Of every random draw. A synchronous run on one machine repeats bit for bit."""
+    threads: int = 0
+    """Threads of the compiled core; 0: the processors this process may use."""
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    """Where map and keyframes are kept, trained and tracked: cuda: an NVIDIA GPU (compiled by nvcc when first used);
+    auto: that if it can be had and memory is not limited, else cpu."""
+    sh_degree: int = 0
+    """Spherical-harmonic degree of the colours, 0 to 3."""
+    tracker: Literal["gicp", "features"] = "gicp"
+    """gicp: G-ICP against the keyframes' points; features: edges and planes in a budget of time, and G-ICP where they
+    do not convince."""
+    realtime_fps: float = 0.0
+    """0: synchronous. Otherwise frames arrive at this rate like from a camera; tracker and mapper run side by side."""
+    refine_iterations: int = 0
+    """Optimisation steps after the last frame."""
+    memory_limit_mb: float = 0.0
+    """Resident memory of the run in 10^6 bytes: what does not fit of map and keyframes is kept on disk; 0: no limit."""
+    tracking: TrackerSettings = field(default_factory=TrackerSettings)
+    features: FeatureTrackerSettings = field(default_factory=FeatureTrackerSettings)
+    keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
+    loops: LoopSettings = field(default_factory=LoopSettings)
+    mapping: MapperSettings = field(default_factory=MapperSettings)
+    identity: IdentitySettings = field(default_factory=IdentitySettings)
+    masks: MaskSettings = field(default_factory=MaskSettings)
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    paging: PagingSettings = field(default_factory=PagingSettings)
+    volumes: VolumeSettings = field(default_factory=VolumeSettings)
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "seed": (0, 2**63), "threads": (0, 1024), "sh_degree": (0, 3), "realtime_fps": (0, 1e4),
+            "refine_iterations": (0, 10**7), "memory_limit_mb": (0, 1e9),
+        }  # fmt: skip
+        check_ranges(self, ranges)
+
+
+def config_to_dict(config: Config) -> dict[str, Any]:
+    """The settings as nested dictionaries of plain values, in the order of the fields."""
+    return _plain(dataclasses.asdict(config))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value.value if hasattr(value, "value") else value
+
+
+def config_from_dict(values: dict[str, Any], origin: str = "settings") -> Config:
+    """The settings from nested dictionaries; what is not named keeps its default.
+
+    Raises:
+        ConfigError: an unknown name (the nearest known one is suggested) or a value of the wrong type or range.
+    """
+    _refuse_unknown(values, Config, "", origin)
+    try:
+        return pydantic.TypeAdapter(Config).validate_python(values)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(f"{origin}: {name}: {first['msg']}, found {first['input']!r}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{origin}: {error}") from None
+
+
+def _refuse_unknown(values: Any, kind: type, prefix: str, origin: str) -> None:
+    if not isinstance(values, dict):
+        place = prefix.rstrip(".") or "top level"
+        raise ConfigError(f"{origin}: {place}: expected names with values, found {values!r}")
+    types = typing.get_type_hints(kind)
+    known = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    for name, value in values.items():
+        if name not in known:
+            near = difflib.get_close_matches(str(name), known, 1)
+            hint = f"; did you mean {prefix}{near[0]}?" if near else f"; known: {', '.join(prefix + k for k in known)}"
+            raise ConfigError(f"{origin}: unknown setting {prefix}{name}{hint}")
+        if dataclasses.is_dataclass(types[name]):
+            _refuse_unknown(value, typing.cast(type, types[name]), f"{prefix}{name}.", origin)
+
+
+def presets() -> dict[str, Path]:
+    """The presets that come with ggslam: name -> file."""
+    folders = [Path(__file__).parents[1] / "configs", Path(str(resources.files("ggslam"))) / "configs"]
+    return {path.stem: path for folder in folders if folder.is_dir() for path in sorted(folder.glob("*.yaml"))}
+
+
+def load_config(preset_or_file: str | Path | None = None, overrides: list[str] | None = None) -> Config:
+    """Settings from a preset's name or a YAML file, then `name.of.setting=value` overrides, in order.
+
+    Raises:
+        ConfigError: naming the file and the setting.
+    """
+    values: dict[str, Any] = {}
+    origin = "settings"
+    if preset_or_file is not None:
+        path = Path(preset_or_file)
+        if not path.suffix and str(preset_or_file) in presets():
+            path = presets()[str(preset_or_file)]
+        values, origin = _read_yaml(path), str(path)
+        config_from_dict(values, origin)
+    for override in overrides or []:
+        name, equals, text = override.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {override}: expected name=value")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--set {override}: cannot be read as a value: {error}") from None
+        _assign(values, name.strip().split("."), value, override)
+    return config_from_dict(values, "--set" if overrides else origin)
+
+
+def _assign(values: dict[str, Any], names: list[str], value: Any, override: str) -> None:
+    for name in names[:-1]:
+        values = values.setdefault(name, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"--set {override}: {name} is a value, not a group")
+    values[names[-1]] = value
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text())
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file, nor a preset (presets: {', '.join(presets())})") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read as YAML: {error}") from None
+    return values if values is not None else {}
+
+
+def save_config(config: Config, path: Path) -> None:
+    """Writes all settings, defaults included, as YAML."""
+    write_text(path, yaml.safe_dump(config_to_dict(config), sort_keys=False))

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real-time operation: frames arrive at a camera's pace, tracker and mapper work side by side.
+
+The tracker runs in the caller's thread and never waits for the mapper: it aligns to the newest target there is. The
+mapper runs in a thread of its own: it inserts keyframes as they come, publishes a new target after each, and otherwise
+optimises the map for as long as the recording lasts. On a GPU the mapper goes on with the stream that its tensors were
+made on; the tracker, which shares none of them, gets another, whose work goes first.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable
+
+from ggslam.native.loader import NativeContext
+from ggslam.scene.frame import Frame
+from ggslam.slam.result import StepReport
+from ggslam.slam.slam import Slam
+from ggslam.tracking.tracker import TrackingResult
+
+MAX_LAG_FRAMES = 3
+"""A frame that is this many frame times late is dropped: a live camera would have overwritten it."""
+MAX_WAITING = 8
+"""While so many keyframes wait for the mapper no more are made, so that memory stays bounded."""
+
+
+class RealtimeSlam:
+    """Paces a `Slam`.
+
+    Args:
+        slam: a fresh `Slam`; its parts are used from two threads.
+        frames_per_second: rate at which frames arrive.
+    """
+
+    def __init__(self, slam: Slam, frames_per_second: float) -> None:
+        self.slam = slam
+        self.period = 1.0 / frames_per_second
+        self._jobs: queue.Queue[tuple[Frame, TrackingResult, int] | None] = queue.Queue()
+        self._mapper_error: BaseException | None = None
+        self._beside_mapper = slam.mapper.beside_others()
+        # The kernels of one context take turns; the tracker must not wait for the mapper's.
+        slam.tracker.context = NativeContext(slam.context.threads, slam.context.instruction_set)
+
+    def run(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
+        """Processes all frames; `report` is called for each. Errors of either thread are raised here."""
+        worker = threading.Thread(target=self._map, name="mapper", daemon=True)
+        worker.start()
+        try:
+            self._track(frames, report)
+        finally:
+            self._jobs.put(None)
+            worker.join()
+        if self._mapper_error is not None:
+            raise self._mapper_error
+
+    # --- tracker's thread --------------------------------------------------------------------------------------------
+
+    def _track(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
+        slam, first_due = self.slam, 0.0
+        for frame in frames:
+            if not slam.frames:
+                self._first(frame, report)
+                first_due = time.perf_counter() - frame.index * self.period
+                continue
+            late = time.perf_counter() - (first_due + frame.index * self.period)
+            if late > MAX_LAG_FRAMES * self.period:
+                slam.dropped_frames.append(frame.index)
+                continue
+            if late < 0:
+                time.sleep(-late)
+            report(frame, self._step(frame))
+            if self._mapper_error is not None:
+                return
+
+    def _first(self, frame: Frame, report: Callable[[Frame, StepReport], None]) -> None:
+        """Nothing can be tracked before there is a map: the clock starts when the first keyframe is in."""
+        report(frame, self._step(frame))
+        while self.slam.tracker.target is None and self._mapper_error is None and self._jobs.unfinished_tasks:
+            time.sleep(1e-3)
+
+    def _step(self, frame: Frame) -> StepReport:
+        slam, start = self.slam, time.perf_counter()
+        slam.times.start()
+        with self._beside_mapper:
+            tracking = slam.track(frame)
+        is_keyframe = self._jobs.qsize() < MAX_WAITING and slam.wants_keyframe(frame, tracking)
+        if is_keyframe:
+            slam.anchor_to(tracking.T_world_camera)
+            self._jobs.put((frame, tracking, slam.moves_followed))
+        slam.remember(frame, tracking)
+        slam.times.stop()
+        seconds = time.perf_counter() - start
+        return slam.note_step(is_keyframe, seconds)
+
+    # --- mapper's thread ---------------------------------------------------------------------------------------------
+
+    def _map(self) -> None:
+        try:
+            while self._insert_next():
+                if self.slam.mapper.keyframes and self.slam.growing:
+                    self.slam.mapper.run(1)
+        except BaseException as error:  # handed to the caller's thread
+            self._mapper_error = error
+
+    def _insert_next(self) -> bool:
+        """Inserts a waiting keyframe, if any; False when the recording is over and none is left."""
+        slam = self.slam
+        try:
+            job = self._jobs.get(block=not slam.mapper.keyframes)
+        except queue.Empty:
+            return True
+        if job is None:
+            return False
+        slam.insert(*job)
+        self._jobs.task_done()
+        return True

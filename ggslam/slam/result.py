@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run gives: poses of its frames, keyframes, map, objects, times."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.mapper import MapperTimes
+from ggslam.objects.table import Observation, Supervision
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IdentityClassifier
+from ggslam.slam.loop_closing import LoopEvent
+from ggslam.submaps.gaussian_cells import GaussianCells
+from ggslam.tracking.tracker import TrackingStatus
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """What is remembered of every frame.
+
+    Attributes:
+        frame_index, source_index, timestamp: of the `Frame`.
+        keyframe: number of the keyframe its pose hangs on.
+        T_keyframe_camera: float64 [4, 4], pose relative to that keyframe, so that it moves when the keyframe moves.
+        overlap: share of its points that matched the map.
+        rmse_m: root mean square point-to-plane distance of the matched points, metres.
+        status: outcome of tracking.
+        reason: why it was lost or how it was recovered, else empty.
+    """
+
+    frame_index: int
+    source_index: int
+    timestamp: float
+    keyframe: int
+    T_keyframe_camera: np.ndarray
+    overlap: float
+    rmse_m: float
+    status: str
+    reason: str = ""
+
+
+@dataclass
+class StepReport:
+    """What one step did, for the progress line; `seconds` is how long it took, `loss` the mean over its optimisation
+    steps (NaN without any)."""
+
+    frame: TrackedFrame
+    is_keyframe: bool
+    gaussians: int
+    psnr: float
+    seconds: float
+    loss: float = float("nan")
+
+
+@dataclass
+class SlamTimes:
+    """Seconds of wall time.
+
+    Attributes:
+        wall: from the first step's begin to the last step's end: reading, tracking, mapping.
+        tracking: spent tracking.
+        tracking_by_frame: the same, frame by frame, so that growth with the map shows.
+        loops: spent looking for places, closing loops and finding lost frames; mostly part of `tracking` or mapping.
+        refinement: spent on the final refinement, not part of `wall`.
+    """
+
+    wall: float = 0.0
+    tracking: float = 0.0
+    loops: float = 0.0
+    refinement: float = 0.0
+    tracking_by_frame: list[float] = field(default_factory=list)
+    _started: float | None = None
+
+    def start(self) -> None:
+        """A step begins."""
+        if self._started is None:
+            self._started = time.perf_counter()
+
+    def tracking_ms_by_window(self, frames: int = 100) -> list[float]:
+        """Mean milliseconds of tracking over each `frames` frames."""
+        seconds = self.tracking_by_frame
+        return [1e3 * float(np.mean(seconds[k : k + frames])) for k in range(0, len(seconds), frames)]
+
+    def stop(self) -> None:
+        """A step ends."""
+        if self._started is not None:
+            self.wall = time.perf_counter() - self._started
+
+
+@dataclass(frozen=True)
+class LearnedObjects:
+    """Objects of a run; the Gaussians' `object_id`, `features` and votes belong to them.
+
+    Attributes:
+        classifier: of identity vectors.
+        supervision: what taught them.
+        observations: where each object was seen.
+    """
+
+    classifier: IdentityClassifier
+    supervision: Supervision
+    observations: dict[int, Observation]
+
+
+@dataclass(frozen=True)
+class LostStretch:
+    """Frames in a row that were lost: the first one's index, how many, from the last known pose to the next in
+    seconds (to the last lost frame if there is no next), and the frame after it, None at the end."""
+
+    first: int
+    frames: int
+    seconds: float
+    after: int | None
+
+
+@dataclass
+class SlamResult:
+    """A run.
+
+    Attributes:
+        gaussians: the map.
+        keyframes: with refined poses.
+        frames: one entry per frame, in order.
+        times: seconds spent tracking and in all.
+        mapper_times: seconds spent mapping, by part.
+        dropped_frames: indices of frames that were not tracked (real-time runs that fell behind).
+        refine_iterations: optimisation steps of the final refinement.
+        objects: what was learned about objects; None if nothing was.
+        places: content of `places.npz`; None if the run remembered no places.
+        loop_events: closures and what became of other candidates, frames found again.
+        cells: the map, if memory was limited and not enough for it; `gaussians` is empty then. Use `parts`.
+        paging: figures of a run whose memory was limited, see `MapPager.report`.
+        notes: what the user should know of it.
+        release: removes its files.
+        steps: what was noted of every step, content of `steps.csv`.
+        device: what it was computed on: "cpu", or the GPU's name.
+    """
+
+    gaussians: GaussianMap
+    keyframes: list[Keyframe]
+    frames: list[TrackedFrame]
+    times: SlamTimes
+    mapper_times: MapperTimes
+    dropped_frames: list[int] = field(default_factory=list)
+    refine_iterations: int = 0
+    objects: LearnedObjects | None = None
+    loop_events: list[LoopEvent] = field(default_factory=list)
+    places: bytes | None = None
+    cells: GaussianCells | None = None
+    paging: dict[str, float] | None = None
+    notes: list[str] = field(default_factory=list)
+    release: Callable[[], None] | None = None
+    steps: str | None = None
+    device: str = "cpu"
+
+    def close(self) -> None:
+        """Removes what is on disk of map and keyframes, if anything is; it cannot be read any more."""
+        if self.release is not None:
+            self.release()
+
+    @property
+    def gaussian_count(self) -> int:
+        """Gaussians of the map."""
+        return len(self.gaussians) if self.cells is None else self.cells.count
+
+    def parts(self) -> Iterator[GaussianMap]:
+        """The map in parts, in the order of map.ply: a map that was paged by cells, another one as a whole."""
+        if self.cells is None:
+            yield self.gaussians
+        else:
+            yield from (part for _, part in self.cells.parts())
+
+    def trajectory(self) -> np.ndarray:
+        """T_world_camera of every frame, float64 [n, 4, 4], NaN for lost ones; the world is the first keyframe's
+        camera."""
+        return tracked_poses(self.frames, [keyframe.T_world_camera for keyframe in self.keyframes])
+
+    def lost_stretches(self) -> list[LostStretch]:
+        """When the camera was lost."""
+        stretches: list[LostStretch] = []
+        begin = 0
+        for lost, group in itertools.groupby(self.frames, lambda f: f.status == TrackingStatus.LOST.value):
+            count = len(list(group))
+            if lost:
+                end = min(begin + count, len(self.frames) - 1)
+                seconds = self.frames[end].timestamp - self.frames[max(0, begin - 1)].timestamp
+                after = self.frames[end].frame_index if begin + count < len(self.frames) else None
+                stretches.append(LostStretch(self.frames[begin].frame_index, count, seconds, after))
+            begin += count
+        return stretches
+
+    def timestamps(self) -> np.ndarray:
+        """Seconds, float64 [n]."""
+        return np.array([f.timestamp for f in self.frames])
+
+    def frames_per_second(self) -> float:
+        """Frames by wall time, reading the recording included, final refinement and scoring not."""
+        return len(self.frames) / self.times.wall if self.times.wall > 0 else float("nan")
+
+
+def tracked_poses(frames: Sequence[TrackedFrame], T_world_keyframe: Sequence[np.ndarray]) -> np.ndarray:
+    """See `SlamResult.trajectory`; from the poses [4, 4] of the keyframes."""
+    poses = np.full((len(frames), 4, 4), np.nan)
+    for pose, f in zip(poses, frames, strict=True):
+        # A keyframe may be missing if a real-time run stopped before its mapper had taken it in.
+        if f.status != TrackingStatus.LOST.value and f.keyframe < len(T_world_keyframe):
+            pose[:] = T_world_keyframe[f.keyframe] @ f.T_keyframe_camera
+    return poses

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`places.npz` in a run folder: what another recording needs to start in the run's map.
+
+The surface that frames are aligned to, the features by which places are found, and for going on with the map which
+keyframe each Gaussian came from. `starting.py` reads it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ggslam.scene.arrays import arrays_to_bytes
+from ggslam.scene.camera import Camera
+from ggslam.tracking.settings import DepthNoise
+
+if TYPE_CHECKING:
+    from ggslam.scene.gaussian_map import GaussianMap
+    from ggslam.slam.loop_closing import LoopCloser
+    from ggslam.tracking.surface import MeasuredSurface
+
+PLACES_FILE = "places.npz"
+
+
+def places_to_bytes(
+    camera: Camera, surface: MeasuredSurface, loops: LoopCloser, noise: DepthNoise, scale: float,
+    keyframe_poses: np.ndarray, parts: Iterable[GaussianMap],
+) -> bytes:  # fmt: skip
+    """Content of `places.npz`.
+
+    Args:
+        camera: of the run.
+        surface: that its frames were aligned to.
+        loops: the features of its keyframes.
+        noise: of its depth camera.
+        scale: size of the scene against a room's.
+        keyframe_poses: T_world_camera, float64 [n, 4, 4].
+        parts: its map in the order of map.ply.
+    """
+    arrays = {f"surface_{name}": values for name, values in surface.to_arrays().items()}
+    arrays |= {f"loops_{name}": values for name, values in loops.to_arrays().items()}
+    arrays |= {
+        "camera": _camera_row(camera),
+        "noise": np.array([noise.constant, noise.square]),
+        "scale": np.array(scale),
+        "keyframe_poses": keyframe_poses,
+        "birth": np.concatenate([np.zeros(0, np.int32), *(part.birth_keyframe.numpy() for part in parts)]),
+    }  # fmt: skip
+    return arrays_to_bytes(**arrays)
+
+
+def _camera_row(camera: Camera) -> np.ndarray:
+    return np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy], float)

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A spinning LiDAR in a generated world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ggslam.errors import check_ranges
+from ggslam.synthetic.world import World, cast_rays
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One turn of the scanner.
+
+    Attributes:
+        points: float32 [n, 3], metres in the sensor's frame: x forward, y left, z up.
+        rings, columns: int32 [n], which ray each point is on; rings count from the lowest, columns from behind the
+            sensor counter-clockwise, as `ggslam.tracking.edges_planes.scans.LidarFeatures` has them.
+        tested: pairs of a ray and a box that were tested.
+    """
+
+    points: np.ndarray
+    rings: np.ndarray
+    columns: np.ndarray
+    tested: int
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Scanner:
+    """The sensor. It stands still during a turn.
+
+    Raises:
+        ConfigError: a number out of its range.
+    """
+
+    rings: int = 16
+    """Rays above one another, evenly spread in elevation."""
+    columns: int = 900
+    """Directions of a turn."""
+    lowest_deg: float = -22.5
+    highest_deg: float = 22.5
+    """Elevation of the outer rings, degrees."""
+    nearest: float = 0.3
+    farthest: float = 30.0
+    """Range within which it measures, metres."""
+    noise: float = 0.02
+    """Standard deviation of a range, metres."""
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "rings": (1, 1024), "columns": (4, 65536), "lowest_deg": (-89, 89), "highest_deg": (-89, 89),
+            "nearest": (0, 1e3), "farthest": (0, 1e3), "noise": (0, 10),
+        }  # fmt: skip
+        check_ranges(self, ranges)
+
+    @cached_property
+    def directions(self) -> np.ndarray:
+        """Unit vectors of the rays in the sensor's frame, float64 [rings columns, 3], ring by ring."""
+        elevation = np.radians(np.linspace(self.lowest_deg, self.highest_deg, self.rings))[:, None]
+        azimuth = ((np.arange(self.columns) + 0.5) / self.columns * 2 - 1)[None] * np.pi
+        parts = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+        return np.stack(np.broadcast_arrays(*parts), -1).reshape(-1, 3)
+
+    def scan(self, world: World, T_world_sensor: np.ndarray, seed: int) -> Scan:
+        """One scan from `T_world_sensor` [4, 4]; the seed is that of the noise."""
+        directions = self.directions @ T_world_sensor[:3, :3].T
+        origins = np.broadcast_to(T_world_sensor[:3, 3], directions.shape)
+        hits = cast_rays(world, origins, directions, self.farthest)
+        rng = np.random.default_rng([seed, 8])
+        measured = hits.distance + self.noise * rng.standard_normal(len(directions))
+        seen = np.nonzero((measured > self.nearest) & (measured <= self.farthest))[0]
+        points = (self.directions[seen] * measured[seen, None]).astype(np.float32)
+        ring, column = np.divmod(seen.astype(np.int32), np.int32(self.columns))
+        return Scan(points, ring, column, hits.tested)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder's files replaced together: the new ones are written to a hidden folder inside it, then change places.
+
+While they do, the folder's marker (a JSON file) says from where and what is to go, so that whoever finds the folder
+after the program was killed can finish. At no time is a file gone whose successor is not on the disk.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ggslam.errors import RunFolderError
+from ggslam.system.atomic import write_text
+
+_SAVING = "saving"
+_NAME = re.compile(r"\.staged-(\d+)-[0-9a-f]{8}")
+
+
+def new_staging(target: Path) -> Path:
+    """A name for a hidden folder in `target` to write files to; folders that killed programs left there go."""
+    for left in leftovers(target):
+        shutil.rmtree(left, ignore_errors=True)
+    return target / f".staged-{os.getpid()}-{secrets.token_hex(4)}"
+
+
+def leftovers(target: Path) -> list[Path]:
+    """Hidden folders in `target` whose writers do not run any more, less one that waits to be put into place."""
+    found = [path for path in target.iterdir() if (match := _NAME.fullmatch(path.name)) and not _runs(int(match[1]))]
+    waiting = [_saving(marker) for marker in target.glob("*.json")] if found else []
+    return [path for path in found if all(record is None or record["from"] != path.name for record in waiting)]
+
+
+def publish(staged: Path, target: Path, marker: str, old: Sequence[str], before: dict[str, Any]) -> None:
+    """Moves the files of `staged` into place, the marker last.
+
+    Args:
+        staged: a folder of `new_staging`, in `target`, with a new marker.
+        target: where to.
+        marker: name of the marker.
+        old: names in `target` that go unless they are replaced.
+        before: content of the marker meanwhile; what `finish_saving` needs is added.
+
+    Raises:
+        RunFolderError: the marker cannot be written; nothing was moved.
+        OSError: something cannot be moved; `finish_saving` may be tried later.
+    """
+    stale = [name for name in old if not (staged / name).exists()]
+    record = {**before, _SAVING: {"from": staged.name, "stale": stale}}
+    write_text(target / marker, json.dumps(record, indent=1) + "\n")
+    _exchange(staged, target, marker, stale)
+
+
+def finish_saving(target: Path, marker: str) -> None:
+    """Finishes a `publish` that was interrupted; does nothing if there was none.
+
+    Raises:
+        RunFolderError: the folder cannot be written to.
+    """
+    record = _saving(target / marker)
+    if record is None or not (target / record["from"]).is_dir():
+        return
+    try:
+        _exchange(target / record["from"], target, marker, record["stale"])
+    except OSError as error:
+        reason = error.strerror or error
+        raise RunFolderError(f"{target}: saving was interrupted and cannot be finished: {reason}") from None
+
+
+def _exchange(staged: Path, target: Path, marker: str, stale: Sequence[str]) -> None:
+    for path in sorted(staged.iterdir()):
+        if path.name != marker:
+            if (target / path.name).is_dir():  # only for folders there is no replacing in one step
+                shutil.rmtree(target / path.name)
+            path.replace(target / path.name)
+    for name in stale:
+        if (target / name).is_dir():
+            shutil.rmtree(target / name)
+        else:
+            (target / name).unlink(missing_ok=True)
+    (staged / marker).replace(target / marker)
+    shutil.rmtree(staged, ignore_errors=True)
+
+
+def _saving(marker: Path) -> dict[str, Any] | None:
+    """What a marker says of a saving under way; None if nothing, or if it was not written by `publish`."""
+    try:
+        values = json.loads(marker.read_text())
+        record = values[_SAVING]
+        good = _NAME.fullmatch(record["from"]) and all(Path(name).name == name for name in record["stale"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return dict(record) if good else None
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The edges and planes about the sensor, what scans are aligned to, and an odometry that needs no more than that."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from ggslam.scene.poses import inverse, orthonormalized, separation
+from ggslam.tracking.edges_planes.alignment import LAST_STEP, FeatureAligner, FeatureAlignment, FrameClock
+from ggslam.tracking.edges_planes.extraction import ScanFeatures
+from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
+from ggslam.tracking.edges_planes.voxels import FeatureMap
+
+
+class LocalFeatureMap:
+    """Planes and edges gathered in voxels; scans are aligned to them and added to them.
+
+    It has a frame of its own, which a correction of the world moves as a whole.
+
+    Args:
+        settings: see `FeatureTrackerSettings`.
+    """
+
+    def __init__(self, settings: FeatureTrackerSettings) -> None:
+        self.settings = settings
+        self.clock = FrameClock(settings.align.budget_ms)
+        self.features = FeatureMap(settings.map, settings.device)
+        self._aligner = FeatureAligner(self.features, settings.align, self.clock)
+        self._T_world_map = np.eye(4)
+        self._T_map_added: np.ndarray | None = None
+        """Where the newest scan in the map was taken."""
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no scan is in."""
+        return self._T_map_added is None
+
+    def clear(self) -> None:
+        """Forgets everything."""
+        self.features.clear()
+        self._T_map_added = None
+
+    def move(self, T_new_old: np.ndarray) -> None:
+        """Moves the map in the world, [4, 4]."""
+        self._T_world_map = orthonormalized(T_new_old @ self._T_world_map)
+
+    def align(self, scan: ScanFeatures, T_world_sensor_guess: np.ndarray) -> FeatureAlignment:
+        """The pose in the world at which the scan fits best; what the result says of the map is said of the world."""
+        s = self.settings.align
+        scan = scan.thinned(s.planes, s.edges)
+        found = self._aligner.align(scan, inverse(self._T_world_map) @ T_world_sensor_guess)
+        A = np.zeros((6, 6))
+        A[:3, :3] = A[3:, 3:] = self._T_world_map[:3, :3]
+        result = dataclasses.replace(
+            found, T_map_sensor=orthonormalized(self._T_world_map @ found.T_map_sensor),
+            information=A @ found.information @ A.T, weak_directions=found.weak_directions @ A.T,
+        )  # fmt: skip
+        self.clock.ended(LAST_STEP)
+        return result
+
+    def is_convincing(self, found: FeatureAlignment) -> bool:
+        """Whether to believe a pose."""
+        return found.usable and found.overlap >= self.settings.align.convincing_overlap
+
+    def update(self, scan: ScanFeatures, T_world_sensor: np.ndarray, overlap: float) -> bool:
+        """Adds a located scan if it has moved enough and there is time left, or if the map covers it badly; returns
+        whether it did."""
+        if not self._wants(scan, T_world_sensor, overlap):
+            return False
+        if not self.clock.allows("update") and overlap >= self.settings.update.urgent_overlap:
+            return False
+        self.clock.begins("update")
+        self.add(scan, T_world_sensor)
+        self.clock.ended("update")
+        return True
+
+    def _wants(self, scan: ScanFeatures, T_world_sensor: np.ndarray, overlap: float) -> bool:
+        s = self.settings.update
+        if self._T_map_added is None or overlap < s.overlap:
+            return True
+        T = inverse(self._T_world_map) @ T_world_sensor
+        moved, turned = separation(self._T_map_added, T)
+        return moved > s.translation * scan.median_distance or turned > s.rotation_deg
+
+    @torch.inference_mode()
+    def add(self, scan: ScanFeatures, T_world_sensor: np.ndarray) -> None:
+        """Adds a located scan."""
+        T = inverse(self._T_world_map) @ T_world_sensor
+        M = torch.from_numpy(T[:3]).to(scan.planes.device, torch.float32)
+        R, t = M[:, :3], M[:, 3]
+        discs = torch.cat([scan.discs, torch.zeros_like(scan.edge_sigmas)])
+        self.features.add(torch.addmm(t, scan.points, R.T), len(scan.planes), scan.all_normals @ R.T, discs)
+        self._T_map_added = T
+
+
+class FeatureOdometry:
+    """Locates scan after scan: constant velocity, alignment to the local map, growth of the map.
+
+    Args:
+        settings: see `FeatureTrackerSettings`.
+        T_world_sensor: pose of the first scan, [4, 4].
+    """
+
+    def __init__(self, settings: FeatureTrackerSettings, T_world_sensor: np.ndarray | None = None) -> None:
+        self.map = LocalFeatureMap(settings)
+        self.T_world_sensor = np.eye(4) if T_world_sensor is None else np.array(T_world_sensor, float)
+        """Of the newest located scan."""
+        self.velocity = np.eye(4)
+        """Its motion since the one before, [4, 4]."""
+
+    def locate(self, scan: ScanFeatures) -> FeatureAlignment | None:
+        """Locates a scan and maybe adds it to the map. None: the first one, whose pose is given. If the result is not
+        convincing (`map.is_convincing`), the pose stays where it was.
+
+        The time for this counts from `map.clock.start()`.
+        """
+        if self.map.is_empty:
+            self.map.add(scan, self.T_world_sensor)
+            return None
+        found = self.map.align(scan, self.T_world_sensor @ self.velocity)
+        if not self.map.is_convincing(found):
+            self.map.clock.lift()  # to be late is better than to be lost
+            found = self.map.align(scan, found.T_map_sensor)
+        if not self.map.is_convincing(found):
+            self.velocity = np.eye(4)
+            return found
+        self.velocity = inverse(self.T_world_sensor) @ found.T_map_sensor
+        self.T_world_sensor = found.T_map_sensor
+        self.map.update(scan, self.T_world_sensor, found.overlap)
+        return found

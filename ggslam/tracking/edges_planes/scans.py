@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From what sensors deliver to edges and planes: depth images, LiDAR scans, clouds already split in two."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ggslam.scene.camera import Camera
+from ggslam.tracking.edges_planes.extraction import LineScanner, ScanFeatures, ScanLines
+from ggslam.tracking.edges_planes.settings import ExtractionSettings
+from ggslam.tracking.settings import DepthNoise
+
+_PATCH = 2
+"""A patch has (2 _PATCH + 1)^2 pixels."""
+
+
+class DepthImageFeatures:
+    """Edges and planes of depth images of one camera.
+
+    Rows give both, columns edges only. A plane's position and normal come from a patch of 25 pixels about it, to
+    which a plane is fitted: in a pinhole image 1/z of a plane is linear in column and row.
+
+    Args:
+        camera: of the images.
+        settings: limits.
+        device: where the work is done.
+    """
+
+    def __init__(self, camera: Camera, settings: ExtractionSettings, device: torch.device | str = "cpu") -> None:
+        self.camera, self.settings = camera, settings
+        self._device = torch.device(device)
+        self._pitch = max(1, round(camera.width / 320))
+        self._lines = _PixelLines(camera, settings, self._pitch, self._device)
+        self._depth = torch.zeros(camera.height, camera.width, device=self._device)
+        offsets = torch.arange(-_PATCH, _PATCH + 1, device=self._device) * (settings.patch_step * self._pitch)
+        dv, du = torch.meshgrid(offsets, offsets, indexing="ij")
+        self._offsets = (dv * camera.width + du).reshape(-1)
+        du, dv = du.reshape(-1).float(), dv.reshape(-1).float()
+        ones = torch.ones_like(du)
+        self._design = torch.stack([du, dv, ones], 1)
+        self._solve = self._design / self._design.square().sum(0)  # the three columns are orthogonal
+        self._margin = int(offsets[-1])
+
+    @torch.inference_mode()
+    def extract(self, depth: np.ndarray, noise: DepthNoise) -> ScanFeatures:
+        """Features of a depth image.
+
+        Args:
+            depth: float32 [H, W], metres, 0 where unknown.
+            noise: of the depth camera.
+
+        Raises:
+            ValueError: another size than the camera's.
+        """
+        expected = (self.camera.height, self.camera.width)
+        if depth.shape != expected:
+            raise ValueError(f"depth is {depth.shape}, expected {expected} of the camera")
+        image = self._depth.copy_(torch.from_numpy(np.ascontiguousarray(depth, np.float32)))
+        edges, planes = self._lines.pick(image, noise)
+        planes, normals, z = self._patches(planes, noise)
+        edge_z = torch.take(image, edges)
+        return ScanFeatures(
+            planes, normals, self._disc(z), noise.constant + noise.square * z * z,
+            self._rays(edges) * edge_z[:, None], noise.constant + noise.square * edge_z * edge_z,
+        )  # fmt: skip
+
+    def _disc(self, z: Tensor) -> Tensor:
+        spread = math.sqrt(_PATCH * (_PATCH + 1) / 3) * self.settings.patch_step * self._pitch  # of -P..P
+        return z * (spread / self.camera.fx)
+
+    def _rays(self, pixels: Tensor) -> Tensor:
+        """Viewing rays with z = 1 of positions in the flat image, [n, 3]."""
+        c = self.camera
+        v = torch.div(pixels, c.width, rounding_mode="floor")
+        u = pixels - v * c.width
+        x, y = (u - c.cx) / c.fx, (v - c.cy) / c.fy
+        return torch.stack([x, y, torch.ones_like(x)], 1).float()
+
+    def _patches(self, pixels: Tensor, noise: DepthNoise) -> tuple[Tensor, Tensor, Tensor]:
+        """Points [n, 3], normals [n, 3] and depths [n] of planes fitted about those pixels that lie on one."""
+        c, margin = self.camera, self._margin
+        v = torch.div(pixels, c.width, rounding_mode="floor")
+        u = pixels - v * c.width
+        inside = (u >= margin) & (u < c.width - margin) & (v >= margin) & (v < c.height - margin)
+        pixels = torch.masked_select(pixels, inside)
+        inverse_depth = 1.0 / torch.take(self._depth, pixels[:, None] + self._offsets)  # infinite where unknown
+        fit = inverse_depth @ self._solve
+        residual = (inverse_depth - fit @ self._design.T).square_().sum(1).mul_(1.0 / (len(self._offsets) - 3)).sqrt_()
+        z = 1.0 / fit[:, 2]
+        rays = self._rays(pixels)
+        a, b = fit[:, 0] * c.fx, fit[:, 1] * c.fy
+        plane = torch.stack([a, b, fit[:, 2] - a * rays[:, 0] - b * rays[:, 1]], 1)  # normal over its distance
+        length = torch.linalg.vector_norm(plane, dim=1)
+        normals = plane / -length[:, None]
+        cosine = fit[:, 2] / (length * torch.linalg.vector_norm(rays, dim=1))
+        s = self.settings
+        limit = s.plane_sigmas * (noise.constant + noise.square * z * z) + s.roughness * z
+        good = (residual * z * z < limit) & (cosine > s.min_cosine)  # false for what is not a number
+        kept = good.nonzero()[:, 0]
+        return (rays * z[:, None]).index_select(0, kept), normals.index_select(0, kept), z.index_select(0, kept)
+
+
+class LidarFeatures:
+    """Edges and planes of the scans of one spinning LiDAR.
+
+    Points are put in order by ring and azimuth: rings lie evenly between the lowest and the highest elevation.
+
+    Args:
+        rings: of the sensor.
+        columns: directions per turn.
+        settings: limits.
+        noise: of the range measurement.
+        device: where the work is done.
+    """
+
+    def __init__(
+        self, rings: int, columns: int, settings: ExtractionSettings, noise: DepthNoise,
+        device: torch.device | str = "cpu",
+    ) -> None:  # fmt: skip
+        self._rings, self._columns, self._noise = rings, columns, noise
+        self._scanner = LineScanner(rings, columns, settings, device)
+        self._points = torch.zeros(3, rings, columns, device=device)
+        self._ranges = torch.zeros(rings, columns, device=device)
+
+    @torch.inference_mode()
+    def extract(self, points: np.ndarray) -> ScanFeatures:
+        """Features of a scan.
+
+        Args:
+            points: [n, 3], metres, in the sensor's frame, in any order; zeros and what is not finite are left out.
+        """
+        p = torch.from_numpy(np.ascontiguousarray(points, np.float32)).to(self._points.device)
+        ranges = p.square().sum(1).sqrt()
+        seen = torch.isfinite(ranges) & (ranges > 1e-3)
+        p, ranges = p[seen], ranges[seen]
+        self._points.zero_()
+        self._ranges.zero_()
+        if len(p):
+            cells = self._cells(p, ranges)
+            self._points.view(3, -1)[:, cells] = p.T
+            self._ranges.view(-1)[cells] = ranges
+        sigmas = self._ranges.square().mul_(self._noise.square).add_(self._noise.constant)
+        edges, planes = self._scanner.scan(ScanLines(self._points, self._ranges, sigmas, self._rings))
+        flat, sigma = self._points.view(3, -1), sigmas.view(-1)
+        return plain_features(flat[:, planes].T, flat[:, edges].T, sigma[planes], sigma[edges])
+
+    def _cells(self, points: Tensor, ranges: Tensor) -> Tensor:
+        """Place of each point in the flat grid of rings and columns."""
+        elevation = torch.asin(points[:, 2] / ranges)
+        low, high = torch.aminmax(elevation)
+        ring = ((elevation - low) * ((self._rings - 1) / (high - low).clamp(min=1e-6))).round().to(torch.int64)
+        turn = torch.atan2(points[:, 1], points[:, 0]) / (2 * math.pi) + 0.5
+        column = (turn * self._columns).to(torch.int64).clamp(max=self._columns - 1)
+        return ring * self._columns + column
+
+
+def plain_features(planes: Tensor, edges: Tensor, plane_sigmas: Tensor, edge_sigmas: Tensor) -> ScanFeatures:
+    """Features of points alone, without patches; [P, 3], [E, 3], [P], [E]."""
+    planes = planes.contiguous()
+    return ScanFeatures(
+        planes, torch.zeros_like(planes), torch.zeros_like(plane_sigmas), plane_sigmas, edges.contiguous(), edge_sigmas
+    )
+
+
+def split_features(
+    planes: np.ndarray, edges: np.ndarray, noise: DepthNoise, device: torch.device | str = "cpu"
+) -> ScanFeatures:
+    """Features of a scan that is already split: points on planes [P, 3] and on edges [E, 3], metres."""
+    p, e = (torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(device) for a in (planes, edges))
+
+    def sigmas(points: Tensor) -> Tensor:
+        return noise.constant + noise.square * points.square().sum(1)
+
+    return plain_features(p, e, sigmas(p), sigmas(e))
+
+
+class _PixelLines:
+    """Rows and, after them, columns of an image as scan lines of one length; short ones end in missing points."""
+
+    def __init__(self, camera: Camera, settings: ExtractionSettings, pitch: int, device: torch.device) -> None:
+        flat = torch.arange(camera.height * camera.width, device=device).view(camera.height, camera.width)
+        self._settings, self._pitch, self._scale = settings, pitch, camera.width / 320
+        rows, columns = self._views(flat)
+        self._rows, length = len(rows), max(rows.shape[1], columns.shape[1])
+        shape = (len(rows) + len(columns), length)
+        self._pixels = torch.zeros(shape, dtype=torch.int64, device=device)
+        self._rays = torch.zeros(3, *shape, device=device)
+        self._points, self._z, self._sigma = torch.zeros_like(self._rays), *torch.zeros(2, *shape, device=device)
+        self._fill(self._pixels, flat)
+        v = torch.div(self._pixels, camera.width, rounding_mode="floor")
+        x, y = ((self._pixels - v * camera.width) - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+        self._rays = torch.stack([x, y, torch.ones_like(x)]).float()
+        self._scanner = LineScanner(*shape, settings, device)
+
+    def _views(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Scanned rows and columns [L, C] of an image."""
+        row = max(1, round(self._settings.row_step * self._scale))
+        column = max(1, round(self._settings.column_step * self._scale)) if self._settings.column_step else 0
+        rows = image[row // 2 :: row, :: self._pitch]
+        return rows, image[:: self._pitch, column // 2 :: column].T if column else rows[:0]
+
+    def _fill(self, out: Tensor, image: Tensor) -> None:
+        rows, columns = self._views(image)
+        out[: self._rows, : rows.shape[1]] = rows
+        out[self._rows :, : columns.shape[1]] = columns
+
+    def pick(self, depth: Tensor, noise: DepthNoise) -> tuple[Tensor, Tensor]:
+        """Positions in the flat image of edges [E] and planes [P]."""
+        z, s = self._z, self._settings
+        self._fill(z, depth)
+        z.mul_((z >= s.min_depth) & (z <= s.max_depth))
+        torch.mul(self._rays, z, out=self._points)
+        sigma = torch.mul(z, z, out=self._sigma).mul_(noise.square).add_(noise.constant)
+        edges, planes = self._scanner.scan(ScanLines(self._points, z, sigma, self._rows))
+        return torch.take(self._pixels, edges), torch.take(self._pixels, planes)

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The volumes of a recording, frame by frame: TSDF, and beside it what else is wanted; how long each frame took.
+
+After a loop was closed, what was fused before lies where the camera was thought to be. Weights are clamped and decay,
+so frames cannot be taken out again; they are fast to put in, though: the maps are begun anew and the keyframes, whose
+images the mapper keeps, are fused again where they are now.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from ggslam.errors import ConfigError
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.occupancy import OccupancyMap
+from ggslam.volumes.tsdf import TsdfMap
+from ggslam.volumes.tsdf_torch import TorchTsdf
+from ggslam.volumes.volume_settings import VolumeSettings
+
+WINDOW = 50
+"""Frames over which times are averaged, to see whether they grow with the map."""
+
+
+@dataclass
+class VolumeTimes:
+    """How long frames took.
+
+    Attributes:
+        rows: for each frame, seconds by part: "slam" (from the frame to its pose and, where they come first, mapping
+            and making the volumes anew after a loop closure), "tsdf", "esdf", "occupancy"; parts that were not done
+            with a frame are missing.
+        blocks: of the TSDF after each frame.
+        rebuilds: seconds of each time that the maps were made anew.
+        last_update: of the distance field, at the end.
+    """
+
+    rows: list[dict[str, float]] = field(default_factory=list)
+    blocks: list[int] = field(default_factory=list)
+    rebuilds: list[float] = field(default_factory=list)
+    last_update: float = 0.0
+
+    def parts(self) -> dict[str, np.ndarray]:
+        """Seconds [n] of the frames with which a part was done, by part."""
+        names = [name for name in ("slam", "tsdf", "esdf", "occupancy") if any(name in row for row in self.rows)]
+        return {name: np.array([row[name] for row in self.rows if name in row]) for name in names}
+
+    def whole(self) -> np.ndarray:
+        """Seconds [n] of the frames with which all parts were done, all together."""
+        parts = self.parts()
+        return np.array([sum(row.values()) for row in self.rows if len(row) == len(parts)])
+
+    def summary(self) -> dict[str, dict[str, Any]]:
+        """Milliseconds a frame by part: mean, 95 %, largest, and means by `WINDOW` frames."""
+        return {name: _statistics(seconds) for name, seconds in {**self.parts(), "all": self.whole()}.items()}
+
+
+def _statistics(seconds: np.ndarray) -> dict[str, Any]:
+    ms = 1e3 * seconds
+    if not len(ms):
+        return {"mean_ms": 0.0, "p95_ms": 0.0, "max_ms": 0.0, "by_window_ms": []}
+    windows = [float(ms[k : k + WINDOW].mean()) for k in range(0, len(ms), WINDOW)]
+    return {"mean_ms": float(ms.mean()), "p95_ms": float(np.percentile(ms, 95)), "max_ms": float(ms.max()),
+            "by_window_ms": windows}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PosedView:
+    """Images to fuse: depth float32 [H, W] in metres, colour uint8 [H, W, 3], object ids uint16 [H, W] or None, and
+    T_world_camera [4, 4]."""
+
+    depth: np.ndarray
+    camera: Camera
+    T_world_camera: np.ndarray
+    color: np.ndarray
+    labels: np.ndarray | None = None
+
+
+class VolumeMaps:
+    """TSDF, distance field and occupancy of one recording.
+
+    Args:
+        settings: of all of them.
+        esdf: whether a distance field is wanted.
+        occupancy: edge of the occupancy map's voxels in metres; None: no occupancy map.
+        onto: a TSDF to go on in; None: an empty one.
+        device: of torch, on which the TSDF is fused; the other maps follow at the end. None: the compiled core does.
+
+    Raises:
+        ConfigError: no such device, or something is wanted that is not done on one.
+    """
+
+    def __init__(
+        self, settings: VolumeSettings, esdf: bool = False, occupancy: float | None = None,
+        onto: TsdfMap | None = None, device: str | None = None,
+    ) -> None:  # fmt: skip
+        self.settings = settings
+        self._on_device = None if device is None else _fusion_on(device, settings, onto)
+        self.tsdf = TsdfMap(settings.tsdf) if onto is None else onto
+        self.context = self.tsdf.context
+        self.field = DistanceField(self.tsdf, settings.esdf) if esdf else None
+        self.occupancy = None if occupancy is None else self._occupancy(occupancy)
+        self.times = VolumeTimes()
+
+    @property
+    def _fusing(self) -> TsdfMap | TorchTsdf:
+        return self.tsdf if self._on_device is None else self._on_device
+
+    def _occupancy(self, resolution: float) -> OccupancyMap:
+        return OccupancyMap(resolution, self.settings.occupancy, self.context)
+
+    def add(
+        self, frame: Frame, T_world_camera: np.ndarray, labels: np.ndarray | None = None, waited: float = 0.0
+    ) -> None:
+        """Fuses one frame.
+
+        Args:
+            frame: the images.
+            T_world_camera: [4, 4].
+            labels: object ids uint16 [H, W], 0 = none.
+            waited: seconds since the frame came.
+        """
+        number = len(self.times.rows)
+        row = {"slam": waited} if waited else {}
+        start = time.perf_counter()
+        self._fuse(frame.depth, frame.camera, T_world_camera, frame.color, labels)
+        every = self.settings.decay_every
+        if every and number % every == every - 1:
+            self.tsdf.decay()
+        row["tsdf"] = time.perf_counter() - start
+        every = self.settings.esdf_every
+        if self.field is not None and every and self._on_device is None and number % every == every - 1:
+            start = time.perf_counter()
+            self.field.update()
+            row["esdf"] = time.perf_counter() - start
+        if self.occupancy is not None:
+            start = time.perf_counter()
+            self._insert(frame.depth, frame.camera, T_world_camera)
+            row["occupancy"] = time.perf_counter() - start
+        self.times.blocks.append(len(self._fusing))
+        self.times.rows.append(row)
+
+    def _fuse(
+        self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, color: np.ndarray,
+        labels: np.ndarray | None,
+    ) -> None:  # fmt: skip
+        self._fusing.integrate(depth, camera, T_world_camera, color, labels)
+
+    def _insert(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> None:
+        assert self.occupancy is not None
+        self.occupancy.insert_depth(depth, camera, T_world_camera)
+
+    def rebuild(self, views: Iterable[PosedView]) -> None:
+        """Begins anew from keyframes where they are now, for after a loop was closed."""
+        start = time.perf_counter()
+        self.tsdf.clear()
+        if self._on_device is not None:
+            self._on_device = TorchTsdf(self.settings.tsdf, self._on_device.device)
+        if self.occupancy is not None:
+            self.occupancy = self._occupancy(self.occupancy.resolution)
+        for view in views:
+            self._fuse(view.depth, view.camera, view.T_world_camera, view.color, view.labels)
+            if self.occupancy is not None:
+                self._insert(view.depth, view.camera, view.T_world_camera)
+        if self.field is not None and self._on_device is None:
+            self.field.update()
+        self.times.rebuilds.append(time.perf_counter() - start)
+
+    def finish(self) -> None:
+        """Brings the TSDF from its device, and the distance field up to date."""
+        if self._on_device is not None:
+            self.tsdf = self._on_device.to_native(self.context)
+            self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)
+        if self.field is not None:
+            self.times.last_update = self.field.update().milliseconds / 1e3
+
+    def relabel(self, table: np.ndarray) -> None:
+        """Gives every object its new id.
+
+        Args:
+            table: uint16 [65536], new id by old one; 0: none.
+        """
+        blocks = self.tsdf.blocks()
+        dense = blocks.coordinates[blocks.dense]
+        for start in range(0, len(dense), 4096):
+            at = dense[start : start + 4096]
+            old = self.tsdf.read(at).label
+            changed = (table[old] != old).any(1)
+            self.tsdf.write(at[changed], label=table[old[changed]])
+
+
+def _fusion_on(device: str, settings: VolumeSettings, onto: TsdfMap | None) -> TorchTsdf:
+    if onto is not None or settings.decay_every:
+        raise ConfigError("--device: on a device a TSDF neither decays nor is one gone on with")
+    try:
+        torch.zeros(1, device=device).cpu()
+        return TorchTsdf(settings.tsdf, device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise ConfigError(f"--device {device}: {str(error).splitlines()[0]}") from None

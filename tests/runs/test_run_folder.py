@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run folder tells the truth about itself, whatever happens while it is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import ggslam.runs.folder as run_folder
+from ggslam.errors import RunFolderError
+from ggslam.runs.folder import RunFolder
+from ggslam.sequences import open_sequence
+from ggslam.slam.config import load_config
+from ggslam.slam.result import SlamResult
+from ggslam.slam.slam import Slam
+
+
+@pytest.fixture(scope="module")
+def result(room: Path) -> SlamResult:
+    sequence = open_sequence(room, stop=3)
+    slam = Slam(sequence.camera, load_config(None, ["mapping.iterations_per_frame=1"]))
+    for frame in sequence.stream():
+        slam.step(frame)
+    return slam.finish()
+
+
+def fail(*_: object, **__: object) -> None:
+    raise RunFolderError("cannot write: No space left on device")
+
+
+@pytest.mark.parametrize(("broken", "complete"), [("write_gaussian_ply", False), ("save_points", True)])
+def test_a_disk_that_fills_up(
+    result: SlamResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, complete: bool
+) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    folder.save(load_config(), {"open": {}}, result)
+    assert folder.read_json("run.json")["complete"] is True
+    monkeypatch.setattr(run_folder, broken, fail)
+    again = RunFolder.create(tmp_path / "run", overwrite=True)
+    with pytest.raises(RunFolderError, match="No space"):
+        again.save(load_config(), {"open": {}}, result)
+    assert again.read_json("run.json")["complete"] is complete  # without the clouds a run is still whole
+    monkeypatch.undo()
+    RunFolder.create(tmp_path / "run", overwrite=True).save(load_config(), {"open": {}}, result)  # it can be replaced
+    assert RunFolder.open(tmp_path / "run").read_json("run.json")["complete"] is True
+
+
+def test_a_probe_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(self: Path, data: bytes) -> int:
+        self.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(RunFolderError, match="No space left"):
+        RunFolder.create(tmp_path / "run")
+    assert list((tmp_path / "run").iterdir()) == []

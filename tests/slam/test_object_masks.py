@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Objects in whole runs: whatever masks a recording has, or none."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ggslam.errors import ConfigError, GgslamError, SequenceError
+from ggslam.jobs.progress import SilentObserver
+from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
+from ggslam.runs.recordings import SequenceRequest
+from ggslam.scene.frame import Frame
+from ggslam.sequences import open_sequence
+from ggslam.slam.config import load_config
+from ggslam.slam.result import SlamResult
+from ggslam.slam.slam import Slam
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+from scramble_masks import scramble_recording  # noqa: E402
+
+FAST = ["mapping.iterations_per_frame=2", "mapping.first_frame_iterations=10"]
+
+
+def run(recording: Path, out: Path, *overrides: str, masks: Path | None = None, evaluate: bool = True) -> RunOutcome:
+    request = SequenceRequest(recording, masks=masks)
+    return execute(RunRequest(request, out, overrides=[*FAST, *overrides], evaluate=evaluate))
+
+
+def table(folder: Path) -> dict:
+    return json.loads((folder / "objects.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def own_ids(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOutcome:
+    return run(room, tmp_path_factory.mktemp("runs") / "own")
+
+
+def test_masks_with_consistent_ids_are_learned_by_name(own_ids: RunOutcome) -> None:
+    assert own_ids.metrics is not None
+    content = table(own_ids.folder.path)
+    assert content["supervision"] == "masks"
+    names = {record["name"] for record in content["objects"]}
+    assert {"floor", "sofa", "coffee table"} <= names
+    scores = own_ids.metrics["segmentation"]["held_out"]
+    assert scores["miou"] > 0.75 and scores["votes_miou"] > 0.7 and scores["accuracy"] > 0.95
+    assert own_ids.metrics["segmentation"]["matching"] == "same"
+    assert own_ids.metrics["segmentation"]["gaussians"]["accuracy"] > 0.9
+
+
+def test_objects_cost_no_quality(room: Path, tmp_path: Path, own_ids: RunOutcome) -> None:
+    plain = run(room, tmp_path / "plain", "identity.enabled=false")
+    assert plain.metrics is not None and own_ids.metrics is not None
+    assert plain.metrics["images"] == own_ids.metrics["images"]
+    assert not (tmp_path / "plain" / "objects.json").exists() and plain.metrics["segmentation"] is None
+
+
+def test_shuffled_ids_become_objects(room: Path, tmp_path: Path) -> None:
+    scramble_recording(room, tmp_path / "masks", 0, 0.2, 0.05, 0.01)
+    outcome = run(room, tmp_path / "run", masks=tmp_path / "masks", evaluate=False)
+    assert table(tmp_path / "run")["supervision"] == "associated masks"
+    from ggslam.jobs.progress import SilentObserver
+    from ggslam.jobs.score.scoring import score_run
+    from ggslam.runs.recordings import open_recording_of
+
+    truth = open_recording_of(outcome.folder, masks=room / "masks")
+    metrics = score_run(outcome.folder, truth, SilentObserver(), lpips=False, masks=room / "masks")
+    assert metrics["segmentation"]["matching"] == "assignment"
+    assert metrics["segmentation"]["all"]["miou"] > 0.5  # by one-to-one matching; 24 small frames with large steps
+    assert metrics["segmentation"]["all"]["accuracy"] > 0.7
+
+
+def test_without_masks_geometry_finds_objects(room: Path, tmp_path: Path) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(room, bare)
+    shutil.rmtree(bare / "masks")
+    run(bare, tmp_path / "run")
+    content = table(tmp_path / "run")
+    assert content["supervision"] == "geometry" and len(content["objects"]) >= 5
+    assert all(record["name"] is None for record in content["objects"])
+    labelled = sum(record["gaussians"] for record in content["objects"])
+    assert labelled > 2 * content["unlabelled_gaussians"]
+
+
+@pytest.mark.parametrize("kind", ["empty", "one id", "half the files", "other size"])
+def test_masks_of_any_kind_are_handled(room: Path, tmp_path: Path, kind: str) -> None:
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for number, path in enumerate(sorted((room / "masks").glob("*.png"))):
+        mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if kind == "empty":
+            mask[:] = 0
+        elif kind == "one id":
+            mask[:] = 7
+        elif kind == "other size":
+            mask = mask[::2, ::2]
+        elif number % 2:
+            continue
+        cv2.imwrite(str(masks / path.name), mask)
+    run(room, tmp_path / "run", masks=masks, evaluate=False)
+    if kind == "empty":
+        assert not (tmp_path / "run" / "objects.json").exists()
+        return
+    ids = [record["id"] for record in table(tmp_path / "run")["objects"]]
+    assert ids == [7] if kind == "one id" else len(ids) > 8
+
+
+def test_a_model_plugs_in(room: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nothere.onnx"):
+        run(room, tmp_path / "run", f"masks.model={tmp_path / 'nothere.onnx'}")
+
+
+def slam_result(frames: list[Frame], *overrides: str, has_masks: bool | None = None) -> SlamResult:
+    slam = Slam(frames[0].camera, load_config(None, [*FAST, *overrides]), has_masks)
+    for frame in frames:
+        slam.step(frame)
+    return slam.finish()
+
+
+def test_from_python_the_first_keyframe_tells_whether_there_are_masks(room: Path) -> None:
+    frames = list(open_sequence(room).stream())[:8]
+    result = slam_result(frames)
+    assert result.objects is not None and result.objects.supervision == "masks"
+    bare = slam_result([dataclasses.replace(frame, mask=None) for frame in frames])
+    assert bare.objects is not None and bare.objects.supervision == "geometry"
+    none = slam_result(frames, "masks.source=none")
+    assert none.objects is None and none.gaussians.features.shape[1] == 0
+    assert result.objects.observations and all(o.views >= 1 for o in result.objects.observations.values())
+
+
+def test_a_mask_of_a_wrong_size_is_refused_by_name(room: Path) -> None:
+    frame = open_sequence(room).frame(0)
+    with pytest.raises(SequenceError, match=r"frame 0: mask is uint16 \[3, 3\], expected uint16"):
+        slam_result([dataclasses.replace(frame, mask=np.ones((3, 3), np.uint16))])
+
+
+def test_masks_that_are_asked_for_must_be_there(room: Path) -> None:
+    frame = open_sequence(room).frame(0)
+    with pytest.raises(SequenceError, match="no masks"):
+        slam_result([frame], "masks.source=recording", has_masks=False)
+
+
+class Notes(SilentObserver):
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+
+def test_masks_that_help_nothing_are_said_so(room: Path, tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    for path in (room / "masks").glob("*.png"):
+        (empty / path.name).write_bytes(cv2.imencode(".png", np.zeros((120, 160), np.uint16))[1].tobytes())
+    notes = Notes()
+    request = SequenceRequest(room, masks=empty, stop=4)
+    execute(RunRequest(request, out=tmp_path / "run", evaluate=False, overrides=FAST), notes)
+    assert any("no objects were learned" in note for note in notes.notes)
+
+
+def test_masks_of_other_frames_are_refused_and_leave_no_folder(room: Path, tmp_path: Path) -> None:
+    late = tmp_path / "late"
+    late.mkdir()
+    last = sorted((room / "masks").glob("*.png"))[-1]
+    shutil.copy(last, late / last.name)
+    with pytest.raises(SequenceError, match="late"):
+        execute(RunRequest(SequenceRequest(room, masks=late, stop=4), out=tmp_path / "run"))
+    (tmp_path / "bad.onnx").write_bytes(b"no model")
+    with pytest.raises(GgslamError, match=r"bad\.onnx"):
+        execute(RunRequest(SequenceRequest(room), tmp_path / "run", overrides=[f"masks.model={tmp_path}/bad.onnx"]))
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(ConfigError, match=r"masks\.model"):
+        execute(RunRequest(SequenceRequest(room), tmp_path / "run", overrides=["masks.source=model"]))

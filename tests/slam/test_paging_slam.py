@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SLAM whose map does not fit into its budget of memory."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ggslam.errors import ConfigError, RunFolderError
+from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.formats.point_ply import read_points
+from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.trajectory import read_tum
+from ggslam.jobs.progress import SilentObserver
+from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
+from ggslam.jobs.score.scoring import score_run
+from ggslam.mapping.deformation import move_with_keyframes
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.runs.recordings import SequenceRequest
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import inverse, se3_exp
+from ggslam.sequences import open_sequence
+from ggslam.slam.config import load_config
+from ggslam.slam.result import SlamResult
+from ggslam.slam.slam import Slam
+from ggslam.submaps.grid import GridStore
+from ggslam.synthetic import write_synthetic_sequence
+
+PLENTY = "memory_limit_mb=100000"
+SMALL = [PLENTY, "paging.budget_mb=3.0", "paging.cell=0.5", "paging.keep_radius=0.5", "paging.view_margin=1"]
+PLAIN = ["mapping.iterations_per_frame=1", "identity.enabled=false", "refine_iterations=60"]
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A camera that turns in the generated room: what it saw first goes out of view. 44 frames of 80x60."""
+    folder = tmp_path_factory.mktemp("recordings") / "turning"
+    return write_synthetic_sequence(folder, frames=44, width=80, height=60, seed=0, trajectory="pan")
+
+
+def slam_over(recording: Path, *overrides: str) -> SlamResult:
+    sequence = open_sequence(recording)
+    slam = Slam(sequence.camera, load_config(None, [*PLAIN, *overrides]), sequence.has_masks)
+    for frame in sequence.stream(masks="lazy"):
+        slam.step(frame)
+    return slam.finish()
+
+
+def executed(recording: Path, out: Path, *overrides: str) -> RunOutcome:
+    return execute(RunRequest(SequenceRequest(recording), out, overrides=[*PLAIN, *overrides], evaluate=False))
+
+
+def held_out_psnr(outcome: RunOutcome, recording: Path) -> float:
+    metrics = score_run(outcome.folder, open_sequence(recording), SilentObserver(), lpips=False)
+    return metrics["images"]["held_out"]["psnr"]
+
+
+@pytest.fixture(scope="module")
+def unlimited(turning: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOutcome:
+    return executed(turning, tmp_path_factory.mktemp("runs") / "unlimited")
+
+
+@pytest.fixture(scope="module")
+def limited(turning: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOutcome:
+    return executed(turning, tmp_path_factory.mktemp("runs") / "limited", *SMALL)
+
+
+def test_a_limit_that_is_not_reached_changes_nothing(turning: Path) -> None:
+    free, bound = slam_over(turning), slam_over(turning, PLENTY)
+    assert bound.cells is None
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "updates"):
+        assert getattr(free.gaussians, name).numpy().tobytes() == getattr(bound.gaussians, name).numpy().tobytes()
+    assert free.trajectory().tobytes() == bound.trajectory().tobytes()
+    bound.close()
+
+
+def test_a_limit_that_is_reached_keeps_the_map(turning: Path, unlimited: RunOutcome, limited: RunOutcome) -> None:
+    paging = json.loads((limited.folder.path / "timing.json").read_text())["paging"]
+    assert paging["moved_out"] > 500
+    assert paging["most_resident"] < 0.9 * limited.result.gaussian_count
+    assert held_out_psnr(limited, turning) > held_out_psnr(unlimited, turning) - 0.2
+    assert limited.result.gaussian_count == pytest.approx(unlimited.result.gaussian_count, rel=0.1)
+
+
+def test_the_run_folder_is_complete_and_nothing_else_is_left(limited: RunOutcome) -> None:
+    folder = limited.folder.path
+    gaussians, index = read_gaussian_ply(folder / "map.ply"), json.loads((folder / "map_cells.json").read_text())
+    assert len(gaussians) == index["gaussians"] == limited.result.gaussian_count
+    for cell in index["cells"]:
+        means = gaussians.means.numpy()[cell["start"] : cell["start"] + cell["count"]]
+        assert (np.floor(means / 0.5 + 0.5) == cell["cell"]).all()
+    assert not [path.name for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def test_points_are_those_of_the_whole_map(limited: RunOutcome) -> None:
+    written = read_points(limited.folder.path / "points.ply")
+    whole = sample_points(read_gaussian_ply(limited.folder.path / "map.ply"))
+    order = [np.lexsort(cloud.grid.T[::-1]) for cloud in (written, whole)]
+    assert np.array_equal(written.grid[order[0]], whole.grid[order[1]])
+    difference = written.colors[order[0]].astype(int) - whole.colors[order[1]]
+    assert np.abs(difference).max() <= 1 and np.allclose(written.origin, whole.origin)
+
+
+def test_a_view_of_the_cells_on_disk_is_the_view_of_the_map(limited: RunOutcome) -> None:
+    parts, whole = limited.folder.map_in_parts(), limited.folder.gaussians()
+    assert parts is not None
+    keyframe, rasterizer = limited.result.keyframes[-1], CpuRasterizer()
+    T_camera_world = inverse(keyframe.T_world_camera)
+    full = rasterizer.forward(whole, keyframe.camera, T_camera_world).image.numpy().copy()
+    seen = parts.in_view(keyframe.camera, T_camera_world)
+    assert len(seen) < len(whole)
+    assert np.abs(rasterizer.forward(seen, keyframe.camera, T_camera_world).image.numpy() - full).max() < 1e-5
+
+
+def test_objects_of_a_map_on_disk(turning: Path, tmp_path: Path) -> None:
+    """A row more than 100 bytes longer, so with the same budget more has to go."""
+    outcome = executed(turning, tmp_path / "objects", *SMALL, "identity.enabled=true", "identity.final_passes=1")
+    segmented = outcome.folder.segmented_map()
+    assert outcome.result.cells is not None and outcome.result.objects is not None
+    ids = segmented.gaussians.object_id.numpy()
+    counts = {record.id: record.gaussians for record in segmented.table.objects}
+    assert counts == {i: n for i, n in enumerate(np.bincount(ids).tolist()) if i and n} and len(counts) > 3
+    votes = segmented.votes
+    assert votes is not None and (votes.labels() == ids)[votes.labels() > 0].mean() > 0.9
+
+
+def test_real_time(turning: Path, tmp_path: Path) -> None:
+    outcome = executed(turning, tmp_path / "live", *SMALL, "realtime_fps=8")
+    assert outcome.error is None and outcome.result.cells is not None
+    assert len(read_gaussian_ply(outcome.folder.path / "map.ply")) == outcome.result.gaussian_count > 4000
+
+
+def test_gaussians_on_disk_follow_a_correction(turning: Path) -> None:
+    """All keyframes are moved, each its own way: what is on disk moves as what is in memory does."""
+    sequence = open_sequence(turning)
+    slam = Slam(sequence.camera, load_config(None, [*PLAIN, *SMALL]), sequence.has_masks)
+    for frame in sequence.stream(masks="lazy"):
+        slam.step(frame)
+    pager = slam.pager
+    assert pager is not None and pager.cells is not None and pager.on_disk > 500
+    whole = GaussianMap(0)
+    for part in [slam.map, *(part for _, part in pager.cells.parts())]:
+        whole.append(part.take(torch.arange(len(part))))
+    rng = np.random.default_rng(0)
+    moves = np.stack([se3_exp(0.3 * rng.normal(size=6)) for _ in slam.mapper.keyframes])
+    move_with_keyframes(whole, moves)
+    slam.mapper.move_keyframes(moves)
+    pager.move_keyframes(moves)
+    found = np.concatenate([slam.map.means.numpy(), *(part.means.numpy() for _, part in pager.cells.parts())])
+    assert np.array_equal(*(np.sort(means.view("f4,f4,f4").ravel()) for means in (found, whole.means.numpy())))
+    slam.finish().close()
+
+
+def test_a_limited_run_repeats(turning: Path, limited: RunOutcome, tmp_path: Path) -> None:
+    again = executed(turning, tmp_path / "again", *SMALL)
+    for name in ("map.ply", "trajectory.txt", "map_cells.json"):
+        assert (again.folder.path / name).read_bytes() == (limited.folder.path / name).read_bytes(), name
+
+
+def test_a_limit_below_the_program_is_refused(turning: Path) -> None:
+    with pytest.raises(ConfigError, match=r"memory_limit_mb=50: the program itself takes \d+ MB"):
+        Slam(open_sequence(turning).camera, load_config(None, ["memory_limit_mb=50"]))
+
+
+def test_an_interrupt_keeps_what_was_done(
+    turning: Path, limited: RunOutcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C arrives twice while cells are written to disk."""
+    real, calls = GridStore.put_cells, []
+
+    def put(store: GridStore, writes) -> None:
+        calls.append(writes)
+        if len(calls) == 2:
+            signal.raise_signal(signal.SIGINT)
+        real(store, writes)
+        if len(calls) == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(GridStore, "put_cells", put)
+    outcome = executed(turning, tmp_path / "stopped", *SMALL)
+    folder = outcome.folder.path
+    assert isinstance(outcome.error, KeyboardInterrupt) and 5 < len(outcome.result.frames) < 44
+    run = json.loads((folder / "run.json").read_text())
+    assert run["complete"] is False and "KeyboardInterrupt" in run["stopped_by"]
+    means = read_gaussian_ply(folder / "map.ply").means.numpy()
+    assert len(means) == outcome.result.gaussian_count and len(np.unique(means, axis=0)) > 0.99 * len(means)
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def test_a_full_disk_is_named_and_the_trajectory_kept(
+    turning: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def put(store: GridStore, writes) -> None:
+        raise RunFolderError("cannot write cells: No space left on device")
+
+    monkeypatch.setattr(GridStore, "put_cells", put)
+    with pytest.raises(RunFolderError, match="No space left on device"):
+        executed(turning, tmp_path / "full", *SMALL)
+    left = sorted(path.name for path in (tmp_path / "full").iterdir())
+    assert left == ["run.json", "trajectory.txt"]  # the map is lost, where the camera was is not
+    assert len(read_tum(tmp_path / "full" / "trajectory.txt")) > 5
+    assert "No space left" in json.loads((tmp_path / "full" / "run.json").read_text())["stopped_by"]
+
+
+def test_what_a_killed_run_left_goes_with_the_next_one(turning: Path, tmp_path: Path) -> None:
+    left = tmp_path / "run" / ".staged-999999999-0123abcd" / "keyframes"
+    left.mkdir(parents=True)
+    (left / "keyframe000000.npz").write_bytes(b"x")
+    outcome = execute(RunRequest(SequenceRequest(turning, stop=3), tmp_path / "run", None, [*PLAIN, PLENTY], False))
+    assert outcome.error is None and not [p for p in outcome.folder.path.iterdir() if p.name.startswith(".")]
+
+
+def test_a_map_made_before_is_taken_whole(turning: Path, limited: RunOutcome, tmp_path: Path) -> None:
+    request = RunRequest(SequenceRequest(turning), tmp_path / "on", None, [*PLAIN, *SMALL], map=limited.folder.path)
+    with pytest.raises(ConfigError, match=r"memory_limit_mb.*--map"):
+        execute(request)
