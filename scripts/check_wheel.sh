@@ -35,7 +35,7 @@ assert needed <= packed, f"{wheel} lacks {needed - packed}"
 assert not junk, f"{wheel} holds {junk[:5]}"
 assert any(n.endswith("licenses/LICENSE") for n in packed), f"{wheel} lacks the licence"
 needed = {"LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "CMakeLists.txt", "pyproject.toml", "ggslam/py.typed",
-          "configs/default.yaml", "tests/conftest.py", "ggslam/native/src/dispatch.hpp", "examples/run_slam.py",
+          "configs/default.yaml", "tests/conftest.py", "ggslam/native/src/common/dispatch.hpp", "examples/run_slam.py",
           "docs/index.md", "ggslam/cuda/kernels/rendering/api.cu", "ggslam/cuda/kernels/rendering/tile.cuh"}
 ends = (".so", ".pyc", ".whl", ".o")
 junk = [n for n in source if n.endswith(ends) or n.split("/")[0] in (".git", "build", "dist", "runs", "demo", ".ci")]

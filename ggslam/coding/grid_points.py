@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points on the codec's grid, by the compiled core (ggslam/native/src/gpcc_grid_api.cpp)."""
+"""Points on the codec's grid, by the compiled core (ggslam/native/src/codec/gpcc_grid_api.cpp)."""
 
 from __future__ import annotations
 

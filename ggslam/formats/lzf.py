@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """LZF, the byte-oriented Lempel-Ziv code that compressed PCD files use (format of M. Lehmann's liblzf).
 
-Both directions run in the compiled core (ggslam/native/src/lzf_api.cpp) and release the interpreter's lock.
+Both directions run in the compiled core (ggslam/native/src/codec/lzf_api.cpp) and release the interpreter's lock.
 """
 
 from __future__ import annotations

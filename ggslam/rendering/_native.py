@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The C interface of the rasterizer: structures as laid out in native/src/rasterizer.hpp."""
+"""The C interface of the rasterizer: structures as laid out in native/src/rendering/rasterizer.hpp."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class AdamArguments(ctypes.Structure):
 
 
 class PixelTerms(ctypes.Structure):
-    """Terms of pixels, as laid out in native/src/pixel_terms.hpp."""
+    """Terms of pixels, as laid out in native/src/rendering/pixel_terms.hpp."""
 
     _fields_ = [
         ("pixels", ctypes.c_int64), ("capacity", _int32), ("gaussians", _pointer), ("weights", _pointer),
@@ -87,7 +87,7 @@ class PixelTerms(ctypes.Structure):
 
 
 class FeatureAdam(ctypes.Structure):
-    """Features and the optimizer's state of them, as laid out in native/src/pixel_terms.hpp."""
+    """Features and the optimizer's state of them, as laid out in native/src/rendering/pixel_terms.hpp."""
 
     _fields_ = [
         ("gaussians", ctypes.c_int64), ("features", _pointer), ("first_moments", _pointer),

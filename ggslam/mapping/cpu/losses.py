@@ -150,7 +150,7 @@ class LossResult:
 
 
 class _Job(ctypes.Structure):
-    """Mirror of struct ImageLossJob in native/src/image_loss.hpp."""
+    """Mirror of struct ImageLossJob in native/src/mapping/image_loss.hpp."""
 
     _fields_ = [
         *[(name, ctypes.c_void_p) for name in (

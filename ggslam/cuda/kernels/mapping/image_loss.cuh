@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The arguments of the image loss, the memory it works in, and how an image is cut into tiles. The loss is that of
-// native/src/image_loss.hpp, stated in ggslam/mapping/cpu/losses.py.
+// native/src/mapping/image_loss.hpp, stated in ggslam/mapping/cpu/losses.py.
 #pragma once
 #include "common/carver.cuh"
 

@@ -2,7 +2,7 @@
 // L1 (or Charbonnier) + SSIM of colour, L1 of depth, and their gradients.
 //
 // SSIM (Wang et al. 2004) needs neighbours twice: for the statistics of a pixel, and for the gradient, to which the
-// derivatives at all pixels around contribute (see native/src/kernels/image_loss.cpp). So one kernel writes three
+// derivatives at all pixels around contribute (see native/src/mapping/kernels/image_loss.cpp). So one kernel writes three
 // derivatives per value, blurring x, y, x^2 + y^2 and x y, and another blurs those and does all that is local.
 #pragma once
 #include "mapping/loss_tile.cuh"

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Adam (Kingma and Ba 2015) on the rows of the Gaussians that were touched, as in native/src/kernels/adam.hpp and
+// Adam (Kingma and Ba 2015) on the rows of the Gaussians that were touched, as in native/src/rendering/kernels/adam.hpp and
 // ggslam/rendering/adam.py: every row counts its own updates, so learning rate and bias corrections are per row. They
 // are computed here rather than looked up, so that other rates need nothing but other arguments.
 #pragma once

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The rendering rules (stated in ggslam/rendering/reference.py) and the arguments of the C interface. GaussianArrays to
-// GaussianGradients are laid out as in native/src/rasterizer.hpp; here their pointers lead to device memory.
+// GaussianGradients are laid out as in native/src/rendering/rasterizer.hpp; here their pointers lead to device memory.
 #pragma once
 #include "common/platform.cuh"
 

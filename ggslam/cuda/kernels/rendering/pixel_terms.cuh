@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sampled compositing, as in native/src/pixel_terms.hpp: which Gaussians make up a pixel, and with what weight.
+// Sampled compositing, as in native/src/rendering/pixel_terms.hpp: which Gaussians make up a pixel, and with what weight.
 //
 //   collect_terms_kernel   walks the lists of the last rendering for some pixels          pixel_terms_collect.cuh
 //   the others             terms x features, gradients x terms, votes, labels             pixel_terms_use.cuh

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The arguments of the tracking functions. All pointers lead to device memory. ggslam/tracking/cuda/contract.py mirrors
 // the structures field by field; those named *Settings and PhotometricReferenceView are the compiled core's
-// (native/src/tracking_types.hpp), so that one mirror serves both.
+// (native/src/tracking/tracking_types.hpp), so that one mirror serves both.
 #pragma once
 #include "common/platform.cuh"
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Points of a depth image on a grid of pixels, with normals and covariances from their neighbours in the image: the
-// rules of native/src/kernels/depth_points.cpp.
+// rules of native/src/tracking/kernels/depth_points.cpp.
 //
 // A first pass notes which grid points are good, one bit each; a second one counts the bits before its own, so that
 // points are written in the order of the image whatever the order of the blocks.

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Levenberg-Marquardt between two linearisations, in double, by one thread: the rules of native/src/gicp_api.cpp. What
+// Levenberg-Marquardt between two linearisations, in double, by one thread: the rules of native/src/tracking/gicp_api.cpp. What
 // that file does in loops is spread over launches here, so the place in the loops is part of the state.
 #pragma once
 #include "common/carver.cuh"

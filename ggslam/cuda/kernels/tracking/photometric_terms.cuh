@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What one textured point contributes to an alignment: its grey value against a reference image, as in
-// native/src/kernels/photometric.cpp, where the equations are stated.
+// native/src/tracking/kernels/photometric.cpp, where the equations are stated.
 #pragma once
 #include "tracking/point_terms.cuh"
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What one point contributes to an alignment: Generalised ICP (Segal et al., RSS 2009) with a Geman-McClure kernel, as in
-// native/src/kernels/gicp.cpp, where the equations are stated.
+// native/src/tracking/kernels/gicp.cpp, where the equations are stated.
 #pragma once
 #include "tracking/voxel_lookup.cuh"
 

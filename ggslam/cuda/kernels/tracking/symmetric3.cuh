@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Symmetric 3x3 matrices packed as xx xy xz yy yz zz: eigenvectors and the regularisation of covariances, as in
-// native/src/kernels/symmetric3.hpp. All indices are known to the compiler, so that everything stays in registers.
+// native/src/common/kernels/symmetric3.hpp. All indices are known to the compiler, so that everything stays in registers.
 #pragma once
 #include "common/platform.cuh"
 

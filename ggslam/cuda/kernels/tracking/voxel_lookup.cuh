@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Voxels of a target on the device: their hash table and the search for the nearest one, which visits the same voxels in
-// the same order as native/src/kernels/voxel_lookup.hpp.
+// the same order as native/src/tracking/kernels/voxel_lookup.hpp.
 #pragma once
 #include "tracking/contract.cuh"
 

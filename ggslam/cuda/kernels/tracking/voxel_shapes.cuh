@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Means, normals and covariances of a target's voxels from the moments of their members, as in
-// native/src/kernels/voxel_target.cpp.
+// native/src/tracking/kernels/voxel_target.cpp.
 #pragma once
 #include "tracking/symmetric3.cuh"
 #include "tracking/voxel_lookup.cuh"

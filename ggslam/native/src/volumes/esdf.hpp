@@ -4,8 +4,8 @@
 #include <memory>
 #include <vector>
 
-#include "buffer.hpp"
-#include "context.hpp"
+#include "common/buffer.hpp"
+#include "common/context.hpp"
 #include "volumes/esdf_types.hpp"
 #include "volumes/tsdf.hpp"
 

@@ -2,7 +2,7 @@
 // The distance field as seen from outside.
 #include <limits>
 
-#include "context.hpp"
+#include "common/context.hpp"
 #include "volumes/esdf.hpp"
 
 GGSLAM_DECLARE_KERNEL(void esdf_query(const ggslam::volumes::QueryInput& in, std::size_t begin, std::size_t end,

@@ -2,8 +2,8 @@
 #include <cstring>
 #include <limits>
 
-#include "buffer.hpp"
-#include "context.hpp"
+#include "common/buffer.hpp"
+#include "common/context.hpp"
 #include "volumes/occupancy_files.hpp"
 #include "volumes/occupancy_queries.hpp"
 #include "volumes/occupancy_update.hpp"

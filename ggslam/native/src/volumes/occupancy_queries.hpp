@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // What is asked of a map.
 #pragma once
-#include "context.hpp"
+#include "common/context.hpp"
 #include "volumes/occupancy_tree.hpp"
 
 namespace ggslam {

@@ -4,7 +4,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "context.hpp"
+#include "common/context.hpp"
 
 GGSLAM_DECLARE_KERNEL(void raycast_tile(const volumes::RaycastScene& scene, const volumes::RaycastView& view,
                                         const volumes::RaycastTile& tile, const volumes::SurfaceImages& out))

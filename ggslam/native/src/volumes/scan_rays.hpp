@@ -4,7 +4,7 @@
 #include <memory>
 #include <vector>
 
-#include "context.hpp"
+#include "common/context.hpp"
 #include "volumes/voxel_masks.hpp"
 
 namespace ggslam {

@@ -4,8 +4,8 @@
 #include <cstdint>
 #include <vector>
 
-#include "dispatch.hpp"
-#include "thread_pool.hpp"
+#include "common/dispatch.hpp"
+#include "common/thread_pool.hpp"
 #include "volumes/tsdf.hpp"
 
 namespace ggslam::volumes {

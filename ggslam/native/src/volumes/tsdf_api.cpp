@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <cstring>
 
-#include "context.hpp"
+#include "common/context.hpp"
 #include "volumes/tsdf.hpp"
 
 using ggslam::volumes::Block;

@@ -6,7 +6,7 @@
 #include <cmath>
 #include <limits>
 
-#include "context.hpp"
+#include "common/context.hpp"
 #include "volumes/tsdf_scratch.hpp"
 
 GGSLAM_DECLARE_KERNEL(void tsdf_prepare_depth(const float* depth, int width, int height, int row, float min_depth,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "context.hpp"
+#include "common/context.hpp"
 #include "volumes/tsdf_scratch.hpp"
 
 namespace {

@@ -1,0 +1,177 @@
+// SPDX-License-Identifier: Apache-2.0
+// Entry points of the G-PCC codec. A slice object holds the octree that geometry and attributes share, and the bytes
+// that were coded last. Functions return a status, or where they say so a size (negative: minus the status).
+#include "codec/gpcc.hpp"
+
+#include <algorithm>
+#include <new>
+
+#include "common/context.hpp"
+
+GGSLAM_DECLARE_KERNEL(void morton_order(const std::int32_t* points, std::uint32_t count, int depth,
+                                        std::uint32_t* order, std::uint64_t* codes))
+GGSLAM_DECLARE_KERNEL(void octree_build(const std::uint64_t* codes, std::uint32_t count, int depth, gpcc::Octree& tree))
+GGSLAM_DECLARE_KERNEL(void octree_positions(const gpcc::Octree& tree, std::int32_t* out))
+GGSLAM_DECLARE_KERNEL(void octree_encode(const gpcc::OctreeSettings& settings, gpcc::Octree& tree,
+                                         std::vector<std::uint8_t>& out))
+GGSLAM_DECLARE_KERNEL(gpcc::Status octree_decode(const gpcc::OctreeSettings& settings, const std::uint8_t* data,
+                                                 std::size_t size, std::uint64_t points, gpcc::Octree& tree))
+GGSLAM_DECLARE_KERNEL(gpcc::Status raht_encode(const gpcc::RahtSettings& settings, const gpcc::Octree& tree,
+                                               std::int32_t* attributes, std::vector<std::uint8_t>& out))
+GGSLAM_DECLARE_KERNEL(gpcc::Status raht_decode(const gpcc::RahtSettings& settings, const gpcc::Octree& tree,
+                                               const std::uint8_t* data, std::size_t size, std::int32_t* attributes))
+GGSLAM_DECLARE_KERNEL(void colours_to_ycbcr(const std::uint8_t* rgb, const std::uint32_t* order, std::uint32_t count,
+                                            std::int32_t* out))
+GGSLAM_DECLARE_KERNEL(void colours_from_ycbcr(const std::int32_t* components, std::uint32_t count, std::uint8_t* rgb))
+
+namespace ggslam {
+namespace gpcc {
+
+void sum_weights(Octree& tree) {
+  for (int depth = tree.depth() - 1; depth >= 0; --depth) {
+    Level& level = tree.levels[depth];
+    const bool leaves_below = depth + 1 == tree.depth();
+    level.weight.assign(level.size() + std::size_t{1}, 0);
+    for (std::uint32_t node = 1; node <= level.size(); ++node) {
+      const std::uint32_t first = level.first_child[node], count = __builtin_popcount(level.occupancy[node]);
+      std::uint32_t sum = 0;
+      for (std::uint32_t child = first; child < first + count; ++child)
+        sum += leaves_below ? tree.weight_of_leaf(child) : tree.levels[depth + 1].weight[child];
+      level.weight[node] = sum;
+    }
+  }
+}
+
+namespace {
+
+struct Slice {
+  Octree tree;
+  std::vector<std::uint8_t> bytes;
+};
+
+template <class Function>
+std::int64_t guarded(const Function& function) {
+  try {
+    return function();
+  } catch (const std::bad_alloc&) {
+    return -static_cast<std::int64_t>(kOutOfMemory);
+  }
+}
+
+Isa isa_of(void* context) { return static_cast<Context*>(context)->isa; }
+
+}  // namespace
+}  // namespace gpcc
+}  // namespace ggslam
+
+using namespace ggslam;
+using gpcc::Slice;
+
+GGSLAM_EXPORT void* ggslam_gpcc_slice_create() { return new (std::nothrow) Slice; }
+
+GGSLAM_EXPORT void ggslam_gpcc_slice_destroy(void* slice) { delete static_cast<Slice*>(slice); }
+
+// Builds the octree of points [count, 3] in [0, 2^depth). `order` [count] receives their coding order.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_build(void* context, void* slice, const std::int32_t* points, std::uint32_t count,
+                                             std::int32_t depth, std::uint32_t* order) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    std::vector<std::uint64_t> codes(count);
+    GGSLAM_DISPATCH(gpcc::isa_of(context), morton_order)(points, count, depth, order, codes.data());
+    GGSLAM_DISPATCH(gpcc::isa_of(context), octree_build)(codes.data(), count, depth, static_cast<Slice*>(slice)->tree);
+    return gpcc::kOk;
+  });
+}
+
+GGSLAM_EXPORT std::uint32_t ggslam_gpcc_leaves(void* slice) { return static_cast<Slice*>(slice)->tree.leaves; }
+
+// Number of nodes at a level below the tree's depth.
+GGSLAM_EXPORT std::uint32_t ggslam_gpcc_nodes(void* slice, std::int32_t level) {
+  return static_cast<Slice*>(slice)->tree.levels[level].size();
+}
+
+// Number of points in each leaf, `counts` [leaves].
+GGSLAM_EXPORT void ggslam_gpcc_leaf_points(void* slice, std::uint32_t* counts) {
+  const gpcc::Octree& tree = static_cast<Slice*>(slice)->tree;
+  for (std::uint32_t leaf = 1; leaf <= tree.leaves; ++leaf) counts[leaf - 1] = tree.weight_of_leaf(leaf);
+}
+
+// Makes every leaf one point.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_merge(void* slice) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    gpcc::Octree& tree = static_cast<Slice*>(slice)->tree;
+    tree.leaf_points.clear();
+    tree.points = tree.leaves;
+    gpcc::sum_weights(tree);
+    return gpcc::kOk;
+  });
+}
+
+// Returns the number of bytes, which ggslam_gpcc_take copies.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slice, const gpcc::OctreeSettings* settings) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    Slice& s = *static_cast<Slice*>(slice);
+    s.bytes.clear();
+    GGSLAM_DISPATCH(gpcc::isa_of(context), octree_encode)(*settings, s.tree, s.bytes);
+    return static_cast<std::int64_t>(s.bytes.size());
+  });
+}
+
+// `attributes` [points, components] in coding order; replaced by what a decoder will reconstruct. Returns the number of
+// bytes.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_attribute(void* context, void* slice, const gpcc::RahtSettings* settings,
+                                                        std::int32_t* attributes) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    Slice& s = *static_cast<Slice*>(slice);
+    s.bytes.clear();
+    const gpcc::Status status =
+        GGSLAM_DISPATCH(gpcc::isa_of(context), raht_encode)(*settings, s.tree, attributes, s.bytes);
+    return status == gpcc::kOk ? static_cast<std::int64_t>(s.bytes.size()) : -static_cast<std::int64_t>(status);
+  });
+}
+
+GGSLAM_EXPORT void ggslam_gpcc_take(void* slice, std::uint8_t* out) {
+  std::vector<std::uint8_t>& bytes = static_cast<Slice*>(slice)->bytes;
+  std::copy(bytes.begin(), bytes.end(), out);
+  bytes.clear();
+}
+
+// Decodes a geometry payload that is said to hold `points` points.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slice, const gpcc::OctreeSettings* settings,
+                                                       const std::uint8_t* data, std::size_t size,
+                                                       std::uint32_t points) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    Slice& s = *static_cast<Slice*>(slice);
+    const gpcc::Status status =
+        GGSLAM_DISPATCH(gpcc::isa_of(context), octree_decode)(*settings, data, size, points, s.tree);
+    if (status == gpcc::kOk) gpcc::sum_weights(s.tree);
+    return -static_cast<std::int64_t>(status);
+  });
+}
+
+// Positions [points, 3] in coding order.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_positions(void* context, void* slice, std::int32_t* out) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    GGSLAM_DISPATCH(gpcc::isa_of(context), octree_positions)(static_cast<Slice*>(slice)->tree, out);
+    return gpcc::kOk;
+  });
+}
+
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_attribute(void* context, void* slice, const gpcc::RahtSettings* settings,
+                                                        const std::uint8_t* data, std::size_t size,
+                                                        std::int32_t* attributes) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    return -static_cast<std::int64_t>(GGSLAM_DISPATCH(gpcc::isa_of(context), raht_decode)(
+        *settings, static_cast<Slice*>(slice)->tree, data, size, attributes));
+  });
+}
+
+// Y, Cb, Cr [count, 3] of the colours rgb[order[i]].
+GGSLAM_EXPORT void ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, const std::uint32_t* order,
+                                        std::uint32_t count, std::int32_t* out) {
+  GGSLAM_DISPATCH(gpcc::isa_of(context), colours_to_ycbcr)(rgb, order, count, out);
+}
+
+GGSLAM_EXPORT void ggslam_gpcc_from_ycbcr(void* context, const std::int32_t* components, std::uint32_t count,
+                                          std::uint8_t* rgb) {
+  GGSLAM_DISPATCH(gpcc::isa_of(context), colours_from_ycbcr)(components, count, rgb);
+}

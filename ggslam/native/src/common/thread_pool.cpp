@@ -1,0 +1,81 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "common/thread_pool.hpp"
+
+#include <algorithm>
+
+namespace ggslam {
+namespace {
+inline void cpu_relax() {
+#if defined(__x86_64__)
+  __builtin_ia32_pause();
+#elif defined(__aarch64__)
+  __asm__ __volatile__("yield");
+#endif
+}
+// Kernels follow one another within microseconds, so a short spin saves a wake-up; it must stay short, because on
+// a busy machine a spinning thread takes the core from the one it waits for.
+constexpr int kSpins = 2000;
+}  // namespace
+
+ThreadPool::ThreadPool(int size) : size_(std::max(1, size)) {
+  for (int t = 1; t < size_; ++t) threads_.emplace_back([this, t] { worker(t); });
+}
+
+ThreadPool::~ThreadPool() {
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    stop_ = true;
+    generation_.fetch_add(1);
+  }
+  wake_.notify_all();
+  for (auto& thread : threads_) thread.join();
+}
+
+void ThreadPool::worker(int index) {
+  int seen = 0;
+  for (;;) {
+    for (int spin = 0; spin < kSpins && generation_.load(std::memory_order_acquire) == seen; ++spin) cpu_relax();
+    if (generation_.load(std::memory_order_acquire) == seen) {
+      std::unique_lock<std::mutex> lock(mutex_);
+      wake_.wait(lock, [&] { return generation_.load() != seen; });
+    }
+    seen = generation_.load(std::memory_order_acquire);
+    if (stop_) return;
+    (*job_)(index);
+    pending_.fetch_sub(1, std::memory_order_acq_rel);
+  }
+}
+
+void ThreadPool::run(const std::function<void(int)>& job) {
+  std::lock_guard<std::mutex> serial(run_mutex_);
+  if (size_ == 1) {
+    job(0);
+    return;
+  }
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    job_ = &job;
+    pending_.store(size_ - 1);
+    generation_.fetch_add(1);
+  }
+  wake_.notify_all();
+  job(0);
+  for (int spin = 0; pending_.load(std::memory_order_acquire) > 0; ++spin) {
+    if (spin > kSpins) std::this_thread::yield();
+    cpu_relax();
+  }
+}
+
+void ThreadPool::parallel_for(std::size_t count, std::size_t chunk,
+                              const std::function<void(std::size_t, std::size_t, int)>& f) {
+  std::atomic<std::size_t> next{0};
+  run([&](int thread) {
+    for (;;) {
+      const std::size_t begin = next.fetch_add(chunk);
+      if (begin >= count) break;
+      f(begin, std::min(count, begin + chunk), thread);
+    }
+  });
+}
+
+}  // namespace ggslam

@@ -1,0 +1,78 @@
+// SPDX-License-Identifier: Apache-2.0
+// Composites single pixels of a tile once more, a vector of any pixels at a time, and notes every contribution.
+#include "rendering/pixel_terms.hpp"
+
+#include "rendering/kernels/tile.hpp"
+
+namespace ggslam::GGSLAM_ISA {
+namespace {
+
+struct Lanes {
+  Float x, y;
+  Int last;                       // number in the tile's list of the last contribution, -1 beyond the last pixel
+  std::int32_t rows[kLanes];
+  std::int32_t sizes[kLanes];
+  std::uint32_t sub_blocks = 0;   // that the pixels lie in
+  std::int32_t last_of_all = -1;
+};
+
+Lanes gather_lanes(const Rasterizer& r, int tile, const TermPixel* pixels, int n) {
+  Lanes lanes;
+  lanes.x = lanes.y = Float{};
+  lanes.last = broadcast_int(-1);
+  for (int lane = 0; lane < n; ++lane) {
+    const TermPixel& p = pixels[lane];
+    const std::size_t at = (static_cast<std::size_t>(tile) * kSubBlocks + p.sub_block) * kLanes + p.lane;
+    const std::int32_t last = r.last_entry[at];
+    lanes.x[lane] = static_cast<float>(p.x);
+    lanes.y[lane] = static_cast<float>(p.y);
+    lanes.last[lane] = last;
+    lanes.rows[lane] = p.row;
+    lanes.sizes[lane] = 0;
+    lanes.sub_blocks |= 1u << p.sub_block;
+    lanes.last_of_all = last > lanes.last_of_all ? last : lanes.last_of_all;
+  }
+  return lanes;
+}
+
+void walk(const Rasterizer& r, int tile, Lanes& lanes, float min_weight, const PixelTerms& out) {
+  const TileEntry* entries = r.entries.data() + r.tile_start[tile];
+  const std::uint16_t* contributed = r.contributed.data() + r.tile_start[tile];
+  Float t = broadcast(1.0f);
+  for (std::int32_t k = 0; k <= lanes.last_of_all; ++k) {
+    if (k + kSplatPrefetch <= lanes.last_of_all && (contributed[k + kSplatPrefetch] & lanes.sub_blocks) != 0)
+      __builtin_prefetch(r.splats.data() + entries[k + kSplatPrefetch].splat);
+    if ((contributed[k] & lanes.sub_blocks) == 0) continue;
+    const Splat& g = r.splats[entries[k].splat];
+    const Float exponent = log2_alpha(g, lanes.x - g.mean_x, lanes.y - g.mean_y);
+    const Mask taken = both(greater_equal(exponent, broadcast(kLog2MinAlpha)),
+                            greater_equal_int(lanes.last, broadcast_int(k)));
+    const Float alpha = zero_unless(taken, minimum(exp2_unchecked(exponent), broadcast(kMaxAlpha)));
+    const Float weight = alpha * t;
+    t = t - weight;
+    std::uint32_t wanted = bits(both(taken, greater_equal(weight, broadcast(min_weight))));
+    for (; wanted != 0; wanted &= wanted - 1) {
+      const int lane = __builtin_ctz(wanted);
+      const std::int32_t size = lanes.sizes[lane];
+      if (size == out.capacity) continue;
+      const std::size_t at = static_cast<std::size_t>(lanes.rows[lane]) * out.capacity + size;
+      out.gaussians[at] = g.gaussian;
+      out.weights[at] = weight[lane];
+      lanes.sizes[lane] = size + 1;
+    }
+  }
+}
+
+}  // namespace
+
+void collect_terms(const Rasterizer& r, int tile, const TermPixel* pixels, int count, float min_weight,
+                   const PixelTerms& out) {
+  for (int first = 0; first < count; first += kLanes) {
+    const int n = count - first < kLanes ? count - first : kLanes;
+    Lanes lanes = gather_lanes(r, tile, pixels + first, n);
+    walk(r, tile, lanes, min_weight, out);
+    for (int lane = 0; lane < n; ++lane) out.counts[lanes.rows[lane]] = lanes.sizes[lane];
+  }
+}
+
+}  // namespace ggslam::GGSLAM_ISA

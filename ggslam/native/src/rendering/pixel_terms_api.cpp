@@ -1,0 +1,201 @@
+// SPDX-License-Identifier: Apache-2.0
+// Entry points of sampled compositing: pixels are handed out by tile, terms are sorted by Gaussian.
+#include "rendering/pixel_terms.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+namespace ggslam {
+namespace {
+
+enum Status { kDone = 0, kOutOfMemory = 1 };
+
+// Places the pixels in the order of tiles and, within a tile, of sub-blocks: lanes that lie together walk together.
+struct SortedPixels {
+  std::vector<TermPixel> pixels;
+  std::vector<std::int32_t> tile_start;
+};
+
+SortedPixels sort_pixels(const Rasterizer& r, const std::int32_t* pixels, std::int64_t count) {
+  const int lanes = r.tile_height, sub_height = lanes / 4;  // a sub-block is 4 x (lanes / 4) pixels
+  std::vector<TermPixel> found(count);
+  std::vector<std::int32_t> key(count), start(static_cast<std::size_t>(r.tiles()) * kSubBlocks + 1, 0);
+  for (std::int64_t i = 0; i < count; ++i) {
+    const int x = pixels[i] % r.view.width, y = pixels[i] / r.view.width;
+    const int in_x = x % kTileWidth, in_y = y % r.tile_height;
+    const int sub = in_y / sub_height * 4 + in_x / 4;
+    found[i] = {x, y, static_cast<std::int32_t>(i), sub, in_y % sub_height * 4 + in_x % 4};
+    key[i] = (y / r.tile_height * r.tiles_x + x / kTileWidth) * kSubBlocks + sub;
+    ++start[key[i] + 1];
+  }
+  for (std::size_t k = 1; k < start.size(); ++k) start[k] += start[k - 1];
+  SortedPixels sorted{std::vector<TermPixel>(count), std::vector<std::int32_t>(r.tiles() + 1)};
+  for (int tile = 0; tile <= r.tiles(); ++tile) sorted.tile_start[tile] = start[static_cast<std::size_t>(tile) * kSubBlocks];
+  for (std::int64_t i = 0; i < count; ++i) sorted.pixels[start[key[i]]++] = found[i];
+  return sorted;
+}
+
+// The transposed terms. Counting sort, so that the order within a Gaussian is that of the pixels.
+class Transposed {
+ public:
+  Transposed(const PixelTerms& terms, std::int64_t gaussians) : first_(gaussians + 1, 0) {
+    std::int64_t total = 0;
+    for (std::int64_t p = 0; p < terms.pixels; ++p) {
+      total += terms.counts[p];
+      for (int i = 0; i < terms.counts[p]; ++i) ++first_[terms.gaussians[p * terms.capacity + i]];
+    }
+    rows_.resize(total);
+    weights_.resize(total);
+    std::int64_t next = 0;
+    for (std::int64_t g = 0; g < gaussians; ++g) {
+      const std::int32_t here = first_[g];
+      if (here == 0) continue;
+      touched_.push_back(static_cast<std::int32_t>(g));
+      starts_.push_back(next);
+      first_[g] = static_cast<std::int32_t>(next);
+      next += here;
+    }
+    starts_.push_back(next);
+    for (std::int64_t p = 0; p < terms.pixels; ++p) {
+      for (int i = 0; i < terms.counts[p]; ++i) {
+        const std::int64_t from = p * terms.capacity + i;
+        const std::int32_t to = first_[terms.gaussians[from]]++;
+        rows_[to] = static_cast<std::int32_t>(p);
+        weights_[to] = terms.weights[from];
+      }
+    }
+  }
+  std::int64_t size() const { return static_cast<std::int64_t>(touched_.size()); }
+  TermsByGaussian view() const { return {touched_.data(), starts_.data(), rows_.data(), weights_.data()}; }
+
+ private:
+  std::vector<std::int32_t> first_, touched_, rows_;
+  std::vector<std::int64_t> starts_;
+  std::vector<float> weights_;
+};
+
+// Adds the weight of `label` to a Gaussian's slots. With every slot taken by other labels, the lightest one gives way
+// and leaves its weight as the newcomer's head start (the space-saving sketch of Metwally et al. 2005), so that a label
+// that holds more than 1 / slots of all the weight is never lost.
+void add_vote(std::int32_t* ids, float* weights, int slots, std::int32_t label, float weight) {
+  int lightest = 0;
+  for (int s = 0; s < slots; ++s) {
+    if (ids[s] == label) {
+      weights[s] += weight;
+      return;
+    }
+    if (weights[s] < weights[lightest]) lightest = s;
+  }
+  ids[lightest] = label;
+  weights[lightest] += weight;
+}
+
+constexpr int kDistinct = 16;
+
+// The label with the largest sum of weights among a pixel's terms, and its share of the whole.
+void label_pixel(const PixelTerms& terms, std::int64_t p, const std::uint16_t* labels, std::uint16_t& id, float& share) {
+  std::uint16_t ids[kDistinct];
+  float sums[kDistinct], whole = 0;
+  int distinct = 0;
+  for (int i = 0; i < terms.counts[p]; ++i) {
+    const std::int64_t at = p * terms.capacity + i;
+    const std::uint16_t label = labels[terms.gaussians[at]];
+    whole += terms.weights[at];
+    int k = 0;
+    while (k < distinct && ids[k] != label) ++k;
+    if (k == kDistinct) continue;  // the seventeenth label of a pixel will not be the heaviest one
+    if (k == distinct) ids[distinct] = label, sums[distinct++] = 0;
+    sums[k] += terms.weights[at];
+  }
+  const int best = distinct == 0 ? 0 : static_cast<int>(std::max_element(sums, sums + distinct) - sums);
+  id = distinct == 0 ? 0 : ids[best];
+  share = distinct == 0 ? 0 : sums[best] / whole;
+}
+
+template <class Function>
+int guarded(const Function& function) {
+  try {
+    function();
+    return kDone;
+  } catch (const std::bad_alloc&) {
+    return kOutOfMemory;
+  }
+}
+
+}  // namespace
+}  // namespace ggslam
+
+using namespace ggslam;
+
+// Fills `out` for pixels (row * width + column, each within the image) of the last forward, leaving out contributions
+// below min_weight and those for which a row has no room. Returns 0 or 1 (out of memory).
+GGSLAM_EXPORT int ggslam_rasterizer_pixel_terms(void* rasterizer, const std::int32_t* pixels, float min_weight,
+                                                const PixelTerms* out) {
+  return guarded([&] {
+    const Rasterizer& r = *static_cast<Rasterizer*>(rasterizer);
+    const SortedPixels sorted = sort_pixels(r, pixels, out->pixels);
+    const auto collect = GGSLAM_DISPATCH(r.context.isa, collect_terms);
+    r.context.pool.parallel_for(r.tiles(), 1, [&](std::size_t tile, std::size_t, int) {
+      const std::int32_t first = sorted.tile_start[tile], count = sorted.tile_start[tile + 1] - first;
+      if (count > 0) collect(r, static_cast<int>(tile), sorted.pixels.data() + first, count, min_weight, *out);
+    });
+  });
+}
+
+// out [P, channels] = sum of weight times feature. Returns 0.
+GGSLAM_EXPORT int ggslam_terms_blend(void* context, const PixelTerms* terms, const float* features, int channels,
+                                     float* out) {
+  Context& c = *static_cast<Context*>(context);
+  const auto blend = GGSLAM_DISPATCH(c.isa, blend_terms);
+  c.pool.parallel_for(terms->pixels, 256, [&](std::size_t begin, std::size_t end, int) {
+    blend(*terms, features, channels, static_cast<std::int64_t>(begin), static_cast<std::int64_t>(end), out);
+  });
+  return kDone;
+}
+
+// Adam on the features of the Gaussians in `terms`, their gradient being the sum of weight times gradient [P, channels].
+// Returns 0 or 1 (out of memory).
+GGSLAM_EXPORT int ggslam_terms_step(void* context, const PixelTerms* terms, const float* gradient,
+                                    const FeatureAdam* adam) {
+  return guarded([&] {
+    Context& c = *static_cast<Context*>(context);
+    const Transposed transposed(*terms, adam->gaussians);
+    const TermsByGaussian view = transposed.view();
+    const auto step = GGSLAM_DISPATCH(c.isa, step_term_rows);
+    c.pool.parallel_for(transposed.size(), 512, [&](std::size_t begin, std::size_t end, int) {
+      step(view, gradient, *adam, static_cast<std::int64_t>(begin), static_cast<std::int64_t>(end));
+    });
+  });
+}
+
+// Adds each pixel's weights, times those of the pixels [P] (null: 1), to the votes [gaussians, slots] of its Gaussians
+// under labels [P]; label 0 votes for nothing. Returns 0 or 1 (out of memory).
+GGSLAM_EXPORT int ggslam_terms_vote(void* context, const PixelTerms* terms, const std::uint16_t* labels,
+                                    const float* pixel_weights, std::int64_t gaussians, int slots, std::int32_t* ids, float* weights) {
+  return guarded([&] {
+    Context& c = *static_cast<Context*>(context);
+    const Transposed transposed(*terms, gaussians);
+    const TermsByGaussian view = transposed.view();
+    c.pool.parallel_for(transposed.size(), 512, [&](std::size_t begin, std::size_t end, int) {
+      for (std::size_t i = begin; i < end; ++i) {
+        const std::size_t at = static_cast<std::size_t>(view.touched[i]) * slots;
+        for (std::int64_t k = view.starts[i]; k < view.starts[i + 1]; ++k) {
+          const std::int32_t row = view.rows[k];
+          const float factor = pixel_weights != nullptr ? pixel_weights[row] : 1.0f;
+          if (labels[row] != 0) add_vote(ids + at, weights + at, slots, labels[row], factor * view.weights[k]);
+        }
+      }
+    });
+  });
+}
+
+// The label with the largest rendering weight at each pixel, and its share of the pixel's weight. `labels` [gaussians].
+GGSLAM_EXPORT int ggslam_terms_label(void* context, const PixelTerms* terms, const std::uint16_t* labels,
+                                     std::uint16_t* ids, float* shares) {
+  Context& c = *static_cast<Context*>(context);
+  c.pool.parallel_for(terms->pixels, 1024, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t p = begin; p < end; ++p) label_pixel(*terms, static_cast<std::int64_t>(p), labels, ids[p], shares[p]);
+  });
+  return kDone;
+}

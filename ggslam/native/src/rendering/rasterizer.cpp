@@ -1,0 +1,147 @@
+// SPDX-License-Identifier: Apache-2.0
+// Runs the stages of the rasterizer over blocks and tiles, and exports them with a C interface.
+#include "rendering/rasterizer.hpp"
+
+#include <algorithm>
+#include <cstring>
+
+namespace ggslam {
+namespace {
+
+enum Status { kDone = 0, kOutOfMemory = 1, kTooManyPairs = 2 };
+
+void prepare(Rasterizer& r, const GaussianArrays& gaussians, const View& view) {
+  r.gaussians = gaussians;
+  r.view = view;
+  r.padded_features = gaussians.render_features ? (gaussians.feature_channels + 3) / 4 * 4 : 0;
+  r.tile_height = GGSLAM_DISPATCH(r.context.isa, rasterizer_lanes)();
+  r.tiles_x = (view.width + kTileWidth - 1) / kTileWidth;
+  r.tiles_y = (view.height + r.tile_height - 1) / r.tile_height;
+
+  // The cut into blocks must not depend on the number of threads: the pose gradient is summed block by block.
+  r.block_shift = 10;
+  while ((gaussians.count >> r.block_shift) >= kMaxBlocks) ++r.block_shift;
+  r.block_size = std::int64_t{1} << r.block_shift;
+  r.blocks = static_cast<int>((gaussians.count + r.block_size - 1) >> r.block_shift);
+
+  const std::size_t tiles = r.tiles(), pixels = tiles * kTileWidth * r.tile_height;
+  r.splats.reserve(static_cast<std::size_t>(r.blocks) * r.block_size);
+  r.footprints.reserve(static_cast<std::size_t>(r.blocks) * r.block_size);
+  r.tile_cursor.reserve(r.blocks * (tiles + 1));
+  r.tile_start.reserve(tiles + 1);
+  r.transmittance.reserve(pixels);
+  r.last_entry.reserve(pixels);
+  // Scratch is reserved here, never in a kernel: an exception in a worker thread would end the process.
+  for (int t = 0; t < r.context.pool.size(); ++t) {
+    r.scratch[t].pixel_features.reserve(std::size_t{kSubBlocks} * r.tile_height * r.padded_features);
+    r.scratch[t].gaussian_features.reserve(std::size_t{kChunk} * r.padded_features);
+  }
+}
+
+// Turns the blocks' tile counts into the places of their entries: tile by tile and, within a tile, block by block, so
+// that a tile's list starts in the order of the Gaussians. False if there are too many pairs to number.
+bool allot_pairs(Rasterizer& r) {
+  r.pair_count = 0;
+  for (int b = 0; b < r.blocks; ++b) {
+    const std::uint64_t here = r.pairs[b];
+    r.pairs[b] = r.pair_count;
+    r.pair_count += here;
+  }
+  if (r.pair_count >= (std::uint64_t{1} << 31)) return false;
+  std::uint32_t next = 0, longest = 0;
+  const int tiles = r.tiles();
+  for (int tile = 0; tile < tiles; ++tile) {
+    r.tile_start[tile] = next;
+    for (int b = 0; b < r.blocks; ++b) {
+      std::uint32_t& cursor = r.cursors(b)[tile];
+      const std::uint32_t here = cursor;
+      cursor = next;
+      next += here;
+    }
+    longest = std::max(longest, next - r.tile_start[tile]);
+  }
+  r.tile_start[tiles] = next;
+  for (int t = 0; t < r.context.pool.size(); ++t) r.scratch[t].sorting.reserve(longest);
+  r.entries.reserve(r.pair_count + kMaxBlocks);
+  r.contributed.reserve(r.pair_count + kChunk);  // written in whole chunks
+  return true;
+}
+
+Status forward(Rasterizer& r, const GaussianArrays& gaussians, const View& view, const RenderTargets& targets) {
+  prepare(r, gaussians, view);
+  const Isa isa = r.context.isa;
+  ThreadPool& pool = r.context.pool;
+  const auto project = GGSLAM_DISPATCH(isa, project_block);
+  const auto scatter = GGSLAM_DISPATCH(isa, scatter_block);
+  const auto render = GGSLAM_DISPATCH(isa, forward_tile);
+  pool.parallel_for(r.blocks, 1, [&](std::size_t b, std::size_t, int) { project(r, static_cast<int>(b)); });
+  if (!allot_pairs(r)) return kTooManyPairs;
+  pool.parallel_for(r.blocks, 1, [&](std::size_t b, std::size_t, int) { scatter(r, static_cast<int>(b)); });
+  pool.parallel_for(r.tiles(), 1, [&](std::size_t tile, std::size_t, int thread) {
+    render(r, static_cast<int>(tile), targets, r.scratch[thread]);
+  });
+  return kDone;
+}
+
+Status backward(Rasterizer& r, const ImageGradients& image_gradients, const GaussianGradients& gradients,
+                const AdamArguments* adam) {
+  const Isa isa = r.context.isa;
+  ThreadPool& pool = r.context.pool;
+  const auto differentiate = GGSLAM_DISPATCH(isa, backward_tile);
+  const auto gather = GGSLAM_DISPATCH(isa, gather_block);
+  r.slots.reserve(r.pair_count * kSlotStride);
+  r.feature_slots.reserve(r.pair_count * r.padded_features);
+  r.slot_used.reserve(r.pair_count);
+  r.block_twist.reserve(6 * kMaxBlocks);
+  if (r.pair_count > 0) std::memset(r.slot_used.data(), 0, r.pair_count);
+
+  pool.parallel_for(r.tiles(), 1, [&](std::size_t tile, std::size_t, int thread) {
+    differentiate(r, static_cast<int>(tile), image_gradients, r.scratch[thread]);
+  });
+  pool.parallel_for(r.blocks, 1, [&](std::size_t b, std::size_t, int thread) {
+    gather(r, static_cast<int>(b), gradients, adam, r.scratch[thread]);
+  });
+  for (int k = 0; k < 6; ++k) {
+    gradients.twist[k] = 0.0;
+    for (int b = 0; b < r.blocks; ++b) gradients.twist[k] += r.block_twist[6 * b + k];
+  }
+  return kDone;
+}
+
+}  // namespace
+}  // namespace ggslam
+
+using namespace ggslam;
+
+GGSLAM_EXPORT void* ggslam_rasterizer_create(void* context) { return new Rasterizer(*static_cast<Context*>(context)); }
+
+GGSLAM_EXPORT void ggslam_rasterizer_destroy(void* rasterizer) { delete static_cast<Rasterizer*>(rasterizer); }
+
+// Renders. Returns 0, 1 (out of memory) or 2 (more than 2^31 pairs of a Gaussian and a tile).
+GGSLAM_EXPORT int ggslam_rasterizer_forward(void* rasterizer, const GaussianArrays* gaussians, const View* view,
+                                            const RenderTargets* targets) {
+  try {
+    return forward(*static_cast<Rasterizer*>(rasterizer), *gaussians, *view, *targets);
+  } catch (const std::bad_alloc&) {
+    return kOutOfMemory;
+  }
+}
+
+// Differentiates the last forward, whose arrays must still be there and unchanged. With `adam`, updates the Gaussians
+// that were touched instead of writing their gradients.
+GGSLAM_EXPORT int ggslam_rasterizer_backward(void* rasterizer, const ImageGradients* image_gradients,
+                                             const GaussianGradients* gradients, const AdamArguments* adam) {
+  try {
+    return backward(*static_cast<Rasterizer*>(rasterizer), *image_gradients, *gradients, adam);
+  } catch (const std::bad_alloc&) {
+    return kOutOfMemory;
+  }
+}
+
+// Numbers of the last forward: visible Gaussians, pairs of a Gaussian and a tile.
+GGSLAM_EXPORT void ggslam_rasterizer_statistics(void* rasterizer, std::int64_t* out) {
+  const Rasterizer& r = *static_cast<Rasterizer*>(rasterizer);
+  out[0] = 0;
+  for (int b = 0; b < r.blocks; ++b) out[0] += r.visible[b];
+  out[1] = static_cast<std::int64_t>(r.pair_count);
+}

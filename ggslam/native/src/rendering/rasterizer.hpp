@@ -1,0 +1,182 @@
+// SPDX-License-Identifier: Apache-2.0
+// The differentiable Gaussian rasterizer: what its stages share. The stages themselves are in kernels/:
+//
+//   project_block    Gaussians -> splats (mean, conic, opacity, colour in the image), tile counts    projection.cpp
+//   scatter_block    splats -> per-tile lists of (depth, splat)                                      binning.cpp
+//   forward_tile     sort one tile's list by depth, composite it front to back                       tiles_forward.cpp
+//   backward_tile    back to front: one gradient slot per (splat, tile) pair                         tiles_backward.cpp
+//   gather_block     sum a Gaussian's slots, differentiate the projection, store or apply Adam       gather.cpp
+//
+// rasterizer.cpp runs them over blocks of Gaussians and over tiles. Blocks and tiles write only to places of their own
+// and every sum has a fixed order, so results do not depend on the number of threads.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+#include "common/buffer.hpp"
+#include "common/context.hpp"
+
+namespace ggslam {
+
+// --- the rendering rules: one contract for all backends, stated in ggslam/rendering/reference.py ---------------------
+constexpr float kLog2MinAlpha = -7.99435344f;   // log2(1 / 255): weaker contributions are skipped
+constexpr float kMaxAlpha = 0.999f;
+constexpr float kMinTransmittance = 1e-4f;      // a pixel takes no further Gaussian once its transmittance is below
+constexpr float kFrustumMargin = 0.15f;         // of the image size: slopes beyond are clamped in the Jacobian
+constexpr float kMaxDepth = 1e6f;               // metres; Gaussians farther away are skipped
+constexpr float kMinLogScale = -23.0f, kMaxLogScale = 10.0f;  // Gaussians with a scale outside are skipped
+constexpr float kMinQuaternionNorm2 = 1e-20f, kMaxQuaternionNorm2 = 1e20f;
+
+constexpr int kTileWidth = 16;
+constexpr int kSubBlocks = 16;                  // sub-blocks of a tile, 4 x 4, each of kLanes pixels
+constexpr int kBaseGradients = 10;              // log-alpha moments 1, dx, dy, dx^2, dx dy, dy^2; colour; depth
+constexpr int kSlotStride = 16;                 // floats from one gradient slot to the next: one cache line
+constexpr int kMaxBlocks = 32;
+constexpr int kChunk = 64;                      // splats that a tile composites at a time
+
+// --- arguments, as laid out by ggslam/rendering/_native.py -----------------------------------------------------------
+struct GaussianArrays {
+  std::int64_t count;
+  const float *means, *quaternions, *log_scales, *opacity_logits, *sh, *features;
+  std::int32_t sh_coefficients;         // coefficients stored per Gaussian: 1, 4, 9 or 16
+  std::int32_t active_sh_coefficients;  // how many of them are evaluated
+  std::int32_t feature_channels;        // channels stored per Gaussian
+  std::int32_t render_features;         // 0: leave them out
+};
+
+struct View {
+  std::int32_t width, height;
+  float fx, fy, cx, cy, near_plane;
+  float low_pass;  // pixels^2 added to both diagonal terms of the 2D covariance
+  float camera_world[12];  // first three rows of T_camera_world
+};
+
+struct RenderTargets {  // planes [H, W]; features and median_depth may be null
+  float *image, *features, *depth, *alpha, *median_depth;
+};
+
+struct ImageGradients {  // each may be null, which means zero
+  const float *image, *features, *depth, *alpha;
+  std::int32_t detach_features;  // 1: gradients of the feature channels reach the features only
+};
+
+struct GaussianGradients {  // gradient arrays may all be null; twist and touched are always written
+  float *means, *quaternions, *log_scales, *opacity_logits, *sh, *features;
+  double* twist;
+  std::uint8_t* touched;
+};
+
+struct AdamArrays {
+  float *parameters, *first_moments, *second_moments;
+};
+
+// schedule [rows][8]: for a Gaussian at its u-th update, row min(u, rows) - 1 holds the step sizes (learning rate over
+// 1 - beta1^u) of the seven groups in the order below, then 1 / sqrt(1 - beta2^u).
+enum AdamGroup { kMeans, kQuaternions, kLogScales, kOpacityLogits, kShConstant, kShRest, kFeatures, kCorrection };
+
+struct AdamArguments {
+  AdamArrays means, quaternions, log_scales, opacity_logits, sh, features;
+  std::int32_t* updates;
+  const float* schedule;
+  std::int32_t schedule_rows;
+  float beta1, beta2, epsilon;
+};
+
+// --- what the stages hand to one another -----------------------------------------------------------------------------
+
+// Tiles that a splat covers.
+struct TileRectangle {
+  std::uint16_t x, y, wide, high;
+};
+
+// What binning needs to know of a splat.
+struct Footprint {
+  std::uint32_t depth_bits;
+  TileRectangle tiles;
+};
+
+// Everything a tile needs to know of a projected Gaussian, in one cache line.
+struct alignas(64) Splat {
+  float mean_x, mean_y;                // pixels
+  float conic_xx, conic_xy, conic_yy;  // log2 alpha = log2_opacity + xx dx^2 + xy dx dy + yy dy^2
+  float log2_opacity;
+  float red, green, blue;
+  float depth;
+  float slope_x, slope_y;              // the dx (dy) of highest alpha in a row (column) is slope_x dy (slope_y dx)
+  std::uint32_t first_pair;            // number of its first (splat, tile) pair, within the block
+  std::int32_t gaussian;               // row in the map
+  TileRectangle tiles;
+};
+static_assert(sizeof(Splat) == 64, "a splat fills one cache line");
+
+struct TileEntry {
+  std::uint32_t depth_bits;  // the float's bits: ordered like the depth, which is positive
+  std::uint32_t splat;
+};
+
+struct ThreadScratch {
+  Buffer<TileEntry> sorting;
+  Buffer<float> pixel_features;     // [sub-blocks][channels][lanes]: accumulated features or their gradients
+  Buffer<float> gaussian_features;  // [up to kChunk Gaussians][channels]
+};
+
+struct Rasterizer {
+  explicit Rasterizer(Context& context_) : context(context_), scratch(new ThreadScratch[context_.pool.size()]) {}
+  ~Rasterizer() { delete[] scratch; }
+  Context& context;
+  ThreadScratch* scratch;  // one per thread
+
+  GaussianArrays gaussians{};
+  View view{};
+  int padded_features = 0;  // rendered feature channels, rounded up to a multiple of 4
+  int tile_height = 0, tiles_x = 0, tiles_y = 0;
+
+  int blocks = 0;                     // Gaussians [b * block_size, (b + 1) * block_size) form block b
+  int block_shift = 0;                // log2 of block_size
+  std::int64_t block_size = 0;
+  Buffer<Splat> splats;               // those of block b start at b * block_size
+  Buffer<Footprint> footprints;       // likewise
+  std::int32_t visible[kMaxBlocks];   // number of splats per block
+  std::uint64_t pairs[kMaxBlocks];    // number of (splat, tile) pairs per block; then of all blocks before it
+  std::uint64_t pair_count = 0;
+
+  Buffer<std::uint32_t> tile_cursor;  // [blocks][tiles + 1]: counts, then where the block's next entry goes; one spare
+  Buffer<std::uint32_t> tile_start;   // [tiles + 1]
+  Buffer<TileEntry> entries;          // [pairs], tile by tile; sorted by depth by forward_tile; one spare per block
+  Buffer<std::uint16_t> contributed;  // [pairs] in the order of entries: sub-blocks to which the splat contributed
+  Buffer<float> transmittance;        // [tiles][sub-blocks][lanes], after the last Gaussian
+  Buffer<std::int32_t> last_entry;    // [tiles][sub-blocks][lanes]: number in the tile's list of the last contribution
+
+  Buffer<std::uint8_t> slot_used;     // [pairs], Gaussian by Gaussian
+  Buffer<float> slots;                // [pairs][kSlotStride]
+  Buffer<float> feature_slots;        // [pairs][padded_features]
+  Buffer<double> block_twist;         // [blocks][6]
+
+  int tiles() const { return tiles_x * tiles_y; }
+  // Number of the pair of a splat and a tile: that of its gradient slot. Pairs are numbered Gaussian by Gaussian
+  // and, within the splat's rectangle, row by row.
+  std::size_t pair_number(std::uint32_t splat_index, const Splat& splat, int tile_x, int tile_y) const {
+    return pairs[splat_index >> block_shift] + splat.first_pair +
+           static_cast<std::size_t>((tile_y - splat.tiles.y) * splat.tiles.wide + (tile_x - splat.tiles.x));
+  }
+  std::uint32_t* cursors(int block) const {
+    return tile_cursor.data() + static_cast<std::size_t>(block) * static_cast<std::size_t>(tiles() + 1);
+  }
+  std::int64_t block_begin(int b) const { return b * block_size; }
+  std::int64_t block_end(int b) const {
+    const std::int64_t end = (b + 1) * block_size;
+    return end < gaussians.count ? end : gaussians.count;
+  }
+};
+
+}  // namespace ggslam
+
+// Number of lanes, which is also the height of a tile in pixels.
+GGSLAM_DECLARE_KERNEL(int rasterizer_lanes())
+GGSLAM_DECLARE_KERNEL(void project_block(Rasterizer& r, int block))
+GGSLAM_DECLARE_KERNEL(void scatter_block(Rasterizer& r, int block))
+GGSLAM_DECLARE_KERNEL(void forward_tile(Rasterizer& r, int tile, const RenderTargets& targets, ThreadScratch& scratch))
+GGSLAM_DECLARE_KERNEL(void backward_tile(Rasterizer& r, int tile, const ImageGradients& gradients,
+                                         ThreadScratch& scratch))
+GGSLAM_DECLARE_KERNEL(void gather_block(Rasterizer& r, int block, const GaussianGradients& gradients,
+                                        const AdamArguments* adam, ThreadScratch& scratch))

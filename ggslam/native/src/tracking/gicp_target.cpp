@@ -1,0 +1,298 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "tracking/gicp_target.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <memory>
+#include <numeric>
+
+#include "tracking/target_kernels.hpp"
+
+namespace ggslam {
+namespace {
+
+constexpr int kPartitions = 64;      // by hash of the block, so that threads fill separate tables
+constexpr std::size_t kChunk = 4096;  // Gaussians that one thread sorts at a time
+
+int partition_of(uint64_t key) { return static_cast<int>(hash_key(key) >> 58); }
+
+// The members of one partition, its blocks in the order of their first member, and its voxels' moments.
+struct Partition {
+  std::vector<int32_t> members, voxels;  // Gaussian, and its voxel in `moments`
+  std::vector<uint64_t> keys;
+  std::vector<VoxelBlock> blocks;
+  std::vector<VoxelMoments> moments;
+};
+
+// Puts the Gaussians of each partition in one run, in the order of the map.
+struct Sorted {
+  std::unique_ptr<uint64_t[]> keys;
+  std::unique_ptr<uint8_t[]> bits;
+  std::vector<int32_t> order;
+  std::array<std::size_t, kPartitions + 1> begin{};
+};
+
+Sorted sort_by_partition(Context& context, const TargetInput& input, const TargetSettings& settings) {
+  const std::size_t n = input.count, chunks = (n + kChunk - 1) / kChunk;
+  Sorted s;
+  s.keys.reset(new uint64_t[n]);
+  s.bits.reset(new uint8_t[n]);
+  std::vector<std::array<std::size_t, kPartitions>> counts(chunks);
+  const auto bin = GGSLAM_DISPATCH(context.isa, bin_gaussians);
+  context.pool.parallel_for(chunks, 1, [&](std::size_t first, std::size_t last, int) {
+    for (std::size_t c = first; c < last; ++c) {
+      const std::size_t begin = c * kChunk, end = std::min(n, begin + kChunk);
+      bin(input, settings, begin, end, s.keys.get(), s.bits.get());
+      counts[c].fill(0);
+      for (std::size_t g = begin; g < end; ++g)
+        if (s.keys[g] != kEmptyKey) ++counts[c][partition_of(s.keys[g])];
+    }
+  });
+  std::size_t total = 0;
+  for (int p = 0; p < kPartitions; ++p) {
+    s.begin[p] = total;
+    for (auto& chunk : counts) {
+      const std::size_t here = chunk[p];
+      chunk[p] = total;
+      total += here;
+    }
+  }
+  s.begin[kPartitions] = total;
+  s.order.resize(total);
+  context.pool.parallel_for(chunks, 1, [&](std::size_t first, std::size_t last, int) {
+    for (std::size_t c = first; c < last; ++c)
+      for (std::size_t g = c * kChunk; g < std::min(n, (c + 1) * kChunk); ++g)
+        if (s.keys[g] != kEmptyKey) s.order[counts[c][partition_of(s.keys[g])]++] = static_cast<int32_t>(g);
+  });
+  return s;
+}
+
+// Blocks of an earlier target that belong to one partition: [begin, end). A target keeps its blocks by partition.
+struct BaseRange {
+  const VoxelLevel* level;
+  std::size_t begin, end;
+};
+
+// The voxels of the blocks: those of the base keep their moments, new ones start empty.
+void make_moments(const BaseRange& base, float size, Partition& out) {
+  std::size_t voxels = 0;
+  for (const VoxelBlock& b : out.blocks) voxels += __builtin_popcountll(b.occupied);
+  out.moments.reserve(voxels);
+  for (std::size_t b = 0; b < out.blocks.size(); ++b) {
+    VoxelBlock before{0, 0, 0};
+    if (base.begin + b < base.end) before = base.level->blocks[base.begin + b];
+    out.blocks[b].first = static_cast<uint32_t>(out.moments.size());
+    const VoxelMoments* old = before.occupied ? base.level->moments.data() + before.first : nullptr;
+    for (uint64_t rest = out.blocks[b].occupied; rest; rest &= rest - 1) {
+      const int bit = __builtin_ctzll(rest);
+      out.moments.push_back(before.occupied >> bit & 1 ? *old++ : empty_moments(out.keys[b], bit, size));
+    }
+  }
+}
+
+// Finds the blocks and voxels of one partition and adds up its members.
+template <typename Accumulate>
+void fill_partition(const Sorted& s, int p, const BaseRange& base, const TargetInput& input,
+                    const TargetSettings& settings, Accumulate accumulate, Partition& out) {
+  const std::size_t begin = s.begin[p], n = s.begin[p + 1] - begin;
+  std::size_t capacity = 16;
+  while (capacity < 2 * (n + base.end - base.begin)) capacity *= 2;
+  std::vector<int32_t> slots(capacity, -1);
+  const auto block_of = [&](uint64_t key) {
+    std::size_t slot = hash_key(key) & (capacity - 1);
+    while (slots[slot] >= 0 && out.keys[slots[slot]] != key) slot = (slot + 1) & (capacity - 1);
+    if (slots[slot] < 0) {
+      slots[slot] = static_cast<int32_t>(out.blocks.size());
+      out.keys.push_back(key);
+      out.blocks.push_back({0, 0, 0});
+    }
+    return slots[slot];
+  };
+  for (std::size_t b = base.begin; b < base.end; ++b)
+    out.blocks[block_of(base.level->block_keys[b])].occupied = base.level->blocks[b].occupied;
+  out.voxels.resize(n);
+  for (std::size_t i = 0; i < n; ++i) {
+    const int32_t g = s.order[begin + i];
+    out.voxels[i] = block_of(s.keys[g]);
+    out.blocks[out.voxels[i]].occupied |= uint64_t{1} << s.bits[g];
+  }
+  make_moments(base, settings.voxel, out);
+  for (std::size_t i = 0; i < n; ++i) {
+    const VoxelBlock& b = out.blocks[out.voxels[i]];
+    const uint64_t below = (uint64_t{1} << s.bits[s.order[begin + i]]) - 1;
+    out.voxels[i] = static_cast<int32_t>(b.first) + __builtin_popcountll(b.occupied & below);
+  }
+  accumulate(input, settings, s.order.data() + begin, out.voxels.data(), n, out.moments.data());
+}
+
+// Partitions are freed as they are taken over: a map's moments are not there twice.
+void concatenate(std::vector<Partition>& partitions, VoxelLevel& level) {
+  level.blocks.clear(), level.block_keys.clear(), level.moments.clear();
+  std::size_t blocks = 0, moments = 0;
+  for (const Partition& p : partitions) blocks += p.blocks.size(), moments += p.moments.size();
+  level.blocks.reserve(blocks), level.block_keys.reserve(blocks), level.moments.reserve(moments);
+  for (Partition& p : partitions) {
+    const uint32_t base = static_cast<uint32_t>(level.moments.size());
+    for (VoxelBlock b : p.blocks) {
+      b.first += base;
+      level.blocks.push_back(b);
+    }
+    level.block_keys.insert(level.block_keys.end(), p.keys.begin(), p.keys.end());
+    level.moments.insert(level.moments.end(), p.moments.begin(), p.moments.end());
+    p = Partition{};
+  }
+}
+
+// A coarse voxel is a block of the fine level.
+template <typename Merge>
+void coarsen(const VoxelLevel& fine, Merge merge, VoxelLevel& coarse) {
+  coarse.size = 4 * fine.size;
+  struct Entry {
+    uint64_t key;
+    int bit, block;
+  };
+  std::vector<Entry> entries;
+  for (std::size_t b = 0; b < fine.blocks.size(); ++b) {
+    int c[3];
+    block_coordinates(fine.block_keys[b], c);
+    entries.push_back({block_key(c[0] >> 2, c[1] >> 2, c[2] >> 2), (c[0] & 3) + 4 * (c[1] & 3) + 16 * (c[2] & 3),
+                       static_cast<int>(b)});
+  }
+  std::sort(entries.begin(), entries.end(),
+            [](const Entry& x, const Entry& y) { return x.key != y.key ? x.key < y.key : x.bit < y.bit; });
+  coarse.blocks.clear(), coarse.block_keys.clear(), coarse.moments.clear();
+  for (const Entry& e : entries) {
+    if (coarse.block_keys.empty() || coarse.block_keys.back() != e.key) {
+      coarse.block_keys.push_back(e.key);
+      coarse.blocks.push_back({0, static_cast<uint32_t>(coarse.moments.size()), 0});
+    }
+    coarse.blocks.back().occupied |= uint64_t{1} << e.bit;
+    coarse.moments.push_back(empty_moments(e.key, e.bit, coarse.size));
+    const VoxelBlock& block = fine.blocks[e.block];
+    merge(fine.moments.data() + block.first, __builtin_popcountll(block.occupied), &coarse.moments.back());
+  }
+}
+
+}  // namespace
+
+void VoxelLevel::index_blocks() {
+  std::size_t capacity = 64;
+  while (capacity < 4 * blocks.size()) capacity *= 2;
+  slot_key.assign(capacity, kEmptyKey);
+  slot_block.assign(capacity, -1);
+  for (std::size_t b = 0; b < blocks.size(); ++b) {
+    std::size_t slot = hash_key(block_keys[b]) & (capacity - 1);
+    while (slot_key[slot] != kEmptyKey) slot = (slot + 1) & (capacity - 1);
+    slot_key[slot] = block_keys[b];
+    slot_block[slot] = static_cast<int32_t>(b);
+  }
+}
+
+int VoxelLevel::block_of(uint64_t key) const {
+  std::size_t slot = hash_key(key) & (slot_key.size() - 1);
+  while (slot_key[slot] != kEmptyKey && slot_key[slot] != key) slot = (slot + 1) & (slot_key.size() - 1);
+  return slot_key[slot] == key ? slot_block[slot] : -1;
+}
+
+VoxelLevelView VoxelLevel::view() const {
+  return {voxels.data(), blocks.data(), slot_key.data(), slot_block.data(), slot_key.size() - 1, size, 1 / size,
+          static_cast<int32_t>(voxels.size())};
+}
+
+void GicpTarget::build(Context& context, const GicpTarget* base, const TargetInput& input,
+                       const TargetSettings& settings) {
+  gather(context, base, input, settings);
+  finish(context, settings);
+}
+
+void GicpTarget::gather(Context& context, const GicpTarget* base, const TargetInput& input,
+                        const TargetSettings& settings) {
+  static const VoxelLevel nothing;
+  const VoxelLevel& before = base ? base->fine : nothing;
+  std::array<std::size_t, kPartitions + 1> base_begin{};
+  for (uint64_t key : before.block_keys) ++base_begin[partition_of(key) + 1];
+  for (int p = 0; p < kPartitions; ++p) base_begin[p + 1] += base_begin[p];
+  const Sorted sorted = sort_by_partition(context, input, settings);
+  std::vector<Partition> partitions(kPartitions);
+  const auto accumulate = GGSLAM_DISPATCH(context.isa, accumulate_members);
+  context.pool.parallel_for(kPartitions, 1, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t p = begin; p < end; ++p)
+      fill_partition(sorted, static_cast<int>(p), {&before, base_begin[p], base_begin[p + 1]}, input, settings,
+                     accumulate, partitions[p]);
+  });
+  fine.size = settings.voxel;
+  concatenate(partitions, fine);
+  coarsen(fine, GGSLAM_DISPATCH(context.isa, merge_moments), coarse);
+}
+
+void GicpTarget::finish(Context& context, const TargetSettings& settings) {
+  const auto shape = GGSLAM_DISPATCH(context.isa, finish_voxels);
+  for (VoxelLevel* level : {&fine, &coarse}) {
+    level->index_blocks();
+    level->voxels.resize(level->moments.size());
+    const VoxelLevelView view = level->view();
+    context.pool.parallel_for(level->voxels.size(), 512, [&](std::size_t begin, std::size_t end, int) {
+      shape(settings, view, level->moments.data(), begin, end, level->voxels.data());
+    });
+  }
+}
+
+}  // namespace ggslam
+
+// --- C interface ------------------------------------------------------------------------------------------------------
+
+GGSLAM_EXPORT void* ggslam_gicp_target_create() { return new ggslam::GicpTarget; }
+
+GGSLAM_EXPORT void ggslam_gicp_target_destroy(void* target) { delete static_cast<ggslam::GicpTarget*>(target); }
+
+GGSLAM_EXPORT void ggslam_gicp_target_build(void* context, void* target, const void* base,
+                                            const ggslam::TargetInput* input,
+                                            const ggslam::TargetSettings* settings) {
+  static_cast<ggslam::GicpTarget*>(target)->build(*static_cast<ggslam::Context*>(context),
+                                                  static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
+}
+
+// As ggslam_gicp_target_build, but leaves the voxels without shapes. Until ggslam_gicp_target_finish has been called, the
+// target may be a base, and be asked for its size, its moments and its blocks.
+GGSLAM_EXPORT void ggslam_gicp_target_gather(void* context, void* target, const void* base,
+                                             const ggslam::TargetInput* input,
+                                             const ggslam::TargetSettings* settings) {
+  static_cast<ggslam::GicpTarget*>(target)->gather(*static_cast<ggslam::Context*>(context),
+                                                   static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
+}
+
+GGSLAM_EXPORT void ggslam_gicp_target_finish(void* context, void* target, const ggslam::TargetSettings* settings) {
+  static_cast<ggslam::GicpTarget*>(target)->finish(*static_cast<ggslam::Context*>(context), *settings);
+}
+
+// Number of voxels of a level (0 fine, 1 coarse).
+GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target_, int level_) {
+  const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
+  const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;
+  return static_cast<int>(std::max(level.voxels.size(), level.moments.size()));
+}
+
+// Copies the moments of a level's voxels, [n, 22] in the order of struct VoxelMoments.
+GGSLAM_EXPORT void ggslam_gicp_target_moments(const void* target_, int level, float* out) {
+  const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
+  const auto& moments = (level ? target.coarse : target.fine).moments;
+  static_assert(sizeof(ggslam::VoxelMoments) == 22 * sizeof(float), "moments are floats and nothing else");
+  std::copy_n(reinterpret_cast<const float*>(moments.data()), moments.size() * 22, out);
+}
+
+// Copies a level's voxels: [n, 16] mean(3) weight normal(3) 0 covariance(6) 0 0.
+GGSLAM_EXPORT void ggslam_gicp_target_voxels(const void* target_, int level, float* out) {
+  const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
+  const auto& voxels = (level ? target.coarse : target.fine).voxels;
+  std::copy_n(reinterpret_cast<const float*>(voxels.data()), voxels.size() * 16, out);
+}
+
+// Number of blocks of a level. Copies them unless `out` is null: [n, 3] key, occupied, first.
+GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target_, int level_, uint64_t* out) {
+  const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
+  const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;
+  for (std::size_t b = 0; out && b < level.blocks.size(); ++b, out += 3)
+    out[0] = level.block_keys[b], out[1] = level.blocks[b].occupied, out[2] = level.blocks[b].first;
+  return static_cast<int>(level.blocks.size());
+}
