@@ -5,7 +5,7 @@
 //     d loss / d alpha = t g - behind / (1 - alpha)
 // so one scalar per pixel stands for everything behind. The transmittance is recovered by dividing by 1 - alpha.
 //
-// d loss / d log(alpha) =: G leads to the splat's geometry through its moments sum G (1, dx, dy, dx^2, dx dy, dy^2).
+// d loss / d log(alpha) =: G leads to the splat's geometry through its moments sum G (1, r, dy, r^2, r dy, dy^2), r of the splat.
 // Sums over a warp's pixels are the business of gradient_queue.cuh. Everything is linear in the image gradients, so that
 // groups of feature channels may be handled by launches of their own.
 #pragma once
@@ -153,7 +153,7 @@ differentiate_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussia
         const Contribution c = differentiate<kFeatures, kDetached>(splat, batch.features[k], first + k, pixel);
         queue.weights[queued * kQueueStride + lane] = c.weight;
         queue.log_alphas[queued * kQueueStride + lane] = c.log_alpha;
-        if (lane % kQueued == queued) mine = {splat.mean_x, splat.mean_y, batch.rows[k]};
+        if (lane % kQueued == queued) mine = {splat.mean_x, splat.mean_y, splat.slope_x, batch.rows[k]};
         if (++queued < kQueued) continue;
         empty_queue(queue, mine, queued, pixel.x, pixel.y, group, out);
         queued = 0;

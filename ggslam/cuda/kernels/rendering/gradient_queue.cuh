@@ -39,7 +39,7 @@ struct __align__(16) WarpQueue {
 
 // What a lane knows of the queued splat that it will stand for, number lane % kQueued.
 struct QueuedSplat {
-  float mean_x, mean_y;
+  float mean_x, mean_y, slope_x;
   std::uint32_t row;
 };
 
@@ -54,16 +54,16 @@ __device__ inline RowOfNumbers load_row(const float* numbers, int lane) {
   return {{a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}};
 }
 
-// values[0..6): moments of G along the lane's row of pixels; left, y: of its first pixel, from the splat's mean.
+// values[0..6): moments of G along the lane's row of pixels; left, y: r and dy of its first pixel, see Splat.
 __device__ inline void sum_moments(const float* log_alphas, int lane, float left, float y, float* values) {
   const RowOfNumbers row = load_row(log_alphas, lane);
-  float m0 = 0.0f, mx = 0.0f, mxx = 0.0f;
+  float m0 = 0.0f, mr = 0.0f, mrr = 0.0f;
 #pragma unroll
   for (int column = 0; column < kWarpWidth; ++column) {
-    const float x = left + static_cast<float>(column), moment = row.values[column] * x;
-    m0 += row.values[column], mx += moment, mxx += moment * x;
+    const float r = left + static_cast<float>(column), moment = row.values[column] * r;
+    m0 += row.values[column], mr += moment, mrr += moment * r;
   }
-  values[0] = m0, values[1] = mx, values[2] = m0 * y, values[3] = mxx, values[4] = mx * y, values[5] = m0 * y * y;
+  values[0] = m0, values[1] = mr, values[2] = m0 * y, values[3] = mrr, values[4] = mr * y, values[5] = m0 * y * y;
 }
 
 // values[0..4 kQuads): weight times image gradient along the lane's row, for channels from 4 kFirst on.
@@ -131,8 +131,8 @@ __device__ inline void empty_queue(const WarpQueue<kFeatures>& queue, const Queu
   __syncwarp();  // the queue has been written
   // The lane's own pixel lies in the row that it sums, as there are as many splats as pixels in a row.
   static_assert(kQueued == kWarpWidth, "a lane's row of pixels is the row that it sums");
-  const float left = x - static_cast<float>(lane % kWarpWidth);
-  sum_row<kFeatures>(queue, lane, left - mine.mean_x, y - mine.mean_y, values);
+  const float left = x - static_cast<float>(lane % kWarpWidth), dy = y - mine.mean_y;
+  sum_row<kFeatures>(queue, lane, fmaf(-mine.slope_x, dy, left - mine.mean_x), dy, values);
   __syncwarp();  // and may be written again
   join_rows(lane, values);
   if (lane % kQueued >= count) return;

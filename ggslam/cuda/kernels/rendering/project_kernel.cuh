@@ -38,11 +38,8 @@ __device__ inline bool make_splat(const GaussianArrays& arrays, const ViewConsta
   view_colour(arrays, c, row, p.position, colour);
   if (!(fabsf(colour[0]) + fabsf(colour[1]) + fabsf(colour[2]) <= kFinite)) return false;
   splat.red = colour[0], splat.green = colour[1], splat.blue = colour[2];
-  const float scale = kLog2E * p.inverse_determinant;
-  splat.conic_xx = -0.5f * scale * p.cov_yy;
-  splat.conic_xy = scale * p.cov_xy;
-  splat.conic_yy = -0.5f * scale * p.cov_xx;
-  splat.slope_x = p.cov_xy / p.cov_yy, splat.slope_y = p.cov_xy / p.cov_xx;
+  splat.conic_r = -0.5f * kLog2E * p.conic_r, splat.conic_y = -0.5f * kLog2E * p.conic_y;
+  splat.slope_x = p.slope, splat.slope_y = p.cov_xy / p.cov_xx;
   splat.depth = p.position[2];
   return true;
 }

@@ -62,6 +62,8 @@ struct Projection {
   float j00, j02, j11, j12;  // Jacobian of the projection; j01 = j10 = 0
   float JW[2][3], V[2][3];
   float cov_xx, cov_xy, cov_yy, inverse_determinant;
+  // The inverse covariance is S^T diag(conic_r, conic_y) S with S = (1, -slope; 0, 1): each factor has all its digits.
+  float slope, conic_r, conic_y;
 };
 
 __device__ inline void project_position(const ViewConstants& c, const RawGaussian& g, Projection& p) {
@@ -111,6 +113,9 @@ __device__ inline void image_covariance(const ViewConstants& c, Projection& p) {
   const float c2 = p.V[0][0] * p.V[1][1] - p.V[0][1] * p.V[1][0];
   const float determinant = (c0 * c0 + c1 * c1 + c2 * c2) + c.low_pass * (xx + yy) + c.low_pass * c.low_pass;
   p.inverse_determinant = 1.0f / determinant;
+  p.conic_r = p.cov_yy * p.inverse_determinant;
+  p.conic_y = 1.0f / p.cov_yy;
+  p.slope = p.cov_xy / p.cov_yy;
 }
 
 __device__ inline Projection project(const ViewConstants& c, const RawGaussian& g) {

@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // Backward of projection.cuh: from the moments of a splat's log-alpha gradient and its depth gradient to the Gaussian's
 // parameters and the camera pose.
+//
+// Everything goes by the sheared offsets (r, dy), r = dx - slope dy, as in native/src/rendering/kernels/
+// projection_backward.hpp, where the reason and the equations are stated.
 #pragma once
 #include "rendering/projection.cuh"
 
@@ -8,7 +11,7 @@ namespace ggslam::cuda {
 
 // Gradients of the image-space quantities, as summed over a Gaussian's pixels.
 struct SplatGradients {
-  float m0, mx, my, mxx, mxy, myy;  // moments of G = d loss / d log(alpha) over the offsets from the mean
+  float m0, mr, my, mrr, mry, myy;  // moments of G = d loss / d log(alpha) over the sheared offsets from the mean
   float colour[3], depth;
 };
 
@@ -16,19 +19,6 @@ struct ParameterGradients {
   float mean[3], quaternion[4], log_scale[3], opacity_logit;
   float twist[6];  // contribution to d loss / d xi, T_camera_world <- exp(xi) T_camera_world, translation first
 };
-
-// Gradient of the 2D covariance: S_xx, S_yy and half of S_xy's (the matrix is symmetric). With the inverse K and the
-// exponent -d^T K d / 2, d loss / d K = -moments / 2 and d loss / d cov = -K (d loss / d K) K.
-__device__ inline void covariance_gradient(const Projection& p, const SplatGradients& g, float& xx, float& xy,
-                                           float& yy) {
-  const float kxx = p.cov_yy * p.inverse_determinant, kxy = -p.cov_xy * p.inverse_determinant;
-  const float kyy = p.cov_xx * p.inverse_determinant;
-  const float a = 0.5f * g.mxx, b = 0.5f * g.mxy, d = 0.5f * g.myy;
-  const float ak = a * kxx + b * kxy, bk = a * kxy + b * kyy, ck = b * kxx + d * kxy, dk = b * kxy + d * kyy;
-  xx = kxx * ak + kxy * ck;
-  xy = kxx * bk + kxy * dk;
-  yy = kxy * bk + kyy * dk;
-}
 
 // From N = d loss / d R, of the rotation matrix of the unit quaternion, to the quaternion before normalisation.
 __device__ inline void quaternion_gradient(const Projection& p, const float N[3][3], float out[4]) {
@@ -48,24 +38,21 @@ __device__ inline void quaternion_gradient(const Projection& p, const float N[3]
 // Scales and rotation; returns in dJW and dJ what flows on to J W and J. cov = V V^T, V = (J W) M.
 __device__ inline void shape_gradient(const ViewConstants& c, const Projection& p, const SplatGradients& g,
                                       float dJ[2][3], ParameterGradients& out) {
-  float sxx, sxy, syy, dV[2][3], dR[3][3];
-  covariance_gradient(p, g, sxx, sxy, syy);
+  const float qrr = p.conic_r * p.conic_r * g.mrr, qry = p.conic_r * p.conic_y * g.mry;
+  const float qyy = p.conic_y * p.conic_y * g.myy;
+  float dV[2][3], dR[3][3];
   for (int j = 0; j < 3; ++j) {
-    dV[0][j] = 2.0f * (sxx * p.V[0][j] + sxy * p.V[1][j]);
-    dV[1][j] = 2.0f * (sxy * p.V[0][j] + syy * p.V[1][j]);
+    const float V0 = p.V[0][j] - p.slope * p.V[1][j];
+    const float first = qrr * V0 + qry * p.V[1][j], second = qry * V0 + qyy * p.V[1][j];
+    out.log_scale[j] = first * V0 + second * p.V[1][j];  // d V / d log_scale = V
+    dV[0][j] = first, dV[1][j] = second - p.slope * first;
+    for (int i = 0; i < 3; ++i)
+      dR[i][j] = ((p.JW[0][i] - p.slope * p.JW[1][i]) * first + p.JW[1][i] * second) * p.scale[j];
   }
   for (int i = 0; i < 2; ++i) {
     float dJW[3];
     for (int j = 0; j < 3; ++j) dJW[j] = dV[i][0] * p.M[j][0] + dV[i][1] * p.M[j][1] + dV[i][2] * p.M[j][2];
     for (int j = 0; j < 3; ++j) dJ[i][j] = dJW[0] * c.W[j][0] + dJW[1] * c.W[j][1] + dJW[2] * c.W[j][2];
-  }
-  for (int j = 0; j < 3; ++j) {
-    out.log_scale[j] = 0.0f;
-    for (int i = 0; i < 3; ++i) {
-      const float dM = p.JW[0][i] * dV[0][j] + p.JW[1][i] * dV[1][j];
-      out.log_scale[j] += dM * p.M[i][j];  // d M / d log_scale = M
-      dR[i][j] = dM * p.scale[j];
-    }
   }
   quaternion_gradient(p, dR, out.quaternion);
 }
@@ -79,9 +66,8 @@ __device__ inline ParameterGradients differentiate_projection(const ViewConstant
   float dJ[2][3];
   shape_gradient(c, p, g, dJ, out);
 
-  // Mean in the image: exponent's gradient K (mx, my). Position: through the mean, the depth and the Jacobian.
-  const float mean_x = (p.cov_yy * g.mx - p.cov_xy * g.my) * p.inverse_determinant;
-  const float mean_y = (p.cov_xx * g.my - p.cov_xy * g.mx) * p.inverse_determinant;
+  // Mean in the image: exponent's gradient. Position: through the mean, the depth and the Jacobian.
+  const float mean_x = p.conic_r * g.mr, mean_y = p.conic_y * g.my - p.slope * mean_x;
   const float iz = p.inverse_z, fx_iz = c.fx * iz, fy_iz = c.fy * iz;
   // Slopes beyond the frustum's margin are clamped in the Jacobian and pass no gradient there.
   const float du = mean_x * c.fx - (p.u == p.clamped_u ? dJ[0][2] * fx_iz : 0.0f);

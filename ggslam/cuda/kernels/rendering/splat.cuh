@@ -10,18 +10,21 @@ namespace ggslam::cuda {
 
 // As stored: three float4.
 struct __align__(16) Splat {
-  float mean_x, mean_y;      // pixels
-  float conic_xx, conic_xy;  // log2 alpha = log2_opacity + xx dx^2 + xy dx dy + yy dy^2
-  float conic_yy, log2_opacity;
+  float mean_x, mean_y;  // pixels
+  // With r = dx - slope_x dy: log2 alpha = log2_opacity + conic_r r^2 + conic_y dy^2. In dx and dy themselves the three
+  // terms of a long, thin splat cancel and leave no digits, neither of alpha nor of its moments.
+  float slope_x, conic_r;
+  float conic_y, log2_opacity;
   float depth;
   float red, green, blue;
-  float slope_x, slope_y;    // the dx (dy) of highest alpha in a row (column) is slope_x dy (slope_y dx)
+  float slope_y;         // the dy of highest alpha in a column is slope_y dx; in a row, dx is slope_x dy
 };
 static_assert(sizeof(Splat) == 48, "a splat is three float4");
 
 // log2 of alpha at the offset (dx, dy) from the mean, before the limit kMaxAlpha.
 __device__ inline float log2_alpha(const Splat& s, float dx, float dy) {
-  return fmaf(dx, fmaf(s.conic_xx, dx, s.conic_xy * dy), fmaf(s.conic_yy * dy, dy, s.log2_opacity));
+  const float r = fmaf(-s.slope_x, dy, dx);
+  return fmaf(s.conic_r * r, r, fmaf(s.conic_y * dy, dy, s.log2_opacity));
 }
 
 __device__ inline float clamp(float x, float low, float high) { return fminf(fmaxf(x, low), high); }

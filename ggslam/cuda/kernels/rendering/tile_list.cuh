@@ -16,8 +16,7 @@ __device__ inline bool reaches_tile(const Splat& s, int tile_x, int tile_y) {
 __device__ inline Splat splat_of_lane(const Splat& mine, int lane) {
   Splat s = {};
   s.mean_x = __shfl_sync(kAllLanes, mine.mean_x, lane), s.mean_y = __shfl_sync(kAllLanes, mine.mean_y, lane);
-  s.conic_xx = __shfl_sync(kAllLanes, mine.conic_xx, lane), s.conic_xy = __shfl_sync(kAllLanes, mine.conic_xy, lane);
-  s.conic_yy = __shfl_sync(kAllLanes, mine.conic_yy, lane);
+  s.conic_r = __shfl_sync(kAllLanes, mine.conic_r, lane), s.conic_y = __shfl_sync(kAllLanes, mine.conic_y, lane);
   s.log2_opacity = __shfl_sync(kAllLanes, mine.log2_opacity, lane);
   s.slope_x = __shfl_sync(kAllLanes, mine.slope_x, lane), s.slope_y = __shfl_sync(kAllLanes, mine.slope_y, lane);
   return s;

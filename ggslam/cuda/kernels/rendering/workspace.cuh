@@ -7,7 +7,7 @@
 namespace ggslam::cuda {
 
 constexpr int kTileSize = 16;  // pixels; a tile is square
-constexpr int kBaseGradients = 12;  // log-alpha moments 1, dx, dy, dx^2, dx dy, dy^2; colour; depth; two not in use
+constexpr int kBaseGradients = 12;  // log-alpha moments 1, r, dy, r^2, r dy, dy^2; colour; depth; two not in use
 
 // Tiles that a splat's bounding box covers.
 struct __align__(8) TileRectangle {

@@ -29,7 +29,7 @@ constexpr float kMinQuaternionNorm2 = 1e-20f, kMaxQuaternionNorm2 = 1e20f;
 
 constexpr int kTileWidth = 16;
 constexpr int kSubBlocks = 16;                  // sub-blocks of a tile, 4 x 4, each of kLanes pixels
-constexpr int kBaseGradients = 10;              // log-alpha moments 1, dx, dy, dx^2, dx dy, dy^2; colour; depth
+constexpr int kBaseGradients = 10;              // log-alpha moments 1, r, dy, r^2, r dy, dy^2; colour; depth
 constexpr int kSlotStride = 16;                 // floats from one gradient slot to the next: one cache line
 constexpr int kMaxBlocks = 32;
 constexpr int kChunk = 64;                      // splats that a tile composites at a time
@@ -98,11 +98,13 @@ struct Footprint {
 // Everything a tile needs to know of a projected Gaussian, in one cache line.
 struct alignas(64) Splat {
   float mean_x, mean_y;                // pixels
-  float conic_xx, conic_xy, conic_yy;  // log2 alpha = log2_opacity + xx dx^2 + xy dx dy + yy dy^2
+  // With r = dx - slope_x dy: log2 alpha = log2_opacity + conic_r r^2 + conic_y dy^2. In dx and dy themselves the three
+  // terms of a long, thin splat cancel and leave no digits, neither of alpha nor of its moments.
+  float slope_x, conic_r, conic_y;
   float log2_opacity;
   float red, green, blue;
   float depth;
-  float slope_x, slope_y;              // the dx (dy) of highest alpha in a row (column) is slope_x dy (slope_y dx)
+  float slope_y;                       // the dy of highest alpha in a column is slope_y dx; in a row, dx is slope_x dy
   std::uint32_t first_pair;            // number of its first (splat, tile) pair, within the block
   std::int32_t gaussian;               // row in the map
   TileRectangle tiles;

@@ -44,7 +44,8 @@ void walk(const Rasterizer& r, int tile, Lanes& lanes, float min_weight, const P
       __builtin_prefetch(r.splats.data() + entries[k + kSplatPrefetch].splat);
     if ((contributed[k] & lanes.sub_blocks) == 0) continue;
     const Splat& g = r.splats[entries[k].splat];
-    const Float exponent = log2_alpha(g, lanes.x - g.mean_x, lanes.y - g.mean_y);
+    const Float dy = lanes.y - g.mean_y;
+    const Float exponent = log2_alpha(g, shear(g, lanes.x - g.mean_x, dy), dy);
     const Mask taken = both(greater_equal(exponent, broadcast(kLog2MinAlpha)),
                             greater_equal_int(lanes.last, broadcast_int(k)));
     const Float alpha = zero_unless(taken, minimum(exp2_unchecked(exponent), broadcast(kMaxAlpha)));

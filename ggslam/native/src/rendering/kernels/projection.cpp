@@ -9,7 +9,7 @@ namespace {
 
 // The splats of one vector of Gaussians, field by field.
 struct SplatVectors {
-  enum Field { kMeanX, kMeanY, kXX, kXY, kYY, kLog2Opacity, kRed, kGreen, kBlue, kDepth, kSlopeX, kSlopeY, kFields };
+  enum Field { kMeanX, kMeanY, kSlopeX, kConicR, kConicY, kLog2Opacity, kRed, kGreen, kBlue, kDepth, kSlopeY, kFields };
   alignas(64) float fields[kFields][kLanes];
   alignas(64) std::int32_t tile_x0[kLanes], tile_x1[kLanes], tile_y0[kLanes], tile_y1[kLanes];  // inclusive
   std::uint32_t visible;  // one bit per lane
@@ -49,10 +49,9 @@ inline void make_splats(const Rasterizer& r, const ViewConstants& c, const std::
   ok = both(ok, tile_range(mean_y, square_root(safe * p.cov_yy), r.view.height, kLanes, out.tile_y0, out.tile_y1));
   out.visible = bits(ok) & ((1u << n) - 1);
 
-  const Float scale = kLog2E * p.inverse_determinant;
   const Float values[SplatVectors::kFields] = {
-      mean_x, mean_y, -0.5f * scale * p.cov_yy, scale * p.cov_xy, -0.5f * scale * p.cov_xx, log2_opacity,
-      colour[0], colour[1], colour[2], p.position[2], p.cov_xy / p.cov_yy, p.cov_xy / p.cov_xx};
+      mean_x, mean_y, p.slope, -0.5f * kLog2E * p.conic_r, -0.5f * kLog2E * p.conic_y, log2_opacity,
+      colour[0], colour[1], colour[2], p.position[2], p.cov_xy / p.cov_xx};
   for (int k = 0; k < SplatVectors::kFields; ++k) store(out.fields[k], values[k]);
 }
 
@@ -83,7 +82,7 @@ void project_block(Rasterizer& r, int block) {
     make_splats(r, c, rows, n, v);
     for (std::uint32_t left = v.visible; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
-      float* fields = &splat->mean_x;  // the twelve floats of a splat, in the order of SplatVectors::Field
+      float* fields = &splat->mean_x;  // the first eleven floats of a splat, in the order of SplatVectors::Field
       for (int k = 0; k < SplatVectors::kFields; ++k) fields[k] = v.fields[k][lane];
       const TileRectangle tiles = tile_rectangle(v, lane);
       splat->first_pair = static_cast<std::uint32_t>(pairs);

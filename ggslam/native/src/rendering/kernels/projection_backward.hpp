@@ -1,6 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // Backward of projection_math.hpp: from the moments of a splat's log-alpha gradient and its depth gradient to the
 // Gaussian's parameters and the camera pose.
+//
+// Everything goes by the sheared offsets S d = (r, dy), r = dx - slope dy, in which the exponent is
+// -(conic_r r^2 + conic_y dy^2) / 2, D := diag(conic_r, conic_y). With the moments M of G over them, the gradient of
+// the 2D covariance is S^T Q S, Q = D M D / 2, and that of V is S^T W with W = 2 Q (S V). In dx and dy the same sums
+// are differences of numbers larger by the square of the splat's aspect ratio, and thin splats lose all digits.
 #pragma once
 #include "rendering/kernels/projection_math.hpp"
 
@@ -8,7 +13,7 @@ namespace ggslam::GGSLAM_ISA {
 
 // Gradients of the image-space quantities, as summed over a Gaussian's slots.
 struct SplatGradients {
-  Float m0, mx, my, mxx, mxy, myy;  // moments of G = d loss / d log(alpha) over the offsets from the mean
+  Float m0, mr, my, mrr, mry, myy;  // moments of G = d loss / d log(alpha) over the sheared offsets from the mean
   Float colour[3], depth;
 };
 
@@ -17,16 +22,25 @@ struct ParameterGradients {
   Float twist[6];  // contribution to d loss / d xi, T_camera_world <- exp(xi) T_camera_world, translation first
 };
 
-// Gradient of the 2D covariance: S_xx, S_yy and half of S_xy's (the matrix is symmetric). With the inverse K and the
-// exponent -d^T K d / 2, d loss / d K = -moments / 2 and d loss / d cov = -K (d loss / d K) K.
-static inline void covariance_gradient(const Projection& p, const SplatGradients& g, Float& xx, Float& xy, Float& yy) {
-  const Float kxx = p.cov_yy * p.inverse_determinant, kxy = -p.cov_xy * p.inverse_determinant;
-  const Float kyy = p.cov_xx * p.inverse_determinant;
-  const Float a = 0.5f * g.mxx, b = 0.5f * g.mxy, d = 0.5f * g.myy;
-  const Float ak = a * kxx + b * kxy, bk = a * kxy + b * kyy, ck = b * kxx + d * kxy, dk = b * kxy + d * kyy;
-  xx = kxx * ak + kxy * ck;
-  xy = kxx * bk + kxy * dk;
-  yy = kxy * bk + kyy * dk;
+// Gradients of the rows of V, and what the parameters of the shape need of them: S V, S J W and W, each one's first
+// row (their second rows are those of V and J W, and row 1 of W).
+struct ShearedGradients {
+  Float dV[2][3], first[3], second[3], V0[3], JW0[3];
+};
+
+static inline ShearedGradients covariance_gradient(const Projection& p, const SplatGradients& g) {
+  const Float qrr = p.conic_r * p.conic_r * g.mrr, qry = p.conic_r * p.conic_y * g.mry;  // of 2 Q
+  const Float qyy = p.conic_y * p.conic_y * g.myy;
+  ShearedGradients out;
+  for (int j = 0; j < 3; ++j) {
+    out.V0[j] = p.V[0][j] - p.slope * p.V[1][j];
+    out.JW0[j] = p.JW[0][j] - p.slope * p.JW[1][j];
+    out.first[j] = qrr * out.V0[j] + qry * p.V[1][j];
+    out.second[j] = qry * out.V0[j] + qyy * p.V[1][j];
+    out.dV[0][j] = out.first[j];
+    out.dV[1][j] = out.second[j] - p.slope * out.first[j];
+  }
+  return out;
 }
 
 // From d loss / d R (3x3, of the rotation matrix of the unit quaternion) to the quaternion before normalisation.
@@ -50,32 +64,22 @@ static inline ParameterGradients differentiate_projection(const ViewConstants& c
                                                           const Projection& p, const SplatGradients& g,
                                                           const Float direction_gradient[3]) {
   ParameterGradients out;
-  Float sxx, sxy, syy;
-  covariance_gradient(p, g, sxx, sxy, syy);
-
   // cov = V V^T, V = (J W) M.
-  Float dV[2][3], dJW[2][3], dJ[2][3], dR[3][3];
-  for (int j = 0; j < 3; ++j) {
-    dV[0][j] = 2.0f * (sxx * p.V[0][j] + sxy * p.V[1][j]);
-    dV[1][j] = 2.0f * (sxy * p.V[0][j] + syy * p.V[1][j]);
-  }
+  const ShearedGradients s = covariance_gradient(p, g);
+  const auto& dV = s.dV;
+  Float dJW[2][3], dJ[2][3], dR[3][3];
   for (int i = 0; i < 2; ++i)
     for (int j = 0; j < 3; ++j) dJW[i][j] = dV[i][0] * p.M[j][0] + dV[i][1] * p.M[j][1] + dV[i][2] * p.M[j][2];
   for (int i = 0; i < 2; ++i)
     for (int j = 0; j < 3; ++j) dJ[i][j] = dJW[i][0] * c.W[j][0] + dJW[i][1] * c.W[j][1] + dJW[i][2] * c.W[j][2];
   for (int j = 0; j < 3; ++j) {
-    out.log_scale[j] = Float{};
-    for (int i = 0; i < 3; ++i) {
-      const Float dM = p.JW[0][i] * dV[0][j] + p.JW[1][i] * dV[1][j];
-      out.log_scale[j] += dM * p.M[i][j];  // d M / d log_scale = M
-      dR[i][j] = dM * p.scale[j];
-    }
+    out.log_scale[j] = s.first[j] * s.V0[j] + s.second[j] * p.V[1][j];  // d V / d log_scale = V
+    for (int i = 0; i < 3; ++i) dR[i][j] = (s.JW0[i] * s.first[j] + p.JW[1][i] * s.second[j]) * p.scale[j];
   }
   quaternion_gradient(p, dR, out.quaternion);
 
-  // Mean in the image: exponent's gradient K (mx, my). Position: through the mean, the depth and the Jacobian.
-  const Float mean_x = (p.cov_yy * g.mx - p.cov_xy * g.my) * p.inverse_determinant;
-  const Float mean_y = (p.cov_xx * g.my - p.cov_xy * g.mx) * p.inverse_determinant;
+  // Mean in the image: exponent's gradient S^T D (mr, my). Position: through the mean, the depth and the Jacobian.
+  const Float mean_x = p.conic_r * g.mr, mean_y = p.conic_y * g.my - p.slope * mean_x;
   const Float iz = p.inverse_z, fx_iz = c.fx * iz, fy_iz = c.fy * iz;
   // Slopes beyond the frustum's margin are clamped in the Jacobian and pass no gradient there.
   const Mask free_u = both(greater_equal(p.u, p.clamped_u), greater_equal(p.clamped_u, p.u));

@@ -67,6 +67,8 @@ struct Projection {
   Float j00, j02, j11, j12;   // Jacobian of the projection; j01 = j10 = 0
   Float JW[2][3], V[2][3];
   Float cov_xx, cov_xy, cov_yy, inverse_determinant;
+  // The inverse covariance is S^T diag(conic_r, conic_y) S with S = (1, -slope; 0, 1): each factor has all its digits.
+  Float slope, conic_r, conic_y;
 };
 
 static inline void rotation_matrix(const Float q[4], Float R[3][3]) {
@@ -115,6 +117,9 @@ static inline Projection project(const ViewConstants& c, const RawGaussians& g) 
   const Float c2 = p.V[0][0] * p.V[1][1] - p.V[0][1] * p.V[1][0];
   const Float determinant = (c0 * c0 + c1 * c1 + c2 * c2) + c.low_pass * (xx + yy) + c.low_pass * c.low_pass;
   p.inverse_determinant = 1.0f / determinant;
+  p.conic_r = p.cov_yy * p.inverse_determinant;
+  p.conic_y = 1.0f / p.cov_yy;
+  p.slope = p.cov_xy / p.cov_yy;
   return p;
 }
 

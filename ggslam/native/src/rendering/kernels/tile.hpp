@@ -39,9 +39,12 @@ static inline Tile make_tile(const Rasterizer& r, int index) {
   return tile;
 }
 
-// log2 of alpha at the offsets (dx, dy) from the mean, before the limit kMaxAlpha.
-static inline Float log2_alpha(const Splat& g, Float dx, Float dy) {
-  return dx * (g.conic_xx * dx + g.conic_xy * dy) + (g.conic_yy * dy * dy + g.log2_opacity);
+// How far a pixel at (dx, dy) from the mean is from the place of highest alpha in its row.
+static inline Float shear(const Splat& g, Float dx, Float dy) { return dx - g.slope_x * dy; }
+
+// log2 of alpha before the limit kMaxAlpha; r: see `shear`.
+static inline Float log2_alpha(const Splat& g, Float r, Float dy) {
+  return g.conic_r * r * r + (g.conic_y * dy * dy + g.log2_opacity);
 }
 
 // The sub-blocks where a splat's alpha reaches 1/255 somewhere in the rectangle of the pixel centres, one bit each.
@@ -63,8 +66,9 @@ static inline std::uint32_t covered_sub_blocks(const Splat& g, const Tile& tile)
     const Float near_x = clamp(Float{}, low_x, high_x), near_y = clamp(Float{}, low_y, high_y);
     const Float best_y = clamp(g.slope_y * near_x, low_y, high_y);  // on the vertical side facing the mean
     const Float best_x = clamp(g.slope_x * near_y, low_x, high_x);  // on the horizontal side
-    const Float vertical = near_x * (g.conic_xx * near_x + g.conic_xy * best_y) + g.conic_yy * best_y * best_y;
-    const Float horizontal = best_x * (g.conic_xx * best_x + g.conic_xy * near_y) + g.conic_yy * near_y * near_y;
+    const Float near_r = near_x - g.slope_x * best_y, best_r = best_x - g.slope_x * near_y;
+    const Float vertical = g.conic_r * near_r * near_r + g.conic_y * best_y * best_y;
+    const Float horizontal = g.conic_r * best_r * best_r + g.conic_y * near_y * near_y;
     result |= bits(greater_equal(maximum(vertical, horizontal), threshold)) << first;
   }
   return result;

@@ -5,8 +5,8 @@
 //     d loss / d alpha = t g - behind / (1 - alpha)
 // so one scalar per pixel stands for everything behind. The transmittance is recovered by dividing by 1 - alpha.
 //
-// d loss / d log(alpha) =: G leads to the splat's geometry through its moments sum G (1, dx, dy, dx^2, dx dy, dy^2).
-// The sums over the tile's pixels go to the pair's own slot; gather.cpp adds up a Gaussian's slots.
+// d loss / d log(alpha) =: G leads to the splat's geometry through its moments sum G (1, r, dy, r^2, r dy, dy^2), r as
+// in the splat. The sums over the tile's pixels go to the pair's own slot; gather.cpp adds up a Gaussian's slots.
 #include "rendering/kernels/tile.hpp"
 
 namespace ggslam::GGSLAM_ISA {
@@ -87,13 +87,13 @@ inline void feature_dots(std::uint32_t sub_blocks, const float* features, const 
 template <FeatureMode kMode>
 inline void differentiate_splat(const Tile& tile, const Splat& g, int entry, std::uint32_t sub_blocks,
                                 const Float* dots, TileGradients& grad, WeightList& list, float* slot) {
-  Float m0 = {}, mx = {}, my = {}, mxx = {}, mxy = {}, myy = {};
+  Float m0 = {}, mr = {}, my = {}, mrr = {}, mry = {}, myy = {};
   Float red = {}, green = {}, blue = {}, depth = {};
   int size = 0;
   for (; sub_blocks != 0; sub_blocks &= sub_blocks - 1) {
     const int s = __builtin_ctz(sub_blocks);
-    const Float dx = tile.x[s] - g.mean_x, dy = tile.y[s] - g.mean_y;
-    const Float exponent = log2_alpha(g, dx, dy);
+    const Float dy = tile.y[s] - g.mean_y, r = shear(g, tile.x[s] - g.mean_x, dy);
+    const Float exponent = log2_alpha(g, r, dy);
     const Mask taken = both(greater_equal(exponent, broadcast(kLog2MinAlpha)),
                             greater_equal_int(grad.last[s], broadcast_int(entry)));
     const Float unlimited = zero_unless(taken, exp2_unchecked(exponent));
@@ -111,9 +111,9 @@ inline void differentiate_splat(const Tile& tile, const Splat& g, int entry, std
     grad.behind[s] = behind + weight * dot;
     // At the limit kMaxAlpha, alpha does not depend on the splat's shape.
     const Float G = zero_unless(greater_equal(broadcast(kMaxAlpha), unlimited), alpha * alpha_gradient);
-    const Float Gx = G * dx, Gy = G * dy;
-    m0 += G, mx += Gx, my += Gy;
-    mxx += Gx * dx, mxy += Gx * dy, myy += Gy * dy;
+    const Float Gr = G * r, Gy = G * dy;
+    m0 += G, mr += Gr, my += Gy;
+    mrr += Gr * r, mry += Gr * dy, myy += Gy * dy;
     red += weight * v[0], green += weight * v[1], blue += weight * v[2], depth += weight * v[3];
     if (kMode != kNoFeatures) {
       list.weights[size] = weight;
@@ -121,8 +121,8 @@ inline void differentiate_splat(const Tile& tile, const Splat& g, int entry, std
     }
   }
   list.size = size;
-  sum4(m0, mx, my, mxx, slot);
-  sum4(mxy, myy, red, green, slot + 4);
+  sum4(m0, mr, my, mrr, slot);
+  sum4(mry, myy, red, green, slot + 4);
   sum4(blue, depth, blue, depth, slot + 8);
 }
 

@@ -70,7 +70,8 @@ inline void composite(const Tile& tile, Chunk& chunk, int s, TileState& state, W
   for (std::uint64_t left = chunk.covering[s]; left != 0; left &= left - 1) {
     const int k = __builtin_ctzll(left);
     const Splat& g = chunk.splats[k];
-    const Float exponent = log2_alpha(g, x - g.mean_x, y - g.mean_y);
+    const Float dy = y - g.mean_y;
+    const Float exponent = log2_alpha(g, shear(g, x - g.mean_x, dy), dy);
     const Mask taken = both(greater_equal(exponent, broadcast(kLog2MinAlpha)),
                             greater_equal(t, broadcast(kMinTransmittance)));
     const Float alpha = zero_unless(taken, minimum(exp2_unchecked(exponent), broadcast(kMaxAlpha)));
