@@ -32,8 +32,13 @@ class AttributeSettings:
     """ycbcr: BT.709, 8 bits; identity: components G, B, R; none: components as they are. None: ycbcr for 3 components
     of uint8, else none."""
     label: str | None = None
-    """The standard's label: color, reflectance, opacity, frame_index, frame_number, material or normal. None: the
-    attribute's name if it is one of them, else color for 3 components and reflectance for 1."""
+    """The standard's label: color, reflectance, opacity, frame_index, frame_number, material or normal. None: color
+    for 3 components, reflectance for 1, which other decoders read (the reference decoder breaks at the others). The
+    attribute's name travels beside it."""
+    offset: int = 0
+    """Values are `offset` + `scale` times what is coded; every decoder undoes that."""
+    scale: int = 1
+    """See `offset`; above 1 values are rounded to multiples."""
     lossless: bool = False
     """Whole values of one component (ids) that come back exactly; `qp` and `bit_depth` are then not used."""
 
@@ -44,6 +49,9 @@ class AttributeSettings:
             check_ranges(self, {"qp": (4, 99)})
         if self.chroma_offset is not None:
             check_ranges(self, {"chroma_offset": (-51, 51)})
+        check_ranges(self, {"scale": (1, 1 << 24), "offset": (-(1 << 30), 1 << 30)})
+        if self.lossless and (self.scale, self.offset) != (1, 0):
+            raise ConfigError("AttributeSettings.lossless goes without scale and offset")
         _check_choice(self, "color_space", (None, "ycbcr", "identity", "none"))
 
 
@@ -59,6 +67,10 @@ class CodecSettings:
     """Voxels per input voxel, along an axis: 0.5 codes positions at half the resolution."""
     voxel_size: float | None = None
     """Edge of an input voxel, metres; None: 1 for integer positions, else from `geometry_bits`."""
+    unit: float | None = None
+    """Length of a step of integer positions, metres; None: they are no lengths. The stream tells it."""
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where integer position 0 stands, metres (with `unit`)."""
     geometry_bits: int = 10
     """Bits of the longest side of a cloud in metres, if `voxel_size` is None."""
     box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
@@ -82,9 +94,9 @@ class CodecSettings:
     """Nodes with an edge below 2^this are predicted from their 26 neighbours; 0: none."""
     raht_prediction: bool = True
     """Attributes are predicted from the octree level above."""
-    rdoq: float = 0.0
+    rdoq: float = 1.0
     """Rate-distortion optimised quantisation: weight of a bit against the squared error when the encoder drops
-    coefficients; 0: it drops none."""
+    coefficients, 1 as the reference encoder has it; 0: it drops none."""
     attributes: Mapping[str, AttributeSettings] = field(default_factory=dict)
     """Settings of single attributes, by name."""
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -108,6 +120,10 @@ class CodecSettings:
                 raise ConfigError(f"CodecSettings.box: expected a lowest and a highest corner, found {self.box!r}")
         if self.voxel_size is not None:
             check_ranges(self, {"voxel_size": (1e-12, 1e12)})
+        if self.unit is not None:
+            check_ranges(self, {"unit": (1e-12, 1e12)})
+        if len(self.shift) != 3 or not np.isfinite(self.shift).all():
+            raise ConfigError(f"CodecSettings.shift: expected 3 finite numbers, found {self.shift!r}")
         if self.workers is not None:
             check_ranges(self, {"workers": (1, 1024)})
         _check_choice(self, "neighbour_boundary", (None, 0, 2, 3, 4, 5, 6, 7, 8))

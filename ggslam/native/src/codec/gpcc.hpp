@@ -37,7 +37,8 @@ struct RahtSettings {
   std::int32_t qp, qp_secondary;  // of component 0 and of the others
   std::int32_t prediction;
   std::int32_t min_parent_neighbours, min_neighbours;  // prediction thresholds 0 and 1
-  float rdoq;                // encoder: weight of the rate in dropping coefficients; 0: none is dropped
+  std::int32_t first_version;  // the stream was written by this codec when its roots of large weights were its own
+  float rdoq;                // encoder: weight of a bit in dropping coefficients, 1 as the reference's; 0: none is dropped
 };
 
 // The nodes of one size in Morton order. Entry 0 of each array stands for "no node"; nodes count from 1.
