@@ -202,7 +202,7 @@ class Known:
             return f"{', '.join(first)} or {last}" if first else last
         if self.kind is bool:
             return "true or false"
-        return self.range()
+        return "text" if self.kind is str else self.range()
 
 
 def group_of(kind: Any) -> type | None:
