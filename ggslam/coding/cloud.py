@@ -18,12 +18,14 @@ class PointCloud:
     grid_points: int32 [N, 3], positions as coded.
     attributes: by name; uint8 (uint16 above 8 bits), [N, 3], or [N] for attributes of one component.
     metadata: what the encoder's caller put into the stream.
+    ids: names of the attributes that were coded losslessly.
     """
 
     grid_points: np.ndarray
     attributes: dict[str, np.ndarray]
     quantization: Quantization
     metadata: dict[str, Any] = field(default_factory=dict)
+    ids: frozenset[str] = frozenset()
 
     @property
     def points(self) -> np.ndarray:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -104,7 +104,7 @@ def decode_box(data: bytes | memoryview, low: Sequence[float], high: Sequence[fl
     points = cloud.points
     inside = ((points >= first) & (points <= last)).all(1)
     attributes = {name: values[inside] for name, values in cloud.attributes.items()}
-    return PointCloud(cloud.grid_points[inside], attributes, cloud.quantization, cloud.metadata)
+    return replace(cloud, grid_points=cloud.grid_points[inside], attributes=attributes)
 
 
 def _decode(stream: CodedStream, slices: list[CodedSliceUnits], workers: int | None) -> PointCloud:
@@ -119,7 +119,8 @@ def _joined(stream: CodedStream, parts: Sequence[tuple[np.ndarray, dict[str, np.
         shape = (0,) if attribute.description.components == 1 else (0, 3)
         attributes[attribute.name] = _concatenate([part[1][attribute.name] for part in parts], shape, attribute.dtype)
     metadata = stream.side.get("metadata")
-    return PointCloud(grid, attributes, stream.quantization, metadata if isinstance(metadata, dict) else {})
+    ids = frozenset(attribute.name for attribute in stream.attributes if attribute.table is not None)
+    return PointCloud(grid, attributes, stream.quantization, metadata if isinstance(metadata, dict) else {}, ids)
 
 
 def _concatenate(parts: list[np.ndarray], empty: tuple[int, ...], dtype: type | np.dtype) -> np.ndarray:

@@ -128,4 +128,5 @@ def _reconstruction(cloud: CloudToCode, slices: list[CodedSlice]) -> PointCloud:
         plan.name: np.concatenate([coded.attributes[plan.name] for coded in slices if coded.attributes is not None])
         for plan, _ in cloud.plans
     }
-    return PointCloud(grid, attributes, cloud.quantization, dict(cloud.settings.metadata))
+    ids = frozenset(plan.name for plan, _ in cloud.plans if plan.table is not None)
+    return PointCloud(grid, attributes, cloud.quantization, dict(cloud.settings.metadata), ids)

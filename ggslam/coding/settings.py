@@ -42,10 +42,10 @@ class AttributeSettings:
     lossless: bool = False
     """Whole values of one component (ids) that come back exactly; `qp` and `bit_depth` are then not used."""
 
-
     def __post_init__(self) -> None:
         if self.lossless and (self.scale, self.offset) != (1, 0):
             raise Conflict("lossless", "goes without scale and offset")
+
 
 @settings_class(frozen=True)
 class CodecSettings:

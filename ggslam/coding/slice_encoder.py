@@ -21,6 +21,7 @@ from ggslam.coding.syntax import AttributeHeader, AttributeParameters, GeometryH
 from ggslam.coding.user_data import write_user_data
 from ggslam.errors import ConfigError
 
+
 @dataclass(frozen=True)
 class CloudToCode:
     """What all slices share. Arrays are read, never changed."""

@@ -110,8 +110,9 @@ def _header(elements: Mapping[str, tuple[int, np.dtype]], comments: Sequence[str
         if not text.isascii() or not text.isprintable():
             raise ValueError(f"a PLY comment must be one line of ASCII, found {text!r}")
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    types = SIZED_NAMES if sized_names else PLY_NAMES
     for name, (count, dtype) in elements.items():
-        lines += [f"element {_checked_name(name)} {count}", *_declarations(dtype, SIZED_NAMES if sized_names else PLY_NAMES)]
+        lines += [f"element {_checked_name(name)} {count}", *_declarations(dtype, types)]
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 

@@ -3,6 +3,7 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "common/dispatch.hpp"
@@ -28,6 +29,20 @@ struct OctreeSettings {
   std::int32_t adjacent_child;
   std::int32_t intra_prediction;    // nodes of an edge below 2^this are predicted from their 26 neighbours
   std::int32_t unique_points;       // 0: the number of points is coded for every leaf
+};
+
+// What geometry coding in general depends on: trees whose nodes are not split along every axis (QTBT), planes, points
+// that are coded directly, scaled positions, several codewords.
+struct TreeSettings {
+  std::int32_t levels, neighbour_boundary, adjacent_child, intra_prediction, unique_points;
+  std::int32_t direct_mode;   // 0 to 3
+  std::int32_t direct_pairs;  // two points share what their positions begin with
+  std::int32_t direct_rate;   // of 32 nodes that could be coded directly, with planes in mode 1
+  std::int32_t planes, plane_thresholds[3];
+  std::int32_t scaling, slice_qp, direct_qp, qp_shift;
+  std::int32_t codewords;
+  std::int32_t separate_bits;  // bins of equal probability are a stream of their own
+  std::uint8_t axes[64];       // by level: 4 x, 2 y, 1 z
 };
 
 // What an attribute's coding by the region-adaptive hierarchical transform depends on.
@@ -59,6 +74,21 @@ struct Octree {
 
   int depth() const { return static_cast<int>(levels.size()); }
   std::uint32_t weight_of_leaf(std::uint32_t leaf) const { return leaf_points.empty() ? 1 : leaf_points[leaf]; }
+};
+
+// Adaptive contexts that a slice leaves to the next one, as bytes; empty: none.
+struct Memory {
+  std::vector<std::uint8_t> bytes;
+
+  template <class Contexts>
+  void load(Contexts& contexts) const {
+    if (bytes.size() == sizeof(Contexts)) std::memcpy(static_cast<void*>(&contexts), bytes.data(), sizeof(Contexts));
+  }
+  template <class Contexts>
+  void save(const Contexts& contexts) {
+    const auto* begin = reinterpret_cast<const std::uint8_t*>(&contexts);
+    bytes.assign(begin, begin + sizeof(Contexts));
+  }
 };
 
 // Counts the points below every node; needed by the attribute coder.
