@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 
 from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 
@@ -51,6 +53,16 @@ class Classes(Protocol):
     def remove(self, object_id: int) -> None: ...
 
 
+class MaskedKeyframe(Protocol):
+    """What is asked of a keyframe: its number, and its mask, uint16 [H, W], or None."""
+
+    @property
+    def index(self) -> int: ...
+
+    @property
+    def mask(self) -> np.ndarray | None: ...
+
+
 @dataclass
 class IdentityObjects(ABC):
     """Objects and their ids.
@@ -81,10 +93,10 @@ class IdentityObjects(ABC):
         """Goes on with the classes of a map made before, whose Gaussians bring their vectors and votes."""
         self.table.resume(classifier)
 
-    def _count_iteration(self, has_mask: bool) -> bool:
-        """Whether this mapping iteration, on a keyframe with or without a mask, shall have an identity step."""
+    def due(self, keyframe: MaskedKeyframe) -> bool:
+        """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
         self._iterations += 1
-        return has_mask and self.table.count > 0 and self._iterations % self.settings.every == 0
+        return keyframe.mask is not None and self.table.count > 0 and self._iterations % self.settings.every == 0
 
     # --- a map that is partly on disk ---------------------------------------------------------------------------------
 
@@ -145,6 +157,35 @@ class IdentityObjects(ABC):
         return True
 
     # --- what depends on where the map is -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def begin(self, gaussians: GaussianMap, rows: slice, labels: Any) -> None:
+        """New Gaussians get their first identity vectors and votes.
+
+        Args:
+            rows: where they are in the map.
+            labels: [M], object under the pixel each was born from, 0 = unknown; uint16 on the host, int32 on a device.
+        """
+
+    @abstractmethod
+    def step(
+        self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, view: RenderBuffers, rate_factor: float = 1.0
+    ) -> torch.Tensor | None:
+        """One step on the view that `rasterizer` rendered last, which must be that of `keyframe`.
+
+        Args:
+            rate_factor: multiplies the learning rates (of the sampled schedule).
+
+        Returns:
+            With the dense schedule the gradient of the rendered features [F, H, W], for the caller's backward pass;
+            else None, and the step is made.
+        """
+
+    @abstractmethod
+    def split(self, gaussians: GaussianMap, rasterizer: Any, mask: np.ndarray, whole: int, part: int) -> None:
+        """An object turned out to be two: what the last rendering shows where `mask` (uint16 [H, W]) has the part, and
+        more of it there than elsewhere, now votes for the part as it did for the whole. In older keyframes the map
+        decides from now on which pixels of the whole are the part's."""
 
     @abstractmethod
     def label(self, gaussians: GaussianMap) -> None:

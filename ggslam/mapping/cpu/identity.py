@@ -121,10 +121,6 @@ class IdentityLearner(IdentityObjects):
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
-    def due(self, keyframe: Keyframe) -> bool:
-        """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
-        return self._count_iteration(keyframe.mask is not None)
-
     def step(
         self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: Keyframe, view: RenderBuffers,
         rate_factor: float = 1.0,

@@ -22,7 +22,15 @@ from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.neighbours import device_neighbours
 from ggslam.mapping.cuda.pixel_pool import DevicePixelPool, PixelDrawer
 from ggslam.mapping.cuda.votes import merge_votes, vote_labels, vote_shares
-from ggslam.mapping.identity_objects import BIRTH_VOTE, IDS, MIN_WEIGHT, POOL_STEPS, TERMS, IdentityObjects
+from ggslam.mapping.identity_objects import (
+    BIRTH_VOTE,
+    IDS,
+    MIN_WEIGHT,
+    POOL_STEPS,
+    TERMS,
+    IdentityObjects,
+    MaskedKeyframe,
+)
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
@@ -41,11 +49,8 @@ SPLIT_PIXELS, SPLIT_TERMS, SPLIT_MIN_WEIGHT = 32768, 48, 1e-3
 """A split looks at so many pixels at a time, with so many contributions to each, none lighter."""
 
 
-class MaskedKeyframe(Protocol):
-    """What is asked of a keyframe: its number, and its mask, uint16 [H, W] on the device, or None."""
-
-    @property
-    def index(self) -> int: ...
+class DeviceMaskedKeyframe(MaskedKeyframe, Protocol):
+    """A keyframe whose mask is on the device, too."""
 
     @property
     def device_mask(self) -> torch.Tensor | None: ...
@@ -148,7 +153,7 @@ class CudaIdentityLearner(IdentityObjects):
         shown, _ = terms.labels(self._shown)
         return torch.where((self._device_whole_of[shown.long()] == labels) & (shown > 0), shown, labels)
 
-    def labels_at(self, keyframe: MaskedKeyframe, pixels: torch.Tensor) -> torch.Tensor:
+    def labels_at(self, keyframe: DeviceMaskedKeyframe, pixels: torch.Tensor) -> torch.Tensor:
         """Objects at pixels (integers [M], flat indices) of a keyframe, int32 [M], for `begin`; 0 = unknown."""
         if keyframe.device_mask is None:
             return torch.zeros(len(pixels), dtype=torch.int32, device=self.device)
@@ -173,12 +178,8 @@ class CudaIdentityLearner(IdentityObjects):
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
-    def due(self, keyframe: MaskedKeyframe) -> bool:
-        """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
-        return self._count_iteration(keyframe.device_mask is not None)
-
     def step(
-        self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: MaskedKeyframe, view: RenderBuffers,
+        self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: DeviceMaskedKeyframe, view: RenderBuffers,
         rate_factor: float = 1.0,
     ) -> torch.Tensor | None:  # fmt: skip
         """Starts one step on the view that `rasterizer` rendered last, which must be that of `keyframe`; arguments and
