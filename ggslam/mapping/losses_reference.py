@@ -6,7 +6,8 @@ from __future__ import annotations
 import torch
 from torch.nn.functional import conv2d
 
-from ggslam.mapping.cpu.losses import KeyframeImages, LossSettings
+from ggslam.mapping.losses import LossTarget
+from ggslam.mapping.settings import LossSettings
 
 
 def blur(images: torch.Tensor) -> torch.Tensor:
@@ -26,7 +27,7 @@ def ssim(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
 
 
 def reference_loss(
-    image: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, exposure: torch.Tensor, target: KeyframeImages,
+    image: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, exposure: torch.Tensor, target: LossTarget,
     settings: LossSettings,
 ) -> dict[str, torch.Tensor]:  # fmt: skip
     """The values of `LossValues` by name, as scalars that carry their graph. Computes in the type of `image`.

@@ -15,13 +15,15 @@ import torch
 
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
-from ggslam.mapping.identity_objects import IdentityObjects
+from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
+from ggslam.mapping.losses import LossGradients
 from ggslam.mapping.pruning import prune
 from ggslam.mapping.residency import Residency
 from ggslam.mapping.sampling import KeyframeSampler
 from ggslam.mapping.settings import MapperSettings
+from ggslam.mapping.votes import vote_labels
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
@@ -64,22 +66,6 @@ class LossSums:
     depth: float = 0.0
 
 
-class LossGradients(Protocol):
-    """What the loss of one view gives its backward pass; tensors on the mapper's device."""
-
-    @property
-    def d_image(self) -> torch.Tensor:
-        """d loss / d rendered image (before exposure), float32 [3, H, W]."""
-
-    @property
-    def d_depth(self) -> torch.Tensor:
-        """d loss / d accumulated depth, float32 [H, W]."""
-
-    @property
-    def d_alpha(self) -> torch.Tensor:
-        """d loss / d alpha, float32 [H, W]."""
-
-
 class TrainingRasterizer(Protocol):
     """What the mapper needs of a rasterizer besides rendering: the backward pass with the optimizer in it."""
 
@@ -115,11 +101,11 @@ class Mapper(ABC):
     """
 
     def __init__(
-        self, gaussians: GaussianMap, settings: MapperSettings, seed: int = 0, identity: IdentityObjects | None = None
+        self, gaussians: GaussianMap, settings: MapperSettings, seed: int = 0, identity: IdentityLearner | None = None
     ) -> None:
         self.map = gaussians
         self.settings = settings
-        self.identity: IdentityObjects | None = identity
+        self.identity: IdentityLearner | None = identity
         self.keyframes: list[Keyframe] = []
         self.times = MapperTimes()
         self.depth_sigma = 0.004
@@ -140,9 +126,9 @@ class Mapper(ABC):
     def last_psnr(self) -> float:
         """Of the last iteration's view before its step, dB; NaN before the first."""
 
-    @abstractmethod
     def vote_labels(self) -> np.ndarray:
-        """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none."""
+        """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none. Waits for the device."""
+        return vote_labels(self.map).cpu().numpy().astype(np.uint16)
 
     def beside_others(self) -> AbstractContextManager[object]:
         """Within, which may be entered again and again, a thread works on the device beside the mapper, which is in

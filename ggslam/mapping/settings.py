@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
-from ggslam.errors import check_ranges
-from ggslam.mapping.cpu.losses import LossSettings
+from ggslam.errors import ConfigError, check_ranges
 
 
 @dataclass(frozen=True)
@@ -122,6 +122,49 @@ class ExposureSettings:
 
     def __post_init__(self) -> None:
         check_ranges(self, {"rate": (0, 1), "regularization": (0, 1e6)})
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """Weights and kinds of the terms of the loss.
+
+    Raises:
+        ConfigError: a value outside its range.
+    """
+
+    dssim_weight: float = 0.2
+    """Share of 1 - SSIM in the colour loss, in [0, 1]. 0 skips SSIM, which is most of the work."""
+    depth_weight: float = 0.5
+    """Per metre."""
+    depth_kind: Literal["accumulated", "normalised"] = "accumulated"
+    """What is compared with the target: the accumulated depth (so that a transparent pixel is too near), or the
+    accumulated depth divided by alpha."""
+    minimum_alpha: float = 0.05
+    """For "normalised": pixels rendered fainter than this have no depth to speak of and are left out, in (0, 1]."""
+    color_kind: Literal["l1", "charbonnier"] = "l1"
+    """rho(r) = |r|, or sqrt(r^2 + epsilon^2) - epsilon."""
+    charbonnier_epsilon: float = 1e-3
+    """In units of colour, > 0."""
+    no_depth_weight: float = 1.0
+    """How much colour counts where the keyframe has no depth, in [0, 1]. 0: not at all."""
+    opacity_weight: float = 0.0
+    """Weight of 1 - alpha where the keyframe has depth, i.e. where there is a surface."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in _RANGES:
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ConfigError(f"loss.{name}: expected a number in [{low:g}, {high:g}], found {value!r}")
+        for name, kinds in (("depth_kind", ("accumulated", "normalised")), ("color_kind", ("l1", "charbonnier"))):
+            if getattr(self, name) not in kinds:
+                raise ConfigError(f"loss.{name}: expected one of {', '.join(kinds)}, found {getattr(self, name)!r}")
+
+
+_TINY, _HUGE = 1e-6, 1e6
+_RANGES = (
+    ("dssim_weight", 0.0, 1.0), ("depth_weight", 0.0, _HUGE), ("minimum_alpha", _TINY, 1.0),
+    ("charbonnier_epsilon", _TINY, _HUGE), ("no_depth_weight", 0.0, 1.0), ("opacity_weight", 0.0, _HUGE),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary, library_for_device
 from ggslam.errors import ConfigError, MissingDependency
-from ggslam.mapping.cpu.identity import IdentityLearner
+from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.mapper import CudaMapper
@@ -65,7 +65,7 @@ def make_mapper(config: Config, learns: bool, context: NativeContext, library: C
     learns = learns and config.identity.enabled
     channels = IDENTITY_CHANNELS if learns else 0
     if library is None:
-        learner = IdentityLearner(config.identity, config.seed) if learns else None
+        learner = CpuIdentityLearner(config.identity, config.seed) if learns else None
         return CpuMapper(GaussianMap(config.sh_degree, channels), config.mapping, context, config.seed, learner)
     device = library.whole_device(None)
     device_learner = CudaIdentityLearner(config.identity, config.seed, device, library) if learns else None

@@ -33,7 +33,7 @@ class TrackingEngine(Protocol):
 
 
 @dataclass(frozen=True)
-class NativeEngine:
+class CpuTrackingEngine:
     """The compiled core.
 
     Attributes:

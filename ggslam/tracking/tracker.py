@@ -14,7 +14,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalized, separation
-from ggslam.tracking.engine import NativeEngine, TrackingEngine
+from ggslam.tracking.engine import CpuTrackingEngine, TrackingEngine
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
@@ -112,7 +112,7 @@ class Tracker:
     @property
     def engine(self) -> TrackingEngine:
         """Where points are extracted and aligned."""
-        return self._given_engine or NativeEngine(self.camera, self.context)
+        return self._given_engine or CpuTrackingEngine(self.camera, self.context)
 
     def set_target(self, target: GicpTarget) -> None:
         """Frames are aligned to `target` from the next one on."""

@@ -14,11 +14,11 @@ from identity_picture import COUNT, HEIGHT, WIDTH, MaskedKeyframe, make_map, pic
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.mapping.cpu.class_table import FIRST_CLASSES
-from ggslam.mapping.cpu.identity import IdentityLearner
+from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.pixel_pool import draw_pool
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
-from ggslam.mapping.cuda.pixel_pool import DevicePixelPool
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
+from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.pixel_terms import PixelTerms
@@ -68,7 +68,7 @@ class Both:
     def __init__(self, library: CudaLibrary, mask: np.ndarray | None = None, **changes: object) -> None:
         self.settings = dataclasses.replace(IdentitySettings(every=1, pixels=64, neighbours=ALONE), **changes)  # type: ignore[arg-type]
         self.device = library.whole_device(None)
-        self.cpu = IdentityLearner(self.settings, 3)
+        self.cpu = CpuIdentityLearner(self.settings, 3)
         self.cuda = CudaIdentityLearner(self.settings, 3, self.device, library)
         self.map, self.device_map = make_map("cpu"), make_map(self.device)
         self.view = View(library, self.device)
@@ -89,7 +89,7 @@ class Both:
         """Both will use the same pixels in their next steps."""
         pool = draw_pool(self.mask, steps * self.settings.pixels, self.settings, np.random.default_rng(seed))
         tensors = torch.from_numpy(pool.pixels).to(self.device), torch.from_numpy(pool.vote_weights).to(self.device)
-        self.cpu._pools[0], self.cuda._pools[0] = pool, DevicePixelPool(*tensors)
+        self.cpu._pools[0], self.cuda._pools[0] = pool, PixelPool(*tensors)
 
     def step(self, steps: int, seed: int = 0) -> None:
         self.give_pool(steps, seed)

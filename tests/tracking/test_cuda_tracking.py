@@ -16,7 +16,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
-from ggslam.tracking.engine import NativeEngine
+from ggslam.tracking.engine import CpuTrackingEngine
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import FramePoints
@@ -63,7 +63,7 @@ def check_points(found: FramePoints, expected: FramePoints) -> None:
 
 @pytest.mark.parametrize("settings", [POINTS, PointSettings(), PointSettings(count=300, window=1, max_depth=2.5)])
 def test_points_are_those_of_the_core(
-    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], settings: PointSettings
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], settings: PointSettings
 ) -> None:
     for frame in frames[:2]:
         found, expected = (e.points(frame.depth, settings, NOISE) for e in (engine, native))
@@ -73,7 +73,9 @@ def test_points_are_those_of_the_core(
 
 
 @pytest.mark.parametrize("kept", [0, 1, 2, 7])
-def test_few_points_and_none(engine: CudaTrackingEngine, native: NativeEngine, target: GicpTarget, kept: int) -> None:
+def test_few_points_and_none(
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, target: GicpTarget, kept: int
+) -> None:
     depth = np.zeros((120, 160), np.float32)
     depth[40:47, 40 : 40 + 7 * kept] = np.linspace(1.0, 1.2, 7 * kept, dtype=np.float32)
     settings = PointSettings(count=50)
@@ -92,7 +94,7 @@ def test_a_depth_image_of_another_camera_is_refused(engine: CudaTrackingEngine) 
 
 
 def check_alignment(
-    engine: CudaTrackingEngine, native: NativeEngine, depth: np.ndarray, target: GicpTarget, guess: np.ndarray,
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, depth: np.ndarray, target: GicpTarget, guess: np.ndarray,
     settings: AlignSettings = SETTINGS, photometric: PhotometricPart | None = None,
 ) -> AlignmentStatus:  # fmt: skip
     found, expected = (
@@ -117,7 +119,7 @@ def check_alignment(
 
 @pytest.mark.parametrize("number", range(len(GUESSES)))
 def test_alignments_are_those_of_the_core(
-    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget, number: int
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget, number: int
 ) -> None:
     guess = truth_of(frames[2]) @ se3_exp(GUESSES[number])
     status = check_alignment(engine, native, frames[2].depth, target, guess)
@@ -128,13 +130,14 @@ def test_alignments_are_those_of_the_core(
     "change", [{"coarse_iterations": 0}, {"fine_iterations": 1}, {"coarse_points": 100}, {"min_normal_dot": -2.0}]
 )
 def test_every_setting_means_the_same(
-    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget, change: dict[str, float]
-) -> None:
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget,
+    change: dict[str, float],
+) -> None:  # fmt: skip
     guess = truth_of(frames[2]) @ se3_exp(GUESSES[1])
     check_alignment(engine, native, frames[2].depth, target, guess, replace(SETTINGS, **change))
 
 
-def test_a_wall_leaves_directions_open(engine: CudaTrackingEngine, native: NativeEngine) -> None:
+def test_a_wall_leaves_directions_open(engine: CudaTrackingEngine, native: CpuTrackingEngine) -> None:
     wall = np.full((120, 160), 2.0, np.float32)
     surface = MeasuredSurface(TrackerSettings().target, native.context)
     target = surface.add(native.points(wall, PointSettings(), NOISE), np.eye(4))
@@ -147,13 +150,15 @@ def test_a_wall_leaves_directions_open(engine: CudaTrackingEngine, native: Nativ
 
 
 def test_far_away_the_frame_is_lost(
-    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget
 ) -> None:
     away = se3_exp(np.array([20.0, 0, 0, 0, 0, 0]))
     assert check_alignment(engine, native, frames[2].depth, target, away) is AlignmentStatus.LOST
 
 
-def test_an_empty_target_matches_nothing(engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame]) -> None:
+def test_an_empty_target_matches_nothing(
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame]
+) -> None:
     nothing = tuple(np.zeros((0, width), np.float32) for width in (3, 4, 3)) + (np.zeros(0, np.float32),)
     target = GicpTarget.from_arrays(*nothing, TrackerSettings().target, native.context)
     found = engine.align(engine.points(frames[0].depth, POINTS, NOISE), target, np.eye(4), SETTINGS, NOISE)
@@ -163,7 +168,7 @@ def test_an_empty_target_matches_nothing(engine: CudaTrackingEngine, native: Nat
 
 
 def test_threads_wait_for_one_another(
-    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget, other_order: None
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget, other_order: None
 ) -> None:
     part = grey_part(frames[2], frames[0], PhotometricSettings(points=800))
     check_points(*(e.points(frames[2].depth, POINTS, NOISE) for e in (engine, native)))
@@ -181,7 +186,7 @@ def test_results_repeat_bit_for_bit(engine: CudaTrackingEngine, frames: list[Fra
 
 
 def test_targets_take_turns(
-    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget
 ) -> None:
     surface = MeasuredSurface(replace(TrackerSettings().target, voxel=0.05), native.context)
     other = surface.add(native.points(frames[3].depth, PointSettings(), NOISE), truth_of(frames[3]))
@@ -191,7 +196,7 @@ def test_targets_take_turns(
 
 @pytest.mark.parametrize("change", [{}, {"neighbour_weight": 0.0}, {"scatter_weight": 0.0, "max_elongation": 2.0}])
 def test_voxels_take_shape_on_the_device_as_in_the_core(
-    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], change: dict[str, float]
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], change: dict[str, float]
 ) -> None:
     settings = replace(TrackerSettings().target, **change)
     targets = []
@@ -222,7 +227,7 @@ def grey_part(view: Frame, reference: Frame, settings: PhotometricSettings) -> P
 
 @pytest.mark.parametrize("number", range(len(GUESSES)))
 def test_grey_values_pull_as_they_do_in_the_core(
-    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget, number: int
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget, number: int
 ) -> None:
     part = grey_part(frames[2], frames[0], PhotometricSettings(points=800))
     assert len(part.points) > 200
@@ -233,7 +238,7 @@ def test_grey_values_pull_as_they_do_in_the_core(
 
 
 def test_what_hides_a_point_in_the_reference_counts_as_in_the_core(
-    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], target: GicpTarget
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget
 ) -> None:
     part = grey_part(frames[2], frames[0], PhotometricSettings(points=800))
     pixels = part.reference.pixels.copy()
@@ -260,7 +265,7 @@ def tracker_settings(mode: PhotometricMode) -> TrackerSettings:
 
 @pytest.mark.parametrize("mode", ["never", "auto", "always"])
 def test_a_tracker_goes_the_same_way_with_either_engine(
-    engine: CudaTrackingEngine, native: NativeEngine, frames: list[Frame], mode: PhotometricMode
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], mode: PhotometricMode
 ) -> None:
     found, expected = (
         track(Tracker(frames[0].camera, tracker_settings(mode), native.context, truth_of(frames[0]), e), frames)
@@ -293,7 +298,7 @@ def test_the_host_waits_once_for_a_frame(
 
 
 def test_the_mode_goes_with_the_median_depth_of_the_frame_itself(
-    engine: CudaTrackingEngine, native: NativeEngine
+    engine: CudaTrackingEngine, native: CpuTrackingEngine
 ) -> None:
     """Although the device tells it only with the alignment."""
 

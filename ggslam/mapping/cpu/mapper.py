@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from ggslam.mapping.cpu.exposure import ExposureAdam
-from ggslam.mapping.cpu.identity import IdentityLearner
+from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, new_gaussians, unexplained
-from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossResult
-from ggslam.mapping.cpu.votes import vote_labels
+from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
+from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
@@ -34,7 +34,7 @@ class CpuMapper(Mapper):
         Others: as in `Mapper`.
     """
 
-    identity: IdentityLearner | None
+    identity: CpuIdentityLearner | None
     _rasterizer: CpuRasterizer
 
     def __init__(
@@ -43,13 +43,13 @@ class CpuMapper(Mapper):
         settings: MapperSettings,
         context: NativeContext,
         seed: int = 0,
-        identity: IdentityLearner | None = None,
+        identity: CpuIdentityLearner | None = None,
     ) -> None:
         super().__init__(gaussians, settings, seed, identity)
         self._losses = LossSums()
         self._last_psnr = float("nan")
         self._rasterizer = CpuRasterizer(context=context)
-        self._loss = ImageLoss(context)
+        self._loss = CpuImageLoss(context)
         self._pose_optimizers: list[PoseAdam] = []
         self._exposure_optimizers: list[ExposureAdam] = []
 
@@ -60,9 +60,6 @@ class CpuMapper(Mapper):
     @property
     def last_psnr(self) -> float:
         return self._last_psnr
-
-    def vote_labels(self) -> np.ndarray:
-        return vote_labels(self.map)
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         super().adopt(gaussians, keyframes)
@@ -111,12 +108,12 @@ class CpuMapper(Mapper):
     def _render(self, keyframe: Keyframe, features: bool) -> RenderBuffers:
         return self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=features)
 
-    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> LossResult:
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> CpuLossResult:
         exposure = keyframe.exposure if self.settings.exposure.enabled else None
-        target = KeyframeImages(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
+        target = LossTarget(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
         return self._loss.evaluate(view, target, self.settings.loss)
 
-    def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: LossResult, pose_rate: float) -> None:
+    def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:
         if pose_rate:
             optimizer = self._pose_optimizers[keyframe.index]
             keyframe.T_camera_world = optimizer.step(keyframe.T_camera_world, twist, pose_rate)

@@ -18,16 +18,17 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.streams import Pace, SideStream
 from ggslam.cuda.transfers import HostMirror, download
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
-from ggslam.mapping.cuda.insertion import DeviceInsertion, Selection
-from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceImages, ImageStore
+from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
+from ggslam.mapping.cuda.keyframe import CudaKeyframe, CudaKeyframeImages, ImageStore
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
-from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages, DeviceLossResult
-from ggslam.mapping.cuda.votes import vote_labels
+from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
+from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.mapping.settings import MapperSettings
+from ggslam.mapping.votes import vote_labels
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
@@ -55,7 +56,7 @@ class CudaMapper(Mapper):
         self.device = library.whole_device(None)
         self._rasterizer = CudaRasterizer(self.device, library=library, waits=False)
         self._loss = CudaImageLoss(self.device, library)
-        self._insertion = DeviceInsertion(self.device, library)
+        self._insertion = CudaInsertion(self.device, library)
         self._states = KeyframeStates(self.device, library)
         self._images = ImageStore(self.device)
         self._totals = HostMirror(self._states.totals)
@@ -75,9 +76,6 @@ class CudaMapper(Mapper):
     def image_bytes(self) -> int:
         """Memory on the device that images of keyframes take at present; part of it for good, see `ImageStore`."""
         return self._images.nbytes
-
-    def vote_labels(self) -> np.ndarray:
-        return vote_labels(self.map).cpu().numpy().astype(np.uint16)
 
     def beside_others(self) -> AbstractContextManager[object]:
         return SideStream(self.device)
@@ -150,8 +148,8 @@ class CudaMapper(Mapper):
         return self._rasterizer.last_overflowed
 
     def selection(
-        self, images: DeviceImages, keyframe: CudaKeyframe, alpha: torch.Tensor | None, depth: torch.Tensor | None,
-        T_world_camera: np.ndarray,
+        self, images: CudaKeyframeImages, keyframe: CudaKeyframe, alpha: torch.Tensor | None,
+        depth: torch.Tensor | None, T_world_camera: np.ndarray,
     ) -> Selection:  # fmt: skip
         """Starts to choose the pixels of a keyframe that the map, rendered as `alpha` and `depth`, does not explain."""
         return self._insertion.select(
@@ -174,14 +172,14 @@ class CudaMapper(Mapper):
             self.map, keyframe.camera, self._states.pose(keyframe.index), features=features
         )
 
-    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> DeviceLossResult:
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> CudaLossResult:
         assert isinstance(keyframe, CudaKeyframe)
         images, s = keyframe.device_images, self.settings
         exposure = self._states.exposure(keyframe.index) if s.exposure.enabled else None
-        target = DeviceKeyframeImages(images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
+        target = LossTarget(images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
         return self._loss.evaluate(view, target, s.loss)
 
-    def _finish_step(self, keyframe: Keyframe, twist: torch.Tensor, loss: DeviceLossResult, pose_rate: float) -> None:
+    def _finish_step(self, keyframe: Keyframe, twist: torch.Tensor, loss: CudaLossResult, pose_rate: float) -> None:
         exposure = self.settings.exposure
         self._states.step(
             keyframe.index, twist, loss.results, self._rasterizer.last_overflowed, pose_rate,

@@ -17,7 +17,7 @@ _BEGIN = 64
 """Words before the arrays, of which the header takes the first two."""
 
 
-class DevicePoints(FramePoints):
+class CudaPoints(FramePoints):
     """`FramePoints` on a device. The arrays, which keyframes and loops need, come to the host with the frame's
     alignment; before it they are fetched, all at once, when any of them is first asked for. So are their number and
     median depth.

@@ -19,7 +19,7 @@ _PLACES[np.triu_indices(6)] = range(21)
 _PLACES += np.triu(_PLACES, 1).T
 
 
-class DeviceAlignment(AlignmentResult):
+class CudaAlignment(AlignmentResult):
     """`AlignmentResult` whose matches and distances stay on the device until someone asks for them."""
 
     _matched: torch.Tensor
@@ -35,7 +35,7 @@ class DeviceAlignment(AlignmentResult):
         return object.__getattribute__(self, name)
 
 
-def device_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSettings) -> DeviceAlignment:
+def cuda_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSettings) -> CudaAlignment:
     """An alignment from what the kernels say.
 
     Args:
@@ -58,7 +58,7 @@ def device_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSe
         "photometric_residual": float(found[contract.RESIDUAL]), "photometric_share": float(found[contract.SHARE]),
         "_matched": matched, "_count": int(found[contract.POINT_COUNT]),
     }  # fmt: skip
-    result = object.__new__(DeviceAlignment)  # the dataclass's own constructor asks for the matches
+    result = object.__new__(CudaAlignment)  # the dataclass's own constructor asks for the matches
     for name, value in values.items():
         object.__setattr__(result, name, value)
     return result
