@@ -42,6 +42,7 @@ from ggslam.tracking.edges_planes.scans import LidarFeatures, split_features
 from ggslam.tracking.edges_planes.settings import LIDAR, FeatureTrackerSettings
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
 from ggslam.tracking.gicp import GicpTarget, align
+from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise, TargetSettings, TrackerSettings
@@ -92,7 +93,7 @@ def track_frames(frames: Iterable[Frame], tracker: Tracker, context: NativeConte
             run.lost += 1
         elif policy.decide(frame.index, result):
             T = result.T_world_camera
-            run.cloud.append(result.points.points @ T[:3, :3].T + T[:3, 3])
+            run.cloud.append(result.points.read().points @ T[:3, :3].T + T[:3, 3])
             if not isinstance(tracker, FeatureTracker):
                 start = time.perf_counter()
                 tracker.set_target(surface.add(result.points, T))
@@ -111,7 +112,7 @@ def run_recording(path: Path, arguments: argparse.Namespace) -> None:
     features = with_budget(FeatureTrackerSettings(device=arguments.device), arguments.budget_ms)
     runs = []
     for name, tracker in (
-        ("gicp", Tracker(sequence.camera, context=context)),
+        ("gicp", GicpTracker(sequence.camera, context=context)),
         ("features", FeatureTracker(sequence.camera, features=features, context=context)),
     ):
         run = track_frames(frames, tracker, context)

@@ -27,7 +27,7 @@ from ggslam.submaps.paging_settings import PagingSettings
 from ggslam.system.atomic import write_text
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
-from ggslam.tracking.tracker import TrackerSettings
+from ggslam.tracking.settings import TrackerSettings
 from ggslam.volumes.volume_settings import VolumeSettings
 
 

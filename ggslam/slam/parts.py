@@ -26,6 +26,7 @@ from ggslam.slam.map_paging import MapPager
 from ggslam.slam.memory_budget import MB, MemoryBudget
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
+from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.tracker import Tracker
 
 
@@ -86,7 +87,7 @@ def make_tracker(camera: Camera, config: Config, context: NativeContext, library
     if config.tracker == "features":
         return FeatureTracker(camera, config.tracking, config.features, context)
     engine = None if library is None else CudaTrackingEngine(camera, library.whole_device(None), library)
-    return Tracker(camera, config.tracking, context, engine=engine)
+    return GicpTracker(camera, config.tracking, context, engine=engine)
 
 
 def make_pager(camera: Camera, config: Config, folder: Path | None) -> MapPager | None:

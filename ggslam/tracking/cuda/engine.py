@@ -26,11 +26,11 @@ from ggslam.tracking import native
 from ggslam.tracking.cuda import contract
 from ggslam.tracking.cuda.contract import AlignJob, DepthPointsJob, declare_tracking
 from ggslam.tracking.cuda.points import CudaPoints
-from ggslam.tracking.cuda.results import CudaAlignment, cuda_alignment
+from ggslam.tracking.cuda.results import cuda_alignment
 from ggslam.tracking.cuda.target import CudaTarget
-from ggslam.tracking.gicp import GicpTarget, PhotometricPart, native_align_settings
+from ggslam.tracking.gicp import AlignmentResult, GicpTarget, PhotometricPart, native_align_settings
 from ggslam.tracking.photometric import PhotometricReference
-from ggslam.tracking.points import FramePoints, check_depth, grid_stride, native_points_settings
+from ggslam.tracking.points import PointSource, check_depth, grid_stride, native_points_settings
 from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings
 
 
@@ -91,9 +91,9 @@ class CudaTrackingEngine:
         return found
 
     def align(
-        self, source: FramePoints, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
+        self, source: PointSource, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
         noise: DepthNoise, photometric: PhotometricPart | None = None,
-    ) -> CudaAlignment:  # fmt: skip
+    ) -> AlignmentResult:  # fmt: skip
         """As `gicp.align`, of points that `points` gave; waits for the result.
 
         Raises:
