@@ -28,10 +28,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 import torch
 
-from ggslam.evaluation.geometry import estimate_normals, register
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.raw_points import read_pose_graph, read_raw_points
+from ggslam.geometry.icp import register
+from ggslam.geometry.normals import estimate_normals
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, so3_log

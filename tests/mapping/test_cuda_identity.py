@@ -129,7 +129,7 @@ def test_many_classes_compete_all_at_once(cuda_library: CudaLibrary) -> None:
     mask = (np.arange(HEIGHT * WIDTH) % 200 + 1).reshape(HEIGHT, WIDTH).astype(np.uint16)
     both = Both(cuda_library, mask)
     both.begin()
-    both.cpu._competing = lambda classes: np.arange(200)  # type: ignore[method-assign]
+    both.cpu._choose_competitors = lambda classes: np.arange(200)  # type: ignore[method-assign]
     both.step(3)
     both.check()
     assert both.cuda.table.count == 200 > FIRST_CLASSES
