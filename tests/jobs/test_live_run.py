@@ -43,7 +43,7 @@ def test_frames_are_kept_and_scored(place: Path, tmp_path: Path) -> None:
     request = LiveRequest(place, stop=6, record=tmp_path / "kept")
     outcome = execute(RunRequest(request, out=tmp_path / "run", overrides=FAST))
     assert outcome.error is None and len(outcome.result.frames) == 6
-    assert outcome.metrics is not None and outcome.metrics["images"]["all"]["frames"] == 6
+    assert outcome.metrics is not None and outcome.metrics.images.all.frames == 6
     again = open_recording_of(outcome.folder)
     assert again.path == tmp_path / "kept" and len(again) == 6
 

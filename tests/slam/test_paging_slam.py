@@ -57,7 +57,7 @@ def executed(recording: Path, out: Path, *overrides: str) -> RunOutcome:
 
 def held_out_psnr(outcome: RunOutcome, recording: Path) -> float:
     metrics = score_run(outcome.folder, open_sequence(recording), SilentObserver(), lpips=False)
-    return metrics["images"]["held_out"]["psnr"]
+    return metrics.images.held_out.psnr
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,8 +24,8 @@ from ggslam.coding.study import GridCloud, StudyRow, SweepStep, run_sweep
 from ggslam.reporting.cloud_pictures import View, contact_sheet, draw_cloud, view_of
 from ggslam.reporting.curves import Curve, Panel, draw_panels, require_plotting
 from ggslam.reporting.pictures import write_picture
-from ggslam.runs.folder import json_ready
 from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.json_files import write_json
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ def write_tables(
         "points": len(cloud.grid), "peak": cloud.peak, "voxels_per_unit": cloud.quantization.scale,
         "workers": settings.workers, "slices": settings.slices, "split": settings.split, "note": note or None,
     }  # fmt: skip
-    write_text(folder / "study.json", json.dumps(json_ready({**about, "rows": table}), indent=1) + "\n")
+    write_json(folder / "study.json", {**about, "rows": table})
     return [folder / "study.csv", folder / "study.json"]
 
 

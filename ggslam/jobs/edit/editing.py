@@ -7,11 +7,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from ggslam.errors import ConfigError, GgslamError
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.jobs.edit.edited_run import save_edited
 from ggslam.jobs.edit.pictures import before_and_after
 from ggslam.mapping.keyframe import ELSEWHERE
@@ -35,9 +35,9 @@ from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import joined
 from ggslam.objects.table import ObjectTable
 from ggslam.objects.traces import drop_traces, places
-from ggslam.runs.folder import MARKER, RunFolder, as_written
-from ggslam.runs.frame_poses import frame_poses, run_camera
+from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.system.interrupts import uninterrupted
@@ -131,9 +131,10 @@ def edit_run(
         outcome.filling = _mend(source, scene, recording, settings or InpaintSettings() if inpainting else None, notes)
         pictures = before_and_after(original, scene.gaussians, changes, source.camera, source.keyframes)
         named_only = all(edit.kind == "rename" for edit in edits)
-        note = {"edits": outcome.changes, "displaced": source.displacement.to_json()}
         with uninterrupted():
-            outcome.pictures = save_edited(folder, written, scene, note, pictures, named_only, sequence)
+            outcome.pictures = save_edited(
+                folder, written, scene, outcome.changes, source.displacement, pictures, named_only, sequence
+            )
     except BaseException:
         written.discard()
         raise
@@ -160,13 +161,13 @@ class _Source:
 
     Attributes:
         camera: it saw with.
-        keyframes: content of keyframes.json.
+        keyframes: where they are, and how frames were tracked.
         views: of the keyframes.
         displacement: by earlier edits; follows this one.
     """
 
     camera: Camera
-    keyframes: dict[str, Any]
+    keyframes: KeyframesRecord
     views: list[View]
     displacement: Displacement
 
@@ -177,22 +178,16 @@ class _Source:
         Raises:
             RunFolderError: a file is missing or damaged, naming it.
         """
-        with as_written(folder.path / MARKER):
-            mark = folder.read_json(MARKER)
-            list(mark.get("edits", []))
-            displacement = Displacement.from_json(mark.get("displaced", {}))
-        with as_written(folder.path / "timing.json"):
-            folder.read_json("timing.json").items()
-        with as_written(folder.path / "sequence.json"):
-            camera = run_camera(folder)
-            folder.read_json("sequence.json")["open"]["path"]
-        with as_written(folder.path / "keyframes.json"):
-            record = folder.read_json("keyframes.json")
-            poses = [(k["frame"], np.array(k["T_world_camera"], float)) for k in record["keyframes"]]
-            # Keyframes of the map that the run began with have no images here.
-            views = [View(camera, inverse(pose), None if frame == ELSEWHERE else frame) for frame, pose in poses]
-            if not views or not frame_poses(record):
-                raise ValueError("it lists no keyframes or no tracked frames")
+        displacement, camera = folder.mark().displacement(), folder.sequence().camera
+        folder.timing()
+        record = folder.keyframes()
+        if not record.keyframes or not record.poses():
+            raise RunFolderError(f"{folder.path / record.FILE}: it lists no keyframes or no tracked frames")
+        # Keyframes of the map that the run began with have no images here.
+        views = [
+            View(camera, inverse(k.T_world_camera), None if k.frame == ELSEWHERE else k.frame)
+            for k in record.keyframes
+        ]  # fmt: skip
         return _Source(camera, record, views, displacement)
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,9 +17,10 @@ from ggslam.formats.trajectory import write_tum
 from ggslam.jobs.progress import Observer
 from ggslam.localization.localizer import Localization
 from ggslam.reporting.curves import Curve, Panel, draw_panels
-from ggslam.runs.folder import json_ready, peak_memory_mb
 from ggslam.scene.poses import turning_angle
-from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.atomic import make_folder
+from ggslam.system.json_files import write_json
+from ggslam.system.process_memory import peak_memory_mb
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def write_report(report: LocalizationReport, out: Path, observer: Observer) -> N
         for time, r in zip(report.timestamps.tolist(), report.results, strict=False)
     ]  # fmt: skip
     content = {"summary": report.summary(), "frames": frames}
-    write_text(out / "localization.json", json.dumps(json_ready(content), indent=1) + "\n")
+    write_json(out / "localization.json", content)
     try:
         draw_panels(out / "path", _panels(report))
     except MissingDependency as error:
