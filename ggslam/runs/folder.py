@@ -83,9 +83,9 @@ class RunFolder:
         try:
             if folder.path.is_dir() and set(folder.path.iterdir()) - set(leftovers(folder.path)):
                 if not (folder.path / MARKER).exists():
-                    raise RunFolderError(f"{path}: not empty and not a run of ggslam; choose another folder with --out")
+                    raise RunFolderError(f"{path}: not empty and not a run of ggslam; choose another folder with `out`")
                 if not overwrite:
-                    raise RunFolderError(f"{path}: there is a run already; use --overwrite or another --out")
+                    raise RunFolderError(f"{path}: there is a run already; use `overwrite` or another `out`")
             else:
                 folder.path.mkdir(parents=True, exist_ok=True)
                 folder._made_here = True

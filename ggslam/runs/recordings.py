@@ -63,7 +63,7 @@ class LiveRequest(SequenceRequest):
         """
         plain = SequenceRequest(self.path, stop=self.stop, scale=self.scale, on_bad_frame=self.on_bad_frame)
         if replace(self, record=None) != LiveRequest(**asdict(plain)):
-            raise SequenceError(f"{self.path}: of a live camera only --stop and --scale can be chosen")
+            raise SequenceError(f"{self.path}: of a live camera only `stop` and `scale` can be chosen")
         source = open_live(str(self.path), self.scale)
         return LiveSequence(source, self.stop, self.record)
 
@@ -119,7 +119,7 @@ def open_recording_of(
         "depth_camera": None if record.open.depth_camera is None else Path(record.open.depth_camera),
     })  # fmt: skip
     if is_live(request.path):
-        raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (--record)")
+        raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (`record`)")
     sequence = replace(request, scale=request.scale if scale is None else scale).open()
     found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scaled(request.scale))}
     expected = {"frames": record.frames, "camera": asdict(record.camera)}

@@ -26,7 +26,7 @@ from ggslam.slam.slam import Slam
 from ggslam.tracking.settings import DepthNoise
 
 _NEEDED = "to grow its map, the images of its keyframes are needed"
-_INSTEAD = "--localize-only does without its images"
+_INSTEAD = "`localize_only` does without its images"
 
 
 class OtherImagesError(Exception):
@@ -52,12 +52,12 @@ def start_in_map(slam: Slam, folder: RunFolder, growing: bool) -> None:
     if not path.is_file():
         raise RunFolderError(f"{path}: missing: the run was made without loops, or its map was edited since")
     if slam.loops is None:
-        raise ConfigError("--map: to start in a map, loops.enabled must not be off")
+        raise ConfigError("`map`: to start in a map, loops.enabled must not be off")
     arrays: dict[str, Any] = read_all_arrays(path, "the places of a run")
     try:
         gaussians, keyframes = _load(slam, slam.loops, folder, arrays)
     except OtherImagesError as error:
-        raise ConfigError(f"{folder.path}: {error}; see --scale") from None
+        raise ConfigError(f"{folder.path}: {error}; see `scale`") from None
     except (KeyError, ValueError, IndexError, TypeError, RuntimeError, ConfigError, FormatError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else error
         raise RunFolderError(f"{path}: not the places of this run: {reason}") from None

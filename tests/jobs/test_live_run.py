@@ -56,5 +56,5 @@ def test_frames_that_are_not_kept(place: Path, tmp_path: Path) -> None:
 
 
 def test_options_for_recordings_only(place: Path) -> None:
-    with pytest.raises(SequenceError, match="only --stop and --scale can be chosen"):
+    with pytest.raises(SequenceError, match="only `stop` and `scale` can be chosen"):
         LiveRequest(place, stride=2).open()

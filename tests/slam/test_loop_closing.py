@@ -198,13 +198,13 @@ def test_a_saved_map_grows(room: Path, first_half: Path, tmp_path: Path) -> None
 
 
 def test_mistakes_with_maps_are_named(room: Path, first_half: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--localize-only needs --map"):
+    with pytest.raises(ConfigError, match="`localize_only` needs `map`"):
         played(room, tmp_path / "a", localize_only=True)
     with pytest.raises(RunFolderError, match="no such folder"):
         played(room, tmp_path / "a", map=tmp_path / "none")
     with pytest.raises(ConfigError, match="is the map to start in"):
         played(room, first_half, map=first_half, overwrite=True)
-    with pytest.raises(ConfigError, match="images of 160x120, these are 80x60; see --scale"):
+    with pytest.raises(ConfigError, match="images of 160x120, these are 80x60; see `scale`"):
         execute(RunRequest(SequenceRequest(room, scale=0.5), tmp_path / "a", map=first_half, evaluate=False))
     assert not (tmp_path / "a").exists()
 

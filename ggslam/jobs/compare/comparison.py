@@ -190,10 +190,10 @@ def _common(a: Side, b: Side) -> np.ndarray:
 def _by_trajectory(a: Side, b: Side, pairs: np.ndarray) -> np.ndarray:
     if a.trajectory is None or b.trajectory is None:
         lacking = a if a.trajectory is None else b
-        raise ConfigError(f"--align trajectory: {lacking.path} is a file and has no trajectory; use icp or none")
+        raise ConfigError(f"`align` trajectory: {lacking.path} is a file and has no trajectory; use icp or none")
     if len(pairs) < FEWEST_POSES:
         raise ConfigError(
-            f"--align trajectory: {a.path} and {b.path} have {len(pairs)} poses at common times, expected at least "
+            f"`align` trajectory: {a.path} and {b.path} have {len(pairs)} poses at common times, expected at least "
             f"{FEWEST_POSES}"
         )
     source, target = a.trajectory.T_world_camera[pairs[:, 0]], b.trajectory.T_world_camera[pairs[:, 1]]

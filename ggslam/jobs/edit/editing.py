@@ -114,9 +114,9 @@ def edit_run(
         SequenceError: the recording is not at `sequence`.
     """
     if not edits:
-        raise ConfigError("no edit was given; there are --" + ", --".join(KINDS))
+        raise ConfigError("no edit was given; there are " + ", ".join(f"`{kind}`" for kind in KINDS))
     if sequence is not None and not inpainting:
-        raise ConfigError("--sequence: only --inpaint looks at the recording")
+        raise ConfigError("`sequence`: only `inpainting` looks at the recording")
     target = _target(folder, out, in_place)
     source = _Source.of(folder)
     notes: list[str] = []
@@ -149,9 +149,9 @@ def _target(folder: RunFolder, out: Path | None, in_place: bool) -> RunFolder:
     """
     path = folder.path if in_place else out or folder.path.with_name(folder.path.name + "-edited")
     if not in_place and path.resolve() == folder.path.resolve():
-        raise ConfigError(f"{path}: is the run itself; use --in-place to edit it there, or another --out")
+        raise ConfigError(f"{path}: is the run itself; use `in_place` to edit it there, or another `out`")
     if folder.path.resolve() in path.resolve().parents:
-        raise ConfigError(f"{path}: lies within the run that is edited; use another --out")
+        raise ConfigError(f"{path}: lies within the run that is edited; use another `out`")
     return RunFolder(path)
 
 
@@ -199,7 +199,7 @@ def _apply_all(scene: SegmentedMap, edits: Sequence[Edit], displacement: Displac
             changes.append(apply_edit(scene, edit))
         except ConfigError as error:
             if changes and set(_named(original, edit)) - set(scene.table.ids()):
-                raise ConfigError(f"--{edit.kind} {edit.objects}: an earlier edit left none of it: {error}") from None
+                raise ConfigError(f"`{edit.kind}` {edit.objects}: an earlier edit left none of it: {error}") from None
             raise
         displacement.follow(changes[-1], scene)
     return changes
@@ -227,32 +227,32 @@ def apply_edit(scene: SegmentedMap, edit: Edit) -> Change:
     if edit.kind == "keep":
         return keep_objects(scene, ids)
     if edit.kind == "move":
-        turn = _vector("--rotate", edit.rotation) if edit.rotation else (0.0, 0.0, 0.0)
-        return move_objects(scene, ids, _vector("--move", edit.value), turn)
+        turn = _vector("rotation", edit.rotation) if edit.rotation else (0.0, 0.0, 0.0)
+        return move_objects(scene, ids, _vector("move", edit.value), turn)
     if edit.kind == "duplicate":
-        return duplicate_objects(scene, ids, _vector("--duplicate", edit.value) if edit.value else None)
+        return duplicate_objects(scene, ids, _vector("duplicate", edit.value) if edit.value else None)
     if edit.kind == "recolor":
         return recolor_objects(scene, ids, parse_color(edit.value))
     if edit.kind == "merge":
-        merged = _single(scene.table, "--merge", edit.value)
-        return merge_objects(scene, _single(scene.table, "--merge", edit.objects), merged)
-    return rename_object(scene, _single(scene.table, "--rename", edit.objects), edit.value)
+        merged = _single(scene.table, "merge", edit.value)
+        return merge_objects(scene, _single(scene.table, "merge", edit.objects), merged)
+    return rename_object(scene, _single(scene.table, "rename", edit.objects), edit.value)
 
 
-def _single(table: ObjectTable, option: str, text: str) -> int:
+def _single(table: ObjectTable, argument: str, text: str) -> int:
     ids = table.select(text)
     if len(ids) != 1:
-        raise ConfigError(f"{option}: expected one object, but {text!r} are {len(ids)}: {', '.join(map(str, ids))}")
+        raise ConfigError(f"`{argument}`: expected one object, but {text!r} are {len(ids)}: {', '.join(map(str, ids))}")
     return ids[0]
 
 
-def _vector(option: str, text: str) -> tuple[float, float, float]:
+def _vector(argument: str, text: str) -> tuple[float, float, float]:
     try:
         x, y, z = (float(part) for part in text.replace(",", " ").split())
     except ValueError:
-        raise ConfigError(f'{option}: expected three numbers like "0.1 0 -0.2", found {text!r}') from None
+        raise ConfigError(f'`{argument}`: expected three numbers like "0.1 0 -0.2", found {text!r}') from None
     if not np.isfinite([x, y, z]).all():
-        raise ConfigError(f"{option}: expected finite numbers, found {text!r}")
+        raise ConfigError(f"`{argument}`: expected finite numbers, found {text!r}")
     return x, y, z
 
 

@@ -125,7 +125,7 @@ def _cloud(folder: RunFolder, voxel_size: float) -> VoxelCloud:
 def _make_empty(out: Path) -> None:
     """Images of an earlier export must not stay among new ones."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise RunFolderError(f"{out}: exists and is not an empty folder; choose another one with --out")
+        raise RunFolderError(f"{out}: exists and is not an empty folder; choose another one with `out`")
     make_folder(out)
 
 

@@ -46,10 +46,10 @@ def select_frames(folder: RunFolder, numbers: str | None, every: int | None, cou
         try:
             wanted = [int(number) for number in numbers.split(",")]
         except ValueError:
-            raise ConfigError(f"--frames: expected numbers like 0,50,100, found {numbers!r}") from None
+            raise ConfigError(f"`frames`: expected numbers like 0,50,100, found {numbers!r}") from None
         missing = [number for number in wanted if number not in known]
         if missing:
-            raise ConfigError(f"--frames: the run has frames {known[0]} to {known[-1]}, not {missing[0]}")
+            raise ConfigError(f"`frames`: the run has frames {known[0]} to {known[-1]}, not {missing[0]}")
         return wanted
     if every is not None:
         return known[::every]
@@ -68,7 +68,7 @@ def render_frames(
     """
     unknown = [kind for kind in what if kind not in KINDS]
     if unknown:
-        raise ConfigError(f"--what: expected some of {','.join(KINDS)}, found {unknown[0]!r}")
+        raise ConfigError(f"`what`: expected some of {','.join(KINDS)}, found {unknown[0]!r}")
     camera = folder.sequence().camera
     if width is not None:
         camera = camera.resized(width, round(camera.height * width / camera.width))

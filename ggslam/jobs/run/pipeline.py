@@ -88,7 +88,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     observer = observer or SilentObserver()
     config, earlier = load_config(request.config, request.overrides), None
     if request.localize_only and request.map is None:
-        raise ConfigError("--localize-only needs --map: the run in whose map to localize")
+        raise ConfigError("`localize_only` needs `map`: the run in whose map to localize")
     if request.map is not None:
         earlier = RunFolder.open(request.map)
         config = replace(config, sh_degree=earlier.config().sh_degree)
@@ -97,7 +97,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
         raise SequenceError(f"{request.sequence.masks}: none of the masks there belongs to a frame of this run")
     out = request.out if request.out is not None else Path("runs") / sequence.name
     if earlier is not None and out.resolve() in ancestors(earlier):
-        raise ConfigError(f"--out {out}: is the map to start in, or one that this comes from; choose another folder")
+        raise ConfigError(f"`out` {out}: is the map to start in, or one that this comes from; choose another folder")
     folder = RunFolder.create(out, overwrite=request.overwrite)
     for warning in sequence.warnings:
         observer.note(warning)
@@ -124,7 +124,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     kept = sequence if isinstance(sequence, Sequence) else None if error else _kept(folder, sequence)
     if request.evaluate and error is None:
         if kept is None:
-            observer.note("not scored: the frames of a live camera are kept with --record FOLDER only")
+            observer.note("not scored: the frames of a live camera are kept with `record` only")
         else:
             outcome.metrics = score_run(folder, kept, observer)
     write_report(folder, kept)

@@ -115,7 +115,7 @@ def frames_of_recording(request: SequenceRequest, objects: bool = True) -> Frame
     poses = {} if truth is None else {i: T for i, T in enumerate(truth) if is_valid_pose(T)}
     if not poses:
         raise ConfigError(
-            f"{sequence.path}: this recording tells no poses; track it with --live, or give the folder of a run of it"
+            f"{sequence.path}: this recording tells no poses; track it with `live`, or give the folder of a run of it"
         )
     source = FrameSource(str(sequence.path), sequence, poses, names=dict(sequence.instance_names))
     source.notes.append(f"poses of the recording itself ({sequence.pose_source})")
