@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import click
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -37,7 +36,7 @@ from ggslam.errors import GgslamError
 
 
 class _Commands(TyperGroup):
-    def invoke(self, context: click.Context) -> Any:
+    def invoke(self, context: Any) -> Any:
         """Runs a command; errors that name arguments name options from here on."""
         try:
             return super().invoke(context)
