@@ -56,7 +56,7 @@ def test_every_argument_that_is_named_has_an_option() -> None:
 
 
 def test_names_become_options() -> None:
-    assert with_options("`localize_only` needs `map`; not `ggslam run`") == "--localize-only needs --map; not `ggslam run`"
+    assert with_options("`no_eval` in `ggslam run`, not `map`") == "--no-eval in `ggslam run`, not --map"
     assert with_options("`overrides` x: expected name=value") == "--set x: expected name=value"
 
 
