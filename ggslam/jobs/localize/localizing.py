@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError, SequenceError
-from ggslam.jobs.localize.report import LocalizationReport, write_report
+from ggslam.jobs.localize.report import LocalizationReport, write_localization
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.stores import INDOORS, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
 from ggslam.localization.frames import FrameTracker
@@ -111,7 +111,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
             None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
         )  # fmt: skip
     with uninterrupted():
-        write_report(report, out, observer)
+        write_localization(report, out, observer)
     if error is not None:
         observer.note(f"stopped after {len(results)} of {len(recording)} frames, which are in {out}")
         raise error
