@@ -328,17 +328,16 @@ def test_a_map_made_before_is_resumed(cuda_library: CudaLibrary) -> None:
 
 
 def test_consecutive_parts_of_a_pool_are_used(cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ggslam.mapping.cuda.identity.KEPT_POOLS", 2)
+    monkeypatch.setattr(CudaIdentityLearner, "kept_pools", 2)
     both = Both(cuda_library)
-    mask = both.keyframe.device_mask
-    assert mask is not None
-    parts = [both.cuda._draw(0, mask)[0] for _ in range(8)]
+    others = [MaskedKeyframe(number, both.keyframe.mask, both.device) for number in (1, 2)]
+    parts = [both.cuda._draw(both.keyframe)[0] for _ in range(8)]
     assert torch.equal(torch.cat(parts), both.cuda._pools[0].pixels)
     first = both.cuda._pools[0]
-    both.cuda._draw(0, mask)
+    both.cuda._draw(both.keyframe)
     assert both.cuda._pools[0] is not first
-    both.cuda._draw(1, mask)
-    both.cuda._draw(2, mask)
+    both.cuda._draw(others[0])
+    both.cuda._draw(others[1])
     assert list(both.cuda._pools) == [1, 2]
     both.cuda.keep_pools([0, 2])
     assert list(both.cuda._pools) == [2]
