@@ -137,7 +137,7 @@ def _refuse_unknown(values: Any, kind: type, prefix: str, origin: str) -> None:
 
 def presets() -> dict[str, Path]:
     """The presets that come with ggslam: name -> file."""
-    folders = [Path(__file__).parents[1] / "configs", Path(str(resources.files("ggslam"))) / "configs"]
+    folders = [Path(__file__).parents[2] / "configs", Path(str(resources.files("ggslam"))) / "configs"]
     return {path.stem: path for folder in folders if folder.is_dir() for path in sorted(folder.glob("*.yaml"))}
 
 
