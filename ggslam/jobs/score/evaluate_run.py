@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.score.scoring import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.metrics import MetricsRecord
 
 
 def evaluate_run(
@@ -20,7 +20,7 @@ def evaluate_run(
     lpips: bool = True,
     every: int = 1,
     observer: Observer | None = None,
-) -> dict[str, Any]:
+) -> MetricsRecord:
     """Scores a run against its recording, as `ggslam eval` does: trajectory, images, objects.
 
     Args:
