@@ -49,9 +49,9 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from ggslam.synthetic import write_synthetic_sequence
 
     package = Path(ggslam.__file__).parent
-    sources = sorted([*package.glob("synthetic/*.py"), *package.glob("scene/*.py"), Path(__file__)])
+    sources = sorted([*package.glob("synthetic/*.py"), *package.glob("scene/*.py")])
     cached = build_once(
-        cached_folder("room", *sources),
+        cached_folder("room-24x160x120", *sources),
         lambda folder: write_synthetic_sequence(folder, frames=24, width=160, height=120, seed=0, noise=True),
     )
     return build_once(session_folder(tmp_path_factory) / "recordings" / "room", lambda to: shutil.copytree(cached, to))
