@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The codec's functions in the compiled core: structures of ggslam/native/src/codec/gpcc.hpp, field by field, and one slice's
-octree with what is coded over it. The functions release the interpreter's lock, so slices are coded side by side."""
+"""The codec's functions in the compiled core: structures of ggslam/native/src/codec/gpcc.hpp, field by field, and one
+slice's octree with what is coded over it. The functions release the interpreter's lock, so that slices are coded side
+by side."""
 
 from __future__ import annotations
 
