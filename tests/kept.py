@@ -6,7 +6,8 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,12 +15,19 @@ import pytest
 CHECKOUT = Path(__file__).parents[1]
 
 
+@contextmanager
+def one_at_a_time(place: Path) -> Iterator[None]:
+    """While one process builds what belongs at a place, others that want it wait."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with place.with_name(place.name + ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
 def build_once(folder: Path, build: Callable[[Path], object]) -> Path:
     """The folder, built by whoever comes first; the others wait. A build that broke off is begun again."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
     done = folder.with_name(folder.name + ".done")
-    with folder.with_name(folder.name + ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with one_at_a_time(folder):
         if not done.exists():
             if folder.exists():
                 folder.rename(folder.with_name(f"{folder.name}.broken-{os.getpid()}"))
