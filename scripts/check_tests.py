@@ -4,7 +4,7 @@
 python scripts/check_tests.py                  # all of them; says caught or missed, by which test, and how long it took
 python scripts/check_tests.py tracker codec    # some
 python scripts/check_tests.py --list           # what would be broken
-python scripts/check_tests.py --nearby         # asks the tests of the same room only, not the whole suite after them
+python scripts/check_tests.py --nearby         # asks only the tests that should notice, not all others after them
 
 A line of compiled code is compiled again (with ccache, where there is one). The copy is made once and thrown away.
 Exits with 1 if a fault was missed.
@@ -36,7 +36,7 @@ class Fault:
     file: in the checkout.
     line: the text that is replaced; it stands in the file once.
     broken: what takes its place.
-    tests: who should notice: files and folders within tests/.
+    tests: who should notice: files within tests/. Then their folders are asked, then all.
     """
 
     name: str
@@ -53,39 +53,39 @@ class Fault:
 
 FAULTS = (
     Fault("tracker", "ggslam/tracking/tracker.py", "if self._was_lost else inverse(self._pose) @ T",
-          "if self._was_lost else T @ inverse(self._pose)", ("tracking",)),
+          "if self._was_lost else T @ inverse(self._pose)", ("tracking/test_tracker.py",)),
     Fault("gicp", "ggslam/native/src/tracking/kernels/gicp.cpp", "factor = weight * ratio * ratio * s.plane_variance;",
-          "factor = weight * s.plane_variance;", ("tracking",)),
+          "factor = weight * s.plane_variance;", ("tracking/test_gicp.py",)),
     Fault("rasterizer", "ggslam/native/src/rendering/kernels/tiles_backward.cpp",
           "const Float alpha_gradient = t * dot - inverse * behind;", "const Float alpha_gradient = t * dot - behind;",
-          ("rendering",)),
+          ("rendering/test_cpu_gradients.py",)),
     Fault("loss", "ggslam/native/src/mapping/image_loss_api.cpp", "job.total += job.dssim_weight * (1.0 - job.ssim);",
-          "job.total += job.dssim_weight * (1.0 + job.ssim);", ("mapping",)),
+          "job.total += job.dssim_weight * (1.0 + job.ssim);", ("mapping/test_losses.py",)),
     Fault("insertion", "ggslam/mapping/cpu/insertion.py", "np.minimum(1 / cosine, s.max_slope)",
-          "np.minimum(cosine, s.max_slope)", ("mapping",)),
+          "np.minimum(cosine, s.max_slope)", ("mapping/test_insertion.py",)),
     Fault("map", "ggslam/scene/gaussian_map.py", 'self._storage["birth_keyframe"][rows].fill_(birth_keyframe)',
-          'self._storage["birth_keyframe"][rows].fill_(0)', ("scene", "mapping")),
+          'self._storage["birth_keyframe"][rows].fill_(0)', ("scene/test_gaussian_map.py",)),
     Fault("pose-graph", "ggslam/loops/condensed.py", "corrections[node] = self.covariances[node] @ push",
-          "corrections[node] = self.covariances[k] @ push", ("loops",)),
+          "corrections[node] = self.covariances[k] @ push", ("loops/test_pose_graph.py",)),
     Fault("codec", "ggslam/native/src/codec/kernels/quantiser.hpp", "return (q * step_[component] + 128) >> 8;",
-          "return (q * step_[component]) >> 8;", ("coding",)),
+          "return (q * step_[component]) >> 8;", ("coding/test_golden_streams.py", "coding/test_attribute_coder.py")),
     Fault("tsdf", "ggslam/native/src/volumes/kernels/tsdf_voxels.cpp",
           "const Float total = weight + measured, share = measured / total;",
-          "const Float total = weight + measured, share = weight / total;", ("volumes",)),
+          "const Float total = weight + measured, share = weight / total;", ("volumes/test_tsdf_fusion.py",)),
     Fault("association", "ggslam/objects/association.py", "within >= _CANDIDATE, within + covers, within - 2)",
-          "within >= _CANDIDATE, within, within - 2)", ("objects",)),
+          "within >= _CANDIDATE, within, within - 2)", ("objects/test_association.py",)),
     Fault("formats", "ggslam/formats/gaussian_ply.py",
           "channel_major = gaussians.sh[:, 1:].transpose(1, 2).reshape(count, 3 * rest)",
-          "channel_major = gaussians.sh[:, 1:].reshape(count, 3 * rest)", ("formats",)),
+          "channel_major = gaussians.sh[:, 1:].reshape(count, 3 * rest)", ("formats/test_gaussian_ply.py",)),
     Fault("sequences", "ggslam/sequences/pose_files.py", "stack[i] = T if reason is None else np.nan", "stack[i] = T",
-          ("sequences",)),
+          ("sequences/test_bad_input.py",)),
     Fault("scores", "ggslam/evaluation/trajectory.py", "T[:3, 3] = target_mean - scale * R @ source_mean",
-          "T[:3, 3] = target_mean - source_mean", ("evaluation",)),
+          "T[:3, 3] = target_mean - source_mean", ("evaluation/test_trajectory_scores.py",)),
     Fault("records", "ggslam/runs/folder.py", '"complete": error is None, "stopped_by": error})',
-          '"complete": True, "stopped_by": error})', ("runs", "slam", "cli")),
-    Fault("settings", "ggslam/slam/config.py", '"sh_degree": (0, 3)', '"sh_degree": (0, 5)', ("slam",)),
-    Fault("atomic", "ggslam/system/atomic.py", "temporary.unlink(missing_ok=True)", "pass", ("system",)),
-    Fault("cli", "ggslam/cli/run_command.py", "if value is not None)]", "if value)]", ("cli",)),
+          '"complete": True, "stopped_by": error})', ("runs/test_run_folder.py", "cli/test_run.py")),
+    Fault("settings", "ggslam/slam/config.py", '"sh_degree": (0, 3)', '"sh_degree": (0, 5)', ("slam/test_config.py",)),
+    Fault("atomic", "ggslam/system/atomic.py", "temporary.unlink(missing_ok=True)", "pass", ("system/test_atomic.py",)),
+    Fault("cli", "ggslam/cli/run_command.py", "if value is not None)]", "if value)]", ("cli/test_run.py",)),
 )  # fmt: skip
 
 
@@ -106,7 +106,7 @@ def environment(copy: Path) -> dict[str, str]:
     if shutil.which("ccache"):
         # With paths as seen from the copy, so that what one copy compiled serves the next.
         given |= {"CMAKE_CXX_COMPILER_LAUNCHER": "ccache", "CCACHE_BASEDIR": str(copy), "CCACHE_NOHASHDIR": "1"}
-    return {**given, **os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    return {**given, **os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": ""}
 
 
 def compile_core(copy: Path) -> None:
@@ -149,8 +149,13 @@ def check(fault: Fault, copy: Path, nearby: bool) -> str | None:
     try:
         if fault.compiled:
             compile_core(copy)
-        near = [f"tests/{name}" for name in fault.tests if (copy / "tests" / name).exists()]
-        return failed_test(copy, near) or (None if nearby else failed_test(copy, ["tests"]))
+        near = [f"tests/{name}" for name in fault.tests]
+        rooms = sorted({str(Path(name).parent) for name in near})
+        for tests in [near] if nearby else [near, rooms, ["tests"]]:
+            noticed = failed_test(copy, tests)
+            if noticed is not None:
+                return noticed
+        return None
     finally:
         path.write_text(whole)
         if fault.compiled:  # the compiled core of the true checkout
@@ -161,7 +166,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="faults to check; default: all")
     parser.add_argument("--list", action="store_true", help="say what would be broken")
-    parser.add_argument("--nearby", action="store_true", help="ask the tests of the same room only")
+    parser.add_argument("--nearby", action="store_true", help="ask only the tests that should notice")
     arguments = parser.parse_args()
     unknown = set(arguments.names) - {fault.name for fault in FAULTS}
     if unknown:
