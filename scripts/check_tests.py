@@ -83,7 +83,8 @@ FAULTS = (
           "T[:3, 3] = target_mean - source_mean", ("evaluation/test_trajectory_scores.py",)),
     Fault("records", "ggslam/runs/folder.py", '"complete": error is None, "stopped_by": error})',
           '"complete": True, "stopped_by": error})', ("runs/test_run_folder.py", "cli/test_run.py")),
-    Fault("settings", "ggslam/slam/config.py", '"sh_degree": (0, 3)', '"sh_degree": (0, 5)', ("slam/test_config.py",)),
+    Fault("settings", "ggslam/slam/config.py", "sh_degree: int = setting(0, 0, 3,",
+          "sh_degree: int = setting(0, 0, 5,", ("slam/test_config.py",)),
     Fault("atomic", "ggslam/system/atomic.py", "temporary.unlink(missing_ok=True)", "pass", ("system/test_atomic.py",)),
     Fault("cli", "ggslam/cli/run_command.py", "if value is not None)]", "if value)]", ("cli/test_run.py",)),
 )  # fmt: skip
