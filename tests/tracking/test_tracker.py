@@ -13,6 +13,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
+from ggslam.tracking.engine import CpuTrackingEngine
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.settings import DepthNoise, PhotometricSettings, RecoverySettings, TrackerSettings
