@@ -20,7 +20,18 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-console = Console()
+from ggslam.cli.argument_names import with_options
+
+
+class CommandConsole(Console):
+    """Prints what the library says with options in place of the arguments that it names."""
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        """As `rich.console.Console.print`."""
+        super().print(*(with_options(item) if isinstance(item, str) else item for item in objects), **how)
+
+
+console = CommandConsole()
 
 LINE_EVERY_S = 10.0
 """Seconds between two lines of progress where output is no terminal."""

@@ -91,8 +91,8 @@ def localize(
             sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
             on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
         ),
-        start=start_pose, no_start=no_start_pose, full=full_map, out=out, radius=radius, voxel=voxel, columns=columns,
-        threads=threads,
+        start_pose=start_pose, no_start_pose=no_start_pose, full=full_map, out=out, radius=radius, voxel=voxel,
+        columns=columns, threads=threads,
     )  # fmt: skip
     with progress_bar() as bar:
         report = locate_all(request, ProgressObserver(bar))

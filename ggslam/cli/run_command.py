@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ggslam.cli import options
+from ggslam.cli import options, settings_help
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
 from ggslam.cli.summary import print_scores
@@ -38,6 +38,8 @@ EPILOG = """
   ggslam run data/redkitchen --scale 0.5 --view
 
   ggslam run realsense: --stop 900 --record data/desk --out runs/desk
+
+  ggslam run --help-settings
 
   ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
 """
@@ -126,6 +128,8 @@ def run(
     port: options.Port = 8080,
     evaluate: Evaluate = True,
     overwrite: Overwrite = False,
+    help_settings: settings_help.HelpSettings = False,
+    help_setting: settings_help.HelpSetting = None,
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
     from ggslam.runs.recordings import SequenceRequest
