@@ -26,7 +26,8 @@ HEAD = """# Commands
 
 Every command has `--help`, which says the same as this page. An option means the same in all commands: `--out` is what
 to write, `--sequence` where the recording is now, `--start`, `--stop`, `--stride` and `--scale` select frames and
-resize images, `--set NAME=VALUE` overrides a [setting](settings.md), `--config` names a [preset](presets.md) or a YAML file.
+resize images, `--set NAME=VALUE` overrides a [setting](settings.md), `--config` names a [preset](presets.md) or a YAML
+file.
 
 Exit codes: 0 done, 2 something in the input is wrong (one line says what and where), 1 ggslam or the machine is at
 fault, 130 interrupted. Where output is no terminal, long commands print a line of progress every 10 seconds.
