@@ -56,7 +56,7 @@ class Matches:
     def __len__(self) -> int:
         return len(self.old)
 
-    def agreeing(
+    def agree(
         self, T_old_new: np.ndarray, camera: Camera, settings: RegistrationSettings, slack: float = 1.0
     ) -> np.ndarray:
         """Which matches a pose [..., 4, 4] explains, bool [..., m]; `slack` widens both limits."""
@@ -120,14 +120,14 @@ def register(old: Landmarks, new: Landmarks, camera: Camera, settings: Registrat
     hypotheses = _hypotheses(matches, settings) if len(matches) >= FEWEST else np.zeros((0, 4, 4))
     if not len(hypotheses):
         return nothing
-    agreeing = matches.agreeing(hypotheses, camera, settings, slack=2.0)
+    agreeing = matches.agree(hypotheses, camera, settings, slack=2.0)
     best = int(agreeing.sum(1).argmax())
     T, inliers = hypotheses[best], agreeing[best]
     for _ in range(3):
         if inliers.sum() < FEWEST:
             return nothing
-        T = _refined(T, matches, inliers, camera)
-        inliers = matches.agreeing(T, camera, settings)
+        T = _refine(T, matches, inliers, camera)
+        inliers = matches.agree(T, camera, settings)
     return Registration(T, matches, inliers)
 
 
@@ -142,7 +142,7 @@ def _hypotheses(matches: Matches, settings: RegistrationSettings) -> np.ndarray:
     return fit_similarity(b, a)[0]
 
 
-def _refined(T_old_new: np.ndarray, matches: Matches, inliers: np.ndarray, camera: Camera) -> np.ndarray:
+def _refine(T_old_new: np.ndarray, matches: Matches, inliers: np.ndarray, camera: Camera) -> np.ndarray:
     """The pose with the smallest reprojection error of the inliers near a first one."""
     T = inverse(T_old_new)
     rotation, translation = cv2.solvePnPRefineLM(

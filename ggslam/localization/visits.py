@@ -90,7 +90,7 @@ class FrameSights:
         place = self._places.describe(View(item.color, item.depth, T_world_sensor))
         normals = found.normals @ T_world_sensor[:3, :3].T
         small = item.depth[::_STEP, ::_STEP].copy()
-        looked_at = partial(_looked_at, small, self.camera, inverse(T_world_sensor))
+        looked_at = partial(_in_view, small, self.camera, inverse(T_world_sensor))
         points = transformed(found.points, T_world_sensor)
         return Sight(points, normals, looked_at, StoredView(place, T_world_sensor))
 
@@ -111,7 +111,7 @@ class ScanSights:
         return Sight(points, normals, lambda others: np.ones(len(others), bool))
 
 
-def _looked_at(depth: np.ndarray, camera: Camera, T_camera_world: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _in_view(depth: np.ndarray, camera: Camera, T_camera_world: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Whether world points [n, 3] are in view of every `_STEP`-th pixel of a depth image and not behind what is there,
     bool [n]."""
     x, y, z = transformed(points.astype(np.float64), T_camera_world).T

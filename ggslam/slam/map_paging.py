@@ -161,7 +161,7 @@ class MapPager:
         found = []
         for begin in range(0, len(numbers), _AT_ONCE):
             asked = numbers[begin : begin + _AT_ONCE]
-            lacking = self.cells.needed(self._frustums(self._views(asked)))
+            lacking = self.cells.visible_cells(self._frustums(self._views(asked)))
             found += [number for number, keys in zip(asked, lacking, strict=True) if not keys]
         return found or [numbers[-1]]  # the budget is less than one view: the newest is trained on what there is
 
@@ -184,7 +184,7 @@ class MapPager:
     def _bring_while_there_is_room(self, numbers: Iterable[int]) -> None:
         assert self.cells is not None
         for number in numbers:
-            keys = self.cells.needed(self._frustums(self._views([number])))[0]
+            keys = self.cells.visible_cells(self._frustums(self._views([number])))[0]
             if len(self.map) + self.cells.count_in(keys) > self._rows():
                 return
             self._move_in(keys)
@@ -284,7 +284,7 @@ class MapPager:
         frustums = self._frustums(views)
         wanted: list[CellKey] = []
         if self.cells is not None:
-            wanted = sorted({key for keys in self.cells.needed(frustums) for key in keys})
+            wanted = sorted({key for keys in self.cells.visible_cells(frustums) for key in keys})
         incoming = 0 if self.cells is None else self.cells.count_in(wanted)
         excess = len(self.map) + incoming + room - self._rows()
         if excess > 0:
