@@ -25,7 +25,7 @@ from ggslam.system.atomic import write_text
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
-from ggslam.tracking.tracker import TrackerSettings
+from ggslam.tracking.settings import TrackerSettings
 from ggslam.volumes.volume_settings import VolumeSettings
 
 
@@ -132,20 +132,20 @@ def load_config(preset_or_file: str | Path | None = None, overrides: list[str] |
     for override in overrides or []:
         name, equals, text = override.partition("=")
         if not equals:
-            raise ConfigError(f"--set {override}: expected name=value")
+            raise ConfigError(f"`overrides` {override}: expected name=value")
         try:
             value = yaml.safe_load(text)
         except yaml.YAMLError as error:
-            raise ConfigError(f"--set {override}: cannot be read as a value: {error}") from None
+            raise ConfigError(f"`overrides` {override}: cannot be read as a value: {error}") from None
         _assign(values, name.strip().split("."), value, override)
-    return config_from_dict(values, "--set" if overrides else origin)
+    return config_from_dict(values, "`overrides`" if overrides else origin)
 
 
 def _assign(values: dict[str, Any], names: list[str], value: Any, override: str) -> None:
     for name in names[:-1]:
         values = values.setdefault(name, {})
         if not isinstance(values, dict):
-            raise ConfigError(f"--set {override}: {name} is a value, not a group")
+            raise ConfigError(f"`overrides` {override}: {name} is a value, not a group")
     values[names[-1]] = value
 
 

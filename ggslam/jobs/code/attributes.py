@@ -86,7 +86,7 @@ def _note_what_is_left_out(cloud: ColoredCloud, notes: list[str]) -> None:
         names = cloud.left_out if len(cloud.left_out) < 6 else (*cloud.left_out[:4], "...", cloud.left_out[-1])
         notes.append(f"left out {', '.join(names)}: neither position nor colour nor reflectance nor whole numbers")
         if {"opacity", "scale_0", "rot_0"} <= set(cloud.left_out):
-            notes.append("these are Gaussians: --preset splat codes them whole")
+            notes.append("these are Gaussians: `preset` splat codes them whole")
     if cloud.nowhere:
         notes.append(f"left out {cloud.nowhere} points that have no position (not a number)")
 
