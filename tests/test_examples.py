@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import runpy
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -45,18 +46,23 @@ def ggslam(*arguments: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the first half of the room."""
-    out = tmp_path_factory.mktemp("examples") / "run"
-    ggslam("run", room, "--stop", 12, "--config", "fast-cpu", "--no-eval", "--out", out)
-    return out
+def finished(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the first part of the room."""
+    return Path(shutil.copytree(room_run.path, tmp_path_factory.mktemp("examples") / "run"))
 
 
 def test_run_slam(run: Program, room: Path, tmp_path: Path) -> None:
     said = run("run_slam.py", room, "out")
-    assert "frame 0: keyframe" in said and "24 frames" in said
+    assert "frame 0: keyframe at [0. 0. 0.]" in said and "24 frames" in said and "sofa (" in said
     assert len(read_trajectory(tmp_path / "out" / "trajectory.txt")) == 24
     assert len(read_gaussian_ply(tmp_path / "out" / "map.ply")) > 1000
+
+
+def test_train_gaussians(run: Program, room: Path, tmp_path: Path) -> None:
+    said = run("train_gaussians.py", room, "trained.ply", 4, 12)
+    before, after = map(float, re.findall(r"PSNR ([\d.]+) dB before, ([\d.]+) dB after", said)[0])
+    assert after > before + 4
+    assert len(read_gaussian_ply(tmp_path / "trained.ply")) > 1000
 
 
 def test_own_camera(run: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

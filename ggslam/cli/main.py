@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import typer
 from rich.console import Console
 from rich.markup import escape
+from typer.core import TyperGroup
 
 from ggslam import __version__
 from ggslam.cli import (
@@ -29,9 +31,23 @@ from ggslam.cli import (
     view_command,
     volumes_command,
 )
+from ggslam.cli.argument_names import with_options
+from ggslam.cli.old_names import Command
 from ggslam.errors import GgslamError
 
+
+class _Commands(TyperGroup):
+    def invoke(self, context: Any) -> Any:
+        """Runs a command; errors that name arguments name options from here on."""
+        try:
+            return super().invoke(context)
+        except GgslamError as error:
+            error.args = (with_options(str(error)),)
+            raise
+
+
 app = typer.Typer(
+    cls=_Commands,
     name="ggslam",
     help="RGB-D Gaussian SLAM on two CPU cores: a recording in; trajectory, Gaussian map and scores out.",
     no_args_is_help=True,
@@ -68,7 +84,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
 }  # fmt: skip
 for _name, (_function, _epilog) in _COMMANDS.items():
-    _class = edit_command.EditCommand if _name == "edit" else None
+    _class = edit_command.EditCommand if _name == "edit" else Command
     app.command(_name, cls=_class, epilog=_epilog, no_args_is_help=_name != "doctor")(_function)
 
 

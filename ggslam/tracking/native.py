@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tracking functions of the compiled core: structures of ggslam/native/src/tracking/tracking_types.hpp, field by field."""
+"""The tracking functions of the compiled core: structures of native/src/tracking/tracking_types.hpp, field by field."""
 
 from __future__ import annotations
 

@@ -16,6 +16,7 @@ from typer.testing import CliRunner, Result
 from ggslam.cli.main import app
 from ggslam.errors import GgslamError
 from ggslam.formats.triangle_mesh import read_mesh
+from ggslam.runs.folder import RunFolder
 from ggslam.volumes.octomap_files import read_octomap
 from ggslam.volumes.tsdf_file import load_tsdf
 
@@ -45,7 +46,7 @@ def one_error(result: Result, *words: str) -> None:
 @pytest.fixture(scope="module")
 def of_recording(room: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     out = tmp_path_factory.mktemp("volumes") / "room"
-    wanted = ["--esdf", "--occupancy", 0.1, "--object-meshes", "--report", "--speeds", "1,3"]
+    wanted = ["--esdf", "--occupancy", 0.1, "--object-meshes", "--driving", "--speeds", "1,3"]
     return out, made(room, "--out", out, *QUICK, *wanted)
 
 
@@ -102,12 +103,11 @@ def test_the_report_is_the_equation(of_recording: tuple[Path, str]) -> None:
     assert f"{3 * latency:.2f} m" in printed and f"{distance:.2f} m" in printed
 
 
-def test_a_run_gives_its_poses_and_its_objects(room: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    assert ggslam("run", room, "--out", run, "--stop", 12, "--iterations", 1, "--no-eval").exception is None
+def test_a_run_gives_its_poses_and_its_objects(room_run: RunFolder, room: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(room_run.path, tmp_path / "run"))
     printed = made(run, *QUICK, "--mesh", tmp_path / "meshes" / "room.ply")
     found = record(run / "volumes")
-    assert found["frames"] == 12 and found["mesh"]["objects"]
+    assert found["frames"] == 10 and found["mesh"]["objects"]
     assert (tmp_path / "meshes" / "room.ply").is_file() and not (run / "volumes" / "esdf.png").exists()
     assert str(run / "volumes") in printed.replace("\n", "")
     one_error(ggslam("volumes", run, "--mesh", run / "points.ply"), "points.ply", "run")
@@ -199,7 +199,7 @@ def test_what_was_there_stays_if_anything_goes_wrong(
 
     with monkeypatch.context() as patched:
         patched.setattr(DistanceField, "update", second_is_interrupted)
-        assert ggslam("volumes", room, "--out", out, *few, "--esdf", "--report").exit_code == 130
+        assert ggslam("volumes", room, "--out", out, *few, "--esdf", "--driving").exit_code == 130
     found = record(out)
     assert found["frames"] == 1 and "KeyboardInterrupt" in found["stopped_by"]
     assert (out / "notes.txt").is_file() and not (out / "occupancy.bt").exists()

@@ -63,14 +63,14 @@ def test_damage_never_does_harm(streams: list[bytes]) -> None:
     outcomes = {"decoded": 0, "refused": 0}
     for _ in range(600):
         data = damaged(streams[int(rng.integers(len(streams)))], rng)
-        start = time.perf_counter()
+        start = time.process_time()
         try:
             decode_cloud(data, workers=1)
             outcomes["decoded"] += 1
         except FormatError as error:
             assert str(error)
             outcomes["refused"] += 1
-        assert time.perf_counter() - start < 5
+        assert time.process_time() - start < 5
     assert outcomes["refused"] > 300
 
 
@@ -111,7 +111,7 @@ def test_made_up_payloads(fill: int | None) -> None:
         coder.build(rng.integers(0, 1 << depth, (50, 3)), depth)
         for components in (1, 3):
             try:
-                values = coder.decode_attribute(RahtSettings(components, 8, 51, 51, 1, 2, 6, 0.0), payload)
+                values = coder.decode_attribute(RahtSettings(components, 8, 51, 51, 1, 2, 6, 0, 0.0), payload)
                 assert values.min() >= 0 and values.max() <= 255
             except FormatError:
                 pass

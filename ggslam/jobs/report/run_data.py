@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What reports know of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.runs.records.timing import TimingRecord
+
+
+@dataclass(frozen=True)
+class LevelAxes:
+    """Directions in which a path is shown.
+
+    Attributes:
+        axes: float [3, 3], rows right, forward and up, unit vectors in the run's world; the first two are level.
+        source: what `up` was taken from, some words.
+        floor: height of the floor over the world's origin along up, metres; None: no floor was found.
+    """
+
+    axes: np.ndarray = field(default_factory=lambda: np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
+    source: str = "the first camera"
+    floor: float | None = None
+
+
+@dataclass(frozen=True)
+class Path3D:
+    """Where the camera was.
+
+    Attributes:
+        frames: int [N], indices of the frames that were located.
+        seconds: float [N], since the first of them.
+        positions: float [N, 3] metres, in the run's world: the first camera (x right, y down, z forward).
+        truth: float [N, 3], true positions laid upon these (rigidly, least squares), NaN where unknown; None: there
+            is no ground truth.
+        error_m: float [N], distance to the truth so laid, metres.
+        reason: why there is no truth.
+        level: the directions in which it is shown.
+    """
+
+    frames: np.ndarray
+    seconds: np.ndarray
+    positions: np.ndarray
+    truth: np.ndarray | None = None
+    error_m: np.ndarray | None = None
+    reason: str = ""
+    level: LevelAxes = field(default_factory=LevelAxes)
+
+
+@dataclass(frozen=True)
+class FrameView:
+    """Pictures of one frame, uint8 [H, W, 3], by what they show."""
+
+    frame: int
+    pictures: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class RunData:
+    """A run as its folder tells it; what an older run did not write is empty.
+
+    Attributes:
+        name: of its folder.
+        path: of its folder.
+        camera_path: where the camera was.
+        tracked: of every frame: `frame`, `status`, `overlap`, `rmse_m` (arrays).
+        keyframes: int [K], frames that became keyframes.
+        steps: columns of steps.csv.
+        scores: columns of frames.csv, scores frame by frame.
+        metrics: the scores; None: it was not scored.
+        timing: where its time went.
+        settings: name -> value, all of them.
+        defaults: name -> value that a fresh run would have.
+        recording: where its recording is and how it was read.
+        mark: what it was made with.
+        warnings: what a user should know.
+        views: pictures.
+    """
+
+    name: str
+    path: str
+    camera_path: Path3D
+    tracked: dict[str, np.ndarray]
+    keyframes: np.ndarray
+    steps: dict[str, np.ndarray] = field(default_factory=dict)
+    scores: dict[str, np.ndarray] = field(default_factory=dict)
+    metrics: MetricsRecord | None = None
+    timing: TimingRecord | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+    defaults: dict[str, Any] = field(default_factory=dict)
+    recording: SequenceRecord | None = None
+    mark: RunRecord = field(default_factory=RunRecord)
+    warnings: list[str] = field(default_factory=list)
+    views: list[FrameView] = field(default_factory=list)
+
+    def recording_name(self) -> str:
+        """Where its recording is."""
+        return "an unknown recording" if self.recording is None else self.recording.open.path
+
+
+STAGES = (
+    ("tracking", "tracking", "locating each frame"),
+    ("insertion", "inserting", "new Gaussians of keyframes, pruning"),
+    ("forward", "rendering", "the map from a keyframe's pose"),
+    ("loss", "loss", "comparing with the keyframe's images"),
+    ("backward", "gradients", "back through the renderer, optimiser"),
+    ("identity", "objects", "identity vectors of the Gaussians"),
+    ("identity_finish", "objects, last", "final identity steps after the last frame"),
+    ("other", "other", "reading frames, loops, waiting"),
+)
+
+
+def stage_seconds(timing: TimingRecord | None) -> list[tuple[str, str, float]]:
+    """Where a run's time went: (stage, what it does, seconds), nothing that took no time.
+
+    In a real-time run stages of tracker and mapper go on side by side: they may add up to more than wall time.
+    """
+    if timing is None:
+        return []
+    wall = timing.wall_s + timing.refinement_s
+    spent = {"tracking": timing.tracking_s}
+    spent |= {key: getattr(timing.mapping, key) for key, *_ in STAGES[1:-1]}
+    within = sum(seconds for key, seconds in spent.items() if key != "identity_finish")
+    spent["other"] = max(0.0, wall - within)
+    return [(name, words, spent[key]) for key, name, words in STAGES if spent[key] > 0]

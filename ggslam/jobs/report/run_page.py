@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of one run."""
+
+from __future__ import annotations
+
+from ggslam.jobs.report.metric_words import MEANINGS, METRICS, TILES
+from ggslam.jobs.report.run_data import RunData, stage_seconds
+from ggslam.jobs.report.run_plots import (
+    error_plot,
+    loss_plots,
+    map_plots,
+    score_plots,
+    time_plots,
+    tracking_plots,
+    trajectory_plots,
+)
+from ggslam.reporting import page as p
+from ggslam.reporting.page import Html
+from ggslam.runs.records.metrics import SETS, MetricsRecord, SegmentationRecord
+from ggslam.runs.records.record import Record
+
+FOOTER = "Written by ggslam. The page needs nothing but itself: no network, no other files."
+_OPEN_VIEWS = 2
+"""Frames that are shown at once; the others are folded away."""
+_NO_STEPS = "This run did not note its steps (it is of an older version, or was edited); there is no course over time."
+
+
+def run_page(run: RunData) -> str:
+    """The whole page as text."""
+    parts = [
+        ("scores", "Scores", _scores(run)), ("views", "Views", _views(run)), ("trajectory", "Trajectory", _path(run)),
+        ("quality", "Image quality", _quality(run)), ("tracking", "Tracking", _tracking(run)),
+        ("time", "Time", _time(run)), ("map", "Map and memory", _map(run)), ("losses", "Losses", _losses(run)),
+        ("meaning", "What the numbers mean", p.definitions(MEANINGS)), ("settings", "Settings", _settings(run)),
+        ("versions", "Recording and versions", _versions(run)),
+    ]  # fmt: skip
+    content = [_tiles(run), _warnings(run), *(p.section(title, anchor, body) for anchor, title, body in parts)]
+    links = [(anchor, title) for anchor, title, _ in parts]
+    return p.page(run.name, _lead(run), content, links, FOOTER)
+
+
+def _lead(run: RunData) -> str:
+    size = "" if run.recording is None else f" at {run.recording.camera.width}x{run.recording.camera.height}"
+    frames = len(run.tracked.get("frame", ()))
+    return f"{frames} frames of {run.recording_name()}{size}, {len(run.keyframes)} keyframes"
+
+
+def _tiles(run: RunData) -> Html:
+    found = [(m.text(m.of(run)), m.unit, m.name) for m in METRICS if m.name in TILES and m.of(run) is not None]
+    return p.tiles(found)
+
+
+def _warnings(run: RunData) -> Html:
+    if not run.warnings:
+        return Html("")
+    return p.tag("div", p.tag("b", "To know of this run"), p.bullets(run.warnings), class_="warnings")
+
+
+_IMAGE_COLUMNS = (
+    ("frames", "frames", 1.0, ".0f"), ("PSNR, dB", "psnr", 1.0, ".2f"), ("unmasked", "psnr_unmasked", 1.0, ".2f"),
+    ("SSIM", "ssim", 1.0, ".3f"), ("LPIPS", "lpips", 1.0, ".3f"), ("depth L1, cm", "depth_l1_m", 100.0, ".2f"),
+)  # fmt: skip
+
+
+def _scores(run: RunData) -> Html:
+    if run.metrics is None:
+        return p.tag("p", "This run was not scored; ggslam eval does that, and writes this page anew.")
+    parts = [_image_scores(run.metrics), _trajectory_scores(run, run.metrics)]
+    if run.metrics.segmentation is not None:
+        parts.append(_object_scores(run.metrics.segmentation))
+    return p.joined(parts)
+
+
+def _numbers(scores: Record | None, columns: tuple[tuple[str, str, float, str], ...]) -> list[str]:
+    found = [(None if scores is None else scores.number(key), factor, form) for _, key, factor, form in columns]
+    return ["-" if value is None else format(factor * value, form) for value, factor, form in found]
+
+
+def _image_scores(metrics: MetricsRecord) -> Html:
+    sets = metrics.images.sets()
+    rows = [[name.replace("_", " "), *_numbers(scores, _IMAGE_COLUMNS)] for name, scores in sets.items()]
+    return p.table(["images of", *(title for title, *_ in _IMAGE_COLUMNS)], rows)
+
+
+def _trajectory_scores(run: RunData, metrics: MetricsRecord) -> Html:
+    scores = metrics.trajectory
+    if scores is None:
+        return p.tag("p", f"No trajectory scores: {run.camera_path.reason or 'too few frames have both poses'}.")
+    columns = (
+        ("ATE RMSE, cm", "ate_rmse_m", 100.0, ".2f"), ("mean", "ate_mean_m", 100.0, ".2f"),
+        ("median", "ate_median_m", 100.0, ".2f"), ("largest", "ate_max_m", 100.0, ".2f"),
+        ("not aligned", "ate_raw_rmse_m", 100.0, ".2f"), ("RPE, cm", "rpe_trans_m", 100.0, ".2f"),
+        ("RPE, deg", "rpe_rot_deg", 1.0, ".3f"), ("frames", "frames_compared", 1.0, ".0f"),
+    )  # fmt: skip
+    return p.table(["", *(title for title, *_ in columns)], [["trajectory", *_numbers(scores, columns)]])
+
+
+def _object_scores(scores: SegmentationRecord) -> Html:
+    columns = (
+        ("objects", "objects", 1.0, ".0f"), ("mIoU, %", "miou", 100.0, ".1f"),
+        ("boundary", "boundary_miou", 100.0, ".1f"), ("pixels right, %", "accuracy", 100.0, ".1f"),
+        ("mIoU by votes", "votes_miou", 100.0, ".1f"),
+    )  # fmt: skip
+    rows = [[n.replace("_", " "), *_numbers(getattr(scores, n), columns)] for n in SETS]
+    overall = p.table(["objects of", *(title for title, *_ in columns)], rows)
+    each = [
+        [i, o.name or "", *_numbers(o, (("", "iou", 100.0, ".1f"),))] for i, o in scores.per_object.items()
+    ]
+    listed = p.table(["id", "name", "IoU, %"], each, sorts=True, text_columns=(1,))
+    return p.joined([overall, p.tag("details", p.tag("summary", f"{len(each)} objects one by one"), listed)])
+
+
+def _views(run: RunData) -> Html:
+    if not run.views:
+        return p.tag("p", "There are no pictures: no frame of this run was located.")
+    shown = [
+        p.tag("div", p.tag("h3", f"frame {view.frame}"), p.cells(view.pictures.items()), class_="view")
+        for view in run.views
+    ]
+    more = shown[_OPEN_VIEWS:]
+    folded = [p.tag("details", p.tag("summary", f"{len(more)} more"), *more)] if more else []
+    return p.joined([*shown[:_OPEN_VIEWS], *folded])
+
+
+def _path(run: RunData) -> Html:
+    words = (
+        "Forward is where the first camera looked, right is to its right, both level; 0 is where it was. Up is that of "
+        f"{run.camera_path.level.source}. One metre is as long along both axes."
+    )
+    missing = []
+    if run.camera_path.truth is None:
+        missing = [p.tag("p", f"No comparison with true poses: {run.camera_path.reason}.")]
+    return p.joined(
+        [p.tag("p", words, class_="note"), p.figures([*trajectory_plots([run]), error_plot([run])]), *missing]
+    )
+
+
+def _quality(run: RunData) -> Html:
+    if not run.scores:
+        return p.tag("p", "This run was not scored; ggslam eval does that, and writes this page anew.")
+    missing = [p.tag("p", f"{plot.title} was not scored.") for plot in score_plots([run]) if not plot.has_data()]
+    return p.joined([p.figures(score_plots([run])), *missing])
+
+
+def _tracking(run: RunData) -> Html:
+    counts = {name: int((run.tracked["status"] == name).sum()) for name in dict.fromkeys(run.tracked["status"])}
+    words = ", ".join(f"{count} {name}" for name, count in counts.items())
+    return p.joined([p.tag("p", f"Frames: {words}."), p.figures(tracking_plots([run]))])
+
+
+def _time(run: RunData) -> Html:
+    stages = stage_seconds(run.timing)
+    if not stages:
+        return p.tag("p", "This run did not note where its time went.")
+    total = sum(seconds for *_, seconds in stages)
+    bar = p.tag("div", *(
+        p.tag("i", class_=f"fill{n}", style=f"flex:{seconds:.4f} 0 0", title=f"{name}: {seconds:.2f} s")
+        for n, (name, _, seconds) in enumerate(stages)
+    ), class_="bar")  # fmt: skip
+    frames = 1 if run.timing is None else max(1, run.timing.frames)
+    rows = [
+        [p.joined([p.tag("span", class_=f"swatch fill{n}"), name]), f"{seconds:.2f}", f"{1000 * seconds / frames:.1f}",
+         f"{100 * seconds / total:.0f}", words] for n, (name, words, seconds) in enumerate(stages)
+    ]  # fmt: skip
+    listed = p.table(["stage", "seconds", "ms a frame", "%", ""], rows, text_columns=(4,))
+    course = p.figures(time_plots([run])) if run.steps else p.tag("p", _NO_STEPS)
+    return p.joined([bar, listed, course])
+
+
+def _map(run: RunData) -> Html:
+    return p.figures(map_plots([run])) if run.steps else p.tag("p", _NO_STEPS)
+
+
+def _losses(run: RunData) -> Html:
+    if not run.steps:
+        return p.tag("p", _NO_STEPS)
+    plots = loss_plots([run])
+    if not any(plot.has_data() for plot in plots):
+        return p.tag("p", "Nothing was trained: frames were located in the map as it was.")
+    return p.figures(plots)
+
+
+def _settings(run: RunData) -> Html:
+    if not run.settings:
+        return p.tag("p", "The settings of this run are not known.")
+    changed = {name for name, value in run.settings.items() if name in run.defaults and run.defaults[name] != value}
+    differing = [[name, str(run.settings[name]), str(run.defaults[name])] for name in sorted(changed)]
+    top = (
+        p.table(["setting", "this run", "default"], differing, text_columns=(1, 2))
+        if changed else p.tag("p", "All settings are the defaults.")
+    )  # fmt: skip
+    rows = [[name, str(value)] for name, value in run.settings.items()]
+    whole = p.table(["setting", "value"], rows, text_columns=(1,))
+    return p.joined([top, p.tag("details", p.tag("summary", f"All {len(rows)} settings"), whole)])
+
+
+def _versions(run: RunData) -> Html:
+    opened = {} if run.recording is None else {k: v for k, v in run.recording.open if v is not None}
+    rows = [["run folder", run.path], *([name, str(value)] for name, value in opened.items())]
+    rows += [[name, str(value)] for name, value in run.mark.versions().items()]
+    return p.table(["", ""], rows, text_columns=(1,))

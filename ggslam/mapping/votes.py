@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the votes that Gaussians carry say: the rendering weight each had under the mask ids it was seen with most. All
+of it happens on the map's device, and nothing waits for it."""
+
+from __future__ import annotations
+
+import torch
+
+from ggslam.scene.gaussian_map import GaussianMap
+
+
+def vote_labels(gaussians: GaussianMap) -> torch.Tensor:
+    """Object with the most votes of each Gaussian, int32 [N], 0 where there are none."""
+    return vote_shares(gaussians)[0]
+
+
+def vote_shares(gaussians: GaussianMap) -> tuple[torch.Tensor, torch.Tensor]:
+    """Object with the most votes of each Gaussian, int32 [N], and its share of all votes there, float32 [N]; 0 where
+    there are none."""
+    ids, weights = gaussians.vote_ids, gaussians.vote_weights
+    most, best = weights.max(1)
+    labels = torch.where(most > 0, ids.gather(1, best[:, None])[:, 0], 0)
+    total = sum(weights.unbind(1), torch.zeros_like(most))  # in this order on every device
+    return labels, most / total.clamp_min(1e-12)
+
+
+def merge_votes(gaussians: GaussianMap, alias: torch.Tensor) -> None:
+    """Replaces ids in the votes by `alias` (int32 [65536] on the map's device); slots that then name one object become
+    one."""
+    ids, weights = gaussians.vote_ids, gaussians.vote_weights
+    ids.copy_(alias[ids.long()])
+    weights.masked_fill_(ids == 0, 0)
+    for a in range(ids.shape[1]):
+        for b in range(a + 1, ids.shape[1]):
+            same = (ids[:, a] == ids[:, b]) & (ids[:, a] != 0)
+            weights[:, a] += torch.where(same, weights[:, b], 0)
+            ids[:, b].masked_fill_(same, 0)
+            weights[:, b].masked_fill_(same, 0)
