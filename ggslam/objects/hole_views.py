@@ -80,8 +80,8 @@ def depth_tolerance(depth: np.ndarray) -> np.ndarray:
 
 def look(kept: Gaussians, removed: Gaussians, views: Sequence[View], count: int) -> list[HoleView]:
     """The views in which the removed object covered most, at most `count`, less those that show little of it."""
-    rasterizer, both = CpuRasterizer(), marked(kept, removed)
-    seen = [_hole_view(kept, both, view, rasterizer) for view in facing(removed, views)]
+    rasterizer, both = CpuRasterizer(), mark_removed(kept, removed)
+    seen = [_hole_view(kept, both, view, rasterizer) for view in find_facing_views(removed, views)]
     areas = np.array([v.covered.sum() for v in seen], int)
     order = np.argsort(-areas, kind="stable")[:count]
     return [seen[i] for i in order if areas[i] > max(8, 0.05 * areas[order[0]])]
@@ -96,7 +96,7 @@ def looked_again(kept: Gaussians, views: Sequence[HoleView]) -> list[HoleView]:
     return out
 
 
-def marked(kept: Gaussians, removed: Gaussians) -> GaussianTensors:
+def mark_removed(kept: Gaussians, removed: Gaussians) -> GaussianTensors:
     """Both sets together with two features: the first is 1 for the removed, the second is 0."""
     tensors = {name: torch.cat([getattr(kept, name), getattr(removed, name)]) for name in PARAMETERS[:-1]}
     mark = torch.zeros(len(tensors["means"]), 2)
@@ -104,7 +104,7 @@ def marked(kept: Gaussians, removed: Gaussians) -> GaussianTensors:
     return GaussianTensors(**tensors, features=mark)
 
 
-def facing(gaussians: Gaussians, views: Sequence[View], most: int = 48) -> list[View]:
+def find_facing_views(gaussians: Gaussians, views: Sequence[View], most: int = 48) -> list[View]:
     """Views that have a good part of some Gaussians in the image, spread evenly if they are more than `most`."""
     means = gaussians.means.numpy()
     return spread([view for view in views if view.project(means)[2].mean() > 0.3], most)

@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ggslam.objects.hole_views import COVERED, View, depth_tolerance, marked, spread
+from ggslam.objects.hole_views import COVERED, View, depth_tolerance, mark_removed, spread
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import copies_of, keep_rows
 from ggslam.rendering.cpu import CpuRasterizer
@@ -76,7 +76,7 @@ def traces(kept: Gaussians, removed: Gaussians, views: Sequence[View]) -> np.nda
     own, means = removed.means.numpy(), kept.means.numpy()
     reach = float(np.linalg.norm(np.ptp(own, axis=0)))
     near = np.isfinite(cKDTree(own).query(means, distance_upper_bound=reach)[0])
-    both, rasterizer = marked(kept, removed), CpuRasterizer()
+    both, rasterizer = mark_removed(kept, removed), CpuRasterizer()
     alone = GaussianTensors(**{name: getattr(both, name)[: len(near)] for name in PARAMETERS})
     weights = torch.zeros(len(near), 3)
     for view in spread([view for view in views if view.project(means[near])[2].any()], _VIEWS):

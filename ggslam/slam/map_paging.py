@@ -92,7 +92,7 @@ class MapPager:
         sight = self._sights.add(T_world_camera, depth)
         self._bring([sight], max(self._new[1:][-_INSERTIONS:], default=0))
 
-    def inserted(self, keyframe: Keyframe, added: int, place_bytes: int = 0) -> None:
+    def finish_insertion(self, keyframe: Keyframe, added: int, place_bytes: int = 0) -> None:
         """After a keyframe was inserted and its points are in the surface: images are handed over, what is too much
         goes.
 

@@ -36,7 +36,7 @@ from ggslam.slam.saved_places import places_to_bytes
 from ggslam.slam.step_log import StepLog
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.tracking.keyframes import KeyframePolicy
-from ggslam.tracking.scale import scaled, scene_scale
+from ggslam.tracking.scale import scale_settings, scene_scale
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
@@ -221,7 +221,7 @@ class Slam:
 
     def use_scale(self, scale: float) -> None:
         """Fits the tracker to a scene of this size; before the first keyframe."""
-        self.scale, self.tracker.settings = scale, scaled(self.config.tracking, scale)
+        self.scale, self.tracker.settings = scale, scale_settings(self.config.tracking, scale)
         self.surface.settings = self.tracker.settings.target
 
     def _follow_moves(self) -> None:
@@ -277,4 +277,4 @@ class Slam:
             if correction is not None:
                 self._corrections.apply(correction, self.loops)
         if self.pager is not None:
-            self.pager.inserted(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
+            self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)

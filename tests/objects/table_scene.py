@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ggslam.mapping.cpu.insertion import new_gaussians, unexplained
+from ggslam.mapping.cpu.insertion import find_unexplained, new_gaussians
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.objects.hole_views import View
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
@@ -81,7 +81,7 @@ def build_table_scene() -> TableScene:
         where = np.ones(view.depth.shape, bool)
         if len(gaussians):
             out = rasterizer.forward(gaussians, CAMERA, inverse(pose), features=False)
-            where = unexplained(view.depth, out.alpha.numpy(), out.expected_depth.numpy(), settings)
+            where = find_unexplained(view.depth, out.alpha.numpy(), out.expected_depth.numpy(), settings)
         new = new_gaussians(view.color, view.depth, CAMERA, pose, where, settings)
         labels = view.mask.reshape(-1)[new.pixels].astype(np.int64)
         gaussians.insert(

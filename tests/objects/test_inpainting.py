@@ -19,7 +19,7 @@ from ggslam.objects.hole_refinement import Recorded
 from ggslam.objects.hole_views import HoleView, View
 from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
 from ggslam.objects.plane_filling import Chart, as_seen, paint
-from ggslam.objects.segmented_rows import copies_of, joined
+from ggslam.objects.segmented_rows import copies_of, join_gaussians
 from ggslam.objects.traces import drop_traces, places
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import RenderBuffers
@@ -160,7 +160,7 @@ def test_things_apart_leave_holes_of_their_own(table: TableScene) -> None:
     other.means += torch.tensor([1.0, 0, 0])
     floater = copies_of(cylinder, np.arange(len(cylinder.means)) < 1)
     floater.means -= torch.tensor([1.0, 0, 0])
-    sizes = sorted(len(part.means) for part in places(joined([cylinder, other, floater])))
+    sizes = sorted(len(part.means) for part in places(join_gaussians([cylinder, other, floater])))
     assert sizes == [len(other.means), len(cylinder.means)]
 
 

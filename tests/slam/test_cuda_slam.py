@@ -137,7 +137,7 @@ def test_a_keyframe_looks_again_if_its_rendering_found_no_room(
     def run_three(short: bool) -> Slam:
         slam = Slam(frames[0].camera, config("keyframes.max_gap=1"), has_masks=True, library=cuda_library)
         mapper: Any = slam.mapper
-        rendered = mapper.rendered
+        rendered = mapper.render_keyframe
 
         def rendered_short(keyframe: Keyframe, with_room: bool) -> Any:
             view = rendered(keyframe, with_room)
@@ -146,7 +146,7 @@ def test_a_keyframe_looks_again_if_its_rendering_found_no_room(
             return view
 
         if short:
-            monkeypatch.setattr(mapper, "rendered", rendered_short)
+            monkeypatch.setattr(mapper, "render_keyframe", rendered_short)
         for frame in frames[:3]:
             slam.step(frame)
         return slam

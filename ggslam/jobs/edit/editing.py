@@ -32,7 +32,7 @@ from ggslam.objects.hole_views import View
 from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
 from ggslam.objects.recoloring import parse_color
 from ggslam.objects.segmented_map import SegmentedMap
-from ggslam.objects.segmented_rows import joined
+from ggslam.objects.segmented_rows import join_gaussians
 from ggslam.objects.table import ObjectTable
 from ggslam.objects.traces import drop_traces, places
 from ggslam.runs.folder import RunFolder
@@ -269,7 +269,7 @@ def _mend(
         if settings is not None:
             notes.append("nothing to inpaint: no object left its place")
         return None
-    removed = joined(left)
+    removed = join_gaussians(left)
     if settings is not None:
         filling = inpaint(scene, removed, source.views, displaced, recording, settings)
     else:

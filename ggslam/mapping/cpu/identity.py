@@ -91,7 +91,7 @@ class CpuIdentityLearner(IdentityLearner):
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
-    def _sampled(
+    def _learn_at_pixels(
         self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: MaskedKeyframe, pixels: np.ndarray,
         vote_weights: np.ndarray, rate_factor: float,
     ) -> None:  # fmt: skip
