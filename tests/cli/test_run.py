@@ -24,6 +24,7 @@ from ggslam.cli.run_command import _print
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.trajectory import read_tum
 from ggslam.jobs.run.pipeline import RunOutcome
+from ggslam.runs.folder import RunFolder
 
 
 def in_a_process(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -270,9 +271,11 @@ def test_a_stopped_run_can_be_scored(room: Path, tmp_path: Path) -> None:
 
 
 def test_other_shares_of_held_out_frames(room: Path, tmp_path: Path) -> None:
-    done = ggslam("run", room, "--out", tmp_path / "run", "--stop", 9, "--iterations", 1,
+    done = ggslam("run", room, "--out", tmp_path / "run", "--stop", 9, "--iterations", 1, "--no-loops",
                   "--set", "evaluation.held_out_every=4")  # fmt: skip
     assert done.returncode == 0, done.stderr
     m = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert m["images"]["held_out"]["frames"] == 2  # frames 4 and 8; frame 0 has to be a keyframe
     assert m["tracking"]["ok"] + m["tracking"].get("degenerate", 0) == 8
+    settings = RunFolder.open(tmp_path / "run").config()
+    assert not settings.loops.enabled and settings.mapping.iterations_per_frame == 1
