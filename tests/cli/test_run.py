@@ -129,11 +129,11 @@ def test_eval_render_export(finished: Path, tmp_path: Path) -> None:
 
 
 def test_realtime_keeps_pace(room: Path, tmp_path: Path) -> None:
-    done = ggslam("run", room, "--out", tmp_path / "run", "--realtime", 10)
+    done = ggslam("run", room, "--out", tmp_path / "run", "--realtime", 6)
     assert done.returncode == 0, done.stderr
     m = json.loads((tmp_path / "run" / "metrics.json").read_text())
     frames = json.loads((tmp_path / "run" / "keyframes.json").read_text())["frames"]
-    assert m["speed"]["frames_per_s"] < 12
+    assert m["speed"]["frames_per_s"] < 8
     assert len(frames) + m["speed"]["dropped_frames"] == 24
     assert m["images"]["held_out"]["psnr"] > 20
 
