@@ -10,8 +10,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ggslam.jobs.edit.editing import Edit, edit_run
-from ggslam.jobs.render.rendering import render_frames, select_frames
+from ggslam.jobs.edit.edits import Edit, edit_run
+from ggslam.jobs.render.frames import render_frames, select_frames
 from ggslam.runs.folder import RunFolder
 
 

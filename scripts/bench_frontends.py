@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 import torch
 
-from ggslam.evaluation.geometry import estimate_normals, register
+from ggslam.evaluation.geometry import estimate_normals, register_clouds
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.raw_points import read_pose_graph, read_raw_points
@@ -124,7 +124,7 @@ def run_recording(path: Path, arguments: argparse.Namespace) -> None:
 
 def map_agreement(run: Run, reference: Run) -> str:
     """How the map of one run lies upon that of another, after the best rigid motion."""
-    found = register(thinned(np.concatenate(run.cloud)), thinned(np.concatenate(reference.cloud)))
+    found = register_clouds(thinned(np.concatenate(run.cloud)), thinned(np.concatenate(reference.cloud)))
     return (
         f"fitness {found.overlap.fitness:.3f}, inlier RMSE {1e3 * found.overlap.inlier_rmse_m:.1f} mm, "
         f"moved {1e3 * found.moved_m:.1f} mm and {found.turned_deg:.2f} degrees"

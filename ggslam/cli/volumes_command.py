@@ -14,7 +14,7 @@ from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.jobs.volumes.fusing import VolumesOutcome
+    from ggslam.jobs.volumes.fuse import VolumesOutcome
     from ggslam.volumes.safety import Braking
 
 EPILOG = """
@@ -95,7 +95,7 @@ def volumes(
     overwrite: Annotated[bool, typer.Option(help="With --live: replace a finished run in the output folder.")] = False,
 ) -> None:  # fmt: skip
     """Maps that planners read: TSDF with mesh, distance field, occupancy; each with a picture."""
-    from ggslam.jobs.volumes.fusing import VolumesRequest, make_volumes
+    from ggslam.jobs.volumes.fuse import VolumesRequest, make_volumes
     from ggslam.runs.recordings import SequenceRequest
     from ggslam.volumes.safety import Braking, Latencies
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well the geometry of two maps, or of a map and the truth, agrees.
 
-`register` brings one cloud upon the other (point-to-plane ICP: Y. Chen and G. Medioni, "Object Modelling by
+`register_clouds` brings one cloud upon the other (point-to-plane ICP: Y. Chen and G. Medioni, "Object Modelling by
 Registration of Multiple Range Images", 1992); `overlap` says how much of a cloud found its partner, in the terms of
 Open3D's `evaluate_registration`: fitness and inlier RMSE. `score_cloud` measures a cloud against a reference as A.
 Knapitsch et al., "Tanks and Temples", 2017, do: precision, recall, F1 at distances, and the mean distances both ways.
@@ -67,7 +67,7 @@ Points = np.ndarray | Cloud
 
 
 @dataclass(frozen=True)
-class Overlap:
+class CloudOverlap:
     """How one cloud lies upon another.
 
     Attributes:
@@ -80,7 +80,7 @@ class Overlap:
 
 
 @dataclass(frozen=True)
-class Registration:
+class CloudRegistration:
     """Result of ICP.
 
     Attributes:
@@ -92,7 +92,7 @@ class Registration:
     """
 
     T_target_source: np.ndarray
-    overlap: Overlap
+    overlap: CloudOverlap
     moved_m: float
     turned_deg: float
     iterations: int
@@ -151,7 +151,7 @@ def estimate_normals(points: Points, rows: np.ndarray | None = None, neighbours:
 
 def overlap(
     source: Points, target: Points, max_distance: float = 0.05, T_target_source: np.ndarray | None = None, seed: int = 0
-) -> Overlap:
+) -> CloudOverlap:
     """Fitness and inlier RMSE of a source upon a target.
 
     Args:
@@ -167,14 +167,14 @@ def overlap(
     apart, _ = _nearest(_cloud(source), _cloud(target), T_target_source, seed, distance)
     inliers = apart[np.isfinite(apart)]
     rmse = float(np.sqrt(np.mean(inliers**2))) if len(inliers) else 0.0
-    return Overlap(len(inliers) / len(apart), rmse)
+    return CloudOverlap(len(inliers) / len(apart), rmse)
 
 
-def register(
+def register_clouds(
     source: Points, target: Points, target_normals: np.ndarray | None = None,
     max_distances: Sequence[float] = (0.25, 0.10, 0.05), T_start: np.ndarray | None = None, iterations: int = 30,
     sample: int = 50_000, seed: int = 0,
-) -> Registration:  # fmt: skip
+) -> CloudRegistration:  # fmt: skip
     """Finds the motion that brings a source upon a target.
 
     Args:
@@ -206,7 +206,7 @@ def register(
                 converged = True
                 break
     middle = source.points.mean(0, keepdims=True)
-    return Registration(
+    return CloudRegistration(
         T_target_source=T,
         overlap=overlap(source, target, distances[-1], T, seed),
         moved_m=float(np.linalg.norm(transformed(middle, T) - transformed(middle, start))),

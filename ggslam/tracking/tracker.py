@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.features.orb import View, pose_from_matches
+from ggslam.features.orb import FeatureView, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -105,8 +105,8 @@ class Tracker:
         self._pose = np.eye(4) if T_world_camera is None else np.array(T_world_camera, float)
         self._velocity = np.eye(4)
         self._was_lost = False
-        self._views: list[View] = []
-        self._reference_view: View | None = None
+        self._views: list[FeatureView] = []
+        self._reference_view: FeatureView | None = None
         self._reference: PhotometricReference | None = None
 
     @property
@@ -137,7 +137,7 @@ class Tracker:
             self.noise = estimate_noise(frame.depth, self.camera)
         noise = self.noise or DepthNoise()
         points = self.engine.points(frame.depth, self.settings.points, noise)
-        view = View(frame.color, frame.depth, self._pose)
+        view = FeatureView(frame.color, frame.depth, self._pose)
         if target is None:
             return self._first(view, points)
         self.noise = noise  # what could not be measured before the first keyframe is taken as usual
@@ -153,7 +153,7 @@ class Tracker:
         status = TrackingStatus.RECOVERED if reason else status
         return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, found)
 
-    def _first(self, view: View, points: FramePoints) -> TrackingResult:
+    def _first(self, view: FeatureView, points: FramePoints) -> TrackingResult:
         """Before the first keyframe: the pose is given, and all a frame needs is depth to begin with."""
         if len(points) < self.settings.align.min_matches:
             reason = f"only {len(points)} points have depth, {self.settings.align.min_matches} needed"
@@ -168,7 +168,7 @@ class Tracker:
             view.T_world_camera = T_new_old @ view.T_world_camera
         self._reference = None
 
-    def relocate(self, view: View, points: FramePoints, found: AlignmentResult, source: str) -> TrackingResult:
+    def relocate(self, view: FeatureView, points: FramePoints, found: AlignmentResult, source: str) -> TrackingResult:
         """A frame that was lost was located by other means; tracking goes on from there.
 
         Args:
@@ -186,7 +186,7 @@ class Tracker:
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
-    def _locate(self, view: View, points: FramePoints, target: GicpTarget) -> tuple[AlignmentResult, str]:
+    def _locate(self, view: FeatureView, points: FramePoints, target: GicpTarget) -> tuple[AlignmentResult, str]:
         """The best alignment, and which start it came from (empty: constant velocity)."""
         depth = points.median_depth_if_known()
         expected = self._median_depth if depth is None else depth
@@ -199,7 +199,7 @@ class Tracker:
         return found
 
     def _locate_by(
-        self, mode: PhotometricMode, view: View, points: FramePoints, target: GicpTarget
+        self, mode: PhotometricMode, view: FeatureView, points: FramePoints, target: GicpTarget
     ) -> tuple[AlignmentResult, str]:
         """As `_locate`, in a photometric mode."""
         guess = self._pose @ self._velocity
@@ -233,7 +233,7 @@ class Tracker:
         settings = self.settings.align if coarse else dataclasses.replace(self.settings.align, coarse_iterations=0)
         return self.engine.align(points, target, guess, settings, self.noise, photometric)
 
-    def _photometric_part(self, view: View) -> PhotometricPart | None:
+    def _photometric_part(self, view: FeatureView) -> PhotometricPart | None:
         """Textured points of the view and the reference; None without either."""
         settings = self.settings.photometric
         reference = self._current_reference()
@@ -248,7 +248,7 @@ class Tracker:
             self._reference = PhotometricReference.from_view(self._small(view), view.T_world_camera)
         return self._reference
 
-    def _small(self, view: View) -> GreyDepth:
+    def _small(self, view: FeatureView) -> GreyDepth:
         shrink = self.settings.photometric.shrink * max(1, round(self.camera.width / 320))
         return GreyDepth.from_images(view.color, view.depth, self.camera, shrink)
 
@@ -278,7 +278,7 @@ class Tracker:
         return seen and found.photometric_residual <= tolerance * recovery.convincing_residual
 
     def _retry(
-        self, view: View, points: FramePoints, target: GicpTarget, found: AlignmentResult,
+        self, view: FeatureView, points: FramePoints, target: GicpTarget, found: AlignmentResult,
         photometric: PhotometricPart | None,
     ) -> tuple[AlignmentResult, str]:  # fmt: skip
         """The best alignment over all starts."""
@@ -326,7 +326,7 @@ class Tracker:
             reason = f"only {len(points)} points have depth, {self.settings.align.min_matches} needed"
         return TrackingResult(self._pose.copy(), TrackingStatus.LOST, found.overlap, found.rmse, reason, points, found)
 
-    def _remember(self, view: View, points: FramePoints) -> None:
+    def _remember(self, view: FeatureView, points: FramePoints) -> None:
         """Keeps the last located frames for feature matching, and a not too distant one for its grey values."""
         self._views = [view, *self._views[: self.settings.recovery.views - 1]]
         reference = self._reference_view

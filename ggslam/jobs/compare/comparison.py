@@ -14,11 +14,11 @@ from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.evaluation.geometry import (
     THRESHOLDS_M,
     Cloud,
+    CloudOverlap,
+    CloudRegistration,
     CloudScores,
-    Overlap,
-    Registration,
     overlap,
-    register,
+    register_clouds,
     score_cloud,
 )
 from ggslam.evaluation.trajectory import FEWEST_POSES, TrajectoryScores, align_points, associate, score_trajectory
@@ -77,10 +77,10 @@ class Comparison:
     T_b_a: np.ndarray
     trajectory: TrajectoryScores | None
     common_poses: int
-    a_on_b: Overlap
-    b_on_a: Overlap
-    icp: Registration | None
-    b_on_a_after_icp: Overlap | None
+    a_on_b: CloudOverlap
+    b_on_a: CloudOverlap
+    icp: CloudRegistration | None
+    b_on_a_after_icp: CloudOverlap | None
     scores: CloudScores
 
     def to_dict(self) -> dict[str, Any]:
@@ -135,7 +135,7 @@ def compare(
     distances = [max(max_distance, d) for d in (0.25, 0.10)] + [max_distance]
     icp = None
     try:
-        icp = register(cloud_a, cloud_b, max_distances=distances, T_start=T_b_a, seed=seed)
+        icp = register_clouds(cloud_a, cloud_b, max_distances=distances, T_start=T_b_a, seed=seed)
     except ValueError as error:
         if align == "icp":
             raise ConfigError(f"{a} cannot be registered upon {b} by ICP: {error}") from None

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.features.orb import View, pose_from_matches
+from ggslam.features.orb import FeatureView, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -110,7 +110,7 @@ class FeatureTracker(Tracker):
             self.noise = estimate_noise(frame.depth, self.camera)
         scan = self._extractor.extract(frame.depth, self.noise or DepthNoise())
         points = DeferredPoints(lambda: self._points(frame), scan.median_depth)
-        view = View(frame.color, frame.depth, self._pose)
+        view = FeatureView(frame.color, frame.depth, self._pose)
         self.counts = FeatureCounts(len(scan.planes), len(scan.edges))
         if self.local_map.is_empty:
             return self._start_in_target(frame, scan) if self._was_lost else self._begin(view, points, scan)
@@ -138,7 +138,7 @@ class FeatureTracker(Tracker):
         super().move(T_new_old)
         self.local_map.move(T_new_old)
 
-    def relocate(self, view: View, points: FramePoints, found: AlignmentResult, source: str) -> TrackingResult:
+    def relocate(self, view: FeatureView, points: FramePoints, found: AlignmentResult, source: str) -> TrackingResult:
         """As `Tracker.relocate`; the local map begins anew there."""
         result = super().relocate(view, points, found, source)
         self.local_map.clear()
@@ -158,13 +158,13 @@ class FeatureTracker(Tracker):
             self.local_map.add(scan, result.T_world_camera)
         return result
 
-    def _begin(self, view: View, points: FramePoints, scan: ScanFeatures) -> TrackingResult:
+    def _begin(self, view: FeatureView, points: FramePoints, scan: ScanFeatures) -> TrackingResult:
         result = self._first(view, points)
         if result.status is not TrackingStatus.LOST:
             self.local_map.add(scan, result.T_world_camera)
         return result
 
-    def _search(self, view: View, scan: ScanFeatures, found: FeatureAlignment) -> tuple[FeatureAlignment, str]:
+    def _search(self, view: FeatureView, scan: ScanFeatures, found: FeatureAlignment) -> tuple[FeatureAlignment, str]:
         """The first convincing alignment from other starts, and which start it was; without one the alignment given,
         and no name. The budget does not count here."""
         self.local_map.clock.lift()
@@ -174,7 +174,7 @@ class FeatureTracker(Tracker):
                 return candidate, name
         return found, ""
 
-    def _starts(self, view: View) -> Iterator[tuple[str, np.ndarray]]:
+    def _starts(self, view: FeatureView) -> Iterator[tuple[str, np.ndarray]]:
         yield "last pose", self._pose
         for number, earlier in enumerate(self._views):
             pose = pose_from_matches(view, earlier, self.camera, self.settings.recovery.features)
@@ -182,7 +182,7 @@ class FeatureTracker(Tracker):
                 yield f"features of view {number}", pose.T_world_camera
 
     def _accept(
-        self, view: View, points: FramePoints, scan: ScanFeatures, found: FeatureAlignment, reason: str
+        self, view: FeatureView, points: FramePoints, scan: ScanFeatures, found: FeatureAlignment, reason: str
     ) -> TrackingResult:
         T = found.T_map_sensor
         self._velocity = np.eye(4) if self._was_lost else inverse(self._pose) @ T
