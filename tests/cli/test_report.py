@@ -17,10 +17,9 @@ from ggslam.errors import FormatError, RunFolderError
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.report.gather import load_run
 from ggslam.jobs.report.pages import write_comparison, write_report
-from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.score.run import score_run
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.recordings import SequenceRequest, open_recording_of
+from ggslam.runs.recordings import open_recording_of
 from ggslam.slam.step_log import COLUMNS, read_table
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "jobs"))
@@ -28,12 +27,9 @@ from test_run_page import checked  # noqa: E402
 
 
 @pytest.fixture(scope="module")
-def small(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of eight frames, not scored."""
-    out = tmp_path_factory.mktemp("reports") / "small"
-    execute(RunRequest(SequenceRequest(room, stop=8), out=out, overrides=["mapping.iterations_per_frame=2"],
-                       evaluate=False))  # fmt: skip
-    return out
+def small(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of ten frames, not scored."""
+    return Path(shutil.copytree(room_run.path, tmp_path_factory.mktemp("reports") / "small"))
 
 
 @pytest.fixture
@@ -49,8 +45,8 @@ def words(path: Path) -> str:
 def test_a_run_writes_its_steps_and_a_report(small: Path) -> None:
     steps = read_table(small / "steps.csv")
     assert tuple(steps) == COLUMNS
-    np.testing.assert_array_equal(steps["frame"], range(8))
-    assert steps["iterations"].tolist() == [10] + 7 * [2]
+    np.testing.assert_array_equal(steps["frame"], range(10))
+    assert steps["iterations"].tolist() == [10] + 9 * [2]
     timing = json.loads((small / "timing.json").read_text())
     assert steps["end_s"][-1] == pytest.approx(timing["wall_s"], rel=1e-4) and (np.diff(steps["end_s"]) > 0).all()
     assert steps["tracking_ms"].sum() == pytest.approx(1e3 * timing["tracking_s"], rel=1e-4)
