@@ -24,11 +24,11 @@ from timing import seconds
 
 from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
 from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages
-from ggslam.mapping.losses_reference import ssim
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
+from ggslam.rendering.losses import ssim_map
 from ggslam.rendering.types import PARAMETERS, GaussianTensors
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -73,7 +73,7 @@ def torch_loss(view: View, target: DeviceKeyframeImages, settings: LossSettings,
     def call() -> None:
         image, depth = leaves
         with torch.device(device):  # the window is made there
-            loss = (1 - w) * (image - y).abs().mean() + w * (1 - ssim(image, y).mean())
+            loss = (1 - w) * (image - y).abs().mean() + w * (1 - ssim_map(image, y).mean())
         error = torch.where(valid, (depth - target_depth).abs(), 0.0).sum() / valid.sum()
         torch.autograd.grad(loss + settings.depth_weight * error, leaves)
 

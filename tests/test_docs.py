@@ -24,17 +24,18 @@ def run_python(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess
     return subprocess.run([sys.executable, *arguments], cwd=cwd, capture_output=True, text=True, check=False)
 
 
-def test_examples_run_in_order(tmp_path: Path) -> None:
-    text = (DOCS / "python.md").read_text()
+@pytest.mark.parametrize(("page", "least"), [("python.md", 12), ("pytorch.md", 6)])
+def test_examples_run_in_order(tmp_path: Path, page: str, least: int) -> None:
+    text = (DOCS / page).read_text()
     blocks = list(re.finditer(r"```python\n(.*?)```", text, re.S))
-    assert len(blocks) >= 9
+    assert len(blocks) >= least
     environment: dict[str, object] = {}
     before = Path.cwd()
     os.chdir(tmp_path)
     try:
         for block in blocks:
             line = text[: block.start(1)].count("\n")
-            exec(compile("\n" * line + block[1], str(DOCS / "python.md"), "exec"), environment)
+            exec(compile("\n" * line + block[1], str(DOCS / page), "exec"), environment)
     finally:
         os.chdir(before)
 
