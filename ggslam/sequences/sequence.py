@@ -30,6 +30,9 @@ OnBadFrame = Literal["error", "skip"]
 ReadMasks = bool | Literal["lazy"]
 """True: masks are read with the frame; "lazy": when `Frame.load_mask` is called; False: never."""
 
+SMALLEST_SIDE = 8
+"""Pixels that `scale` has to leave of both sides of an image: windows of trackers and filters need so many."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -82,7 +85,7 @@ class Sequence:
 
         Raises:
             SequenceError: the first frame is damaged (with on_bad_frame="skip": every frame is), files are missing, or
-                `scale` is not in (0, 1].
+                `scale` is not in (0, 1] or leaves hardly an image.
         """
         if on_bad_frame not in ("error", "skip"):
             raise SequenceError(f"on_bad_frame: expected 'error' or 'skip', found '{on_bad_frame}'")
@@ -116,6 +119,9 @@ class Sequence:
         self.color_size: tuple[int, int] = self._geometry.color_size
         self.depth_size: tuple[int, int] = self._geometry.depth_size
         self.camera: Camera = self._geometry.camera
+        if scale < 1 and min(self.camera.width, self.camera.height) < SMALLEST_SIDE:
+            size = f"{self.camera.width}x{self.camera.height}"
+            raise SequenceError(f"scale: {scale:g} leaves images of {size}, needed are {SMALLEST_SIDE} pixels a side")
         self.native_camera: Camera = self._geometry.native_camera
 
     def _select(self, selection: range) -> int:
