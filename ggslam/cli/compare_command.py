@@ -14,7 +14,7 @@ from ggslam.cli.console import console, table
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.evaluation.geometry import CloudOverlap
+    from ggslam.geometry.clouds import Overlap
     from ggslam.jobs.compare.comparison import Comparison
     from ggslam.runs.records.metrics import MetricsRecord
 
@@ -102,7 +102,7 @@ def _print(c: Comparison, max_distance: float) -> None:
 
 
 def _overlaps(c: Comparison) -> list[list[str]]:
-    def row(name: str, o: CloudOverlap) -> list[str]:
+    def row(name: str, o: Overlap) -> list[str]:
         return [name, f"{o.fitness:.4f}", f"{100 * o.inlier_rmse_m:.2f} cm"]
 
     rows = [row("A on B", c.a_on_b), row("B on A", c.b_on_a)]

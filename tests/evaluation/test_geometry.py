@@ -6,13 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ggslam.evaluation import geometry
-from ggslam.evaluation.geometry import (
-    estimate_normals,
-    overlap,
-    register_clouds,
-    score_cloud,
-)
+from ggslam.evaluation.geometry import score_cloud
+from ggslam.geometry import clouds
+from ggslam.geometry.clouds import overlap
+from ggslam.geometry.icp import register
+from ggslam.geometry.normals import estimate_normals
 from ggslam.scene.poses import inverse, se3_exp
 
 
@@ -48,7 +46,7 @@ def test_overlap_counts_and_measures() -> None:
 def test_icp_finds_the_motion() -> None:
     target, source = corner(6000, seed=1), corner(6000, seed=2)  # the same walls, other points
     T = se3_exp(np.array([0.06, -0.05, 0.08, 0.03, -0.04, 0.05]))
-    found = register_clouds(moved(source, inverse(T)), target)
+    found = register(moved(source, inverse(T)), target)
     assert found.converged
     error = inverse(T) @ found.T_target_source
     assert np.linalg.norm(error[:3, 3]) < 3e-3 and np.abs(error[:3, :3] - np.eye(3)).max() < 3e-3
@@ -56,14 +54,14 @@ def test_icp_finds_the_motion() -> None:
     middle = moved(source, inverse(T)).mean(0)
     assert found.moved_m == pytest.approx(np.linalg.norm(moved(middle[None], T)[0] - middle), abs=5e-3)
     assert found.turned_deg == pytest.approx(np.degrees(np.sqrt(0.03**2 + 0.04**2 + 0.05**2)), abs=0.2)
-    again = register_clouds(moved(source, inverse(T)), target, T_start=found.T_target_source)
+    again = register(moved(source, inverse(T)), target, T_start=found.T_target_source)
     assert again.moved_m < 1e-3 and again.iterations < found.iterations
 
 
 def test_icp_leaves_alone_what_nothing_holds() -> None:
     """Two planes: sliding along them changes nothing and is not done."""
     target = grid(0.02, 0.0, 80)
-    found = register_clouds(target + (0.004, -0.003, 0.02), target)
+    found = register(target + (0.004, -0.003, 0.02), target)
     assert found.T_target_source[2, 3] == pytest.approx(-0.02, abs=1e-4)
     assert np.abs(found.T_target_source[:2, 3]).max() < 1e-6
 
@@ -71,9 +69,9 @@ def test_icp_leaves_alone_what_nothing_holds() -> None:
 def test_icp_of_a_sample_is_repeatable_and_scores_all_points() -> None:
     target = corner(6000)
     source = moved(target, se3_exp(np.array([0.02, 0.01, 0, 0, 0, 0.02])))
-    one = register_clouds(source, target, sample=500, seed=3)
-    two = register_clouds(source, target, sample=500, seed=3)
-    other = register_clouds(source, target, sample=500, seed=4)
+    one = register(source, target, sample=500, seed=3)
+    two = register(source, target, sample=500, seed=3)
+    other = register(source, target, sample=500, seed=4)
     assert (one.T_target_source == two.T_target_source).all()
     assert (one.T_target_source != other.T_target_source).any()
     assert one.overlap.fitness == pytest.approx(1.0)
@@ -81,7 +79,7 @@ def test_icp_of_a_sample_is_repeatable_and_scores_all_points() -> None:
 
 def test_icp_without_common_ground_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 10 points within 0.25 m of the target, found 0 of 600"):
-        register_clouds(corner(600) + 5, corner(600))
+        register(corner(600) + 5, corner(600))
     with pytest.raises(ValueError, match="point 1 is not finite"):
         overlap(np.array([[0, 0, 0], [0, np.nan, 0]]), corner(600))
     with pytest.raises(ValueError, match="expected points"):
@@ -112,7 +110,7 @@ def test_scores_of_a_map_that_is_half_there() -> None:
 def test_large_clouds_are_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
     reference, estimate = grid(0.1, 0.0), grid(0.1, 0.0)
     estimate[::4, 2] = 0.03
-    monkeypatch.setattr(geometry, "MOST_QUERIES", 900)
+    monkeypatch.setattr(clouds, "MOST_QUERIES", 900)
     found = score_cloud(estimate, reference, (0.01,), seed=1)
     assert found.thresholds[0].precision == pytest.approx(0.75, abs=0.04)
     assert found.thresholds[0].precision != 0.75  # which all of them would give

@@ -11,21 +11,14 @@ from typing import Any, Literal
 import numpy as np
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
-from ggslam.evaluation.geometry import (
-    THRESHOLDS_M,
-    Cloud,
-    CloudOverlap,
-    CloudRegistration,
-    CloudScores,
-    overlap,
-    register_clouds,
-    score_cloud,
-)
+from ggslam.evaluation.geometry import THRESHOLDS_M, CloudScores, score_cloud
 from ggslam.evaluation.trajectory import FEWEST_POSES, TrajectoryScores, align_points, associate, score_trajectory
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.trajectory import Trajectory
 from ggslam.formats.triangle_mesh import read_mesh
+from ggslam.geometry.clouds import Cloud, Overlap, overlap
+from ggslam.geometry.icp import CloudRegistration, register
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.scene.poses import inverse
@@ -77,10 +70,10 @@ class Comparison:
     T_b_a: np.ndarray
     trajectory: TrajectoryScores | None
     common_poses: int
-    a_on_b: CloudOverlap
-    b_on_a: CloudOverlap
+    a_on_b: Overlap
+    b_on_a: Overlap
     icp: CloudRegistration | None
-    b_on_a_after_icp: CloudOverlap | None
+    b_on_a_after_icp: Overlap | None
     scores: CloudScores
 
     def to_dict(self) -> dict[str, Any]:
@@ -135,7 +128,7 @@ def compare(
     distances = [max(max_distance, d) for d in (0.25, 0.10)] + [max_distance]
     icp = None
     try:
-        icp = register_clouds(cloud_a, cloud_b, max_distances=distances, T_start=T_b_a, seed=seed)
+        icp = register(cloud_a, cloud_b, max_distances=distances, T_start=T_b_a, seed=seed)
     except ValueError as error:
         if align == "icp":
             raise ConfigError(f"{a} cannot be registered upon {b} by ICP: {error}") from None
