@@ -105,7 +105,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         results, error = _run(localizer, recording, observer)
         if error is not None and not results:
             raise error
-        damaged = sorted([*surface.damaged, *(places.damaged if places is not None else [])])
+        damaged = sorted([*surface.damage, *(places.damaged if places is not None else [])])
         report = LocalizationReport(
             str(request.map), str(request.sequence.path), request.full, recording.timestamps[: len(results)], results,
             None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
