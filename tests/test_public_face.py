@@ -74,7 +74,7 @@ def test_importing_loads_nothing_heavy() -> None:
 def programs() -> list[tuple[str, str]]:
     """(place, Python) of everything that shows others how ggslam is used."""
     found = [(path.name, path.read_text()) for path in sorted((ROOT / "examples").glob("*.py"))]
-    for page in sorted((ROOT / "docs").glob("*.md")):
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         for number, block in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(), re.S)):
             found.append((f"{page.name}, block {number}", block))
     return found

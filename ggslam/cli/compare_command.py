@@ -14,7 +14,7 @@ from ggslam.cli.console import console, table
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.evaluation.geometry import Overlap
+    from ggslam.geometry.clouds import Overlap
     from ggslam.jobs.compare.comparison import Comparison
     from ggslam.runs.records.metrics import MetricsRecord
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ggslam.features.orb import Landmarks
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import inverse
+from ggslam.scene.poses import fit_similarity, inverse
 from ggslam.system.settings import setting, settings_class
 
 FEWEST = 6
@@ -139,13 +139,7 @@ def _hypotheses(matches: Matches, settings: RegistrationSettings) -> np.ndarray:
     alike = np.abs(sides - others) < _ALIKE_SHARE * np.maximum(sides, others) + _ALIKE_CONSTANT
     chosen = alike.all(1) & (sides.min(1) > 0.1)  # a small triangle says little about rotation
     a, b = a[chosen], b[chosen]
-    a_mean, b_mean = a.mean(1, keepdims=True), b.mean(1, keepdims=True)
-    U, _, Vt = np.linalg.svd(np.swapaxes(a - a_mean, 1, 2) @ (b - b_mean))
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]  # no reflections
-    T = np.tile(np.eye(4), (len(a), 1, 1))
-    T[:, :3, :3] = U @ Vt
-    T[:, :3, 3] = a_mean[:, 0] - np.einsum("nij,nj->ni", T[:, :3, :3], b_mean[:, 0])
-    return T
+    return fit_similarity(b, a)[0]
 
 
 def _refine(T_old_new: np.ndarray, matches: Matches, inliers: np.ndarray, camera: Camera) -> np.ndarray:

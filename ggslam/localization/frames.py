@@ -20,10 +20,11 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transformed
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
+from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.noise import estimate_noise
-from ggslam.tracking.points import FramePoints, extract_points
+from ggslam.tracking.points import FramePoints, PointSource, extract_points
 from ggslam.tracking.settings import DepthNoise, TrackerSettings
-from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 _OUTCOMES = {
     TrackingStatus.FIRST: LocalizationStatus.LOST,
@@ -46,7 +47,7 @@ class LookUpSettings:
 
 
 class FrameTracker:
-    """Locates frames; see `Tracker`.
+    """Locates frames; see `GicpTracker`.
 
     Args:
         camera: of all frames.
@@ -61,10 +62,10 @@ class FrameTracker:
         self, camera: Camera, settings: TrackerSettings, context: NativeContext, T_world_camera: np.ndarray | None,
         places: StoredPlaces | None = None, look_up: LookUpSettings | None = None,
     ) -> None:  # fmt: skip
-        self.tracker = Tracker(camera, settings, context, T_world_camera)
+        self.tracker = GicpTracker(camera, settings, context, T_world_camera)
         self._places = places
         self._look_up = look_up or LookUpSettings()
-        self._tracked: tuple[Frame, FramePoints] | None = None
+        self._tracked: tuple[Frame, PointSource] | None = None
 
     def track(self, item: Frame, surface: Surface, target: GicpTarget) -> Tracked:
         """See `FrontEnd`."""
@@ -99,7 +100,7 @@ class FrameTracker:
     def _points_of(self, frame: Frame) -> FramePoints:
         """The frame's points, as just tracked, or extracted now."""
         if self._tracked is not None and self._tracked[0] is frame:
-            return self._tracked[1]
+            return self._tracked[1].read()
         tracker = self.tracker
         if tracker.noise is None:
             tracker.noise = estimate_noise(frame.depth, tracker.camera)

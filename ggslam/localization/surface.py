@@ -15,9 +15,9 @@ from types import TracebackType
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ggslam.errors import FormatError
+from ggslam.geometry.normals import estimate_normals
 from ggslam.native.loader import NativeContext
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import POINTS
@@ -59,7 +59,7 @@ def load_surface(store: GridStore, key: CellKey) -> tuple[np.ndarray, np.ndarray
     arrays = load_points(store, key)
     points = np.ascontiguousarray(arrays["points"], np.float32)
     if NORMAL not in arrays:
-        normals = estimated_normals(points)
+        normals = surface_normals(points)
         return points, np.where(normals @ _ANYWHERE < 0, -1, 1).astype(np.float32)[:, None] * normals, False
     stored = arrays[NORMAL].astype(np.float32)
     if stored.shape != points.shape:
@@ -101,14 +101,11 @@ def _rank(key: CellKey) -> int:
     return sum((coordinate & mask) << (_RANK_BITS * axis) for axis, coordinate in enumerate(key))
 
 
-def estimated_normals(points: np.ndarray) -> np.ndarray:
+def surface_normals(points: np.ndarray) -> np.ndarray:
     """Unit normals float32 [n, 3] of points [n, 3] from each one's nearest neighbours, of either sign."""
-    count = min(_NEIGHBOURS, len(points))
-    if count < 3:
+    if min(_NEIGHBOURS, len(points)) < 3:
         return np.tile(np.array([0, 0, 1], np.float32), (len(points), 1))
-    neighbours = points[cKDTree(points).query(points, count)[1]].astype(np.float64)
-    centred = neighbours - neighbours.mean(1, keepdims=True)
-    return np.linalg.eigh(centred.transpose(0, 2, 1) @ centred)[1][:, :, 0].astype(np.float32)
+    return estimate_normals(points, neighbours=_NEIGHBOURS).astype(np.float32)
 
 
 class Surface(Protocol):

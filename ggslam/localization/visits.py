@@ -17,7 +17,7 @@ import numpy as np
 from ggslam.features.orb import View
 from ggslam.localization.places import PLACES, StoredView, places_to_bytes, stored_views
 from ggslam.localization.scans import LaserScan
-from ggslam.localization.surface import NORMAL, estimated_normals, packed_normals
+from ggslam.localization.surface import NORMAL, packed_normals, surface_normals
 from ggslam.loops.places import PlaceIndex
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
@@ -105,7 +105,7 @@ class ScanSights:
         """What a scan adds."""
         seen = item.points[np.isfinite(item.points).all(1)].astype(np.float64)
         points = transformed(seen, T_world_sensor)
-        normals = estimated_normals(points)
+        normals = surface_normals(points)
         away = ((points - T_world_sensor[:3, 3]) * normals).sum(1) > 0
         normals[away] *= -1
         return Sight(points, normals, lambda others: np.ones(len(others), bool))

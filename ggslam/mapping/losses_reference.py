@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import torch
 
-from ggslam.mapping.cpu.losses import KeyframeImages, LossSettings
+from ggslam.mapping.losses import LossTarget
+from ggslam.mapping.settings import LossSettings
 from ggslam.rendering.losses import ssim_map
 
 
 def reference_loss(
-    image: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, exposure: torch.Tensor, target: KeyframeImages,
+    image: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, exposure: torch.Tensor, target: LossTarget,
     settings: LossSettings,
 ) -> dict[str, torch.Tensor]:  # fmt: skip
     """The values of `LossValues` by name, as scalars that carry their graph. Computes in the type of `image`.

@@ -24,7 +24,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation, transformed
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
-from ggslam.tracking.points import FramePoints
+from ggslam.tracking.points import FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult
@@ -223,9 +223,10 @@ class LoopCloser:
         return None
 
     def _verify(
-        self, points: FramePoints, place: Place, old: int
+        self, source: PointSource, place: Place, old: int
     ) -> tuple[Verification, AlignmentResult | None]:
         """Whether a frame sees what keyframe `old` saw, and the last alignment to the surface there."""
+        points = source.read()
         around = self._around(old)
         T_world_old, last = self.poses[old], None
         T_old_world = inverse(T_world_old)

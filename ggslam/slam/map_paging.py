@@ -24,10 +24,10 @@ import torch
 
 from ggslam.formats.array_archive import ArrayArchive
 from ggslam.geometry.frustums import Frustums, depth_reach
-from ggslam.mapping.cpu.votes import vote_labels
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper
+from ggslam.mapping.votes import vote_labels
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
@@ -216,7 +216,7 @@ class MapPager:
         for _, part in () if self.cells is None else self.cells.parts():
             if self.mapper.identity is not None:
                 self.mapper.identity.catch_up(part)
-            sizes += np.bincount(vote_labels(part), minlength=65536)
+            sizes += np.bincount(vote_labels(part).numpy(), minlength=65536)
         return sizes
 
     def settle(self) -> GaussianCells | None:

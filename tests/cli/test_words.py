@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from ggslam.cli import console as printing
 from ggslam.cli import main
 from ggslam.cli.console import ProgressLines, duration
-from ggslam.cli.export_formats import ExportFormat, choose_format
 from ggslam.cli.observer import ProgressObserver
 from ggslam.cli.old_names import OLD_NAMES
 from ggslam.errors import ConfigError
+from ggslam.jobs.export.formats import ExportFormat, choose_format
 
 COMMANDS = typer.main.get_command(main.app).commands  # type: ignore[attr-defined]
 
@@ -71,8 +71,8 @@ def test_formats_that_share_a_suffix_and_folders() -> None:
 
 @pytest.mark.parametrize(
     ("asked", "name", "words"),
-    [("mesh", "x.splat", "says splat, but --format says mesh"), ("ply", "x.obj", "says mesh, but --format says ply"),
-     ("points", "x.ply", "says ply"), (None, "x.xyz", "does not say which format"), (None, "folder", "--format")],
+    [("mesh", "x.splat", "says splat, but `format` says mesh"), ("ply", "x.obj", "says mesh, but `format` says ply"),
+     ("points", "x.ply", "says ply"), (None, "x.xyz", "does not say which format"), (None, "folder", "`format`")],
 )  # fmt: skip
 def test_a_name_against_the_format_is_refused(asked: str | None, name: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):

@@ -19,9 +19,9 @@ from ggslam.localization.surface import (
     NORMAL,
     FullSurface,
     PartialSurface,
-    estimated_normals,
     load_surface,
     packed_normals,
+    surface_normals,
 )
 from ggslam.localization.visits import FrameSights, ScanSights, record_visit
 from ggslam.native.loader import NativeContext
@@ -145,7 +145,7 @@ def test_normals_are_made_up_where_the_map_has_none(world, tmp_path: Path, conte
             results = located(surface, context, poses[:12], scans[:12])
             assert all(r.status.is_located for r in results) and rmse(results, poses[:12]) < 0.03
     flat = points[near & (points[:, 2] == 0)][:2000]
-    assert (np.abs(estimated_normals(flat)[:, 2]) > 0.999).mean() > 0.95
+    assert (np.abs(surface_normals(flat)[:, 2]) > 0.999).mean() > 0.95
 
 
 def test_a_target_on_the_way_is_what_it_is_when_made_there(world, store: GridStore, context: NativeContext) -> None:

@@ -9,8 +9,10 @@ import torch
 
 from ggslam.errors import RenderError
 from ggslam.mapping.cpu.identity import cross_entropy
-from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
+from ggslam.mapping.cpu.losses import CpuImageLoss
 from ggslam.mapping.cpu.neighbours import kl_gradient
+from ggslam.mapping.losses import LossTarget
+from ggslam.mapping.settings import LossSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.losses import color_loss, depth_loss, identity_loss, neighbour_loss
 from ggslam.rendering.types import RenderBuffers
@@ -26,7 +28,7 @@ def test_colour_and_depth_are_those_of_the_compiled_core() -> None:
     rendered = torch.from_numpy(random.uniform(0.5, 3, size).astype(np.float32)).requires_grad_()
     view = RenderBuffers(image.detach(), rendered.detach(), torch.ones(size))
     settings = LossSettings(dssim_weight=0.2, depth_weight=0.7)
-    expected = ImageLoss(NativeContext()).evaluate(view, KeyframeImages(color, depth, 1.0), settings)
+    expected = CpuImageLoss(NativeContext()).evaluate(view, LossTarget(color, depth, 1.0), settings)
 
     target = torch.from_numpy(color).permute(2, 0, 1) / 255
     of_color, of_depth = color_loss(image, target), depth_loss(rendered, torch.from_numpy(depth))

@@ -50,7 +50,7 @@ def run_recording(
     """
     if isinstance(recording, Sequence):
         if selection:
-            raise ConfigError(f"run_recording: {', '.join(selection)}: choose these when the sequence is opened")
+            raise ConfigError(f"run_recording: choose {', '.join(selection)} when the sequence is opened")
         sequence = request_of(recording)
     else:
         sequence = _request(Path(recording), selection)

@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 
 from ggslam.tracking.cuda import contract
-from ggslam.tracking.gicp import AlignmentResult, judge
+from ggslam.tracking.gicp import AlignmentResult, PointMatches, judge
 from ggslam.tracking.observability import PointSpread, about_point
 from ggslam.tracking.settings import AlignSettings
 
@@ -19,23 +17,27 @@ _PLACES[np.triu_indices(6)] = range(21)
 _PLACES += np.triu(_PLACES, 1).T
 
 
-class DeviceAlignment(AlignmentResult):
-    """`AlignmentResult` whose matches and distances stay on the device until someone asks for them."""
+class CudaMatches:
+    """Matches of points that stay on the device until they are read.
 
-    _matched: torch.Tensor
-    _count: int
+    Args:
+        matched: float32 [2, room] on the device, bits of the matches and squared distances.
+        count: points there are.
+    """
 
-    def __getattr__(self, name: str) -> Any:
-        """Matches and distances, at the first look at either."""
-        if name not in ("matches", "squared_distances"):
-            raise AttributeError(name)
-        matches, squared = self._matched.cpu().numpy()[:, : self._count]
-        object.__setattr__(self, "matches", matches.view(np.int32))
-        object.__setattr__(self, "squared_distances", squared)
-        return object.__getattribute__(self, name)
+    def __init__(self, matched: torch.Tensor, count: int) -> None:
+        self._matched, self._count = matched, count
+        self._matches: PointMatches | None = None
+
+    def read(self) -> PointMatches:
+        """The matches on the host; the first call waits for the device."""
+        if self._matches is None:
+            voxels, squared = self._matched.cpu().numpy()[:, : self._count]
+            self._matches = PointMatches(voxels.view(np.int32), squared)
+        return self._matches
 
 
-def device_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSettings) -> DeviceAlignment:
+def cuda_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSettings) -> AlignmentResult:
     """An alignment from what the kernels say.
 
     Args:
@@ -49,16 +51,10 @@ def device_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSe
     spread = PointSpread(float(found[contract.SPREAD_TOTAL]), found[contract.CENTROID], float(found[contract.RADIUS]))
     usable = bool(found[contract.USABLE])
     status, visibility, weak = judge(information, T[:3, :3], spread, usable, settings.degenerate_below)
-    values = {
-        "T_world_camera": T, "status": status, "converged": bool(found[contract.CONVERGED]),
-        "iterations": int(found[contract.COARSE_ITERATIONS] + found[contract.FINE_ITERATIONS]),
-        "overlap": float(found[contract.OVERLAP]), "rmse": float(found[contract.RMSE]),
-        "information": about_point(information, T[:3, 3]), "camera_information": information,
-        "visibility": visibility, "weak_directions": weak, "cost": float(found[contract.COST]),
-        "photometric_residual": float(found[contract.RESIDUAL]), "photometric_share": float(found[contract.SHARE]),
-        "_matched": matched, "_count": int(found[contract.POINT_COUNT]),
-    }  # fmt: skip
-    result = object.__new__(DeviceAlignment)  # the dataclass's own constructor asks for the matches
-    for name, value in values.items():
-        object.__setattr__(result, name, value)
-    return result
+    return AlignmentResult(
+        T, status, bool(found[contract.CONVERGED]),
+        int(found[contract.COARSE_ITERATIONS] + found[contract.FINE_ITERATIONS]), float(found[contract.OVERLAP]),
+        float(found[contract.RMSE]), about_point(information, T[:3, 3]), information, visibility, weak,
+        CudaMatches(matched, int(found[contract.POINT_COUNT])), float(found[contract.COST]),
+        float(found[contract.RESIDUAL]), float(found[contract.SHARE]),
+    )  # fmt: skip

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which format `ggslam export` writes: the one that was asked for, or the one that the file's name says."""
+"""Which format an export has: the one that was asked for, or the one that the file's name says."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ SUFFIXES = {
     ".pcd": (ExportFormat.pcd,),
     ".txt": (ExportFormat.trajectory,),
 }
-"""Formats that a file with this suffix may hold; the first is meant where `--format` is not given."""
+"""Formats that a file with this suffix may hold; the first is meant where none is asked for."""
 
 
 def choose_format(asked: ExportFormat | None, out: Path, objects: str | None) -> ExportFormat:
     """The format to write.
 
     Args:
-        asked: `--format`, if it was given.
-        out: `--out`.
-        objects: `--objects`; with it alone, a folder of one PLY for each object is meant.
+        asked: the format, if it was given.
+        out: file or folder to write.
+        objects: which objects; with them alone, a folder of one PLY for each is meant.
 
     Raises:
         ConfigError: the name says no format, or says another one than `asked`.
@@ -52,13 +52,13 @@ def choose_format(asked: ExportFormat | None, out: Path, objects: str | None) ->
     named = (ExportFormat.compressed_ply,) if out.name.lower().endswith(".compressed.ply") else SUFFIXES.get(suffix, ())
     if asked is not None:
         if named and asked not in named:
-            raise ConfigError(f"--out {out}: the name says {named[0].value}, but --format says {asked.value}")
+            raise ConfigError(f"`out` {out}: the name says {named[0].value}, but `format` says {asked.value}")
         return asked
     if named:
         return named[0]
     if objects is not None:
         return ExportFormat.ply
     raise ConfigError(
-        f"--out {out}: the name does not say which format to write; end it with one of {', '.join(SUFFIXES)}, or give "
-        f"--format ({', '.join(kind.value for kind in ExportFormat)})"
+        f"`out` {out}: the name does not say which format to write; end it with one of {', '.join(SUFFIXES)}, or give "
+        f"`format` ({', '.join(kind.value for kind in ExportFormat)})"
     )
