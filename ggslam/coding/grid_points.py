@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, Structure, c_double, c_int32, c_int64, c_size_t, c_void_p
+from ctypes import POINTER, Structure, c_double, c_int32, c_int64, c_size_t, c_uint32, c_void_p
 from functools import lru_cache
 
 import numpy as np
@@ -34,6 +34,8 @@ def _library() -> ctypes.CDLL:
         "plane_counts": [points, grid, c_int32, c_void_p],
         "number_planes": [points, grid, c_int32, c_void_p, c_void_p, c_void_p, c_void_p],
     }
+    core.ggslam_gpcc_sample_cubes.restype = c_int64
+    core.ggslam_gpcc_sample_cubes.argtypes = [points, grid, c_uint32, c_void_p]
     for name, arguments in signatures.items():
         function = getattr(core, f"ggslam_gpcc_{name}")
         function.restype, function.argtypes = None, arguments
@@ -78,6 +80,13 @@ class GridPoints:
         out = np.empty(chosen.count, np.int32)
         _library().ggslam_gpcc_along_axis(chosen, self._grid, axis, out.ctypes.data)
         return out
+
+    def sample_cubes(self, one_in: int) -> np.ndarray:
+        """Codes uint64 [M] of 21 bits a coordinate, x first, of the points in one of so many (a power of two) cubes of
+        4 x 4 x 4 voxels."""
+        codes = np.empty(len(self), np.uint64)
+        count = _library().ggslam_gpcc_sample_cubes(self._chosen(None), self._grid, one_in - 1, codes.ctypes.data)
+        return codes[:count].copy()
 
     def plane_counts(self, axis: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Number of points in each plane across an axis, uint32 [size of the axis]."""

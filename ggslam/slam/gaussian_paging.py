@@ -20,7 +20,7 @@ from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.paging_settings import PagingSettings
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.system.interrupts import uninterrupted
+from ggslam.system.interrupts import delay_interrupts
 
 
 class GaussianPager:
@@ -109,7 +109,7 @@ class GaussianPager:
         if self.cells is None or not keys:
             return
         begin = len(self.map)
-        with uninterrupted():
+        with delay_interrupts():
             rows = self.cells.move_in(self.map, keys)
         self.moved_in += rows.stop - begin
         self.note_size()
@@ -129,7 +129,7 @@ class GaussianPager:
             return 0
         chosen = self._choose(sights, cells, rows, excess, excess + int(self._settings.slack * limit))
         left = len(self.map) - sum(len(part) for part in chosen.values())
-        with uninterrupted():
+        with delay_interrupts():
             self.moved_out += cells.move_out(self.map, chosen) if chosen else 0
         return max(0, left - limit)
 
@@ -168,7 +168,7 @@ class GaussianPager:
         if self.cells is None:
             return
         moved = np.flatnonzero(np.abs(T_new_old - np.eye(4)).max((1, 2)) > 0).tolist()
-        with uninterrupted():
+        with delay_interrupts():
             self.cells.change(lambda gaussians: move_with_keyframes(gaussians, T_new_old), moved)
 
     def vote_sizes(self) -> np.ndarray:
@@ -185,7 +185,7 @@ class GaussianPager:
         if self.cells is None:
             return None
         self._prune_nowhere()
-        with uninterrupted():
+        with delay_interrupts():
             self.cells.move_out(self.map, self.cells.cells_of(self.map))
         self.map.shrink(0)
         if self.mapper.identity is not None:

@@ -32,7 +32,7 @@ from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.parts import device_name, make_parts
 from ggslam.slam.result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
 from ggslam.slam.run_objects import RunObjects
-from ggslam.slam.saved_places import places_to_bytes
+from ggslam.slam.saved_places import saved_places_to_bytes
 from ggslam.slam.step_log import StepLog
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.tracking.keyframes import KeyframePolicy
@@ -187,7 +187,7 @@ class Slam:
         parts = [gaussians] if cells is None else (part for _, part in cells.parts())
         poses = np.stack([k.T_world_camera for k in self.mapper.keyframes])
         noise = self.tracker.noise or DepthNoise()
-        return places_to_bytes(self.camera, self.surface, self.loops, noise, self.scale, poses, parts)
+        return saved_places_to_bytes(self.camera, self.surface, self.loops, noise, self.scale, poses, parts)
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, for a run that has no result."""

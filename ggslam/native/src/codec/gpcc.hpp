@@ -3,6 +3,7 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "common/dispatch.hpp"
@@ -30,6 +31,20 @@ struct OctreeSettings {
   std::int32_t unique_points;       // 0: the number of points is coded for every leaf
 };
 
+// What geometry coding in general depends on: trees whose nodes are not split along every axis (QTBT), planes, points
+// that are coded directly, scaled positions, several codewords.
+struct TreeSettings {
+  std::int32_t levels, neighbour_boundary, adjacent_child, intra_prediction, unique_points;
+  std::int32_t direct_mode;   // 0 to 3
+  std::int32_t direct_pairs;  // two points share what their positions begin with
+  std::int32_t direct_rate;   // of 32 nodes that could be coded directly, with planes in mode 1
+  std::int32_t planes, plane_thresholds[3];
+  std::int32_t scaling, slice_qp, direct_qp, qp_shift;
+  std::int32_t codewords;
+  std::int32_t separate_bits;  // bins of equal probability are a stream of their own
+  std::uint8_t axes[64];       // by level: 4 x, 2 y, 1 z
+};
+
 // What an attribute's coding by the region-adaptive hierarchical transform depends on.
 struct RahtSettings {
   std::int32_t components;   // 1 or 3
@@ -37,7 +52,8 @@ struct RahtSettings {
   std::int32_t qp, qp_secondary;  // of component 0 and of the others
   std::int32_t prediction;
   std::int32_t min_parent_neighbours, min_neighbours;  // prediction thresholds 0 and 1
-  float rdoq;                // encoder: weight of the rate in dropping coefficients; 0: none is dropped
+  std::int32_t first_version;  // the stream was written by this codec when its roots of large weights were its own
+  float rdoq;                // encoder: weight of a bit in dropping coefficients, 1 as the reference's; 0: none is dropped
 };
 
 // The nodes of one size in Morton order. Entry 0 of each array stands for "no node"; nodes count from 1.
@@ -58,6 +74,21 @@ struct Octree {
 
   int depth() const { return static_cast<int>(levels.size()); }
   std::uint32_t weight_of_leaf(std::uint32_t leaf) const { return leaf_points.empty() ? 1 : leaf_points[leaf]; }
+};
+
+// Adaptive contexts that a slice leaves to the next one, as bytes; empty: none.
+struct Memory {
+  std::vector<std::uint8_t> bytes;
+
+  template <class Contexts>
+  void load(Contexts& contexts) const {
+    if (bytes.size() == sizeof(Contexts)) std::memcpy(static_cast<void*>(&contexts), bytes.data(), sizeof(Contexts));
+  }
+  template <class Contexts>
+  void save(const Contexts& contexts) {
+    const auto* begin = reinterpret_cast<const std::uint8_t*>(&contexts);
+    bytes.assign(begin, begin + sizeof(Contexts));
+  }
 };
 
 // Counts the points below every node; needed by the attribute coder.
