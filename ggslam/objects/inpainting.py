@@ -19,7 +19,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from ggslam.objects.hole_refinement import Recorded, refine
-from ggslam.objects.hole_views import HoleView, MapView, look, looked_again
+from ggslam.objects.hole_views import CameraView, HoleView, look, looked_again
 from ggslam.objects.plane_filling import as_seen, cover, find_hole, make_chart, paint, widen_hole
 from ggslam.objects.rim_planes import RimPlane, find_rim_planes, rim_points
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
@@ -70,7 +70,7 @@ class Filling:
 def inpaint(
     scene: SegmentedMap,
     removed: GaussianTensors,
-    views: Sequence[MapView],
+    views: Sequence[CameraView],
     ignored: Sequence[int] = (),
     recorded: Callable[[int], Recorded] | None = None,
     settings: InpaintSettings | None = None,
@@ -95,7 +95,7 @@ class _Hole:
     """One hole while it is closed. New Gaussians are the last rows of the map."""
 
     def __init__(
-        self, scene: SegmentedMap, removed: GaussianTensors, views: Sequence[MapView], ignored: Sequence[int],
+        self, scene: SegmentedMap, removed: GaussianTensors, views: Sequence[CameraView], ignored: Sequence[int],
         settings: InpaintSettings,
     ) -> None:  # fmt: skip
         self.scene, self.removed, self.views, self.settings = scene, removed, views, settings

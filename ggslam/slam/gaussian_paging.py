@@ -48,7 +48,7 @@ class GaussianPager:
 
     @property
     def mapper(self) -> Mapper:
-        """Whose map it is."""
+        """The mapper whose map is paged."""
         assert self._mapper is not None
         return self._mapper
 

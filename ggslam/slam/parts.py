@@ -142,7 +142,7 @@ def make_tracker(camera: Camera, config: Config, context: NativeContext, library
 
 
 def make_pager(camera: Camera, config: Config, folder: Path | None) -> MapPager | None:
-    """Who keeps a run within its limit of memory, if it has one."""
+    """Keeps the run within its limit of memory; None if it has none."""
     if not config.memory_limit_mb:
         return None
     budget = MemoryBudget(int(config.memory_limit_mb * MB), int(config.paging.budget_mb * MB))

@@ -21,6 +21,7 @@ from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
+from ggslam.runs.records.sequence import OpenRecord, SequenceRecord
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import open_sequence
@@ -238,5 +239,6 @@ def test_a_run_that_may_choose_tells_where_it_was(
     settings = config("device=auto", "identity.enabled=false")
     _, result = run(frames[:1], settings, None)
     assert len(result.notes) == 1 and "NVIDIA GPU" in result.notes[0]
-    RunFolder.create(tmp_path / "run").save(settings, {}, result)
+    record = SequenceRecord(open=OpenRecord(path="room"), camera=frames[0].camera)
+    RunFolder.create(tmp_path / "run").save(settings, record, result)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["environment"]["device"] == "cpu"

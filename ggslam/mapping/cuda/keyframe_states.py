@@ -119,7 +119,7 @@ class KeyframeStates:
 
     def append(self, T_camera_world: np.ndarray, exposure: np.ndarray) -> int:
         """Adds a keyframe, for which no step was made yet; returns its number. Views of other keyframes that were
-        handed out before must not be used any more: the table may have moved.
+        handed out before are invalid afterwards: the table may have moved.
 
         Args:
             T_camera_world: [4, 4].

@@ -3,7 +3,7 @@
 starts work.
 
 It waits at a new keyframe (once, for the number of Gaussians to insert and for what the map shows of objects), and when
-somebody asks for poses. What it tells of losses is what has arrived of them without waiting.
+poses are read. The losses it reports are those that have arrived without waiting.
 """
 
 from __future__ import annotations
