@@ -28,7 +28,7 @@ _pointer, _int32, _int64, _float = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int
 
 
 class _Terms(ctypes.Structure):
-    """Mirror of struct PixelTerms in cuda/kernels/rendering/pixel_terms.cuh."""
+    """Mirror of struct CpuPixelTerms in cuda/kernels/rendering/pixel_terms.cuh."""
 
     _fields_ = [
         ("pixels", _int64), ("gaussians", _pointer), ("weights", _pointer), ("counts", _pointer), ("stream", _pointer),
