@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from test_run_page import checked
 from typer.testing import CliRunner
 
 from ggslam.cli.main import app
@@ -21,9 +21,6 @@ from ggslam.jobs.score.run import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.slam.step_log import COLUMNS, read_table
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "jobs"))
-from test_run_page import checked  # noqa: E402
 
 
 @pytest.fixture(scope="module")
