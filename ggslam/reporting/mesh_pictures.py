@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from ggslam.native.loader import NativeContext, load_library
-from ggslam.reporting.cloud_pictures import View
+from ggslam.reporting.cloud_pictures import CloudView
 from ggslam.scene.poses import inverse
 
 _BACKGROUND = 255
@@ -36,7 +36,7 @@ def _library() -> ctypes.CDLL:
 
 
 def draw_mesh(
-    vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray, colors: np.ndarray, view: View,
+    vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray, colors: np.ndarray, view: CloudView,
     cull: bool = True, near: float = 0.05, context: NativeContext | None = None,
 ) -> np.ndarray:  # fmt: skip
     """A picture, uint8 [H, W, 3], of a mesh lit from the camera; white where there is none.
