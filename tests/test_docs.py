@@ -114,6 +114,7 @@ def test_pictures_are_used_and_small() -> None:
         assert path.name in text and path.stat().st_size < 3e6, path
 
 
+@pytest.mark.long("runs the programs of the README and the pages as they stand")
 def test_short_programs_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of the README and of the pages that have no test of their own; they share what a reader would have."""
     import numpy as np
