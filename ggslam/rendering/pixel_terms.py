@@ -79,7 +79,7 @@ class CpuPixelTerms:
         terms.gaussians[:, 0], terms.weights[:, 0], terms.counts[:] = rows, 1, 1
         return terms
 
-    def joined(self, other: CpuPixelTerms) -> CpuPixelTerms:
+    def append(self, other: CpuPixelTerms) -> CpuPixelTerms:
         """These pixels followed by those of `other`, which must have the same capacity."""
         return CpuPixelTerms(
             np.concatenate([self.gaussians, other.gaussians]), np.concatenate([self.weights, other.weights]),

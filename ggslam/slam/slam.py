@@ -20,6 +20,7 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError
+from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -51,14 +52,17 @@ class Slam:
         has_masks: whether the recording has object masks; None: judged by the first keyframe's frame.
         paging: folder that what does not fit into `memory_limit_mb` moves to; None: a temporary one.
         library: CUDA kernels to compute with; None: as `config.device` says.
+        extra_loss: a loss of one's own in every mapping iteration, extra_loss(view, keyframe) -> scalar tensor, see
+            `mapping.extra_loss.ExtraLoss`; on the CPU only.
 
     Raises:
-        ConfigError: a limit of memory that is less than the program itself takes; no such device.
+        ConfigError: a limit of memory that is less than the program itself takes; no such device; an extra loss on a
+            GPU.
     """
 
     def __init__(
         self, camera: Camera, config: Config | None = None, has_masks: bool | None = None, paging: Path | None = None,
-        library: CudaLibrary | None = None,
+        library: CudaLibrary | None = None, extra_loss: ExtraLoss | None = None,
     ) -> None:  # fmt: skip
         self.camera = camera
         self.config = config or Config()
@@ -66,6 +70,9 @@ class Slam:
         self.context, self.masks, self.tracker, self.surface = parts.context, parts.masks, parts.tracker, parts.surface
         self.mapper, self.pager, self.loops = parts.mapper, parts.pager, parts.loops
         self._notes, self._on_device = parts.notes, parts.on_device
+        if extra_loss is not None and self._on_device:
+            raise ConfigError("`extra_loss` needs device: cpu; on a GPU losses are computed by kernels only")
+        self.mapper.extra_loss = extra_loss
         self.policy = KeyframePolicy(self.config.keyframes)
         self.scale = 1.0
         """Size of the scene against a room's, see `tracking.scale`."""
