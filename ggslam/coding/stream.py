@@ -10,9 +10,9 @@ import numpy as np
 
 from ggslam.coding.attribute_values import CodedAttribute, IdTable
 from ggslam.coding.container import Unit, UnitType, read_units
-from ggslam.coding.native import MAX_SLICE_POINTS
 from ggslam.coding.quantization import Quantization
 from ggslam.coding.sequence_parameters import MATRIX_BT709, MATRIX_IDENTITY, SequenceParameters
+from ggslam.coding.slice_coder import MAX_SLICE_POINTS
 from ggslam.coding.syntax import AttributeHeader, AttributeParameters, GeometryHeader, GeometryParameters
 from ggslam.coding.user_data import read_user_data
 from ggslam.errors import FormatError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gpcc_reference import CoefficientDecoder, inverse_transform
 
-from ggslam.coding.native import SliceCoder, raht_settings
+from ggslam.coding.slice_coder import SliceCoder, raht_settings
 from ggslam.coding.syntax import AttributeParameters
 
 

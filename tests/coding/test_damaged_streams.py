@@ -10,7 +10,7 @@ import pytest
 
 from ggslam.coding import AttributeSettings, CodecSettings, decode_cloud, encode_cloud
 from ggslam.coding.container import HEADER, UnitType, read_units, unit_bytes
-from ggslam.coding.native import RahtSettings, SliceCoder
+from ggslam.coding.slice_coder import RahtSettings, SliceCoder
 from ggslam.coding.syntax import GeometryParameters
 from ggslam.errors import FormatError
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ggslam.tracking.cuda import contract
+from ggslam.interface.cuda.tracking import AlignResult
 from ggslam.tracking.gicp import AlignmentResult, judge
 from ggslam.tracking.observability import PointSpread, about_point
 from ggslam.tracking.settings import AlignSettings
@@ -39,24 +39,26 @@ def device_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSe
     """An alignment from what the kernels say.
 
     Args:
-        found: float64 [RESULTS], see `contract`.
+        found: float64 [ALIGN_RESULTS], see `AlignResult`.
         matched: float32 [2, room] on the device, bits of the matches and squared distances.
         settings: that it was made with.
     """
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = found[contract.POSE][:9].reshape(3, 3), found[contract.POSE][9:]
-    information = found[contract.INFORMATION][_PLACES]
-    spread = PointSpread(float(found[contract.SPREAD_TOTAL]), found[contract.CENTROID], float(found[contract.RADIUS]))
-    usable = bool(found[contract.USABLE])
+    T[:3, :3], T[:3, 3] = found[AlignResult.POSE :][:9].reshape(3, 3), found[AlignResult.POSE :][9:12]
+    information = found[AlignResult.INFORMATION :][_PLACES]
+    centroid = found[AlignResult.CENTROID : AlignResult.RADIUS]
+    spread = PointSpread(float(found[AlignResult.SPREAD_TOTAL]), centroid, float(found[AlignResult.RADIUS]))
+    usable = bool(found[AlignResult.USABLE])
     status, visibility, weak = judge(information, T[:3, :3], spread, usable, settings.degenerate_below)
     values = {
-        "T_world_camera": T, "status": status, "converged": bool(found[contract.CONVERGED]),
-        "iterations": int(found[contract.COARSE_ITERATIONS] + found[contract.FINE_ITERATIONS]),
-        "overlap": float(found[contract.OVERLAP]), "rmse": float(found[contract.RMSE]),
+        "T_world_camera": T, "status": status, "converged": bool(found[AlignResult.CONVERGED]),
+        "iterations": int(found[AlignResult.COARSE_ITERATIONS] + found[AlignResult.FINE_ITERATIONS]),
+        "overlap": float(found[AlignResult.OVERLAP]), "rmse": float(found[AlignResult.RMSE]),
         "information": about_point(information, T[:3, 3]), "camera_information": information,
-        "visibility": visibility, "weak_directions": weak, "cost": float(found[contract.COST]),
-        "photometric_residual": float(found[contract.RESIDUAL]), "photometric_share": float(found[contract.SHARE]),
-        "_matched": matched, "_count": int(found[contract.POINT_COUNT]),
+        "visibility": visibility, "weak_directions": weak, "cost": float(found[AlignResult.COST]),
+        "photometric_residual": float(found[AlignResult.PHOTOMETRIC_RESIDUAL]),
+        "photometric_share": float(found[AlignResult.PHOTOMETRIC_SHARE]),
+        "_matched": matched, "_count": int(found[AlignResult.POINT_COUNT]),
     }  # fmt: skip
     result = object.__new__(DeviceAlignment)  # the dataclass's own constructor asks for the matches
     for name, value in values.items():

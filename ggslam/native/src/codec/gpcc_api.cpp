@@ -71,7 +71,6 @@ GGSLAM_EXPORT void* ggslam_gpcc_slice_create() { return new (std::nothrow) Slice
 
 GGSLAM_EXPORT void ggslam_gpcc_slice_destroy(void* slice) { delete static_cast<Slice*>(slice); }
 
-// Builds the octree of points [count, 3] in [0, 2^depth). `order` [count] receives their coding order.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_build(void* context, void* slice, const std::int32_t* points, std::uint32_t count,
                                              std::int32_t depth, std::uint32_t* order) {
   return gpcc::guarded([&]() -> std::int64_t {
@@ -84,18 +83,15 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_build(void* context, void* slice, const s
 
 GGSLAM_EXPORT std::uint32_t ggslam_gpcc_leaves(void* slice) { return static_cast<Slice*>(slice)->tree.leaves; }
 
-// Number of nodes at a level below the tree's depth.
 GGSLAM_EXPORT std::uint32_t ggslam_gpcc_nodes(void* slice, std::int32_t level) {
   return static_cast<Slice*>(slice)->tree.levels[level].size();
 }
 
-// Number of points in each leaf, `counts` [leaves].
 GGSLAM_EXPORT void ggslam_gpcc_leaf_points(void* slice, std::uint32_t* counts) {
   const gpcc::Octree& tree = static_cast<Slice*>(slice)->tree;
   for (std::uint32_t leaf = 1; leaf <= tree.leaves; ++leaf) counts[leaf - 1] = tree.weight_of_leaf(leaf);
 }
 
-// Makes every leaf one point.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_merge(void* slice) {
   return gpcc::guarded([&]() -> std::int64_t {
     gpcc::Octree& tree = static_cast<Slice*>(slice)->tree;
@@ -106,7 +102,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_merge(void* slice) {
   });
 }
 
-// Returns the number of bytes, which ggslam_gpcc_take copies.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slice, const gpcc::OctreeSettings* settings) {
   return gpcc::guarded([&]() -> std::int64_t {
     Slice& s = *static_cast<Slice*>(slice);
@@ -116,8 +111,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slic
   });
 }
 
-// `attributes` [points, components] in coding order; replaced by what a decoder will reconstruct. Returns the number of
-// bytes.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_attribute(void* context, void* slice, const gpcc::RahtSettings* settings,
                                                         std::int32_t* attributes) {
   return gpcc::guarded([&]() -> std::int64_t {
@@ -135,7 +128,6 @@ GGSLAM_EXPORT void ggslam_gpcc_take(void* slice, std::uint8_t* out) {
   bytes.clear();
 }
 
-// Decodes a geometry payload that is said to hold `points` points.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slice, const gpcc::OctreeSettings* settings,
                                                        const std::uint8_t* data, std::size_t size,
                                                        std::uint32_t points) {
@@ -148,7 +140,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slic
   });
 }
 
-// Positions [points, 3] in coding order.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_positions(void* context, void* slice, std::int32_t* out) {
   return gpcc::guarded([&]() -> std::int64_t {
     GGSLAM_DISPATCH(gpcc::isa_of(context), octree_positions)(static_cast<Slice*>(slice)->tree, out);
@@ -165,7 +156,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_attribute(void* context, void* sli
   });
 }
 
-// Y, Cb, Cr [count, 3] of the colours rgb[order[i]].
 GGSLAM_EXPORT void ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, const std::uint32_t* order,
                                         std::uint32_t count, std::int32_t* out) {
   GGSLAM_DISPATCH(gpcc::isa_of(context), colours_to_ycbcr)(rgb, order, count, out);

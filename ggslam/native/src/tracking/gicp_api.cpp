@@ -293,8 +293,6 @@ class Aligner {
 }  // namespace
 }  // namespace ggslam
 
-// Aligns points to a target from the guess `pose` (T_world_camera, row by row). `photometric_points` and `reference`
-// may be null. `match` and `squared_distance` have room for one entry per point.
 GGSLAM_EXPORT void ggslam_gicp_align(void* context, const void* target, const ggslam::AlignPoints* points,
                                      const ggslam::AlignSettings* settings,
                                      const ggslam::PhotometricPoints* photometric_points,
@@ -314,8 +312,6 @@ GGSLAM_EXPORT void ggslam_gicp_align(void* context, const void* target, const gg
     for (int j = 0; j < 4; ++j) result->pose[4 * i + j] = i == 3 ? (j == 3) : j == 3 ? pose.t[i] : pose.r[3 * i + j];
 }
 
-// One linearisation at a pose, for tests: level 0 fine, 1 coarse. h [36], b [6] in sums over points, twist about the
-// camera centre; returns the cost.
 GGSLAM_EXPORT double ggslam_gicp_linearize(void* context_, const void* target_, const ggslam::AlignPoints* points,
                                            const ggslam::AlignSettings* settings, int level, const double* pose,
                                            int32_t* match, float* squared_distance, double* h, double* b) {

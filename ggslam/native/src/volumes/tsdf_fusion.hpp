@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "interface/core/volumes.hpp"
 #include "volumes/tsdf.hpp"
 
 namespace ggslam {
@@ -15,26 +16,6 @@ namespace ggslam::volumes {
 constexpr int kTile = 4;        // pixels along an edge of the depth pyramid's smallest tiles
 constexpr int kErosion = 2;     // pixels: what is looked through must be so in this neighbourhood
 constexpr float kNear = 0.02f;  // metres; what is nearer is not projected
-
-// Numbers of the fusion, field by field as in ggslam/volumes/tsdf_native.py. Distances in metres.
-struct FusionSettings {
-  float min_depth, max_depth, free_share, edge, clearing, max_free_weight;
-};
-
-// A view to be fused. `color` [H, W, 3] and `labels` [H, W] may be null.
-struct FusionInput {
-  const float* depth;
-  const uint8_t* color;
-  const uint16_t* labels;
-  int32_t width, height;
-  float fx, fy, cx, cy;
-  double rotation[9], translation[3];  // of T_camera_world, row by row
-};
-
-struct FusionStats {
-  int64_t blocks, updated, made, freed;
-  double prepare_ms, select_ms, update_ms;
-};
 
 // Smallest and largest depth in tiles of kTile x 2^level pixels; (inf, 0) where there is none.
 struct DepthTile {

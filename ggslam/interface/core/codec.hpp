@@ -1,0 +1,124 @@
+// SPDX-License-Identifier: Apache-2.0
+// The compiled core's G-PCC codec (ISO/IEC 23090-9, first edition) and LZF.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+#include "interface/export.hpp"
+
+namespace ggslam::gpcc {
+
+enum Status : int {
+  kOk = 0,
+  kOutOfMemory = 1,
+  kTruncated = 2,      // the payload ends before what it describes, or holds an impossible value
+  kCountMismatch = 3,  // it describes another number of points than its unit says
+  kTooLarge = 4,       // it describes more than the decoder is willing to hold
+};
+
+// What octree geometry coding depends on.
+struct OctreeSettings {
+  std::int32_t depth;               // levels that are coded; the root has an edge of 2^depth
+  std::int32_t neighbour_boundary;  // neighbours are looked up within cubes of 2^this nodes; 0: siblings only
+  std::int32_t adjacent_child;
+  std::int32_t intra_prediction;    // nodes of an edge below 2^this are predicted from their 26 neighbours
+  std::int32_t unique_points;       // 0: the number of points is coded for every leaf
+};
+
+// What an attribute's coding by the region-adaptive hierarchical transform depends on.
+struct RahtSettings {
+  std::int32_t components;   // 1 or 3
+  std::int32_t bit_depth;
+  std::int32_t qp, qp_secondary;  // of component 0 and of the others
+  std::int32_t prediction;
+  std::int32_t min_parent_neighbours, min_neighbours;  // prediction thresholds 0 and 1
+  float rdoq;                // encoder: weight of the rate in dropping coefficients; 0: none is dropped
+};
+
+// clip(floor(scale p + rounding), first, last) - first.
+struct Grid {
+  double scale, rounding;
+  std::int64_t first[3], last[3];
+  std::int32_t exact;  // coordinates are integers and stand for themselves
+};
+
+// Points [*, 3] of which `rows` [count] are meant; without rows, the first `count`.
+struct Points {
+  const void* data;
+  const std::int64_t* rows;
+  std::size_t count;
+  std::int32_t kind;  // 0: int32, 1: int64, 2: float, 3: double
+};
+
+}  // namespace ggslam::gpcc
+
+GGSLAM_EXPORT void* ggslam_gpcc_slice_create();
+GGSLAM_EXPORT void ggslam_gpcc_slice_destroy(void* slice);
+
+// Builds the octree of points [count, 3] in [0, 2^depth). `order` [count] receives their coding order.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_build(void* context, void* slice, const std::int32_t* points,
+                                             std::uint32_t count, std::int32_t depth, std::uint32_t* order);
+GGSLAM_EXPORT std::uint32_t ggslam_gpcc_leaves(void* slice);
+
+// Number of nodes at a level below the tree's depth.
+GGSLAM_EXPORT std::uint32_t ggslam_gpcc_nodes(void* slice, std::int32_t level);
+
+// Number of points in each leaf, `counts` [leaves].
+GGSLAM_EXPORT void ggslam_gpcc_leaf_points(void* slice, std::uint32_t* counts);
+
+// Makes every leaf one point.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_merge(void* slice);
+
+// Returns the number of bytes, which ggslam_gpcc_take copies.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slice,
+                                                       const ggslam::gpcc::OctreeSettings* settings);
+
+// `attributes` [points, components] in coding order; replaced by what a decoder will reconstruct. Returns the number of
+// bytes.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_attribute(void* context, void* slice,
+                                                        const ggslam::gpcc::RahtSettings* settings,
+                                                        std::int32_t* attributes);
+GGSLAM_EXPORT void ggslam_gpcc_take(void* slice, std::uint8_t* out);
+
+// Decodes a geometry payload that is said to hold `points` points.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slice,
+                                                       const ggslam::gpcc::OctreeSettings* settings,
+                                                       const std::uint8_t* data, std::size_t size,
+                                                       std::uint32_t points);
+
+// Positions [points, 3] in coding order.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_positions(void* context, void* slice, std::int32_t* out);
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_attribute(void* context, void* slice,
+                                                        const ggslam::gpcc::RahtSettings* settings,
+                                                        const std::uint8_t* data, std::size_t size,
+                                                        std::int32_t* attributes);
+
+// Y, Cb, Cr [count, 3] of the colours rgb[order[i]].
+GGSLAM_EXPORT void ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, const std::uint32_t* order,
+                                        std::uint32_t count, std::int32_t* out);
+GGSLAM_EXPORT void ggslam_gpcc_from_ycbcr(void* context, const std::int32_t* components, std::uint32_t count,
+                                          std::uint8_t* rgb);
+
+// Grid positions [count, 3].
+GGSLAM_EXPORT void ggslam_gpcc_on_grid(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
+                                       std::int32_t* out);
+
+// Grid coordinates [count] along one axis.
+GGSLAM_EXPORT void ggslam_gpcc_along_axis(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
+                                          std::int32_t axis, std::int32_t* out);
+
+// Adds to counts [planes] the number of points in each plane across an axis.
+GGSLAM_EXPORT void ggslam_gpcc_plane_counts(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
+                                            std::int32_t axis, std::uint32_t* counts);
+
+// numbers [count] become number_of_plane[coordinate]. The indices of points in planes that are marked as cut are appended
+// to `inside`, which has room for them.
+GGSLAM_EXPORT void ggslam_gpcc_number_planes(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
+                                             std::int32_t axis, const std::uint16_t* number_of_plane,
+                                             const std::uint8_t* cut, std::uint16_t* numbers, std::int64_t* inside);
+
+// Bytes written to `out`, which must hold size + size / 32 + 1, or kNoRoom.
+GGSLAM_EXPORT int64_t ggslam_lzf_compress(const uint8_t* data, int64_t size, uint8_t* out, int64_t capacity);
+
+// 0 when `data` stand for exactly `size` bytes, which are then in `out`; else one of Failure.
+GGSLAM_EXPORT int64_t ggslam_lzf_decompress(const uint8_t* data, int64_t packed, uint8_t* out, int64_t size);

@@ -1,0 +1,31 @@
+// SPDX-License-Identifier: Apache-2.0
+// Written by scripts/make_native_mirrors.py from codec.hpp; changes are lost. Size of each structure and
+// offsets of its fields, in the order of the header, so that a caller can check its mirrors of them.
+#include <cstddef>
+#include <cstdint>
+
+#include "interface/core/codec.hpp"
+
+using ggslam::gpcc::Grid;
+using ggslam::gpcc::OctreeSettings;
+using ggslam::gpcc::Points;
+using ggslam::gpcc::RahtSettings;
+
+namespace {
+constexpr std::size_t kLayout[] = {
+    sizeof(OctreeSettings), offsetof(OctreeSettings, depth), offsetof(OctreeSettings, neighbour_boundary),
+    offsetof(OctreeSettings, adjacent_child), offsetof(OctreeSettings, intra_prediction),
+    offsetof(OctreeSettings, unique_points),
+    sizeof(RahtSettings), offsetof(RahtSettings, components), offsetof(RahtSettings, bit_depth),
+    offsetof(RahtSettings, qp), offsetof(RahtSettings, qp_secondary), offsetof(RahtSettings, prediction),
+    offsetof(RahtSettings, min_parent_neighbours), offsetof(RahtSettings, min_neighbours), offsetof(RahtSettings, rdoq),
+    sizeof(Grid), offsetof(Grid, scale), offsetof(Grid, rounding), offsetof(Grid, first), offsetof(Grid, last),
+    offsetof(Grid, exact),
+    sizeof(Points), offsetof(Points, data), offsetof(Points, rows), offsetof(Points, count), offsetof(Points, kind),
+};
+}  // namespace
+
+GGSLAM_EXPORT const std::size_t* ggslam_codec_layout(int* count) {
+  *count = static_cast<int>(sizeof(kLayout) / sizeof(kLayout[0]));
+  return kLayout;
+}
