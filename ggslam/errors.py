@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 
 class GgslamError(Exception):
     """Base of every error that ggslam raises on purpose. The command line prints it and exits with `exit_code`."""
@@ -47,11 +45,3 @@ class NativeCoreError(GgslamError):
     """The compiled core is missing or does not fit this version of the Python code."""
 
     exit_code = 1
-
-
-def check_ranges(settings: object, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """Raises ConfigError for the first attribute of `settings` that is not a number in its closed range."""
-    for name, (low, high) in ranges.items():
-        value = getattr(settings, name)
-        if not low <= value <= high:  # NaN is in no range
-            raise ConfigError(f"{type(settings).__name__}.{name}: expected {low:g} to {high:g}, found {value}")

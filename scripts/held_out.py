@@ -6,14 +6,13 @@ from __future__ import annotations
 import numpy as np
 
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.frame_poses import frame_poses
 from ggslam.scene.poses import inverse
 
 
 def held_out_poses(folder: RunFolder) -> dict[int, np.ndarray]:
     """T_camera_world by frame number; of a run that held out none, those of the frames that are no keyframes."""
-    record = folder.read_json("keyframes.json")
-    poses, keyframes = frame_poses(record), {k["frame"] for k in record["keyframes"]}
+    record = folder.keyframes()
+    poses, keyframes = record.poses(), record.keyframe_numbers()
     evaluation = folder.config().evaluation
     others = [index for index in sorted(poses) if index not in keyframes]
     return {index: inverse(poses[index]) for index in [i for i in others if evaluation.is_held_out(i)] or others}

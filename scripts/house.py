@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import argparse
 import ast
-import dataclasses
 import re
 import subprocess
 import sys
 import time
-import typing
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -86,28 +84,12 @@ def length(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 
 def settings_without_range() -> tuple[int, list[str]]:
-    """How many settings there are, and those whose number is not bounded or whose text or unit is missing."""
+    """How many settings there are, and those whose number is not bounded or whose text is missing."""
     from ggslam.slam.config import Config
+    from ggslam.system.settings import walk
 
-    return _unbounded(Config, "")
-
-
-def _unbounded(kind: type, prefix: str) -> tuple[int, list[str]]:
-    types = typing.get_type_hints(kind, include_extras=True)
-    count, lacking = 0, []
-    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
-        declared = types[field.name]
-        bare = typing.get_args(declared)[0] if hasattr(declared, "__metadata__") else declared
-        if dataclasses.is_dataclass(bare):
-            n, names = _unbounded(typing.cast(type, bare), f"{prefix}{field.name}.")
-            count, lacking = count + n, lacking + names
-            continue
-        count += 1
-        numbers = {int, float} & {bare, *typing.get_args(bare)}
-        bounds = [m for m in getattr(declared, "__metadata__", ()) if "ge=" in repr(m) or "gt=" in repr(m)]
-        if numbers and not bounds:
-            lacking.append(prefix + field.name)
-    return count, lacking
+    known = list(walk(Config))
+    return len(known), [one.path for one in known if not one.text or (one.is_number and not one.range())]
 
 
 def raw_json_reads() -> list[str]:

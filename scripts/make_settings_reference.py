@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes docs/settings.md: every setting with its type, default and meaning, from the settings classes themselves.
+"""Writes docs/settings.md: every setting with its default, range and meaning, as the settings classes declare them.
 
     python scripts/make_settings_reference.py            # writes the page
     python scripts/make_settings_reference.py --check    # exit code 1 if the page is not up to date
@@ -7,17 +7,15 @@
 
 from __future__ import annotations
 
-import ast
-import dataclasses
 import inspect
 import sys
-import textwrap
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from ggslam.slam.config import Config, presets
+from ggslam.system.settings import Known, group_of, walk
 
 PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
 
@@ -39,69 +37,68 @@ mapping:
 refine_iterations: 1000
 ```
 
-Names that do not exist and values that cannot be are refused before a run begins. Every run writes all settings, with
-their values, to `config.yaml` in its folder.
+Names that do not exist and values out of their range are refused before a run begins, with their path:
+`tracking.photometric.shrink: expected 1 to 16, found 0`. Every run writes all settings, with their values, to
+`config.yaml` in its folder. `ggslam run --help-settings` prints the table below, `--help-setting all` every setting,
+`--help-setting depth` those with "depth" in their names. In Python: `Config(mapping={{"iterations_per_frame": 8}})`.
 """
 
 
-def field_meanings(kind: type) -> dict[str, str]:
-    """What the string below each field of a dataclass says; a field without one shares that of the next field."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
-    assert isinstance(body, ast.ClassDef)
-    meanings: dict[str, str] = {}
-    waiting: list[str] = []
-    for node in body.body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            waiting.append(node.target.id)
-        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            meanings |= dict.fromkeys(waiting, one_line(node.value.value))
-            waiting = []
-        else:
-            waiting = []
-    return meanings
-
-
-def one_line(text: str) -> str:
-    """A docstring as it stands in a cell of a table."""
-    return " ".join(text.split()).replace("|", "\\|")
+def cell(text: str) -> str:
+    """Text as it stands in a cell of a table."""
+    return text.replace("|", "\\|")
 
 
 def type_name(kind: Any) -> str:
-    """`int`, `float`, ...; of a choice its values."""
-    if typing.get_origin(kind) is typing.Literal:
-        return ", ".join(f"`{value}`" for value in typing.get_args(kind))
+    """`int`, `float`, `DepthNoise or None`..."""
     parts = typing.get_args(kind) if type(None) in typing.get_args(kind) else (kind,)
     names = [part.__name__ if isinstance(part, type) and not typing.get_args(part) else str(part) for part in parts]
     return " or ".join(f"`{name.replace('NoneType', 'None')}`" for name in names)
 
 
-def optional_group(kind: Any) -> type | None:
-    """The settings class in `Class | None`, if it is one."""
-    return next((part for part in typing.get_args(kind) if dataclasses.is_dataclass(part)), None)
+def values_of(setting: Known) -> str:
+    """What a setting may be: its choices, its range, or its type."""
+    if setting.kind is bool:
+        return "`true`, `false`"
+    if setting.choices:
+        return ", ".join(f"`{value}`" for value in setting.choices)
+    return setting.range() or type_name(setting.kind)
 
 
-def sections(settings: Any, path: str = "") -> Iterator[str]:
-    """A section for each group of settings."""
-    kind = type(settings)
-    types, meanings = typing.get_type_hints(kind), field_meanings(kind)
-    fields = [(f.name, getattr(settings, f.name)) for f in dataclasses.fields(kind)]
-    lines = [f"## {path.rstrip('.') or 'General'}", "", one_line((inspect.getdoc(kind) or "").split("\n\n")[0]), ""]
+def default_of(setting: Known) -> str:
+    """Its default as YAML has it."""
+    text = str(setting.default)
+    return f"`{text.lower() if setting.kind is bool else text}`" if text else "none"
+
+
+def table(settings: Iterable[Known]) -> str:
+    """Rows of settings."""
     rows = [
-        f"| `{path}{name}` | {type_name(types[name])} | `{getattr(value, 'value', value)}` | {meanings.get(name, '')} |"
-        for name, value in fields if not dataclasses.is_dataclass(value)
-    ]  # fmt: skip
-    if rows:
-        yield "\n".join([*lines, "| setting | type | default | meaning |", "|---|---|---|---|", *rows, ""])
-    for name, value in fields:
-        group = optional_group(types[name])
-        if dataclasses.is_dataclass(value) or group is not None:
-            yield from sections(group() if group is not None else value, f"{path}{name}.")
+        f"| `{one.path}` | {default_of(one)} | {values_of(one)} | {cell(one.text)} |"
+        for one in settings
+    ]
+    return "\n".join(["| setting | default | values | meaning |", "|---|---|---|---|", *rows, ""])
+
+
+def groups(kind: type, path: str = "") -> Iterator[tuple[str, str]]:
+    """Path and one line of text of each group of settings."""
+    yield path, " ".join((inspect.getdoc(kind) or "").split("\n\n")[0].split())
+    for name, declared in typing.get_type_hints(kind).items():
+        group = group_of(declared)
+        if group is not None:
+            yield from groups(group, f"{path}{name}.")
 
 
 def page() -> str:
     """The whole page."""
-    names = ", ".join(f"`{name}`" for name in presets())
-    return _INTRODUCTION.format(presets=names) + "\n" + "\n".join(sections(Config()))
+    known = list(walk(Config))
+    parts = [_INTRODUCTION.format(presets=", ".join(f"`{name}`" for name in presets()))]
+    parts += ["## The ones to know", "", table(one for one in known if one.declaration.basic)]
+    parts += ["Those below are for experts, all of them by their groups.", ""]
+    for path, text in groups(Config):
+        if inside := [one for one in known if one.path.rpartition(".")[0] == path.rstrip(".")]:
+            parts += [f"## {path.rstrip('.') or 'General'}", "", text, "", table(inside)]
+    return "\n".join(parts)
 
 
 def main() -> None:

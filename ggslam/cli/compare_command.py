@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +16,7 @@ from ggslam.errors import ConfigError
 if TYPE_CHECKING:
     from ggslam.evaluation.geometry import Overlap
     from ggslam.jobs.compare.comparison import Comparison
+    from ggslam.runs.records.metrics import MetricsRecord
 
 EPILOG = """
 [bold]Examples[/]
@@ -135,18 +136,11 @@ _METRICS = [
 ]  # fmt: skip
 
 
-def _metric_rows(a: dict[str, Any] | None, b: dict[str, Any] | None) -> list[list[str]]:
+def _metric_rows(a: MetricsRecord | None, b: MetricsRecord | None) -> list[list[str]]:
     """Scores that at least one side has."""
     rows = []
     for name, keys, factor, form in _METRICS:
-        values = [_at(side, keys) for side in (a, b)]
+        values = [None if side is None else side.number(*keys) for side in (a, b)]
         if any(value is not None for value in values):
             rows.append([name, *("-" if v is None else format(factor * v, form) for v in values)])
     return rows
-
-
-def _at(metrics: dict[str, Any] | None, keys: tuple[str, ...]) -> float | None:
-    value: Any = metrics
-    for key in keys:
-        value = value.get(key) if isinstance(value, dict) else None
-    return value if isinstance(value, (int, float)) else None

@@ -3,12 +3,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-console = Console()
+from ggslam.cli.argument_names import with_options
+
+
+class CommandConsole(Console):
+    """Prints what the library says with options in place of the arguments that it names."""
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        """As `rich.console.Console.print`."""
+        super().print(*(with_options(item) if isinstance(item, str) else item for item in objects), **how)
+
+
+console = CommandConsole()
 
 
 class RateColumn(ProgressColumn):

@@ -88,7 +88,7 @@ def encode(
     sweep: Annotated[
         Sweep | None, typer.Option(help="Write a study over QPs or geometry scales: tables, plots, pictures.")
     ] = None,
-    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw a study's plots (needs matplotlib).")] = True,
+    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw a study's plots.")] = True,
 ) -> None:
     """Encode a point cloud or a Gaussian map as an MPEG G-PCC stream (ISO/IEC 23090-9), in parallel slices."""
     from ggslam.coding import CodecSettings

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import typer
 from rich.console import Console
 from rich.markup import escape
+from typer.core import TyperGroup
 
 from ggslam import __version__
 from ggslam.cli import (
@@ -29,9 +31,22 @@ from ggslam.cli import (
     view_command,
     volumes_command,
 )
+from ggslam.cli.argument_names import with_options
 from ggslam.errors import GgslamError
 
+
+class _Commands(TyperGroup):
+    def invoke(self, context: Any) -> Any:
+        """Runs a command; errors that name arguments name options from here on."""
+        try:
+            return super().invoke(context)
+        except GgslamError as error:
+            error.args = (with_options(str(error)),)
+            raise
+
+
 app = typer.Typer(
+    cls=_Commands,
     name="ggslam",
     help="RGB-D Gaussian SLAM on two CPU cores: a recording in; trajectory, Gaussian map and scores out.",
     no_args_is_help=True,

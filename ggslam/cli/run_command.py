@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ggslam.cli import options
+from ggslam.cli import options, settings_help
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
 from ggslam.cli.summary import print_scores
@@ -35,6 +35,8 @@ EPILOG = """
   ggslam run data/redkitchen --scale 0.5 --view
 
   ggslam run realsense: --stop 900 --record data/desk --out runs/desk
+
+  ggslam run --help-settings
 
   ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
 """
@@ -107,6 +109,8 @@ def run(
     port: options.Port = 8080,
     evaluate: Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")] = True,
     overwrite: Annotated[bool, typer.Option(help="Replace a finished run in the output folder.")] = False,
+    help_settings: settings_help.HelpSettings = False,
+    help_setting: settings_help.HelpSetting = None,
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
     from ggslam.jobs.run.pipeline import RunRequest  # imports torch: only when needed

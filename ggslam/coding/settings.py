@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any, Literal
 
 import numpy as np
 
-from ggslam.errors import ConfigError, check_ranges
+from ggslam.system.settings import Conflict, setting, settings_class
 
 Split = Literal["count", "interval", "cube"]
 ColorSpace = Literal["ycbcr", "identity", "none"]
@@ -18,15 +18,15 @@ LEVEL_LIMIT = 1_100_000
 """Points per slice that the levels of the first edition allow."""
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class AttributeSettings:
     """How one attribute is coded."""
 
-    qp: int | None = None
+    qp: int | None = setting(None, 4, 99)
     """Quantiser parameter: the step is 2^((qp - 4) / 6). None: that of `CodecSettings`."""
-    chroma_offset: int | None = None
+    chroma_offset: int | None = setting(None, -51, 51)
     """Added to the quantiser parameter of components 1 and 2. None: that of `CodecSettings`."""
-    bit_depth: int | None = None
+    bit_depth: int | None = setting(None, 1, 16, "bits")
     """Bits of a value; None: 8 for uint8, else 16."""
     color_space: ColorSpace | None = None
     """ycbcr: BT.709, 8 bits; identity: components G, B, R; none: components as they are. None: ycbcr for 3 components
@@ -37,52 +37,43 @@ class AttributeSettings:
     lossless: bool = False
     """Whole values of one component (ids) that come back exactly; `qp` and `bit_depth` are then not used."""
 
-    def __post_init__(self) -> None:
-        if self.bit_depth is not None:
-            check_ranges(self, {"bit_depth": (1, 16)})
-        if self.qp is not None:
-            check_ranges(self, {"qp": (4, 99)})
-        if self.chroma_offset is not None:
-            check_ranges(self, {"chroma_offset": (-51, 51)})
-        _check_choice(self, "color_space", (None, "ycbcr", "identity", "none"))
 
-
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class CodecSettings:
     """How a cloud is coded. The defaults are lossless geometry of voxelised clouds with all tools on."""
 
-    qp: int = 22
+    qp: int = setting(22, 4, 99)
     """Quantiser parameter of the attributes, 4 (nearly lossless) to 51 (99 for 16 bits); 6 more double the step."""
-    chroma_offset: int = 0
+    chroma_offset: int = setting(0, -51, 51)
     """Added to `qp` for components 1 and 2."""
-    geometry_scale: float = 1.0
+    geometry_scale: float = setting(1.0, 1e-6, 1e6)
     """Voxels per input voxel, along an axis: 0.5 codes positions at half the resolution."""
-    voxel_size: float | None = None
-    """Edge of an input voxel, metres; None: 1 for integer positions, else from `geometry_bits`."""
-    geometry_bits: int = 10
-    """Bits of the longest side of a cloud in metres, if `voxel_size` is None."""
+    voxel_size: float | None = setting(None, 1e-12, 1e12, "m")
+    """Edge of an input voxel; None: 1 for integer positions, else from `geometry_bits`."""
+    geometry_bits: int = setting(10, 1, 21, "bits")
+    """Bits of the longest side of a cloud whose positions are no whole numbers, if `voxel_size` is None."""
     box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     """Lowest and highest corner, metres: points outside are moved to its faces. None: the cloud's own box."""
     duplicates: Duplicates = "merge"
     """Points in one voxel: merge makes them one, with mean attributes (ids: the most frequent); keep codes them all."""
-    slices: int = 1
+    slices: int = setting(1, 1, 65536)
     """Slices to cut the cloud into; more, if one would have more than `max_points`."""
     split: Split = "count"
     """count: equal numbers of points along the longest axis; interval: equal lengths of it; cube: octree cubes."""
-    max_points: int = LEVEL_LIMIT
+    max_points: int = setting(LEVEL_LIMIT, 1, LEVEL_LIMIT)
     """Points of a slice at most."""
-    workers: int | None = None
+    workers: int | None = setting(None, 1, 1024)
     """Threads that code slices; None: one for each processor. The stream does not depend on it."""
-    neighbour_boundary: int | None = None
+    neighbour_boundary: Literal[0, 2, 3, 4, 5, 6, 7, 8] | None = None
     """Neighbours give contexts within cubes of 2^this nodes, 2 to 8; 0: siblings only (fast, for sparse clouds);
     None: 8 if a slice is dense enough for neighbours to tell something, else 0."""
     adjacent_child: bool = True
     """Contexts from the children of coded neighbours."""
-    intra_prediction_size: int = 6
+    intra_prediction_size: int = setting(6, 0, 21)
     """Nodes with an edge below 2^this are predicted from their 26 neighbours; 0: none."""
     raht_prediction: bool = True
     """Attributes are predicted from the octree level above."""
-    rdoq: float = 0.0
+    rdoq: float = setting(0.0, 0, 100)
     """Rate-distortion optimised quantisation: weight of a bit against the squared error when the encoder drops
     coefficients; 0: it drops none."""
     attributes: Mapping[str, AttributeSettings] = field(default_factory=dict)
@@ -91,35 +82,11 @@ class CodecSettings:
     """Whatever the caller wants to find in `PointCloud.metadata` again (JSON values)."""
 
     def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            {
-                "qp": (4, 99), "chroma_offset": (-51, 51), "geometry_scale": (1e-6, 1e6), "geometry_bits": (1, 21),
-                "slices": (1, 65536), "max_points": (1, LEVEL_LIMIT), "intra_prediction_size": (0, 21),
-                "rdoq": (0, 100),
-            },
-        )  # fmt: skip
-        for name in ("qp", "chroma_offset", "geometry_bits", "slices", "max_points", "intra_prediction_size"):
-            if not isinstance(getattr(self, name), (int, np.integer)):
-                raise ConfigError(f"CodecSettings.{name}: expected a whole number, found {getattr(self, name)!r}")
         if self.box is not None:
             corners = np.asarray(self.box, np.float64)
             if corners.shape != (2, 3) or not np.isfinite(corners).all() or not (corners[0] <= corners[1]).all():
-                raise ConfigError(f"CodecSettings.box: expected a lowest and a highest corner, found {self.box!r}")
-        if self.voxel_size is not None:
-            check_ranges(self, {"voxel_size": (1e-12, 1e12)})
-        if self.workers is not None:
-            check_ranges(self, {"workers": (1, 1024)})
-        _check_choice(self, "neighbour_boundary", (None, 0, 2, 3, 4, 5, 6, 7, 8))
-        _check_choice(self, "split", ("count", "interval", "cube"))
-        _check_choice(self, "duplicates", ("merge", "keep"))
+                raise Conflict("box", f"expected a lowest and a highest corner, found {self.box!r}")
 
     def attribute(self, name: str) -> AttributeSettings:
         """Settings of one attribute."""
         return self.attributes.get(name, AttributeSettings())
-
-
-def _check_choice(settings: object, name: str, choices: tuple[object, ...]) -> None:
-    if (value := getattr(settings, name)) not in choices:
-        expected = ", ".join(str(choice) for choice in choices if choice is not None)
-        raise ConfigError(f"{type(settings).__name__}.{name}: expected one of {expected}, found {value!r}")

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One slice's octree in the compiled core, with what is coded over it. The core's functions release the interpreter's
-lock, so slices are coded side by side."""
+lock, so that slices are coded side by side."""
 
 from __future__ import annotations
 

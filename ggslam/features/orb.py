@@ -8,28 +8,23 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ggslam.errors import check_ranges
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
+from ggslam.system.settings import setting, settings_class
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class FeatureSettings:
     """How many features, and when matches make a pose."""
 
-    count: int = 1000
+    count: int = setting(1000, 1, 10**5)
     """Features of a view at most."""
-    max_hamming: int = 64
+    max_hamming: int = setting(64, 0, 256, "bits")
     """The largest distance of two descriptors that match, of 256."""
-    reprojection: float = 2.0
+    reprojection: float = setting(2.0, 0.01, 1e3, "px")
     """RANSAC's inlier distance in pixels of a 320-pixel-wide image."""
-    min_inliers: int = 12
+    min_inliers: int = setting(12, 6, 10**5)
     """Matches that agree on a pose at least; else there is none."""
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self, {"count": (1, 10**5), "max_hamming": (0, 256), "reprojection": (0.01, 1e3), "min_inliers": (6, 10**5)}
-        )
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ggslam.errors import check_ranges
 from ggslam.features.orb import Landmarks
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
+from ggslam.system.settings import setting, settings_class
 
 FEWEST = 6
 """Matches below which nothing is tried."""
@@ -25,27 +25,21 @@ _ALIKE_CONSTANT, _ALIKE_SHARE = 0.03, 0.1
 """Two matched points lie as far apart in both views, to so many metres plus this share."""
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class RegistrationSettings:
     """When matches agree with a pose."""
 
-    max_hamming: int = 64
+    max_hamming: int = setting(64, 0, 256, "bits")
     """The largest distance of two descriptors that match, of 256."""
-    hypotheses: int = 400
+    hypotheses: int = setting(400, 1, 10**5)
     """Triples of matches that are tried."""
-    reprojection: float = 2.5
+    reprojection: float = setting(2.5, 0.01, 1e3, "px")
     """Inlier distance in pixels of a 320-pixel-wide image."""
-    depth_constant: float = 0.025
-    depth_square: float = 0.008
-    """Inlier distance in depth, metres: constant + square z^2 (three standard deviations of two structured-light
-    measurements, and a feature's reach)."""
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "max_hamming": (0, 256), "hypotheses": (1, 10**5), "reprojection": (0.01, 1e3),
-            "depth_constant": (1e-4, 10), "depth_square": (0, 10),
-        }  # fmt: skip
-        check_ranges(self, ranges)
+    depth_constant: float = setting(0.025, 1e-4, 10, "m")
+    """Inlier distance in depth is constant + square z^2 (three standard deviations of two structured-light
+    measurements, and a feature's reach): the constant..."""
+    depth_square: float = setting(0.008, 0, 10, "1/m")
+    """...and the square."""
 
 
 @dataclass(frozen=True)

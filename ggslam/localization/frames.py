@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transformed
+from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.points import FramePoints, extract_points
@@ -33,14 +34,14 @@ _OUTCOMES = {
 }
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class LookUpSettings:
     """How a frame is looked up among the places of a map."""
 
-    candidates: int = 5
+    candidates: int = setting(5, 1, 1000)
     """Views that are tried, the likeliest first."""
-    reach: float = 4.0
-    """Points of the map this far from a view, in metres, are compared with the frame's."""
+    reach: float = setting(4.0, 0.01, 1e6, "m")
+    """Points of the map this far from a view are compared with the frame's."""
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 

@@ -14,10 +14,10 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from ggslam.errors import check_ranges
 from ggslam.localization.surface import Surface
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, orthonormalized
+from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
 from ggslam.tracking.scan_points import ScanSettings, scan_points
 from ggslam.tracking.settings import AlignSettings, DepthNoise
@@ -161,21 +161,18 @@ class Localizer(Generic[Item]):
         self._pose, self._lost = T.copy(), False
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class ScanTrackerSettings:
     """How scans are located."""
 
     scan: ScanSettings = field(default_factory=ScanSettings)
     """Which of their points are used."""
-    sigma: float = 0.02
-    """Standard deviation of a range, metres."""
+    sigma: float = setting(0.02, 1e-4, 10, "m")
+    """Standard deviation of a range."""
     align: AlignSettings = field(default_factory=lambda: AlignSettings(min_normal_dot=0.0, coarse_iterations=8))
     """The points' "normals" point to the sensor, hence the cosine."""
-    min_overlap: float = 0.5
+    min_overlap: float = setting(0.5, 0, 0.9)
     """Under this share of points that match, the scan is lost."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, {"sigma": (1e-4, 10), "min_overlap": (0, 1)})
 
 
 class ScanTracker:

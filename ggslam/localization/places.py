@@ -134,5 +134,5 @@ def _check_camera(store: GridStore, key: CellKey, found: np.ndarray, camera: Cam
     if found.shape != (6,) or (np.abs(found - expected) > _SAME * camera.width).any():
         seen, own = (f"{int(c[0])}x{int(c[1])} pixels, fx {c[2]:.1f}" for c in (found, expected) if c.shape == (6,))
         raise ConfigError(
-            f"{store.path}: cell {key}: its places were seen by a camera of {seen}, the images have {own}; see --scale"
+            f"{store.path}: cell {key}: its places were seen by a camera of {seen}, the images have {own}; see `scale`"
         )

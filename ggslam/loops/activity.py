@@ -11,33 +11,26 @@ all of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ggslam.errors import check_ranges
+from ggslam.system.settings import setting, settings_class
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class ActivitySettings:
     """When keyframes are put aside and taken back."""
 
-    forget_after: float = 5.0
+    forget_after: float = setting(5.0, 0, 1e6)
     """A keyframe is put aside when the camera has travelled this many times the median depth since it looked at the
     keyframe's surface last."""
-    near: float = 1.0
+    near: float = setting(1.0, 0, 1e3)
     """The camera looks at a keyframe's surface if the middles of what both see are nearer than this many times the
     mean of their median depths."""
-    batch: int = 8
+    batch: int = setting(8, 1, 10**6)
     """Keyframes are put aside so many at a time: each time the surface is gathered anew."""
-    spread: int = 3
+    spread: int = setting(3, 0, 10**6)
     """A keyframe near the camera is taken back if one of so many before or after it is active: neighbours in time lie
     right to each other."""
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self, {"forget_after": (0, 1e6), "near": (0, 1e3), "batch": (1, 10**6), "spread": (0, 10**6)}
-        )
 
 
 class ActiveKeyframes:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from types import ModuleType
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv  # scipy.stats takes a second to load
 
 from ggslam.loops.odometry import OdometryTree
 from ggslam.loops.uncertainty import adjoint, covariance_in_frame
@@ -68,7 +68,7 @@ class CondensedGraph:
 
     def believed(self, gtsam: ModuleType, probability: float) -> tuple[np.ndarray, float, np.ndarray]:
         """Which closures agree (bool [m]), the limit of a residual's Mahalanobis length, and the lengths found [m]."""
-        limit = float(chi2.ppf(probability, 6)) ** 0.5
+        limit = chi_squared_limit(probability) ** 0.5
         if not self.loops:
             return np.zeros(0, bool), limit, np.zeros(0)
         graph, values = self._problem(gtsam, np.ones(len(self.loops), bool))
@@ -123,6 +123,11 @@ class CondensedGraph:
             noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
             graph.add(gtsam.BetweenFactorPose3(link.i, link.j, gtsam.Pose3(link.T_i_j), noise))
         return graph, values
+
+
+def chi_squared_limit(probability: float) -> float:
+    """What the squared Mahalanobis length of six numbers stays below with this probability."""
+    return float(2 * gammaincinv(3.0, probability))
 
 
 def gtsam_covariance(covariance: np.ndarray, T_i_j: np.ndarray) -> np.ndarray:

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 from types import ModuleType
 
 import numpy as np
-from scipy.stats import chi2
 
 from ggslam.errors import MissingDependency
-from ggslam.loops.condensed import CondensedGraph, Link
+from ggslam.loops.condensed import CondensedGraph, Link, chi_squared_limit
 from ggslam.loops.odometry import OdometryTree
 from ggslam.loops.settings import GraphSettings
 from ggslam.loops.uncertainty import covariance_in_frame, covariance_of
@@ -130,7 +129,7 @@ class PoseGraph:
 
     def _beyond_drift(self, poses: Sequence[np.ndarray] | np.ndarray, numbers: Iterable[int]) -> dict[int, str]:
         """Reason by number of those closures that drift does not explain, given poses [n, 4, 4] to start from."""
-        limit = float(chi2.ppf(self.settings.drift_probability, 6))
+        limit = chi_squared_limit(self.settings.drift_probability)
         rejected = {}
         for number in numbers:
             loop = self.loops[number]

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
-from ggslam.errors import check_ranges
 from ggslam.features.orb import FeatureSettings
 from ggslam.features.registration import RegistrationSettings
+from ggslam.system.settings import Conflict, setting, settings_class
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class GraphSettings:
     """What the pose graph takes odometry and closures to be worth, and when it believes a closure.
 
@@ -19,86 +19,72 @@ class GraphSettings:
     whatever the number of keyframes on it. The defaults allow for 7 cm (one standard deviation) over 20 m.
     """
 
-    translation_drift: float = 0.015
-    """Standard deviation per axis in metres after a path of one metre; it grows with the root of the path."""
-    rotation_drift_deg: float = 0.3
-    """Likewise, degrees."""
-    turn_length: float = 1.0
-    """A turn by one radian counts as a path of so many metres."""
-    loop_translation: float = 0.01
-    loop_rotation_deg: float = 0.3
-    """Standard deviation per axis (metres, degrees) that is added to a closure's own."""
-    drift_probability: float = 0.999
+    translation_drift: float = setting(0.015, 1e-5, 10, "m")
+    """Standard deviation per axis after a path of one metre; it grows with the root of the path."""
+    rotation_drift_deg: float = setting(0.3, 1e-4, 90, "deg")
+    """Standard deviation per axis after a path of one metre, likewise."""
+    turn_length: float = setting(1.0, 0, 1e3, "m")
+    """A turn by one radian counts as a path of this length."""
+    loop_translation: float = setting(0.01, 1e-5, 10, "m")
+    """Standard deviation per axis that is added to a closure's own, of the translation..."""
+    loop_rotation_deg: float = setting(0.3, 1e-4, 90, "deg")
+    """...and of the rotation."""
+    drift_probability: float = setting(0.999, 0.5, 1 - 1e-12)
     """A closure is dismissed when drift stays below its correction with this probability."""
-    inlier_probability: float = 0.99
+    inlier_probability: float = setting(0.99, 0.5, 1 - 1e-12)
     """Closures that agree have residuals below the chi-square limit of this probability (GNC's threshold)."""
 
-    def __post_init__(self) -> None:
-        ranges = {
-            "translation_drift": (1e-5, 10), "rotation_drift_deg": (1e-4, 90), "turn_length": (0, 1e3),
-            "loop_translation": (1e-5, 10), "loop_rotation_deg": (1e-4, 90), "drift_probability": (0.5, 1 - 1e-12),
-            "inlier_probability": (0.5, 1 - 1e-12),
-        }  # fmt: skip
-        check_ranges(self, ranges)
 
-
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class PlaceSettings:
     """How places are described and compared."""
 
     features: FeatureSettings = field(default_factory=lambda: FeatureSettings(count=1000))
     """Of the ORB features that a place is known by."""
-    bits: int = 16
-    tables: int = 8
-    """A descriptor makes `tables` words of so many of its bits each."""
-    entries: int = 20000
+    bits: int = setting(16, 1, 24, "bits")
+    """Bits of the descriptor that make a word."""
+    tables: int = setting(8, 1, 100)
+    """Words that a descriptor makes."""
+    entries: int = setting(20000, 1, 10**9)
     """A query reads so many entries of the words' lists, those of the rarest words first."""
-    ferns: int = 500
+    ferns: int = setting(500, 1, 10**5)
     """Pixels of the thumbnail that are compared."""
-    near: float = 0.8
-    far: float = 3.5
-    """Depths in metres between which ferns tell near from far."""
-    shortlist: int = 50
+    near: float = setting(0.8, 0, 1e3, "m")
+    """Ferns tell near from far by a depth drawn between this..."""
+    far: float = setting(3.5, 0, 1e3, "m")
+    """...and this."""
+    shortlist: int = setting(50, 1, 10**6)
     """So many keyframes with the most common words have their thumbnails compared."""
-    support: float = 0.25
+    support: float = setting(0.25, 0, 1)
     """A keyframe next in time that scores as well adds this share to a score; a lucky hit stands alone."""
 
     def __post_init__(self) -> None:
-        ranges = {
-            "bits": (1, 24), "tables": (1, 100), "entries": (1, 10**9), "ferns": (1, 10**5), "near": (0, 1e3),
-            "far": (0, 1e3), "shortlist": (1, 10**6), "support": (0, 1),
-        }  # fmt: skip
-        check_ranges(self, ranges)
+        if self.near >= self.far:
+            raise Conflict("far", f"expected more than near, {self.near:g}, found {self.far:g}")
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class VerificationSettings:
     """What a closure has to show before it goes into the graph. Lengths follow the depth noise."""
 
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     """Of the feature matches."""
-    min_inliers: int = 15
+    min_inliers: int = setting(15, 6, 10**5)
     """Matches that agree with one pose."""
-    min_cells: int = 5
+    min_cells: int = setting(5, 1, 16)
     """Of the 4x4 cells of the image, so many have inliers."""
-    min_kept: float = 0.6
+    min_kept: float = setting(0.6, 0, 1)
     """After refinement by geometry this share of the inliers still agrees (within twice the limits): a refinement that
     slides along a wall or into another minimum leaves the matches behind."""
-    min_alignment_overlap: float = 0.5
+    min_alignment_overlap: float = setting(0.5, 0, 1)
     """Share of the points that G-ICP matches to the old surface."""
-    max_rmse_constant: float = 0.01
-    max_rmse_sigmas: float = 2.0
-    """G-ICP's RMSE stays below constant + sigmas sigma(z) metres at the points' median depth z."""
-    min_overlap: float = 0.4
+    max_rmse_constant: float = setting(0.01, 0, 10, "m")
+    """G-ICP's RMSE stays below this..."""
+    max_rmse_sigmas: float = setting(2.0, 0, 100)
+    """...plus this many standard deviations sigma(z) at the points' median depth z."""
+    min_overlap: float = setting(0.4, 0, 1)
     """Share of the new points' voxels that the old points also fill."""
-    voxel_constant: float = 0.03
-    voxel_sigmas: float = 4.0
-    """Edge of those voxels in metres: constant + sigmas sigma(z)."""
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "min_inliers": (6, 10**5), "min_cells": (1, 16), "min_kept": (0, 1), "min_alignment_overlap": (0, 1),
-            "max_rmse_constant": (0, 10), "max_rmse_sigmas": (0, 100), "min_overlap": (0, 1),
-            "voxel_constant": (1e-3, 10), "voxel_sigmas": (0, 100),
-        }  # fmt: skip
-        check_ranges(self, ranges)
+    voxel_constant: float = setting(0.03, 1e-3, 10, "m")
+    """Edge of those voxels is this..."""
+    voxel_sigmas: float = setting(4.0, 0, 100)
+    """...plus this many standard deviations sigma(z)."""

@@ -3,95 +3,85 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
-from ggslam.errors import check_ranges
 from ggslam.mapping.cpu.losses import LossSettings
+from ggslam.system.settings import setting, settings_class
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class InsertionSettings:
     """Where new Gaussians are born and what they look like."""
 
-    alpha_threshold: float = 0.6
+    alpha_threshold: float = setting(0.6, 0, 1)
     """A pixel whose rendered alpha is below this is not yet explained by the map."""
-    depth_tolerance_m: float = 0.05
+    depth_tolerance_m: float = setting(0.05, 0, 1e3, "m")
     """A pixel whose measured depth lies this much in front of the rendered depth is not explained either..."""
-    depth_tolerance_relative: float = 0.03
+    depth_tolerance_relative: float = setting(0.03, 0, 1)
     """...or this share of the depth, whichever is larger."""
-    opacity: float = 0.5
+    opacity: float = setting(0.5, 1e-3, 0.999)
     """Opacity at birth."""
-    scale_pixels: float = 0.5
+    scale_pixels: float = setting(0.5, 1e-2, 100, "px")
     """Standard deviation at birth along the surface, in pixels of the frame that inserts it (times the stride)."""
-    flatness: float = 1.0
+    flatness: float = setting(1.0, 1e-3, 1)
     """Standard deviation along the surface normal as a share of that along the surface. Flat discs (0.2) cost 0.5 dB
     at 4 iterations a frame: a Gaussian that is thick at birth is still seen from the side."""
-    max_slope: float = 3.0
+    max_slope: float = setting(3.0, 1, 100)
     """How far a footprint may be stretched along a surface seen at a grazing angle."""
     adaptive_stride: bool = True
     """One Gaussian per 2x2 pixels where colour and depth are smooth, one per pixel elsewhere."""
-    texture_threshold: float = 90.0
+    texture_threshold: float = setting(90.0, 0, 1e4)
     """For `adaptive_stride`: Sobel magnitude of the grey image (0 to 255) under which a pixel is flat."""
-    fill_stride: int = 3
+    fill_stride: int = setting(3, 0, 1000, "px")
     """Pixels without depth, where nothing is rendered either, get a Gaussian on a grid of this stride at the depth of
     the nearest pixel that has one; 0: none. Training with colour then makes them fit what is seen there."""
-    max_depth_m: float = 20.0
+    max_depth_m: float = setting(20.0, 0.05, 1e4, "m", basic=True)
     """Farther measurements do not become Gaussians."""
 
-    def __post_init__(self) -> None:
-        ranges = {
-            "alpha_threshold": (0, 1), "depth_tolerance_m": (0, 1e3), "depth_tolerance_relative": (0, 1),
-            "opacity": (1e-3, 0.999), "scale_pixels": (1e-2, 100), "flatness": (1e-3, 1), "max_slope": (1, 100),
-            "texture_threshold": (0, 1e4), "fill_stride": (0, 1000), "max_depth_m": (0.05, 1e4),
-        }  # fmt: skip
-        check_ranges(self, ranges)
 
-
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class LearningRates:
     """Adam step sizes of each group of parameters."""
 
-    means: float = 6e-4
-    """Of the means, metres."""
-    quaternions: float = 4e-3
-    log_scales: float = 5e-2
-    opacity_logits: float = 5e-2
-    sh_dc: float = 1.8e-2
-    sh_rest: float = 5e-4
-    features: float = 1e-2
-    """Of the other parameters, by the names that they have in the map; `sh_dc` is the coefficient of degree 0."""
-    beta1: float = 0.9
-    beta2: float = 0.99
-    epsilon: float = 1e-15
-    """Adam's decay rates of the two moments, and what is added to the root of the second."""
-    young_factor: float = 3.0
+    means: float = setting(6e-4, 0, 10, "m")
+    """Of the means."""
+    quaternions: float = setting(4e-3, 0, 10)
+    """Of the quaternions."""
+    log_scales: float = setting(5e-2, 0, 10)
+    """Of the logarithms of the standard deviations."""
+    opacity_logits: float = setting(5e-2, 0, 10)
+    """Of the logits of the opacities."""
+    sh_dc: float = setting(1.8e-2, 0, 10)
+    """Of the colours' coefficient of degree 0."""
+    sh_rest: float = setting(5e-4, 0, 10)
+    """Of the colours' other coefficients."""
+    features: float = setting(1e-2, 0, 10)
+    """Of the feature vectors."""
+    beta1: float = setting(0.9, 0, 0.9999)
+    """Decay rate of the first moment."""
+    beta2: float = setting(0.99, 0, 0.99999)
+    """Decay rate of the second moment."""
+    epsilon: float = setting(1e-15, 1e-30, 1)
+    """Added to the root of the second moment."""
+    young_factor: float = setting(3.0, 1, 100)
     """A Gaussian's first step is this much longer..."""
-    young_updates: int = 8
+    young_updates: int = setting(8, 1, 10**4)
     """...and the rates fall to their values over this many of its steps."""
 
-    def __post_init__(self) -> None:
-        groups = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "features")
-        check_ranges(self, dict.fromkeys(groups, (0.0, 10.0)))
-        betas = {"beta1": (0.0, 0.9999), "beta2": (0.0, 0.99999), "epsilon": (1e-30, 1.0)}
-        check_ranges(self, {**betas, "young_factor": (1, 100), "young_updates": (1, 10**4)})
 
-
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class PruningSettings:
     """Which Gaussians are dropped, and how often one looks."""
 
-    every_keyframes: int = 5
+    every_keyframes: int = setting(5, 1, 10**6, "keyframes")
     """One looks after every n-th keyframe."""
-    min_opacity: float = 0.05
+    min_opacity: float = setting(0.05, 1e-6, 0.999)
     """Fainter Gaussians are dropped."""
-    max_scale_m: float = 0.25
+    max_scale_m: float = setting(0.25, 1e-4, 1e4, "m")
     """Larger Gaussians are dropped."""
 
-    def __post_init__(self) -> None:
-        check_ranges(self, {"every_keyframes": (1, 10**6), "min_opacity": (1e-6, 0.999), "max_scale_m": (1e-4, 1e4)})
 
-
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class PoseRefinementSettings:
     """Refinement of keyframe poses through the renderer's pose gradient (Adam on the twist).
 
@@ -99,40 +89,36 @@ class PoseRefinementSettings:
     steps would only shake the map.
     """
 
-    enabled: bool = True
-    rate_sigmas: float = 0.1
-    """Step in standard deviations of the depth noise at the scene's median depth: metres, and radians times 1 m."""
-    max_rate: float = 5e-4
+    enabled: bool = setting(True, basic=True)
+    """Whether keyframe poses are refined."""
+    rate_sigmas: float = setting(0.1, 0, 100)
+    """Step in standard deviations of the depth noise at the scene's median depth; a turn by one radian
+    counts as 1 m."""
+    max_rate: float = setting(5e-4, 0, 1, "m")
     """Upper bound of the step."""
 
-    def __post_init__(self) -> None:
-        check_ranges(self, {"rate_sigmas": (0, 100), "max_rate": (0, 1)})
 
-
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class ExposureSettings:
     """Per-keyframe affine colour (gain and offset per channel), pulled towards the identity."""
 
-    enabled: bool = False
+    enabled: bool = setting(False, basic=True)
     """Whether keyframes get an exposure of their own; scores are those of renders without it."""
-    rate: float = 2e-3
+    rate: float = setting(2e-3, 0, 1)
     """Learning rate of gains and offsets."""
-    regularization: float = 1e-2
+    regularization: float = setting(1e-2, 0, 1e6)
     """Weight of half the squared distance from the identity in the loss."""
 
-    def __post_init__(self) -> None:
-        check_ranges(self, {"rate": (0, 1), "regularization": (0, 1e6)})
 
-
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class MapperSettings:
     """Everything the mapper needs to know."""
 
-    iterations_per_frame: int = 4
+    iterations_per_frame: int = setting(4, 0, 1000, basic=True)
     """Optimisation steps after each frame (synchronous runs)."""
-    first_frame_iterations: int = 10
+    first_frame_iterations: int = setting(10, 0, 10**5)
     """Steps on the first keyframe before the second frame is read."""
-    refine_decay: float = 0.1
+    refine_decay: float = setting(0.1, 1e-6, 1)
     """Final refinement: learning rates fall exponentially to this share of their value."""
     insertion: InsertionSettings = field(default_factory=InsertionSettings)
     rates: LearningRates = field(default_factory=LearningRates)
@@ -140,7 +126,3 @@ class MapperSettings:
     pruning: PruningSettings = field(default_factory=PruningSettings)
     pose_refinement: PoseRefinementSettings = field(default_factory=PoseRefinementSettings)
     exposure: ExposureSettings = field(default_factory=ExposureSettings)
-
-    def __post_init__(self) -> None:
-        ranges = {"iterations_per_frame": (0, 1000), "first_frame_iterations": (0, 10**5), "refine_decay": (1e-6, 1)}
-        check_ranges(self, ranges)

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from ggslam.errors import check_ranges
 from ggslam.objects.hole_refinement import Recorded, refine
 from ggslam.objects.hole_views import HoleView, View, look, looked_again
 from ggslam.objects.plane_filling import as_seen, cover, find_hole, make_chart, overlapped, paint
@@ -28,9 +27,10 @@ from ggslam.objects.segmented_rows import copies_of
 from ggslam.objects.traces import drop_traces, places
 from ggslam.objects.view_filling import LEAST_PIXELS, close, open_pixels
 from ggslam.rendering.types import GaussianTensors
+from ggslam.system.settings import setting, settings_class
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class InpaintSettings:
     """How a hole is closed.
 
@@ -38,21 +38,16 @@ class InpaintSettings:
         ConfigError: a value outside its range.
     """
 
-    views: int = 12
+    views: int = setting(12, 1, 1000)
     """Views of the hole that are used, those that show most of the object."""
-    plane_tolerance_m: float = 0.015
+    plane_tolerance_m: float = setting(0.015, 1e-4, 1, "m")
     """Distance from a plane within which surface counts as flat."""
-    closings: int = 8
+    closings: int = setting(8, 0, 1000)
     """Views, at most, in which open pixels are closed."""
-    refine_iterations: int = 40
+    refine_iterations: int = setting(40, 0, 10**5)
     """Training steps of the new Gaussians, if the recording is at hand."""
-    touching_m: float = 0.05
+    touching_m: float = setting(0.05, 0, 1e3, "m")
     """Removed things nearer to each other than this leave one hole."""
-
-    def __post_init__(self) -> None:
-        ranges = {"views": (1, 1000), "plane_tolerance_m": (1e-4, 1.0), "closings": (0, 1000),
-                  "refine_iterations": (0, 10**5), "touching_m": (0.0, 1e3)}  # fmt: skip
-        check_ranges(self, ranges)
 
 
 @dataclass(frozen=True)

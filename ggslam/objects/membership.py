@@ -21,14 +21,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from ggslam.errors import check_ranges
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.system.settings import setting, settings_class
 
 _VALUES_AT_ONCE = 1 << 22
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class MembershipSettings:
     """What counts as part of an object.
 
@@ -36,34 +36,30 @@ class MembershipSettings:
         ConfigError: a value outside its range.
     """
 
-    threshold: float = 0.4
+    threshold: float = setting(0.4, 0, 1)
     """Probability of the chosen objects (their sum) from which a Gaussian is claimed."""
     repair: bool = True
     """Rules 2 to 4; without, labels are taken as they are."""
     floaters: bool = True
     """Whether floaters count as members: yes for removing (they look like the object), no for moving (they would fly
     along as a swarm)."""
-    neighbours: int = 12
+    neighbours: int = setting(12, 1, 1000)
     """Neighbours that are asked in rules 2 and 4."""
-    lonely: float = 0.1
+    lonely: float = setting(0.1, 0, 1)
     """With no more than this share of its labelled neighbours on its side a label is taken for wrong (rule 2)."""
-    agreement: float = 0.75
+    agreement: float = setting(0.75, 0, 1)
     """Share of members that takes a Gaussian along (rule 4); neighbours that are unlabelled like it do not count..."""
-    few: float = 0.3
+    few: float = setting(0.3, 0, 1)
     """...but this share must be members."""
-    link_spacings: float = 4.0
+    link_spacings: float = setting(4.0, 0, 1e6)
     """Members this many spacings of the object's Gaussians apart are still joined (rule 3)."""
-    floater_share: float = 0.05
+    floater_share: float = setting(0.05, 0, 1)
     """Components with less than this share of the members are floaters..."""
-    confident: float = 0.6
+    confident: float = setting(0.6, 0, 1)
     """Probability of another object from which a Gaussian inside the hull is that object's."""
-    crowding: float = 0.25
+    crowding: float = setting(0.25, 0, 1)
     """A hull that holds more strangers than this share of its members is no compact object's (a wall's hull holds the
     room): then it claims nothing."""
-
-    def __post_init__(self) -> None:
-        shares = ("threshold", "lonely", "agreement", "few", "floater_share", "confident", "crowding")
-        check_ranges(self, {**dict.fromkeys(shares, (0.0, 1.0)), "neighbours": (1, 1000), "link_spacings": (0.0, 1e6)})
 
 
 def members(

@@ -3,51 +3,42 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from ggslam.errors import ConfigError, MissingDependency, check_ranges
+from ggslam.errors import ConfigError, MissingDependency
 from ggslam.objects.mask_painting import distinct_masks, paint_segments
 from ggslam.objects.onnx_outputs import PROTOTYPE_GREY, Candidates, Letterbox, mask_candidates, yolo_candidates
+from ggslam.system.settings import setting, settings_class
 
 IMAGENET_MEAN = np.array((0.485, 0.456, 0.406), np.float32)
 IMAGENET_DEVIATION = np.array((0.229, 0.224, 0.225), np.float32)
 _INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class OnnxSegmenterSettings:
     """How a model is fed and which of its masks are believed."""
 
-    detection_score: float = 0.25
+    detection_score: float = setting(0.25, 0, 1)
     """Lowest class score of a detection (YOLO family)."""
-    mask_quality: float = 0.7
+    mask_quality: float = setting(0.7, 0, 1)
     """Lowest score of a mask (SAM family: the intersection over union that the model predicts for it)."""
-    overlap: float = 0.7
+    overlap: float = setting(0.7, 0, 1)
     """Of two masks whose intersection over union is above this, the one with the lower score goes."""
-    min_area: float = 5e-4
+    min_area: float = setting(5e-4, 0, 1)
     """Segments smaller than this share of the image are left out."""
-    max_masks: int = 300
+    max_masks: int = setting(300, 1, 65535)
     """So many masks of the highest scores are looked at."""
-    input_size: int = 640
+    input_size: int = setting(640, 32, 8192, "px")
     """Width and height of the model's input in pixels, if the model leaves them open."""
     pixels: Literal["unit", "imagenet"] = "unit"
     """What a model with real numbers as input expects: values from 0 to 1, or these less ImageNet's mean, divided by
     its standard deviation."""
-    threads: int = 0
+    threads: int = setting(0, 0, 1024)
     """Threads of the model; 0: as many as onnxruntime likes."""
-
-    def __post_init__(self) -> None:
-        if self.pixels not in ("unit", "imagenet"):
-            raise ConfigError(f"OnnxSegmenterSettings.pixels: expected unit or imagenet, found '{self.pixels}'")
-        ranges = {
-            "detection_score": (0, 1), "mask_quality": (0, 1), "overlap": (0, 1), "min_area": (0, 1),
-            "max_masks": (1, 65535), "input_size": (32, 8192), "threads": (0, 1024),
-        }  # fmt: skip
-        check_ranges(self, ranges)
 
 
 class OnnxSegmenter:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -132,10 +133,32 @@ def write_plots(folder: Path, plots: list[Plot]) -> list[Path]:
     Raises:
         RunFolderError: a file cannot be written.
     """
-    written = []
-    for plot in plots:
-        drawing = draw(plot, height=480 if plot.equal else 340, titled=True)
-        written += [folder / f"{plot.name}.svg", folder / f"{plot.name}.png"]
-        write_text(written[-2], svg(drawing, plot, _FILE_STYLE) + "\n")
-        write_picture(written[-1], picture(drawing))
-    return written
+    return [path for plot in plots for path in write_sheet(folder / plot.name, [plot])]
+
+
+def write_sheet(stem: Path, plots: Sequence[Plot]) -> list[Path]:
+    """Writes plots side by side as `stem`.svg and `stem`.png; returns the files. Those without data are left out, and
+    if all are, nothing is written.
+
+    Raises:
+        RunFolderError: a file cannot be written.
+    """
+    shown = [plot for plot in plots if plot.has_data()]
+    if not shown:
+        return []
+    height = 480 if any(plot.equal for plot in shown) else 340
+    drawings = [draw(plot, height=height, titled=True) for plot in shown]
+    if len(shown) == 1:
+        text = svg(drawings[0], shown[0], _FILE_STYLE)
+    else:
+        ends = np.cumsum([drawing.width for drawing in drawings]).tolist()
+        parts = [
+            svg(drawing, plot).replace("<svg ", f'<svg x="{end - drawing.width}" width="{drawing.width}" ', 1)
+            for drawing, plot, end in zip(drawings, shown, ends, strict=True)
+        ]
+        text = (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {ends[-1]} {height}">'
+                f"<style>{_FILE_STYLE}</style>{''.join(parts)}</svg>")  # fmt: skip
+    files = [stem.with_name(stem.name + suffix) for suffix in (".svg", ".png")]
+    write_text(files[0], text + "\n")
+    write_picture(files[1], np.concatenate([picture(drawing) for drawing in drawings], axis=1))
+    return files

@@ -29,7 +29,7 @@ class Series:
     Attributes:
         label: its name in the legend.
         x, y: as many numbers each; where one is not finite, the curve is interrupted.
-        kind: line, or dots alone.
+        kind: line, dots alone, or a line with a dot at each point.
         color: number of its colour, 0 to 7.
         dashed: whether the line is.
     """
@@ -37,7 +37,7 @@ class Series:
     label: str
     x: Sequence[float] | np.ndarray
     y: Sequence[float] | np.ndarray
-    kind: Literal["line", "dots"] = "line"
+    kind: Literal["line", "dots", "marked"] = "line"
     color: int = 0
     dashed: bool = False
 
@@ -180,6 +180,8 @@ def draw(plot: Plot, width: int = 640, height: int = 300, titled: bool = False) 
             pixels = np.array([left, bottom]) + (part - np.array([x0, y0])) * scale
             dots = series.kind == "dots" or len(part) == 1
             drawing.items.append(Stroke(pixels, f"series{series.color}", 1.8, series.dashed, dots, number))
+            if series.kind == "marked" and not dots:
+                drawing.items.append(Stroke(pixels, f"series{series.color}", dots=True))
     _legend(drawing, plot, legend, _TOP + (24 if titled else 0))
     return drawing
 

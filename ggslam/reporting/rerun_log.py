@@ -23,13 +23,13 @@ def check_target(target: str) -> None:
     if target != VIEWER:
         path = Path(target)
         if path.suffix != _ENDING:
-            raise ConfigError(f"--log {target}: expected rerun, to open a viewer, or a file NAME{_ENDING}")
+            raise ConfigError(f"`log` {target}: expected rerun, to open a viewer, or a file NAME{_ENDING}")
         if not path.parent.is_dir():
-            raise ConfigError(f"--log {target}: no such folder: {path.parent}")
+            raise ConfigError(f"`log` {target}: no such folder: {path.parent}")
     try:
         from rerun import RecordingStream  # noqa: F401  (a mere folder of that name can be imported, too)
     except ImportError:
-        raise MissingDependency("--log needs rerun: pip install 'ggslam[rerun]'") from None
+        raise MissingDependency("`log` needs rerun: pip install 'ggslam[rerun]'") from None
 
 
 class RerunLog:
@@ -58,7 +58,7 @@ class RerunLog:
             else:
                 self._stream.save(target)
         except (OSError, RuntimeError) as error:
-            raise RunFolderError(f"--log {target}: {error}") from None
+            raise RunFolderError(f"`log` {target}: {error}") from None
         self._stream.send_recording_name(name)
         self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
 

@@ -19,14 +19,11 @@ of a run with objects, whose map.ply also holds each Gaussian's object id and id
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -39,6 +36,12 @@ from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.environment import environment
 from ggslam.runs.map_index import MAP_INDEX, MapIndex, MapInParts
+from ggslam.runs.records.keyframes import KeyframesRecord
+from ggslam.runs.records.loops import LoopsRecord
+from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_map_in_parts, save_points
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
@@ -47,10 +50,9 @@ from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.atomic import write_bytes, write_text
-from ggslam.system.process_memory import peak_memory_bytes
 from ggslam.system.staging import finish_saving, leftovers
 
-MARKER = "run.json"
+MARKER = RunRecord.FILE
 """Is there if and only if a folder is a run of ggslam."""
 TRUTH_FILE = "ground_truth.txt"
 """True poses of the frames that have both, with the times of trajectory.txt; written by the report."""
@@ -81,9 +83,9 @@ class RunFolder:
         try:
             if folder.path.is_dir() and set(folder.path.iterdir()) - set(leftovers(folder.path)):
                 if not (folder.path / MARKER).exists():
-                    raise RunFolderError(f"{path}: not empty and not a run of ggslam; choose another folder with --out")
+                    raise RunFolderError(f"{path}: not empty and not a run of ggslam; choose another folder with `out`")
                 if not overwrite:
-                    raise RunFolderError(f"{path}: there is a run already; use --overwrite or another --out")
+                    raise RunFolderError(f"{path}: there is a run already; use `overwrite` or another `out`")
             else:
                 folder.path.mkdir(parents=True, exist_ok=True)
                 folder._made_here = True
@@ -128,21 +130,23 @@ class RunFolder:
     # --- writing -----------------------------------------------------------------------------------------------------
 
     def save(
-        self, config: Config, sequence: dict[str, Any], result: SlamResult, error: str | None = None,
+        self, config: Config, sequence: SequenceRecord, result: SlamResult, error: str | None = None,
         names: Mapping[int, str] | None = None,
     ) -> None:  # fmt: skip
         """Writes everything but scores and pictures.
 
         Args:
             config: all settings.
-            sequence: how the recording was read, as keyword arguments of `open_sequence`, for scoring later.
+            sequence: how the recording was read, for scoring later.
             result: of the run.
             error: why the run stopped early, if it did.
             names: of object ids, as far as the recording knows them.
         """
-        mark = {"ggslam": __version__, "complete": False, "stopped_by": "saving did not finish",
-                "environment": {**environment(config.threads), "device": result.device}}  # fmt: skip
-        self.write_json(MARKER, mark)  # before any file of an earlier run is replaced
+        mark = RunRecord(
+            ggslam=__version__, complete=False, stopped_by="saving did not finish",
+            environment={**environment(config.threads), "device": result.device},
+        )  # fmt: skip
+        mark.write(self.path)  # before any file of an earlier run is replaced
         stale_files = ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", PLACES_FILE, MAP_INDEX,
                        STEPS_FILE, TRUTH_FILE, REPORT_FILE)  # fmt: skip
         for stale in (*stale_files, *OBJECT_FILES):
@@ -150,10 +154,9 @@ class RunFolder:
         for stale in ("renders", "volumes", "plots"):
             shutil.rmtree(self.path / stale, ignore_errors=True)
         save_config(config, self.path / "config.yaml")
-        self.write_json("sequence.json", sequence)
-        self.write_json("timing.json", timing(result))
-        self.write_json("keyframes.json", _keyframes(result))
-        self.write_json("loops.json", _loops(result))
+        for record in (sequence, TimingRecord.of_result(result), KeyframesRecord.of_result(result),
+                       LoopsRecord.of_result(result)):  # fmt: skip
+            record.write(self.path)
         write_tum(self.path / "trajectory.txt", result.timestamps(), result.trajectory())
         if result.steps is not None:
             write_text(self.path / STEPS_FILE, result.steps)
@@ -165,10 +168,10 @@ class RunFolder:
             self.save_objects(segmented(result, names))
         if result.places is not None:
             write_bytes(self.path / PLACES_FILE, result.places)
-        self.write_json(MARKER, {**mark, "complete": error is None, "stopped_by": error})
+        mark.model_copy(update={"complete": error is None, "stopped_by": error}).write(self.path)
         # Last and largest; `ggslam export --format points` makes them again from the map.
         save_points(self.path, result)
-        self.write_json("timing.json", timing(result))  # once more: peak memory is that of the whole run
+        TimingRecord.of_result(result).write(self.path)  # once more: peak memory is that of the whole run
 
     def save_trajectory(self, timestamps: np.ndarray, poses: np.ndarray, error: str) -> None:
         """Writes what is left of a run whose map is lost: trajectory.txt, and why it stopped.
@@ -181,7 +184,7 @@ class RunFolder:
         for name in (*OBJECT_FILES, "map.ply", "metrics.json", REPORT_FILE):  # of a run that this one replaces
             (self.path / name).unlink(missing_ok=True)
         write_tum(self.path / "trajectory.txt", timestamps, poses)
-        self.write_json(MARKER, {"ggslam": __version__, "complete": False, "stopped_by": error})
+        RunRecord(ggslam=__version__, complete=False, stopped_by=error).write(self.path)
 
     def save_objects(self, segmented: SegmentedMap) -> None:
         """Writes a map with its objects: map.ply with object ids and identity vectors, and the files beside it."""
@@ -193,26 +196,31 @@ class RunFolder:
         write_bytes(self.path / "classifier.npz", segmented.classifier.to_bytes())
         segmented.table.save(self.path / "objects.json")
 
-    def write_json(self, name: str, values: Any) -> Path:
-        """Writes `values` as JSON; numbers that are not finite become null."""
-        write_text(self.path / name, json.dumps(json_ready(values), indent=1) + "\n")
-        return self.path / name
-
     # --- reading -----------------------------------------------------------------------------------------------------
 
-    def read_json(self, name: str) -> Any:
-        """Content of a JSON file of the run.
+    def mark(self) -> RunRecord:
+        """run.json. This and the next raise RunFolderError if the file is missing or damaged."""
+        return RunRecord.read(self.path)
 
-        Raises:
-            RunFolderError: it is missing or damaged.
-        """
-        path = self.path / name
-        try:
-            return json.loads(path.read_text())
-        except FileNotFoundError:
-            raise RunFolderError(f"{path}: missing") from None
-        except (OSError, ValueError, RecursionError) as error:
-            raise RunFolderError(f"{path}: cannot be read: {error}") from None
+    def sequence(self) -> SequenceRecord:
+        """sequence.json: where the recording is and how it was read."""
+        return SequenceRecord.read(self.path)
+
+    def keyframes(self) -> KeyframesRecord:
+        """keyframes.json: where the keyframes are, and how each frame was tracked."""
+        return KeyframesRecord.read(self.path)
+
+    def timing(self) -> TimingRecord:
+        """timing.json: where the time went."""
+        return TimingRecord.read(self.path)
+
+    def loops(self) -> LoopsRecord | None:
+        """loops.json; None if an older run has none."""
+        return LoopsRecord.read_if_there(self.path)
+
+    def metrics(self) -> MetricsRecord | None:
+        """metrics.json: the scores; None if the run was not scored."""
+        return MetricsRecord.read_if_there(self.path)
 
     def config(self) -> Config:
         """The settings of the run."""
@@ -313,59 +321,3 @@ def segmented(result: SlamResult, names: Mapping[int, str] | None = None) -> Seg
     known = names if found.supervision == "masks" else None
     table = ObjectTable.build(result.gaussians, found.classifier, found.supervision, known, found.observations)
     return SegmentedMap(result.gaussians, found.classifier, table, ObjectVotes.of(result.gaussians))
-
-
-def json_ready(value: Any) -> Any:
-    """Plain Python values: numpy numbers converted, NaN and infinity as None (JSON has no word for them)."""
-    if isinstance(value, dict):
-        return {str(key): json_ready(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [json_ready(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return json_ready(value.tolist())
-    if isinstance(value, np.generic):
-        return json_ready(value.item())
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
-    return value
-
-
-def timing(result: SlamResult) -> dict[str, Any]:
-    """Where the time went, by part."""
-    frames, t, m = max(1, len(result.frames)), result.times, result.mapper_times
-    return {
-        "frames": len(result.frames), "dropped_frames": result.dropped_frames,
-        "frames_per_s": result.frames_per_second(),
-        "wall_s": t.wall, "tracking_s": t.tracking, "loops_s": t.loops, "refinement_s": t.refinement,
-        "tracking_ms_per_frame": 1e3 * t.tracking / frames, "tracking_ms_per_100_frames": t.tracking_ms_by_window(),
-        "mapping_ms_per_iteration": m.iteration_ms,
-        "refine_iterations": result.refine_iterations, "mapping": asdict(m), "gaussians": result.gaussian_count,
-        "peak_rss_mb": peak_memory_mb(), "paging": result.paging,
-    }  # fmt: skip
-
-
-def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, in MB (10^6 bytes)."""
-    return peak_memory_bytes() / 1e6
-
-
-def _loops(result: SlamResult) -> dict[str, Any]:
-    return {
-        "seconds": result.times.loops, "events": [asdict(event) for event in result.loop_events],
-        "lost": [asdict(stretch) for stretch in result.lost_stretches()],
-    }  # fmt: skip
-
-
-def _keyframes(result: SlamResult) -> dict[str, Any]:
-    keyframes = [
-        {"index": k.index, "frame": k.frame_index, "timestamp": k.timestamp, "T_world_camera": k.T_world_camera,
-         "exposure": k.exposure, "iterations": k.iterations} for k in result.keyframes
-    ]  # fmt: skip
-    frames = [
-        {"frame": f.frame_index, "source": f.source_index, "timestamp": f.timestamp, "keyframe": f.keyframe,
-         "T_keyframe_camera": f.T_keyframe_camera, "overlap": f.overlap, "rmse_m": f.rmse_m, "status": f.status,
-         "reason": f.reason} for f in result.frames
-    ]  # fmt: skip
-    return {"keyframes": keyframes, "frames": frames}

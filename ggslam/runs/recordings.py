@@ -6,12 +6,13 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from ggslam.errors import RunFolderError, SequenceError
-from ggslam.runs.folder import RunFolder, json_ready
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.sequences import Sequence, open_sequence
 from ggslam.sequences.live import LiveSequence, is_live, open_live
+from ggslam.system.json_files import json_ready
 
 
 @dataclass(frozen=True)
@@ -62,14 +63,14 @@ class LiveRequest(SequenceRequest):
         """
         plain = SequenceRequest(self.path, stop=self.stop, scale=self.scale, on_bad_frame=self.on_bad_frame)
         if replace(self, record=None) != LiveRequest(**asdict(plain)):
-            raise SequenceError(f"{self.path}: of a live camera only --stop and --scale can be chosen")
+            raise SequenceError(f"{self.path}: of a live camera only `stop` and `scale` can be chosen")
         source = open_live(str(self.path), self.scale)
         return LiveSequence(source, self.stop, self.record)
 
 
 def describe(
     request: SequenceRequest, sequence: Sequence | LiveSequence, earlier: RunFolder | None = None
-) -> dict[str, Any]:
+) -> SequenceRecord:
     """What `sequence.json` holds: how to open the recording again, its camera, and the run whose map this one began
     with, if any."""
     values = asdict(request)
@@ -79,12 +80,12 @@ def describe(
     for name in ("path", "masks", "depth_camera"):
         if values[name] is not None and not is_live(values[name]):
             values[name] = Path(values[name]).absolute()
-    return {
+    return SequenceRecord.of({
         "open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence),
         "warnings": sequence.warnings, "skipped": [asdict(skipped) for skipped in sequence.skipped],
         "mask_problems": sequence.mask_problems, "map": None if earlier is None else earlier.path.absolute(),
         "map_fingerprint": None if earlier is None else fingerprint(earlier),
-    }  # fmt: skip
+    })  # fmt: skip
 
 
 def fingerprint(folder: RunFolder) -> str:
@@ -110,21 +111,18 @@ def open_recording_of(
         SequenceError: it is not there any more.
         RunFolderError: the run does not say which it was.
     """
-    try:
-        record = folder.read_json("sequence.json")
-        values = dict(record["open"])
-        values["path"] = Path(path if path is not None else values["path"])
-        used = masks if masks is not None else values["masks"]
-        values["masks"] = None if used is None else Path(used)
-        values["depth_camera"] = None if values.get("depth_camera") is None else Path(values["depth_camera"])
-        request = SequenceRequest(**values)
-    except (KeyError, TypeError, ValueError) as error:
-        raise RunFolderError(f"{folder.path / 'sequence.json'}: not as ggslam writes it: {error!r}") from None
+    record = folder.sequence()
+    used = masks if masks is not None else record.open.masks
+    request = SequenceRequest(**{
+        **record.open.model_dump(), "path": Path(path if path is not None else record.open.path),
+        "masks": None if used is None else Path(used), "topics": tuple(record.open.topics),
+        "depth_camera": None if record.open.depth_camera is None else Path(record.open.depth_camera),
+    })  # fmt: skip
     if is_live(request.path):
-        raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (--record)")
+        raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (`record`)")
     sequence = replace(request, scale=request.scale if scale is None else scale).open()
     found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scaled(request.scale))}
-    expected = {name: record.get(name) for name in found}
+    expected = {"frames": record.frames, "camera": asdict(record.camera)}
     if json_ready(found) != expected:
         raise RunFolderError(f"{sequence.path}: not the recording of {folder.path}: expected {expected}, found {found}")
     return sequence

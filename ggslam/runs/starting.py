@@ -26,7 +26,7 @@ from ggslam.slam.slam import Slam
 from ggslam.tracking.settings import DepthNoise
 
 _NEEDED = "to grow its map, the images of its keyframes are needed"
-_INSTEAD = "--localize-only does without its images"
+_INSTEAD = "`localize_only` does without its images"
 
 
 class OtherImagesError(Exception):
@@ -52,12 +52,12 @@ def start_in_map(slam: Slam, folder: RunFolder, growing: bool) -> None:
     if not path.is_file():
         raise RunFolderError(f"{path}: missing: the run was made without loops, or its map was edited since")
     if slam.loops is None:
-        raise ConfigError("--map: to start in a map, loops.enabled must not be off")
+        raise ConfigError("`map`: to start in a map, loops.enabled must not be off")
     arrays: dict[str, Any] = read_all_arrays(path, "the places of a run")
     try:
         gaussians, keyframes = _load(slam, slam.loops, folder, arrays)
     except OtherImagesError as error:
-        raise ConfigError(f"{folder.path}: {error}; see --scale") from None
+        raise ConfigError(f"{folder.path}: {error}; see `scale`") from None
     except (KeyError, ValueError, IndexError, TypeError, RuntimeError, ConfigError, FormatError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else error
         raise RunFolderError(f"{path}: not the places of this run: {reason}") from None
@@ -132,42 +132,43 @@ def _with_images(folder: RunFolder, keyframes: list[Keyframe], with_masks: bool)
     Raises:
         RunFolderError: a recording is not there any more.
     """
-    record = folder.read_json("sequence.json")
-    if record.get("map") is not None:
-        earlier = parent(folder, record)
-        first = len(earlier.read_json("keyframes.json")["keyframes"])
+    if folder.sequence().map is not None:
+        earlier = parent(folder)
+        first = len(earlier.keyframes().keyframes)
         keyframes = _with_images(earlier, keyframes[:first], with_masks) + keyframes[first:]
     else:
         first = 0
-    records = folder.read_json("keyframes.json")["keyframes"][first:]
+    records = folder.keyframes().keyframes[first:]
     try:
         sequence = open_recording_of(folder)
     except SequenceError as error:
         raise RunFolderError(f"{folder.path}: {_NEEDED} ({error}); {_INSTEAD}") from None
     out = keyframes[:first]
     for keyframe, record in zip(keyframes[first:], records, strict=True):
-        frame = sequence.frame(record["frame"], masks=with_masks)
+        frame = sequence.frame(record.frame, masks=with_masks)
         made = make_keyframe(keyframe.index, frame, keyframe.T_world_camera)
-        out.append(replace(made, frame_index=ELSEWHERE, iterations=record["iterations"]))
+        out.append(replace(made, frame_index=ELSEWHERE, iterations=record.iterations))
     return out
 
 
-def parent(folder: RunFolder, record: dict[str, Any]) -> RunFolder:
+def parent(folder: RunFolder) -> RunFolder:
     """The run whose map a run began with.
 
     Args:
         folder: of the run.
-        record: content of its sequence.json.
 
     Raises:
         RunFolderError: it is not there any more, or is another one now.
     """
-    path = Path(record["map"])
+    record = folder.sequence()
+    if record.map is None:
+        raise RunFolderError(f"{folder.path}: did not begin with the map of another run")
+    path = Path(record.map)
     try:
         earlier = RunFolder.open(path)
     except RunFolderError as error:
         raise RunFolderError(f"{folder.path} began with the map of another run: {error}; {_INSTEAD}") from None
-    if fingerprint(earlier) != record.get("map_fingerprint"):
+    if fingerprint(earlier) != record.map_fingerprint:
         raise RunFolderError(
             f"{path}: not the run any more whose map {folder.path} began with (it was made anew); {_INSTEAD}"
         )
@@ -177,7 +178,7 @@ def parent(folder: RunFolder, record: dict[str, Any]) -> RunFolder:
 def ancestors(folder: RunFolder) -> list[Path]:
     """Folders of the runs that a run's map comes from, its own first."""
     paths = [folder.path.resolve()]
-    while (earlier := RunFolder(paths[-1]).read_json("sequence.json").get("map")) is not None:
+    while (earlier := RunFolder(paths[-1]).sequence().map) is not None:
         if Path(earlier).resolve() in paths or not Path(earlier).is_dir():
             break
         paths.append(Path(earlier).resolve())

@@ -171,7 +171,7 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None) -> None:
         add(
             f"the true poses look like {CONVENTIONS[doubt.convention].description}: read so, neighbouring depth images "
             f"agree to {doubt.best:.2%}, as {CONVENTIONS[OURS].description} only to {doubt.error:.2%}; "
-            f"try --pose-convention {doubt.convention}"
+            f"try `pose_convention` {doubt.convention}"
         )
     elif doubt.wrong_scale:
         found = report.depth_scale / doubt.ratio
@@ -180,7 +180,7 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None) -> None:
         add(
             f"depth scale {report.depth_scale:g} is suspicious: with about {scale:g} units a metre neighbouring "
             f"depth images agree with the poses to {doubt.best:.2%}, so only to {doubt.error:.2%}; "
-            f"try --depth-scale {scale:g}"
+            f"try `depth_scale` {scale:g}"
         )
     elif doubt.error > 0.05:
         add(f"true poses and depth disagree by {doubt.error:.0%}: wrong depth scale or poses, or little seen twice")
@@ -195,7 +195,7 @@ def _check_alignment(report: SequenceReport) -> None:
     size = "" if found.scale == 1 else f" and enlarged by {found.scale:g}"
     report.warnings.append(
         "depth does not lie on colour: its outlines fit the edges of the colour images better when moved "
-        f"{', '.join(parts)}{size}; wrong intrinsics, depth that is not registered (--depth-camera FILE), or images of "
+        f"{', '.join(parts)}{size}; wrong intrinsics, depth that is not registered (`depth_camera`), or images of "
         "different times"
     )
 

@@ -1,47 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every setting in one typed tree. Presets are YAML files in configs/; unknown names and impossible values are refused.
 
-The settings of a part live beside the part (`ggslam/tracking`, `ggslam/mapping`) as frozen dataclasses whose fields
-are documented there; `Config` puts them together.
+The settings of a part are declared beside the part (`ggslam/tracking`, `ggslam/mapping`), see
+`ggslam/system/settings.py`; `Config` puts them together.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import typing
-from dataclasses import dataclass, field
+from dataclasses import field
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-import pydantic
 import yaml
 
-from ggslam.errors import ConfigError, check_ranges
+from ggslam.errors import ConfigError
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.settings import MapperSettings
 from ggslam.slam.loop_closing import LoopSettings
 from ggslam.slam.object_masks import MaskSettings
 from ggslam.submaps.paging_settings import PagingSettings
 from ggslam.system.atomic import write_text
+from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
 from ggslam.tracking.tracker import TrackerSettings
 from ggslam.volumes.volume_settings import VolumeSettings
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class EvaluationSettings:
     """What is kept away from training, so that it can be scored honestly."""
 
-    held_out_every: int = 8
+    held_out_every: int = setting(8, 0, 10**9, "frames", basic=True)
     """Every n-th frame is tracked but never a keyframe and never trained on; 0: none."""
-    held_out_offset: int = 4
-    """The first frame held out, modulo `held_out_every`. (The first keyframe is never held out.)"""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, {"held_out_every": (0, 1e9), "held_out_offset": (0, 1e9)})
+    held_out_offset: int = setting(4, 0, 10**9, "frames")
+    """The first frame held out, modulo `held_out_every`; the first keyframe never is."""
 
     def is_held_out(self, frame_index: int) -> bool:
         """Whether the frame is kept for scoring."""
@@ -49,28 +44,30 @@ class EvaluationSettings:
         return every > 0 and frame_index % every == self.held_out_offset % every
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class Config:
     """Settings of a run."""
 
-    seed: int = 0
+    is_root: ClassVar[bool] = True
+    """Errors name settings by their path from here."""
+    seed: int = setting(0, 0, 2**63 - 1, basic=True)
     """Of every random draw. A synchronous run on one machine repeats bit for bit."""
-    threads: int = 0
+    threads: int = setting(0, 0, 1024, basic=True)
     """Threads of the compiled core; 0: the processors this process may use."""
-    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    device: Literal["auto", "cpu", "cuda"] = setting("cpu", basic=True)
     """Where map and keyframes are kept, trained and tracked: cuda: an NVIDIA GPU (compiled by nvcc when first used);
     auto: that if it can be had and memory is not limited, else cpu."""
-    sh_degree: int = 0
-    """Spherical-harmonic degree of the colours, 0 to 3."""
-    tracker: Literal["gicp", "features"] = "gicp"
+    sh_degree: int = setting(0, 0, 3, basic=True)
+    """Spherical-harmonic degree of the colours."""
+    tracker: Literal["gicp", "features"] = setting("gicp", basic=True)
     """gicp: G-ICP against the keyframes' points; features: edges and planes in a budget of time, and G-ICP where they
     do not convince."""
-    realtime_fps: float = 0.0
+    realtime_fps: float = setting(0.0, 0, 1e4, "frames/s", basic=True)
     """0: synchronous. Otherwise frames arrive at this rate like from a camera; tracker and mapper run side by side."""
-    refine_iterations: int = 0
+    refine_iterations: int = setting(0, 0, 10**7, basic=True)
     """Optimisation steps after the last frame."""
-    memory_limit_mb: float = 0.0
-    """Resident memory of the run in 10^6 bytes: what does not fit of map and keyframes is kept on disk; 0: no limit."""
+    memory_limit_mb: float = setting(0.0, 0, 1e9, "MB", basic=True)
+    """Resident memory of the run: what does not fit of map and keyframes is kept on disk; 0: no limit."""
     tracking: TrackerSettings = field(default_factory=TrackerSettings)
     features: FeatureTrackerSettings = field(default_factory=FeatureTrackerSettings)
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
@@ -81,13 +78,6 @@ class Config:
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     paging: PagingSettings = field(default_factory=PagingSettings)
     volumes: VolumeSettings = field(default_factory=VolumeSettings)
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "seed": (0, 2**63), "threads": (0, 1024), "sh_degree": (0, 3), "realtime_fps": (0, 1e4),
-            "refine_iterations": (0, 10**7), "memory_limit_mb": (0, 1e9),
-        }  # fmt: skip
-        check_ranges(self, ranges)
 
 
 def config_to_dict(config: Config) -> dict[str, Any]:
@@ -109,35 +99,19 @@ def config_from_dict(values: dict[str, Any], origin: str = "settings") -> Config
     Raises:
         ConfigError: an unknown name (the nearest known one is suggested) or a value of the wrong type or range.
     """
-    _refuse_unknown(values, Config, "", origin)
+    if not isinstance(values, dict):
+        raise ConfigError(f"{origin}: top level: expected names with values, found {values!r}")
+    if unnamed := [name for name in values if not isinstance(name, str)]:
+        raise ConfigError(f"{origin}: unknown setting {unnamed[0]}")
     try:
-        return pydantic.TypeAdapter(Config).validate_python(values)
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{origin}: {name}: {first['msg']}, found {first['input']!r}") from None
+        return Config(**values)
     except ConfigError as error:
         raise ConfigError(f"{origin}: {error}") from None
 
 
-def _refuse_unknown(values: Any, kind: type, prefix: str, origin: str) -> None:
-    if not isinstance(values, dict):
-        place = prefix.rstrip(".") or "top level"
-        raise ConfigError(f"{origin}: {place}: expected names with values, found {values!r}")
-    types = typing.get_type_hints(kind)
-    known = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]
-    for name, value in values.items():
-        if name not in known:
-            near = difflib.get_close_matches(str(name), known, 1)
-            hint = f"; did you mean {prefix}{near[0]}?" if near else f"; known: {', '.join(prefix + k for k in known)}"
-            raise ConfigError(f"{origin}: unknown setting {prefix}{name}{hint}")
-        if dataclasses.is_dataclass(types[name]):
-            _refuse_unknown(value, typing.cast(type, types[name]), f"{prefix}{name}.", origin)
-
-
 def presets() -> dict[str, Path]:
     """The presets that come with ggslam: name -> file."""
-    folders = [Path(__file__).parents[1] / "configs", Path(str(resources.files("ggslam"))) / "configs"]
+    folders = [Path(__file__).parents[2] / "configs", Path(str(resources.files("ggslam"))) / "configs"]
     return {path.stem: path for folder in folders if folder.is_dir() for path in sorted(folder.glob("*.yaml"))}
 
 
@@ -158,20 +132,20 @@ def load_config(preset_or_file: str | Path | None = None, overrides: list[str] |
     for override in overrides or []:
         name, equals, text = override.partition("=")
         if not equals:
-            raise ConfigError(f"--set {override}: expected name=value")
+            raise ConfigError(f"`overrides` {override}: expected name=value")
         try:
             value = yaml.safe_load(text)
         except yaml.YAMLError as error:
-            raise ConfigError(f"--set {override}: cannot be read as a value: {error}") from None
+            raise ConfigError(f"`overrides` {override}: cannot be read as a value: {error}") from None
         _assign(values, name.strip().split("."), value, override)
-    return config_from_dict(values, "--set" if overrides else origin)
+    return config_from_dict(values, "`overrides`" if overrides else origin)
 
 
 def _assign(values: dict[str, Any], names: list[str], value: Any, override: str) -> None:
     for name in names[:-1]:
         values = values.setdefault(name, {})
         if not isinstance(values, dict):
-            raise ConfigError(f"--set {override}: {name} is a value, not a group")
+            raise ConfigError(f"`overrides` {override}: {name} is a value, not a group")
     values[names[-1]] = value
 
 

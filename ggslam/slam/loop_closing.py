@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ggslam.errors import check_ranges
 from ggslam.features.orb import View
 from ggslam.loops.activity import ActiveKeyframes, ActivitySettings
 from ggslam.loops.places import Place, PlaceIndex
@@ -23,6 +22,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation, transformed
+from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
@@ -33,39 +33,30 @@ _FIRM = 1e6 * np.eye(6)
 """Information of a motion that is sure to a millimetre and a milliradian."""
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class LoopSettings:
     """When loops are looked for, and when they are believed."""
 
-    enabled: bool = True
+    enabled: bool = setting(True, basic=True)
     """Whether loops are closed and lost frames are looked up among all keyframes."""
-    candidates: int = 3
+    candidates: int = setting(3, 1, 1000)
     """Old keyframes that are tried for a new one, and for a frame that is lost, the likeliest first."""
-    confirmations: int = 2
+    confirmations: int = setting(2, 1, 100)
     """A loop is closed when so many keyframes in a row have found the same correction."""
-    confirmation_gap: int = 5
+    confirmation_gap: int = setting(5, 1, 10**6, "keyframes")
     """In a row: no more than so many keyframes apart."""
-    agreement_m: float = 0.05
-    agreement_deg: float = 2.0
-    """Two corrections are the same if they differ by less where the camera is, metres and degrees."""
-    neighbourhood: int = 3
+    agreement_m: float = setting(0.05, 0, 1e3, "m")
+    """Two corrections are the same if they move the camera to places nearer than this..."""
+    agreement_deg: float = setting(2.0, 0, 180, "deg")
+    """...and turn it to directions nearer than this."""
+    neighbourhood: int = setting(3, 0, 1000, "keyframes")
     """Keyframes before and after an old one whose points make its local map."""
-    repair_iterations: int = 40
+    repair_iterations: int = setting(40, 0, 10**6)
     """Optimisation steps after a closure, on the keyframes at both of its ends."""
     activity: ActivitySettings = field(default_factory=ActivitySettings)
     places: PlaceSettings = field(default_factory=PlaceSettings)
     verification: VerificationSettings = field(default_factory=VerificationSettings)
     graph: GraphSettings = field(default_factory=GraphSettings)
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            {
-                "candidates": (1, 1000), "confirmations": (1, 100), "confirmation_gap": (1, 10**6),
-                "agreement_m": (0, 1e3), "agreement_deg": (0, 180), "neighbourhood": (0, 1000),
-                "repair_iterations": (0, 10**6),
-            },
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)

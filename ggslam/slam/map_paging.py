@@ -330,7 +330,7 @@ class MapPager:
             in_view = len(self.map) - count
             self.budget.notes.append(
                 f"the map's part of the memory limit holds {self._rows()} Gaussians, but {in_view} are in "
-                "view of one keyframe: the limit will be exceeded (a larger memory_limit_mb, a smaller --scale or "
+                "view of one keyframe: the limit will be exceeded (a larger memory_limit_mb, a smaller `scale` or "
                 "paging.view_range helps)"
             )
         with uninterrupted():

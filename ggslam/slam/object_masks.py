@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Literal
 
 import numpy as np
 
-from ggslam.errors import ConfigError, SequenceError, check_ranges
+from ggslam.errors import SequenceError
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, MapLabels
 from ggslam.objects.association import Associator, MapView
@@ -22,22 +22,23 @@ from ggslam.objects.segments import boundary_trust, clean_segments
 from ggslam.objects.settings import AssociationSettings, CleaningSettings, GeometricSettings
 from ggslam.objects.table import Observation, Supervision
 from ggslam.scene.frame import Frame
+from ggslam.system.settings import Conflict, setting, settings_class
 
 Source = Literal["auto", "recording", "geometry", "model", "none"]
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class MaskSettings:
     """Where object masks come from and what is done to them."""
 
-    source: Source = "auto"
+    source: Source = setting("auto", basic=True)
     """auto: `model` if one is named, else the recording's masks if it has any, else geometry; none: no objects."""
-    model: str = ""
+    model: str = setting("", basic=True)
     """ONNX file of a segmentation model (YOLO-seg or SAM family); needs the extra [masks]."""
-    min_views: int = 3
+    min_views: int = setting(3, 1, 10**6)
     """Objects that a segmenter or association found on fewer keyframes are noise. Runs of less than ten keyframes for
     each of these views ask for less."""
-    min_gaussians: int = 20
+    min_gaussians: int = setting(20, 0, 10**9)
     """...and so are those with fewer Gaussians."""
     cleaning: CleaningSettings = field(default_factory=CleaningSettings)
     association: AssociationSettings = field(default_factory=AssociationSettings)
@@ -45,9 +46,8 @@ class MaskSettings:
     onnx: OnnxSegmenterSettings = field(default_factory=OnnxSegmenterSettings)
 
     def __post_init__(self) -> None:
-        check_ranges(self, {"min_views": (1, 10**6), "min_gaussians": (0, 10**9)})
         if self.source == "model" and not self.model:
-            raise ConfigError("masks.source=model: masks.model must name an ONNX file")
+            raise Conflict("model", "expected an ONNX file, because masks.source is model, found none")
 
 
 class ObjectMasks:

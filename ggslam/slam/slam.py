@@ -124,7 +124,7 @@ class Slam:
             ConfigError: memory is limited, and maps made before are taken whole.
         """
         if self.pager is not None:
-            raise ConfigError("memory_limit_mb: a run that starts in the map of another (--map) has no limit of memory")
+            raise ConfigError("memory_limit_mb: a run that starts in the map of another (`map`) has no limit of memory")
         self._objects, self._keyframes_made = objects, len(keyframes)
         self.mapper.adopt(gaussians, keyframes)
         if objects is None or gaussians.feature_channels != IDENTITY_CHANNELS:

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ggslam.errors import check_ranges
 from ggslam.synthetic.world import World, cast_rays
+from ggslam.system.settings import setting, settings_class
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Scan:
         return len(self.points)
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class Scanner:
     """The sensor. It stands still during a turn.
 
@@ -40,25 +40,20 @@ class Scanner:
         ConfigError: a number out of its range.
     """
 
-    rings: int = 16
+    rings: int = setting(16, 1, 1024)
     """Rays above one another, evenly spread in elevation."""
-    columns: int = 900
+    columns: int = setting(900, 4, 65536)
     """Directions of a turn."""
-    lowest_deg: float = -22.5
-    highest_deg: float = 22.5
-    """Elevation of the outer rings, degrees."""
-    nearest: float = 0.3
-    farthest: float = 30.0
-    """Range within which it measures, metres."""
-    noise: float = 0.02
-    """Standard deviation of a range, metres."""
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "rings": (1, 1024), "columns": (4, 65536), "lowest_deg": (-89, 89), "highest_deg": (-89, 89),
-            "nearest": (0, 1e3), "farthest": (0, 1e3), "noise": (0, 10),
-        }  # fmt: skip
-        check_ranges(self, ranges)
+    lowest_deg: float = setting(-22.5, -89, 89, "deg")
+    """Elevation of the lowest ring."""
+    highest_deg: float = setting(22.5, -89, 89, "deg")
+    """Elevation of the highest ring."""
+    nearest: float = setting(0.3, 0, 1e3, "m")
+    """Nearer surfaces are not measured."""
+    farthest: float = setting(30.0, 0, 1e3, "m")
+    """Farther surfaces are not measured."""
+    noise: float = setting(0.02, 0, 10, "m")
+    """Standard deviation of a range."""
 
     @cached_property
     def directions(self) -> np.ndarray:

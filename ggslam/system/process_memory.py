@@ -20,6 +20,11 @@ def peak_memory_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
+def peak_memory_mb() -> float:
+    """The same in MB (10^6 bytes)."""
+    return peak_memory_bytes() / 1e6
+
+
 def resident_bytes() -> int:
     """Resident memory of this process now; where the system does not tell, the largest so far."""
     try:

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from ggslam.errors import check_ranges
 from ggslam.scene.poses import separation
+from ggslam.system.settings import setting, settings_class
 
 
 class Tracked(Protocol):
@@ -39,28 +38,21 @@ class KeyframeKind(enum.Enum):
     """Enough frames or motion since the last keyframe: the mapper wants the view."""
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class KeyframeSettings:
     """Limits. What counts as overlap already scales with depth noise (`AlignSettings.overlap_*`), motion with depth."""
 
-    min_overlap: float = 0.8
+    min_overlap: float = setting(0.8, 0, 1)
     """A tracking keyframe is made when less of the frame than this matches the target."""
-    min_gap: int = 2
+    min_gap: int = setting(2, 0, 10**6, "frames")
     """Tracking keyframes come at least this many frames after the last keyframe unless overlap falls under 3/4 of the
     limit: where part of every frame matches nothing (clutter at the depth camera's edge), each frame would be one."""
-    max_gap: int = 5
+    max_gap: int = setting(5, 1, 10**9, "frames")
     """A mapping keyframe is made after this many frames without a keyframe."""
-    max_translation: float = 0.1
+    max_translation: float = setting(0.1, 0, 1e9)
     """A mapping keyframe is made after a motion of this many times the median depth."""
-    max_rotation_deg: float = 10.0
-    """Likewise, degrees."""
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "min_overlap": (0, 1), "min_gap": (0, 10**6), "max_gap": (1, 10**9), "max_translation": (0, 1e9),
-            "max_rotation_deg": (0, 1e9),
-        }  # fmt: skip
-        check_ranges(self, ranges)
+    max_rotation_deg: float = setting(10.0, 0, 360, "deg")
+    """A mapping keyframe is also made after a turn by this."""
 
 
 class KeyframePolicy:

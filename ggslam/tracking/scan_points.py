@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ggslam.errors import check_ranges
+from ggslam.system.settings import Conflict, setting, settings_class
 from ggslam.tracking.points import FramePoints
 
 _THICKNESS = 0.01
@@ -15,18 +13,20 @@ _THICKNESS = 0.01
 counts the distance to the plane."""
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class ScanSettings:
     """How points are taken from a scan."""
 
-    voxel: float = 0.2
-    """Of the points in a cube with this edge one is used, in metres; near surfaces then count no more than far ones."""
-    nearest: float = 0.3
-    farthest: float = 60.0
-    """Range in metres."""
+    voxel: float = setting(0.2, 1e-3, 100, "m")
+    """Of the points in a cube with this edge one is used; near surfaces then count no more than far ones."""
+    nearest: float = setting(0.3, 0, 1e4, "m")
+    """Nearer points are not used."""
+    farthest: float = setting(60.0, 1e-3, 1e6, "m")
+    """Farther points are not used."""
 
     def __post_init__(self) -> None:
-        check_ranges(self, {"voxel": (1e-3, 100), "nearest": (0, 1e4), "farthest": (1e-3, 1e6)})
+        if self.nearest >= self.farthest:
+            raise Conflict("farthest", f"expected more than nearest, {self.nearest:g}, found {self.farthest:g}")
 
 
 def scan_points(points: np.ndarray, settings: ScanSettings) -> FramePoints:

@@ -7,166 +7,157 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ggslam.errors import check_ranges
 from ggslam.features.orb import FeatureSettings
+from ggslam.system.settings import Conflict, setting, settings_class
 
 PhotometricMode = Literal["never", "degenerate", "auto", "always"]
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class DepthNoise:
     """Standard deviation of a depth measurement: sigma(z) = constant + square z^2 (z, sigma in metres).
 
     The default is a structured-light camera's (Khoshelham and Oude Elberink, Sensors 2012, round the values up).
     """
 
-    constant: float = 0.0012
-    """Metres."""
-    square: float = 0.0019
-    """Metres per square metre of depth."""
+    constant: float = setting(0.0012, 1e-6, 1, "m")
+    """At the camera."""
+    square: float = setting(0.0019, 0, 1, "1/m")
+    """Growth with the squared depth."""
 
     def sigma(self, z: float) -> float:
         """Standard deviation in metres at depth `z`."""
         return self.constant + self.square * z * z
 
-    def __post_init__(self) -> None:
-        ranges = {
-            "constant": (1e-6, 1),
-            "square": (0, 1),
-        }  # fmt: skip
-        check_ranges(self, ranges)
 
-
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class PointSettings:
     """How points are taken from a depth image."""
 
-    count: int = 5000
+    count: int = setting(5000, 50, 10**6)
     """Points aimed at; the pixel stride follows from it and the number of pixels with depth."""
-    window: int = 2
+    window: int = setting(2, 1, 20)
     """Neighbours come from (2 window + 1)^2 samples, about as far apart as a pixel of a 320-pixel-wide image."""
-    min_neighbours: float = 0.6
+    min_neighbours: float = setting(0.6, 0, 1)
     """Share of the window that must lie on the point's surface, or the point is dropped."""
-    min_depth: float = 0.1
-    max_depth: float = 8.0
-    """Depth range in metres; in scenes larger than a room the upper bound goes with the first frame's median depth."""
-    min_thickness: float = 0.01
+    min_depth: float = setting(0.1, 0, 1e4, "m")
+    """Nearer depth is not used."""
+    max_depth: float = setting(8.0, 0.01, 1e4, "m", basic=True)
+    """Farther depth is not used; in scenes larger than a room this bound goes with the first frame's median depth."""
+    min_thickness: float = setting(0.01, 1e-4, 1)
     """Lower bound of the smallest regularised eigenvalue (equation 1 of GS-ICP): a plane's thickness."""
-    max_elongation: float = 4.0
+    max_elongation: float = setting(4.0, 1, 1e4)
     """Upper bound of the largest regularised eigenvalue."""
 
     def __post_init__(self) -> None:
-        ranges = {
-            "count": (50, 10**6),
-            "window": (1, 20),
-            "min_neighbours": (0, 1),
-            "min_depth": (0, 1e4),
-            "max_depth": (0, 1e4),
-            "min_thickness": (1e-4, 1),
-            "max_elongation": (1, 1e4),
-        }  # fmt: skip
-        check_ranges(self, ranges)
+        if self.min_depth >= self.max_depth:
+            raise Conflict("max_depth", f"expected more than min_depth, {self.min_depth:g}, found {self.max_depth:g}")
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class TargetSettings:
     """How the map's Gaussians become what a frame is aligned to."""
 
-    voxel: float = 0.03
-    """Edge of a fine voxel in metres in a room, where the first frame's median depth is 1 to 4 m; in larger and smaller
-    scenes it goes with that depth (`scale`). Coarse voxels are four times as wide."""
-    min_opacity: float = 0.1
+    voxel: float = setting(0.03, 1e-3, 10, "m")
+    """Edge of a fine voxel in a room, where the first frame's median depth is 1 to 4 m; in larger and smaller scenes it
+    goes with that depth (`scale`). Coarse voxels are four times as wide."""
+    min_opacity: float = setting(0.1, 1e-3, 0.999)
     """Gaussians less opaque than this take no part."""
-    min_thickness: float = 0.01
-    max_thickness: float = 0.01
-    """Bounds of a voxel's smallest regularised eigenvalue. The upper one keeps a noisy plane a plane."""
-    max_elongation: float = 4.0
+    min_thickness: float = setting(0.01, 1e-4, 1)
+    """Lower bound of a voxel's smallest regularised eigenvalue."""
+    max_thickness: float = setting(0.01, 1e-4, 1)
+    """Upper bound of the same: keeps a noisy plane a plane."""
+    max_elongation: float = setting(4.0, 1, 1e4)
     """Upper bound of the largest regularised eigenvalue."""
-    scatter_weight: float = 1.0
+    scatter_weight: float = setting(1.0, 0, 1e3)
     """Weight of the scatter of the means against the Gaussians' own covariances in a voxel's shape."""
-    neighbour_weight: float = 0.3
+    neighbour_weight: float = setting(0.3, 0, 1e3)
     """Weight of the 26 neighbours in a voxel's scatter."""
 
     def __post_init__(self) -> None:
-        ranges = {
-            "voxel": (1e-3, 10),
-            "min_opacity": (1e-3, 0.999),
-            "min_thickness": (1e-4, 1),
-            "max_elongation": (1, 1e4),
-        }  # fmt: skip
-        check_ranges(self, ranges)
+        if self.min_thickness > self.max_thickness:
+            raise Conflict(
+                "max_thickness",
+                f"expected min_thickness, {self.min_thickness:g}, or more, found {self.max_thickness:g}",
+            )
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class AlignSettings:
     """How points are aligned to a target."""
 
-    coarse_iterations: int = 6
-    coarse_points: int = 1500
-    """Iterations and points at the coarse level; 0 iterations: fine level only."""
-    fine_iterations: int = 12
-    translation_tolerance: float = 1e-4
-    rotation_tolerance: float = 5e-5
-    """The iteration stops at a step below both (metres, radians)."""
-    kernel_constant: float = 0.01
-    kernel_sigmas: float = 2.0
-    """Width of the Geman-McClure kernel in metres: constant + sigmas sigma(z)."""
-    coarse_kernel_factor: float = 2.0
+    coarse_iterations: int = setting(6, 0, 1000)
+    """Iterations at the coarse level; 0: fine level only."""
+    coarse_points: int = setting(1500, 50, 10**6)
+    """Points used at the coarse level."""
+    fine_iterations: int = setting(12, 1, 1000)
+    """Iterations at the fine level."""
+    translation_tolerance: float = setting(1e-4, 0, 1, "m")
+    """The iteration stops at a step below this..."""
+    rotation_tolerance: float = setting(5e-5, 0, 1, "rad")
+    """...and below this."""
+    kernel_constant: float = setting(0.01, 1e-4, 10, "m")
+    """Width of the Geman-McClure kernel: this..."""
+    kernel_sigmas: float = setting(2.0, 0, 100)
+    """...plus this many standard deviations sigma(z) of the depth noise."""
+    coarse_kernel_factor: float = setting(2.0, 0.1, 100)
     """The coarse level's kernel is this much wider."""
-    overlap_constant: float = 0.01
-    overlap_sigmas: float = 2.0
-    """A match is an inlier if its point-to-plane distance is below constant + sigmas sigma(z), metres."""
-    min_normal_dot: float = 0.5
+    overlap_constant: float = setting(0.01, 1e-4, 10, "m")
+    """A match is an inlier if its point-to-plane distance is below this..."""
+    overlap_sigmas: float = setting(2.0, 0, 100)
+    """...plus this many standard deviations sigma(z) of the depth noise."""
+    min_normal_dot: float = setting(0.5, -1, 1)
     """Normals of a match agree to this cosine."""
-    min_matches: int = 100
-    degenerate_below: float = 0.01
+    min_matches: int = setting(100, 6, 10**6)
+    """Points that need a match; else the alignment fails."""
+    degenerate_below: float = setting(0.01, 0, 1)
     """Geometry is degenerate if some direction of motion is seen by less than this share of the points."""
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class PhotometricSettings:
     """The photometric part of the alignment (direct image alignment, Huber norm)."""
 
     mode: PhotometricMode = "auto"
     """never; degenerate: where geometry leaves a direction of motion open; always; auto: always if the depth camera is
     noisy, else where geometry is degenerate."""
-    noisy_m: float = 0.001
-    """For "auto": the depth camera is noisy if its standard deviation at the median depth is above this, metres."""
-    shrink: int = 2
+    noisy_m: float = setting(0.001, 0, 1, "m")
+    """For "auto": the depth camera is noisy if its standard deviation at the median depth is above this."""
+    shrink: int = setting(2, 1, 16)
     """Images are this many times smaller, for 320-pixel-wide ones; wider ones are shrunk more."""
-    points: int = 5000
+    points: int = setting(5000, 1, 10**6)
     """Textured points at most."""
-    min_gradient: float = 0.02
+    min_gradient: float = setting(0.02, 1e-4, 1)
     """A point is textured if grey, in [0, 1], changes by this per (shrunken) pixel."""
-    sigma: float = 0.03
+    sigma: float = setting(0.03, 1e-4, 1)
     """Standard deviation of a residual, grey levels in [0, 1]."""
-    weight: float = 0.2
+    weight: float = setting(0.2, 0, 1e3)
     """Weight against the geometry when both are weighed by their noise, per point."""
-    surface_sigma: float = 0.002
-    """Metres; the geometry's noise at 1 m is taken to be no less."""
-    huber: float = 0.05
+    surface_sigma: float = setting(0.002, 1e-5, 1, "m")
+    """The geometry's noise at 1 m is taken to be no less."""
+    huber: float = setting(0.05, 1e-4, 1)
     """Grey difference from which a residual counts linearly."""
-    depth_tolerance: float = 0.05
+    depth_tolerance: float = setting(0.05, 0, 1)
     """A pixel of the reference is occluded if its depth differs by more than this share."""
-    renew_translation: float = 0.1
+    renew_translation: float = setting(0.1, 0, 1e3)
     """A frame becomes the reference after a motion of this many times the median depth since the last one."""
-    renew_rotation_deg: float = 8.0
-    """Likewise, degrees."""
+    renew_rotation_deg: float = setting(8.0, 0, 180, "deg")
+    """A frame also becomes the reference after a turn by this."""
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class RecoverySettings:
     """What happens when constant velocity does not lead to the pose."""
 
-    convincing_overlap: float = 0.6
+    convincing_overlap: float = setting(0.6, 0, 1)
     """Under this overlap other starts are tried, too."""
-    convincing_residual: float = 0.04
+    convincing_residual: float = setting(0.04, 0, 1)
     """Over this mean grey difference, where grey values were compared, other starts are tried, too."""
-    min_overlap: float = 0.25
+    min_overlap: float = setting(0.25, 0, 0.9)
     """Under this overlap from every start the frame is lost."""
-    min_share: float = 0.2
+    min_share: float = setting(0.2, 0, 1)
     """A pose short of the convincing overlap is believed only if this share of the textured points was compared."""
-    views: int = 2
+    views: int = setting(2, 1, 100)
     """Located frames whose features are matched, the latest first."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     """Of the frames, and when their matches make a start."""

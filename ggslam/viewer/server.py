@@ -96,7 +96,7 @@ def _check_free(host: str, port: int) -> None:
         ConfigError: another program listens there, or the address is not this machine's.
     """
     if not 0 <= port <= 65535:
-        raise ConfigError(f"--port: expected 0 to 65535, found {port}")
+        raise ConfigError(f"`port`: expected 0 to 65535, found {port}")
     try:
         kind = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(kind[0], kind[1]) as probe:
@@ -104,8 +104,8 @@ def _check_free(host: str, port: int) -> None:
             probe.bind(kind[4])
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        option = "--port" if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES) else "--host"
-        raise ConfigError(f"{host}:{port}: cannot be listened at: {reason}; choose another with {option}") from None
+        argument = "port" if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES) else "host"
+        raise ConfigError(f"{host}:{port}: cannot be listened at: {reason}; choose another with `{argument}`") from None
 
 
 @contextlib.contextmanager

@@ -18,24 +18,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.errors import ConfigError, check_ranges
+from ggslam.errors import ConfigError
 from ggslam.interface.core.volumes import FieldStats
 from ggslam.native.loader import load_library
+from ggslam.system.settings import setting, settings_class
 from ggslam.volumes.tsdf import VOXELS, TsdfMap
 
 _MOST_VOXELS = 2000
 """Largest distance in voxels; the core counts them in 16 bits."""
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class FieldSettings:
     """What the distance field holds."""
 
-    max_distance: float = 2.0
-    """Distances are computed up to this, metres; farther voxels have this distance and no gradient."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, {"max_distance": (1e-3, 100)})
+    max_distance: float = setting(2.0, 1e-3, 100, "m")
+    """Distances are computed up to this; farther voxels have this distance and no gradient."""
 
 
 @dataclass(frozen=True)

@@ -198,9 +198,9 @@ class VolumeMaps:
 
 def _fusion_on(device: str, settings: VolumeSettings, onto: TsdfMap | None) -> TorchTsdf:
     if onto is not None or settings.decay_every:
-        raise ConfigError("--device: on a device a TSDF neither decays nor is one gone on with")
+        raise ConfigError("`device`: on a device a TSDF neither decays nor is one gone on with")
     try:
         torch.zeros(1, device=device).cpu()
         return TorchTsdf(settings.tsdf, device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise ConfigError(f"--device {device}: {str(error).splitlines()[0]}") from None
+        raise ConfigError(f"`device` {device}: {str(error).splitlines()[0]}") from None

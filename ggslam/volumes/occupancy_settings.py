@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.errors import ConfigError, check_ranges
+from ggslam.system.settings import Conflict, setting, settings_class
 
 
 def log_odds(probability: float) -> float:
@@ -16,35 +15,29 @@ def log_odds(probability: float) -> float:
     return float(np.float32(math.log(probability / (1.0 - probability))))
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class OccupancySettings:
     """How a scan changes the map. The defaults are OctoMap's (Hornung et al., "OctoMap", Autonomous Robots 2013)."""
 
-    probability_hit: float = 0.7
+    probability_hit: float = setting(0.7, 0.501, 0.999)
     """Occupancy that one scan with a point in the voxel speaks for."""
-    probability_miss: float = 0.4
+    probability_miss: float = setting(0.4, 0.001, 0.499)
     """Occupancy that one scan whose rays pass the voxel speaks for."""
-    probability_minimum: float = 0.1192
-    probability_maximum: float = 0.971
-    """Clamping: a voxel is never more sure than these, so that the map can follow a change in few scans."""
-    probability_occupied: float = 0.5
+    probability_minimum: float = setting(0.1192, 0.001, 0.499)
+    """Clamping: a voxel is never more sure to be free than this, so that the map can follow a change in few scans."""
+    probability_maximum: float = setting(0.971, 0.501, 0.999)
+    """Clamping: nor more sure to be occupied than this."""
+    probability_occupied: float = setting(0.5, 0.001, 0.999)
     """A voxel is occupied from this probability on."""
     quantize: bool = True
     """One ray per occupied voxel, to its centre. False: one per point, OctoMap's plain update."""
 
     def __post_init__(self) -> None:
-        ranges = {
-            "probability_hit": (0.501, 0.999),
-            "probability_miss": (0.001, 0.499),
-            "probability_minimum": (0.001, 0.499),
-            "probability_maximum": (0.501, 0.999),
-            "probability_occupied": (0.001, 0.999),
-        }  # fmt: skip
-        check_ranges(self, ranges)
         if not self.probability_minimum <= self.probability_occupied <= self.probability_maximum:
-            raise ConfigError(
-                f"OccupancySettings.probability_occupied: expected {self.probability_minimum:g} to "
-                f"{self.probability_maximum:g} (the clamping thresholds), found {self.probability_occupied}"
+            raise Conflict(
+                "probability_occupied",
+                f"expected {self.probability_minimum:g} to {self.probability_maximum:g} (the clamping thresholds), "
+                f"found {self.probability_occupied}",
             )
 
     @classmethod

@@ -10,32 +10,26 @@ t = t_sensor + t_map + t_plan + t_network, over a distance v t. Then it brakes w
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 
-from ggslam.errors import check_ranges
+from ggslam.system.settings import setting, settings_class
 
 GRAVITY = 9.81
 """Metres per second squared."""
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class Latencies:
-    """Seconds from the light on the sensor to the brake.
+    """Times from the light on the sensor to the brake."""
 
-    Attributes:
-        sensor: exposure and transfer.
-        map: until the map knows; measured.
-        plan: until the planner has reacted.
-        network: on the way between machines.
-    """
-
-    sensor: float = 0.033
-    map: float = 0.0
-    plan: float = 0.05
-    network: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self, dict.fromkeys(("sensor", "map", "plan", "network"), (0.0, 60.0)))
+    sensor: float = setting(0.033, 0, 60, "s")
+    """Exposure and transfer."""
+    map: float = setting(0.0, 0, 60, "s")
+    """Until the map knows; measured."""
+    plan: float = setting(0.05, 0, 60, "s")
+    """Until the planner has reacted."""
+    network: float = setting(0.0, 0, 60, "s")
+    """On the way between machines."""
 
     @property
     def total(self) -> float:
@@ -43,20 +37,14 @@ class Latencies:
         return self.sensor + self.map + self.plan + self.network
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class Braking:
-    """A robot that brakes.
-
-    Attributes:
-        latencies: before the brake works.
-        friction: coefficient mu between wheels and ground.
-    """
+    """A robot that brakes."""
 
     latencies: Latencies = field(default_factory=Latencies)
-    friction: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_ranges(self, {"friction": (0.01, 2.0)})
+    """Before the brake works."""
+    friction: float = setting(0.5, 0.01, 2)
+    """Coefficient mu between wheels and ground."""
 
     def blind_distance(self, speed: float) -> float:
         """Metres driven before the brake works, at `speed` in m/s."""

@@ -3,27 +3,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
-from ggslam.errors import check_ranges
+from ggslam.system.settings import setting, settings_class
 from ggslam.volumes.esdf import FieldSettings
 from ggslam.volumes.occupancy_settings import OccupancySettings
 from ggslam.volumes.settings import TsdfSettings
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class VolumeSettings:
     """What `ggslam volumes` makes."""
 
     tsdf: TsdfSettings = field(default_factory=TsdfSettings)
     esdf: FieldSettings = field(default_factory=FieldSettings)
     occupancy: OccupancySettings = field(default_factory=OccupancySettings.raised)
-    esdf_every: int = 0
+    esdf_every: int = setting(0, 0, 10**6, "frames")
     """The distance field is updated with every n-th frame; 0: with every one when volumes are made live or their
     latency is to be reported, else once at the end."""
-    decay_every: int = 0
+    decay_every: int = setting(0, 0, 10**6, "frames")
     """Weights of the TSDF decay with every n-th frame; 0: never. For live maps of places where things move out of
     sight; a map made of a recording would lose what the camera saw first."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, {"esdf_every": (0, 10**6), "decay_every": (0, 10**6)})

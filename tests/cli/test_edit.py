@@ -36,10 +36,9 @@ def one_error(result: Result, *words: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the first frames of the generated room, with objects."""
-    out = tmp_path_factory.mktemp("edited") / "room"
-    done("run", room, "--out", out, "--stop", 8, "--iterations", 2, "--no-eval")
+def finished(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the first frames of the generated room, with objects and some scores."""
+    out = Path(shutil.copytree(room_run.path, tmp_path_factory.mktemp("edited") / "room"))
     done("eval", out, "--no-lpips", "--every", 6)
     return out
 

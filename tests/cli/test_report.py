@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -14,25 +15,21 @@ from typer.testing import CliRunner
 from ggslam.cli.main import app
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.jobs.progress import SilentObserver
-from ggslam.jobs.report.data import load_run
+from ggslam.jobs.report.gather import load_run
 from ggslam.jobs.report.pages import write_comparison, write_report
-from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.score.scoring import score_run
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.recordings import SequenceRequest, open_recording_of
+from ggslam.runs.recordings import open_recording_of
 from ggslam.slam.step_log import COLUMNS, read_table
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "reporting"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "jobs"))
 from test_run_page import checked  # noqa: E402
 
 
 @pytest.fixture(scope="module")
-def small(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of eight frames, not scored."""
-    out = tmp_path_factory.mktemp("reports") / "small"
-    execute(RunRequest(SequenceRequest(room, stop=8), out=out, overrides=["mapping.iterations_per_frame=2"],
-                       evaluate=False))  # fmt: skip
-    return out
+def small(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of ten frames, not scored."""
+    return Path(shutil.copytree(room_run.path, tmp_path_factory.mktemp("reports") / "small"))
 
 
 @pytest.fixture
@@ -48,9 +45,9 @@ def words(path: Path) -> str:
 def test_a_run_writes_its_steps_and_a_report(small: Path) -> None:
     steps = read_table(small / "steps.csv")
     assert tuple(steps) == COLUMNS
-    np.testing.assert_array_equal(steps["frame"], range(8))
-    assert steps["iterations"].tolist() == [10] + 7 * [2]
-    timing = RunFolder.open(small).read_json("timing.json")
+    np.testing.assert_array_equal(steps["frame"], range(10))
+    assert steps["iterations"].tolist() == [10] + 9 * [2]
+    timing = json.loads((small / "timing.json").read_text())
     assert steps["end_s"][-1] == pytest.approx(timing["wall_s"], rel=1e-4) and (np.diff(steps["end_s"]) > 0).all()
     assert steps["tracking_ms"].sum() == pytest.approx(1e3 * timing["tracking_s"], rel=1e-4)
     assert steps["forward_ms"].sum() == pytest.approx(1e3 * timing["mapping"]["forward"], rel=1e-4)
@@ -61,7 +58,7 @@ def test_a_run_writes_its_steps_and_a_report(small: Path) -> None:
     found = checked((small / "report.html").read_text())
     assert "This run was not scored" in " ".join(found.words)
     assert found.counts["img"] == 4 * 7  # recorded and rendered, their difference, the same of depth; objects
-    assert RunFolder.open(small).read_json("run.json")["environment"]["torch"]
+    assert RunFolder.open(small).mark().versions()["torch"]
 
 
 def test_errors_over_time_agree_with_the_score(copied: RunFolder) -> None:
@@ -70,19 +67,20 @@ def test_errors_over_time_agree_with_the_score(copied: RunFolder) -> None:
     run = load_run(copied)  # the truth from the folder alone
     assert run.camera_path.error_m is not None
     rms = float(np.sqrt((run.camera_path.error_m**2).mean()))
-    assert rms == pytest.approx(metrics["trajectory"]["ate_rmse_m"], rel=1e-4)
+    assert rms == pytest.approx(metrics.trajectory.ate_rmse_m, rel=1e-4)
     text = words(write_report(copied, recording))
-    assert f"{metrics['images']['all']['psnr']:.2f}" in text and "This run was not scored" not in text
+    assert f"{metrics.images.all.psnr:.2f}" in text and "This run was not scored" not in text
     assert "LPIPS was not scored." in text
 
 
 def test_an_older_run_whose_recording_is_gone_has_a_report(copied: RunFolder) -> None:
     for name in ("steps.csv", "ground_truth.txt", "report.html", "timing.json", "loops.json", "config.yaml"):
         (copied.path / name).unlink()
-    copied.write_json("run.json", {"ggslam": "0.0.1", "complete": True, "stopped_by": None})
-    record = copied.read_json("sequence.json")
+    mark = {"ggslam": "0.0.1", "complete": True, "stopped_by": None}
+    (copied.path / "run.json").write_text(json.dumps(mark))
+    record = json.loads((copied.path / "sequence.json").read_text())
     record["open"]["path"] = str(copied.path / "gone")
-    copied.write_json("sequence.json", record)
+    (copied.path / "sequence.json").write_text(json.dumps(record))
     found = checked(write_report(copied).read_text())
     text = " ".join(found.words)
     assert "the recording is not where it was" in text and "did not note its steps" in text

@@ -63,14 +63,14 @@ def test_damage_never_does_harm(streams: list[bytes]) -> None:
     outcomes = {"decoded": 0, "refused": 0}
     for _ in range(600):
         data = damaged(streams[int(rng.integers(len(streams)))], rng)
-        start = time.perf_counter()
+        start = time.process_time()
         try:
             decode_cloud(data, workers=1)
             outcomes["decoded"] += 1
         except FormatError as error:
             assert str(error)
             outcomes["refused"] += 1
-        assert time.perf_counter() - start < 5
+        assert time.process_time() - start < 5
     assert outcomes["refused"] > 300
 
 

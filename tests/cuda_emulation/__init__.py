@@ -11,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import pytest
+from kept import one_at_a_time
 
 from ggslam.cuda.compiler import common_arguments, source_files, translation_units
 from ggslam.cuda.library import CudaLibrary
@@ -38,10 +39,10 @@ def emulated_library() -> CudaLibrary:
     for source in [*source_files(), *sorted(EMULATION.glob("*.?pp"))]:
         digest.update(source.read_bytes())
     library = KEPT / f"{digest.hexdigest()[:16]}.so"
-    if not library.exists():
-        KEPT.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=KEPT) as folder:
-            _compile(compiler, Path(folder)).replace(library)
+    with one_at_a_time(library):
+        if not library.exists():
+            with tempfile.TemporaryDirectory(dir=KEPT) as folder:
+                _compile(compiler, Path(folder)).replace(library)
     return CudaLibrary(library, device_type="cpu")
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from kept import one_at_a_time
 
 SOURCE = Path(__file__).with_name("no_op_guard.cpp")
 KEPT = SOURCE.parents[2] / "build" / "device_watch"
@@ -29,10 +30,10 @@ def register_guard() -> None:
         pytest.skip("no g++ to compile a device guard with")
     digest = hashlib.sha256(SOURCE.read_bytes() + torch.__version__.encode()).hexdigest()[:16]
     library = KEPT / f"{digest}.so"
-    if not library.exists():
-        KEPT.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=KEPT) as folder:
-            _compile(compiler, Path(folder) / "guard.so").replace(library)
+    with one_at_a_time(library):
+        if not library.exists():
+            with tempfile.TemporaryDirectory(dir=KEPT) as folder:
+                _compile(compiler, Path(folder) / "guard.so").replace(library)
     ctypes.CDLL(str(library)).ggslam_register_guard()
 
 

@@ -18,7 +18,6 @@ from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.jobs.export.splats import export_packed, export_pcd
 from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.frame_poses import frame_poses
 from ggslam.runs.recordings import SequenceRequest, describe
 from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.sequences import open_sequence
@@ -42,7 +41,7 @@ def run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 def poses(run: RunFolder) -> dict[int, np.ndarray]:
-    return frame_poses(run.read_json("keyframes.json"))
+    return run.keyframes().poses()
 
 
 def seen_depth(points: np.ndarray, T_camera_world: np.ndarray, K: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -110,7 +109,7 @@ def test_nerfstudio_folder(run: RunFolder, room: Path, tmp_path: Path) -> None:
 def test_only_keyframes_and_what_is_held_out(run: RunFolder, tmp_path: Path) -> None:
     export_nerfstudio(run, tmp_path / "few", voxel_size=0.05, keyframes_only=True)
     values = json.loads((tmp_path / "few" / "transforms.json").read_text())
-    keyframes = {k["frame"] for k in run.read_json("keyframes.json")["keyframes"]}
+    keyframes = run.keyframes().keyframe_numbers()
     found = {int(frame["file_path"][-10:-4]) for frame in values["frames"]}
     assert found == keyframes | set(HELD_OUT) and len(found) < 14
     assert len(list((tmp_path / "few" / "images").iterdir())) == len(found)

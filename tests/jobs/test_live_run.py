@@ -43,7 +43,7 @@ def test_frames_are_kept_and_scored(place: Path, tmp_path: Path) -> None:
     request = LiveRequest(place, stop=6, record=tmp_path / "kept")
     outcome = execute(RunRequest(request, out=tmp_path / "run", overrides=FAST))
     assert outcome.error is None and len(outcome.result.frames) == 6
-    assert outcome.metrics is not None and outcome.metrics["images"]["all"]["frames"] == 6
+    assert outcome.metrics is not None and outcome.metrics.images.all.frames == 6
     again = open_recording_of(outcome.folder)
     assert again.path == tmp_path / "kept" and len(again) == 6
 
@@ -56,5 +56,5 @@ def test_frames_that_are_not_kept(place: Path, tmp_path: Path) -> None:
 
 
 def test_options_for_recordings_only(place: Path) -> None:
-    with pytest.raises(SequenceError, match="only --stop and --scale can be chosen"):
+    with pytest.raises(SequenceError, match="only `stop` and `scale` can be chosen"):
         LiveRequest(place, stride=2).open()

@@ -15,7 +15,6 @@ from ggslam.cli.main import app
 from ggslam.errors import ConfigError, FormatError, GgslamError, SequenceError
 from ggslam.jobs.export.meshes import MeshRequest, export_mesh
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.frame_poses import frame_poses
 from ggslam.scene.poses import transformed
 from ggslam.sequences import open_sequence
 
@@ -46,7 +45,7 @@ def run(recording: Path) -> RunFolder:
 
 def measured(run: RunFolder, recording: Path) -> np.ndarray:
     """Points that the depth camera saw, in the run's world."""
-    poses, sequence = frame_poses(run.read_json("keyframes.json")), open_sequence(recording, stop=10)
+    poses, sequence = run.keyframes().poses(), open_sequence(recording, stop=10)
     clouds = []
     for index, T in poses.items():
         points = sequence.camera.back_project(sequence.frame(index).depth).reshape(-1, 3)
@@ -72,7 +71,7 @@ def test_glb_has_a_node_for_each_object_and_lies_on_what_was_seen(
 
 def test_rendered_depth_gives_the_same_surface(run: RunFolder, recording: Path, tmp_path: Path) -> None:
     said = ggslam("export", run.path, "--format", "mesh", "--rendered", "--voxel", VOXEL, "--out", tmp_path / "map.ply")
-    keyframes = len(run.read_json("keyframes.json")["keyframes"])
+    keyframes = len(run.keyframes().keyframes)
     assert f"rendered at {keyframes} keyframes" in said
     mesh = trimesh.load(tmp_path / "map.ply")
     far = cKDTree(mesh.vertices).query(measured(run, recording))[0]

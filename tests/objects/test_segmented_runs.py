@@ -114,8 +114,9 @@ def test_a_run_without_objects_says_so(plain_run: RunFolder) -> None:
 
 
 def test_objects_of_an_earlier_run_do_not_stay(run: RunFolder, segmented_room: Any) -> None:
+    recording = run.sequence()
     again = RunFolder.create(run.path, overwrite=True)
-    again.save(Config(), {"open": {}}, result_of(segmented_room))
+    again.save(Config(), recording, result_of(segmented_room))
     assert not again.has_objects() and not (run.path / "classifier.npz").exists() and again.votes() is None
 
 

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from ggslam.reporting.plot_files import picture, svg, write_plots
+from ggslam.reporting.plot_files import picture, svg, write_plots, write_sheet
 from ggslam.reporting.plots import MOST_POINTS, Band, Plot, Series, Stroke, Word, draw, tick_text, ticks
 
 
@@ -102,3 +103,19 @@ def test_files_show_curves_in_their_colours(tmp_path: Path) -> None:
     blue = (pixels == (0, 0x72, 0xB2)).all(-1).sum()
     orange = (pixels == (0xD5, 0x5E, 0)).all(-1).sum()
     assert 0.4 * blue < orange < 0.8 * blue  # three fifths of it
+
+
+def test_a_sheet_holds_plots_side_by_side(tmp_path: Path) -> None:
+    one = Plot("one", "One", "x", "y", [Series("a", [0, 1, 2], [3, 1, 2], "marked")])
+    other, empty = replace(one, name="other", title="Other"), replace(one, series=[Series("a", [0], [np.inf])])
+    written = write_sheet(tmp_path / "sheet_0.5", [one, empty, other])
+    assert [path.name for path in written] == ["sheet_0.5.svg", "sheet_0.5.png"]
+    space = "{http://www.w3.org/2000/svg}"
+    parts = ElementTree.parse(written[0]).getroot().findall(f"{space}svg")
+    assert [float(part.get("x", -1)) for part in parts] == [0.0, float(parts[0].get("width", 0))]
+    assert all(len(part.findall(f"{space}path")) == 1 for part in parts)  # the dots
+    left = picture(draw(one, height=340, titled=True))
+    pixels = cv2.imread(str(written[1]))[..., ::-1]
+    assert pixels.shape[1] == 2 * left.shape[1]
+    np.testing.assert_array_equal(pixels[:, : left.shape[1]], left)
+    assert write_sheet(tmp_path / "none", [empty]) == [] and len(list(tmp_path.iterdir())) == 2

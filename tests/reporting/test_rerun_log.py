@@ -123,7 +123,7 @@ def test_poses_images_map_and_numbers_are_sent() -> None:
 @pytest.mark.usefixtures("stand_in")
 @pytest.mark.parametrize("target", ["run.txt", "viewer", "no_such_folder/run.rrd"])
 def test_targets_that_are_none_are_refused(target: str) -> None:
-    with pytest.raises(ConfigError, match="--log"):
+    with pytest.raises(ConfigError, match="`log`"):
         RerunLog(target, "kitchen")
 
 

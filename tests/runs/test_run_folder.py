@@ -10,6 +10,7 @@ import pytest
 import ggslam.runs.folder as run_folder
 from ggslam.errors import RunFolderError
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
 from ggslam.slam.result import SlamResult
@@ -25,6 +26,10 @@ def result(room: Path) -> SlamResult:
     return slam.finish()
 
 
+CAMERA = {"width": 32, "height": 24, "fx": 30.0, "fy": 30.0, "cx": 15.5, "cy": 11.5}
+RECORDING = SequenceRecord.of({"open": {"path": "room"}, "camera": CAMERA})
+
+
 def fail(*_: object, **__: object) -> None:
     raise RunFolderError("cannot write: No space left on device")
 
@@ -34,16 +39,16 @@ def test_a_disk_that_fills_up(
     result: SlamResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, complete: bool
 ) -> None:
     folder = RunFolder.create(tmp_path / "run")
-    folder.save(load_config(), {"open": {}}, result)
-    assert folder.read_json("run.json")["complete"] is True
+    folder.save(load_config(), RECORDING, result)
+    assert folder.mark().complete is True
     monkeypatch.setattr(run_folder, broken, fail)
     again = RunFolder.create(tmp_path / "run", overwrite=True)
     with pytest.raises(RunFolderError, match="No space"):
-        again.save(load_config(), {"open": {}}, result)
-    assert again.read_json("run.json")["complete"] is complete  # without the clouds a run is still whole
+        again.save(load_config(), RECORDING, result)
+    assert again.mark().complete is complete  # without the clouds a run is still whole
     monkeypatch.undo()
-    RunFolder.create(tmp_path / "run", overwrite=True).save(load_config(), {"open": {}}, result)  # it can be replaced
-    assert RunFolder.open(tmp_path / "run").read_json("run.json")["complete"] is True
+    RunFolder.create(tmp_path / "run", overwrite=True).save(load_config(), RECORDING, result)  # it can be replaced
+    assert RunFolder.open(tmp_path / "run").mark().complete is True
 
 
 def test_a_probe_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from conftest import FRAMES, HEIGHT, WIDTH, pose, rows, write_color, write_depth, write_mask
+from tiny_recordings import FRAMES, HEIGHT, WIDTH, pose, rows, write_color, write_depth, write_mask
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 

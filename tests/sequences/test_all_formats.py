@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import FRAMES, MAKERS, pose, write_depth
 from format_makers import MORE_MAKERS, confidence, make_record3d, write_bag, write_video
+from tiny_recordings import FRAMES, MAKERS, pose, write_depth
 
 from ggslam.errors import SequenceError
 from ggslam.sequences import FORMATS, open_sequence, recognise_format

@@ -85,7 +85,7 @@ def test_pose_convention(copy: Path, name: str, option: str, change: Callable[[n
     assert poses is not None
     (copy / "poses.txt").write_text("".join(" ".join(map(str, change(T).ravel())) + "\n" for T in poses))
     (text,) = warnings_of(copy)
-    assert f"the true poses look like {name}" in text and text.endswith(f"try --pose-convention {option}")
+    assert f"the true poses look like {name}" in text and text.endswith(f"try `pose_convention` {option}")
     assert_remedy(copy, option, poses)
 
 

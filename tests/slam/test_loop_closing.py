@@ -15,12 +15,12 @@ import torch
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.jobs.edit.editing import Edit, edit_run
-from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute, tracking_notes
+from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
 from ggslam.loops.activity import ActivitySettings
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.frame_poses import frame_poses
 from ggslam.runs.recordings import SequenceRequest
+from ggslam.runs.records.loops import LoopsRecord
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
 from ggslam.sequences import open_sequence
@@ -123,7 +123,7 @@ def test_a_lost_camera_is_found_far_from_where_it_was_lost(frames: list[Frame]) 
         assert np.linalg.norm(poses[27 + k][:3, 3] - truth[k][:3, 3]) < 0.02
     (stretch,) = result.lost_stretches()
     assert (stretch.first, stretch.frames, stretch.after) == (24, 3, 27) and stretch.seconds == pytest.approx(0.4)
-    assert any("lost for 3 frames (0.40 s) from frame 24" in note for note in tracking_notes(result))
+    assert any("lost for 3 frames (0.40 s) from frame 24" in note for note in LoopsRecord.of_result(result).notes())
 
 
 def test_a_keyframe_from_before_the_loss_that_comes_late_hangs_on_the_one_before_it(frames: list[Frame]) -> None:
@@ -157,7 +157,7 @@ def errors_in_map(run: Path, room: Path, start: int) -> list[float]:
     """Distance of each frame from where it is, in the world of the first recording."""
     truth = open_sequence(room).ground_truth
     assert truth is not None
-    poses = frame_poses(RunFolder.open(run).read_json("keyframes.json"))
+    poses = RunFolder.open(run).keyframes().poses()
     wanted = {i: inverse(truth[0]) @ truth[start + i] for i in sorted(poses)}
     return [float(np.linalg.norm(poses[i][:3, 3] - T[:3, 3])) for i, T in wanted.items()]
 
@@ -188,8 +188,8 @@ def test_a_saved_map_grows(room: Path, first_half: Path, tmp_path: Path) -> None
     outcome = played(room, tmp_path / "grown", start=10, map=first_half)
     new = RunFolder.open(tmp_path / "grown")
     assert outcome.error is None and max(errors_in_map(new.path, room, 10)) < 0.03
-    numbers = [k["frame"] for k in new.read_json("keyframes.json")["keyframes"]]
-    count = len(old.read_json("keyframes.json")["keyframes"])
+    numbers = [k.frame for k in new.keyframes().keyframes]
+    count = len(old.keyframes().keyframes)
     assert numbers[:count] == [-1] * count and len(numbers) > count
     assert len(new.gaussians()) > len(old.gaussians())
     assert set(old.object_table().ids()) <= set(new.object_table().ids())
@@ -198,13 +198,13 @@ def test_a_saved_map_grows(room: Path, first_half: Path, tmp_path: Path) -> None
 
 
 def test_mistakes_with_maps_are_named(room: Path, first_half: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--localize-only needs --map"):
+    with pytest.raises(ConfigError, match="`localize_only` needs `map`"):
         played(room, tmp_path / "a", localize_only=True)
     with pytest.raises(RunFolderError, match="no such folder"):
         played(room, tmp_path / "a", map=tmp_path / "none")
     with pytest.raises(ConfigError, match="is the map to start in"):
         played(room, first_half, map=first_half, overwrite=True)
-    with pytest.raises(ConfigError, match="images of 160x120, these are 80x60; see --scale"):
+    with pytest.raises(ConfigError, match="images of 160x120, these are 80x60; see `scale`"):
         execute(RunRequest(SequenceRequest(room, scale=0.5), tmp_path / "a", map=first_half, evaluate=False))
     assert not (tmp_path / "a").exists()
 

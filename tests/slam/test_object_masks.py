@@ -49,17 +49,17 @@ def test_masks_with_consistent_ids_are_learned_by_name(own_ids: RunOutcome) -> N
     assert content["supervision"] == "masks"
     names = {record["name"] for record in content["objects"]}
     assert {"floor", "sofa", "coffee table"} <= names
-    scores = own_ids.metrics["segmentation"]["held_out"]
-    assert scores["miou"] > 0.75 and scores["votes_miou"] > 0.7 and scores["accuracy"] > 0.95
-    assert own_ids.metrics["segmentation"]["matching"] == "same"
-    assert own_ids.metrics["segmentation"]["gaussians"]["accuracy"] > 0.9
+    scores = own_ids.metrics.segmentation.held_out
+    assert scores.miou > 0.75 and scores.votes_miou > 0.7 and scores.accuracy > 0.95
+    assert own_ids.metrics.segmentation.matching == "same"
+    assert own_ids.metrics.segmentation.gaussians.accuracy > 0.9
 
 
 def test_objects_cost_no_quality(room: Path, tmp_path: Path, own_ids: RunOutcome) -> None:
     plain = run(room, tmp_path / "plain", "identity.enabled=false")
     assert plain.metrics is not None and own_ids.metrics is not None
-    assert plain.metrics["images"] == own_ids.metrics["images"]
-    assert not (tmp_path / "plain" / "objects.json").exists() and plain.metrics["segmentation"] is None
+    assert plain.metrics.images == own_ids.metrics.images
+    assert not (tmp_path / "plain" / "objects.json").exists() and plain.metrics.segmentation is None
 
 
 def test_shuffled_ids_become_objects(room: Path, tmp_path: Path) -> None:
@@ -72,9 +72,9 @@ def test_shuffled_ids_become_objects(room: Path, tmp_path: Path) -> None:
 
     truth = open_recording_of(outcome.folder, masks=room / "masks")
     metrics = score_run(outcome.folder, truth, SilentObserver(), lpips=False, masks=room / "masks")
-    assert metrics["segmentation"]["matching"] == "assignment"
-    assert metrics["segmentation"]["all"]["miou"] > 0.5  # by one-to-one matching; 24 small frames with large steps
-    assert metrics["segmentation"]["all"]["accuracy"] > 0.7
+    assert metrics.segmentation.matching == "assignment"
+    assert metrics.segmentation.all.miou > 0.5  # by one-to-one matching; 24 small frames with large steps
+    assert metrics.segmentation.all.accuracy > 0.7
 
 
 def test_without_masks_geometry_finds_objects(room: Path, tmp_path: Path) -> None:

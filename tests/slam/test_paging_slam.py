@@ -57,7 +57,7 @@ def executed(recording: Path, out: Path, *overrides: str) -> RunOutcome:
 
 def held_out_psnr(outcome: RunOutcome, recording: Path) -> float:
     metrics = score_run(outcome.folder, open_sequence(recording), SilentObserver(), lpips=False)
-    return metrics["images"]["held_out"]["psnr"]
+    return metrics.images.held_out.psnr
 
 
 @pytest.fixture(scope="module")
@@ -217,5 +217,5 @@ def test_what_a_killed_run_left_goes_with_the_next_one(turning: Path, tmp_path: 
 
 def test_a_map_made_before_is_taken_whole(turning: Path, limited: RunOutcome, tmp_path: Path) -> None:
     request = RunRequest(SequenceRequest(turning), tmp_path / "on", None, [*PLAIN, *SMALL], map=limited.folder.path)
-    with pytest.raises(ConfigError, match=r"memory_limit_mb.*--map"):
+    with pytest.raises(ConfigError, match=r"memory_limit_mb.*`map`"):
         execute(request)

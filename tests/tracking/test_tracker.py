@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
+from ggslam.tracking.engine import NativeEngine
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.settings import DepthNoise, PhotometricSettings, RecoverySettings
 from ggslam.tracking.surface import MeasuredSurface
@@ -72,6 +74,27 @@ def test_a_slow_motion_is_followed() -> None:
     for result, truth in zip(results[1:], poses[1:], strict=True):
         assert result.status is TrackingStatus.OK
         assert error_m(result.T_world_camera, truth) < 2e-3
+
+
+def test_a_frame_is_looked_for_where_the_motion_leads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The camera's motion is taken in its own axes, which are turned against the world's here."""
+    T_world_wall = se3_exp(np.array([0.3, -0.2, 0.1, 0.5, 1.2, -0.4]))
+    poses = [T_world_wall @ se3_exp(i * np.array([0.03, -0.01, 0.02, 0.01, 0.02, 0.0])) for i in range(3)]
+    starts, align = [], NativeEngine.align
+
+    def watched(engine: NativeEngine, points: Any, target: Any, guess: np.ndarray, *more: Any) -> Any:
+        starts.append(guess)
+        return align(engine, points, target, guess, *more)
+
+    monkeypatch.setattr(NativeEngine, "align", watched)
+    tracker = Tracker(CAMERA, TrackerSettings(), NativeContext(2), poses[0])
+    surface = MeasuredSurface(TrackerSettings().target, tracker.context)
+    for T in poses:
+        starts.clear()
+        result = tracker.track(wall_view(inverse(T_world_wall) @ T, True))
+        if tracker.target is None:
+            tracker.set_target(surface.add(result.points, T))
+    assert error_m(starts[0], poses[2]) < 3e-3
 
 
 @pytest.mark.parametrize("gain", [1.0, 0.8])

@@ -25,7 +25,7 @@ def test_a_taken_port_is_told() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        with pytest.raises(ConfigError, match="--port"):
+        with pytest.raises(ConfigError, match="`port`"):
             open_server(port=taken.getsockname()[1])
 
 
@@ -75,7 +75,7 @@ def test_words_in_markdown_are_no_markup(name: str) -> None:
 @pytest.mark.parametrize("host", ["", "nonsense.invalid", "8.8.8.8"])
 def test_an_address_of_elsewhere_is_told(host: str) -> None:
     pytest.importorskip("viser")
-    with pytest.raises(ConfigError, match="--host"):
+    with pytest.raises(ConfigError, match="`host`"):
         open_server(host, 0)
 
 

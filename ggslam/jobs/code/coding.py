@@ -261,7 +261,7 @@ def _coded_attributes(cloud: ColoredCloud, notes: list[str]) -> tuple[dict[str, 
         names = cloud.left_out if len(cloud.left_out) < 6 else (*cloud.left_out[:4], "...", cloud.left_out[-1])
         notes.append(f"left out {', '.join(names)}: neither position nor colour nor whole numbers")
         if {"opacity", "scale_0", "rot_0"} <= set(cloud.left_out):
-            notes.append("these are Gaussians: --preset splat codes them whole")
+            notes.append("these are Gaussians: `preset` splat codes them whole")
     if cloud.nowhere:
         notes.append(f"left out {cloud.nowhere} points that have no position (not a number)")
     return attributes, offsets

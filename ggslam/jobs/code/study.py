@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +22,11 @@ from ggslam.coding.energy import EnergyMeter
 from ggslam.coding.settings import CodecSettings
 from ggslam.coding.study import GridCloud, StudyRow, SweepStep, run_sweep
 from ggslam.reporting.cloud_pictures import View, contact_sheet, draw_cloud, view_of
-from ggslam.reporting.curves import Curve, Panel, draw_panels, require_plotting
 from ggslam.reporting.pictures import write_picture
-from ggslam.runs.folder import json_ready
+from ggslam.reporting.plot_files import write_sheet
+from ggslam.reporting.plots import Plot, Series
 from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.json_files import write_json
 
 
 @dataclass(frozen=True)
@@ -53,15 +53,12 @@ def write_study(
         steps: from `sweep_steps`.
         settings: slices, workers and tools.
         folder: where to.
-        plots: whether to draw the plots, which needs matplotlib.
+        plots: whether to draw the plots.
         progress: is given each row when it is there.
 
     Raises:
-        MissingDependency: plots are wanted and matplotlib is not installed; before anything is coded.
         RunFolderError: a file cannot be written.
     """
-    if plots:
-        require_plotting()
     meter = EnergyMeter()
     pictures = _Pictures(cloud, folder)
     rows = []
@@ -91,7 +88,7 @@ def write_tables(
         "points": len(cloud.grid), "peak": cloud.peak, "voxels_per_unit": cloud.quantization.scale,
         "workers": settings.workers, "slices": settings.slices, "split": settings.split, "note": note or None,
     }  # fmt: skip
-    write_text(folder / "study.json", json.dumps(json_ready({**about, "rows": table}), indent=1) + "\n")
+    write_json(folder / "study.json", {**about, "rows": table})
     return [folder / "study.csv", folder / "study.json"]
 
 
@@ -140,27 +137,31 @@ def _draw_plots(folder: Path, rows: Sequence[StudyRow]) -> list[Path]:
     for sweep in ("qp", "geometry"):
         table = [row.values() for row in rows if row.step.sweep == sweep]
         if table:
-            written += draw_panels(folder / f"rate_distortion_{sweep}", _rate_panels(table, sweep))
-            written += draw_panels(folder / f"time_{sweep}", [_time_panel(table, sweep)])
+            written += write_sheet(folder / f"rate_distortion_{sweep}", _rate_plots(table, sweep))
+            written += write_sheet(folder / f"time_{sweep}", [_time_plot(table, sweep)])
     return written
 
 
-def _rate_panels(table: list[dict[str, Any]], sweep: str) -> list[Panel]:
+def _rate_plots(table: list[dict[str, Any]], sweep: str) -> list[Plot]:
     groups = [("colour, Y U V", ["psnr_y", "psnr_u", "psnr_v"]), ("colour, R G B", ["psnr_r", "psnr_g", "psnr_b"])]
     if sweep == "geometry":
         groups = [("geometry", ["d1", "d2"]), *groups]
     rate = "geometry_bpp" if sweep == "geometry" else "color_bpp"
-    panels = []
+    plots = []
     for title, names in groups:
         used = rate if title == "geometry" or sweep == "qp" else "total_bpp"
         x = [row[used] for row in table]
-        curves = [Curve(name.removeprefix("psnr_").upper(), x, [row[name] for row in table]) for name in names]
-        panels.append(Panel(title, f"bits per point ({used.removesuffix('_bpp')})", "PSNR, dB", curves))
-    return panels
+        curves = _series({name.removeprefix("psnr_").upper(): [row[name] for row in table] for name in names}, x)
+        plots.append(Plot(title, title, f"bits per point ({used.removesuffix('_bpp')})", "PSNR, dB", curves))
+    return plots
 
 
-def _time_panel(table: list[dict[str, Any]], sweep: str) -> Panel:
+def _time_plot(table: list[dict[str, Any]], sweep: str) -> Plot:
     key, label = ("qp", "QP") if sweep == "qp" else ("geometry_scale", "geometry scale")
     x = [row[key] for row in table]
-    curves = [Curve(name, x, [row[f"{name}_s"] for row in table]) for name in ("encode", "decode")]
-    return Panel("time", label, "seconds", curves, from_zero=True)
+    curves = _series({name: [row[f"{name}_s"] for row in table] for name in ("encode", "decode")}, x)
+    return Plot("time", "time", label, "seconds", curves, from_zero=True)
+
+
+def _series(columns: dict[str, list[float]], x: list[float]) -> list[Series]:
+    return [Series(name, x, y, "marked", color) for color, (name, y) in enumerate(columns.items())]

@@ -26,8 +26,10 @@ from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.trajectory import Trajectory
 from ggslam.formats.triangle_mesh import read_mesh
-from ggslam.runs.folder import RunFolder, json_ready
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.scene.poses import inverse
+from ggslam.system.json_files import json_ready
 
 Alignment = Literal["none", "icp", "trajectory"]
 MESH_SPACING = 0.01
@@ -50,7 +52,7 @@ class Side:
     path: Path
     points: np.ndarray
     trajectory: Trajectory | None = None
-    metrics: dict[str, Any] | None = None
+    metrics: MetricsRecord | None = None
 
 
 @dataclass(frozen=True)
@@ -84,9 +86,12 @@ class Comparison:
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         sides = {
-            name: {"path": str(side.path), "points": len(side.points), "metrics": side.metrics}
+            name: {
+                "path": str(side.path), "points": len(side.points),
+                "metrics": None if side.metrics is None else side.metrics.values(),
+            }
             for name, side in (("a", self.a), ("b", self.b))
-        }
+        }  # fmt: skip
         icp = None
         if self.icp is not None and self.b_on_a_after_icp is not None:
             icp = {**asdict(self.icp), "a_on_b": asdict(self.icp.overlap), "b_on_a": asdict(self.b_on_a_after_icp)}
@@ -172,10 +177,7 @@ def _read_run(path: Path) -> Side:
     points = read_point_cloud(cloud).points if cloud.is_file() else sample_points(folder.gaussians()).points
     if not len(points):
         raise RunFolderError(f"{path}: the map has no points to compare")
-    metrics = folder.read_json("metrics.json") if (path / "metrics.json").is_file() else None
-    if metrics is not None and not isinstance(metrics, dict):
-        raise RunFolderError(f"{path / 'metrics.json'}: damaged: expected an object")
-    return Side(path, np.asarray(points, np.float64), folder.trajectory(), metrics)
+    return Side(path, np.asarray(points, np.float64), folder.trajectory(), folder.metrics())
 
 
 def _common(a: Side, b: Side) -> np.ndarray:
@@ -188,10 +190,10 @@ def _common(a: Side, b: Side) -> np.ndarray:
 def _by_trajectory(a: Side, b: Side, pairs: np.ndarray) -> np.ndarray:
     if a.trajectory is None or b.trajectory is None:
         lacking = a if a.trajectory is None else b
-        raise ConfigError(f"--align trajectory: {lacking.path} is a file and has no trajectory; use icp or none")
+        raise ConfigError(f"`align` trajectory: {lacking.path} is a file and has no trajectory; use icp or none")
     if len(pairs) < FEWEST_POSES:
         raise ConfigError(
-            f"--align trajectory: {a.path} and {b.path} have {len(pairs)} poses at common times, expected at least "
+            f"`align` trajectory: {a.path} and {b.path} have {len(pairs)} poses at common times, expected at least "
             f"{FEWEST_POSES}"
         )
     source, target = a.trajectory.T_world_camera[pairs[:, 0]], b.trajectory.T_world_camera[pairs[:, 1]]

@@ -49,7 +49,6 @@ EXTRAS = {
     "splats": Extra(("gaussforge",), "export as compressed PLY and SPZ"),
     "mesh": Extra(("trimesh",), "meshes as OBJ and GLB"),
     "octomap": Extra(("pyoctomap",), "occupancy in trees of OctoMap's own library"),
-    "plots": Extra(("matplotlib",), "plots of rate-distortion studies"),
     "formats": Extra(("gsply",), "SPZ in scripts/bench_splats.py"),
     "bench": Extra(("pyoctomap", "open3d", "edt"), "what the benchmarks of volumes compare with"),
     "cuda": Extra(("nvidia.cu13.nvvm",), "nvcc for run --device cuda, where no CUDA toolkit is installed"),

@@ -4,15 +4,15 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ggslam.errors import RunFolderError
 from ggslam.formats.point_ply import write_points_in_parts
 from ggslam.formats.point_sampling import MapPart, sample_parts
+from ggslam.objects.displacement import Displacement
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import MARKER, OBJECT_FILES, REPORT_FILE, TRUTH_FILE, RunFolder
@@ -32,7 +32,7 @@ POINTS = ("points.ply", "points_grid.ply")
 
 
 def save_edited(
-    source: RunFolder, target: RunFolder, scene: SegmentedMap, note: Mapping[str, Any],
+    source: RunFolder, target: RunFolder, scene: SegmentedMap, edits: Sequence[str], displacement: Displacement,
     pictures: Mapping[str, np.ndarray], named_only: bool, sequence: Path | None = None,
 ) -> list[Path]:  # fmt: skip
     """Writes an edited run; returns the files of the pictures.
@@ -45,7 +45,8 @@ def save_edited(
         source: the run that was edited.
         target: where to; may be the same.
         scene: the edited map.
-        note: for the marker: `edits`, what was done, is added to the run's; other keys are replaced.
+        edits: what was done, a sentence each; added to the run's.
+        displacement: where objects were moved to by now.
         pictures: by file name, for `renders/`.
         named_only: whether nothing but names changed, so that scores, points and renders stay.
         sequence: where the recording is now, if it was moved.
@@ -53,16 +54,17 @@ def save_edited(
     Raises:
         RunFolderError: a file cannot be written; the target is as it was, or opening it finishes the work.
     """
-    mark = source.read_json(MARKER)
+    mark = source.mark()
     staged = RunFolder(new_staging(target.path))
     try:
         _stage(source, staged, scene, pictures, named_only)
         if sequence is not None:
-            record = source.read_json("sequence.json")
-            opened = {**record["open"], "path": sequence.absolute()}
-            staged.write_json("sequence.json", {**record, "open": opened})
-        staged.write_json(MARKER, {**mark, **note, "edits": [*mark.get("edits", []), *note["edits"]]})
-        meanwhile = {**mark, "complete": False, "stopped_by": "saving did not finish"}
+            record = source.sequence()
+            opened = record.open.model_copy(update={"path": str(sequence.absolute())})
+            record.model_copy(update={"open": opened}).write(staged.path)
+        note = {"edits": [*mark.edits, *edits], "displaced": displacement.to_json()}
+        mark.model_copy(update=note).write(staged.path)
+        meanwhile = mark.model_copy(update={"complete": False, "stopped_by": "saving did not finish"})
     except BaseException as error:
         shutil.rmtree(staged.path, ignore_errors=True)
         if isinstance(error, OSError):
@@ -70,7 +72,7 @@ def save_edited(
         raise
     old = (*SCORES, *POINTS, *OBJECT_FILES, *RECORDS, REPORT_FILE, PLACES_FILE, MAP_INDEX, "renders", "plots")
     try:
-        publish(staged.path, target.path, MARKER, old, meanwhile)
+        publish(staged.path, target.path, MARKER, old, meanwhile.values())
     except RunFolderError:
         shutil.rmtree(staged.path, ignore_errors=True)
         raise
@@ -90,7 +92,7 @@ def _stage(
             shutil.copyfile(source.path / name, staged.path / name)
     if named_only and (source.path / "renders").is_dir():
         shutil.copytree(source.path / "renders", staged.path / "renders", dirs_exist_ok=True)
-    staged.write_json("timing.json", {**source.read_json("timing.json"), "gaussians": len(scene.gaussians)})
+    source.timing().model_copy(update={"gaussians": len(scene.gaussians)}).write(staged.path)
     for name, picture in pictures.items():
         write_picture(staged.path / "renders" / name, picture)
     if not named_only:

@@ -7,11 +7,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from ggslam.errors import ConfigError, GgslamError
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.jobs.edit.edited_run import save_edited
 from ggslam.jobs.edit.pictures import before_and_after
 from ggslam.mapping.keyframe import ELSEWHERE
@@ -35,9 +35,9 @@ from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import joined
 from ggslam.objects.table import ObjectTable
 from ggslam.objects.traces import drop_traces, places
-from ggslam.runs.folder import MARKER, RunFolder, as_written
-from ggslam.runs.frame_poses import frame_poses, run_camera
+from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.system.interrupts import uninterrupted
@@ -114,9 +114,9 @@ def edit_run(
         SequenceError: the recording is not at `sequence`.
     """
     if not edits:
-        raise ConfigError("no edit was given; there are --" + ", --".join(KINDS))
+        raise ConfigError("no edit was given; there are " + ", ".join(f"`{kind}`" for kind in KINDS))
     if sequence is not None and not inpainting:
-        raise ConfigError("--sequence: only --inpaint looks at the recording")
+        raise ConfigError("`sequence`: only `inpainting` looks at the recording")
     target = _target(folder, out, in_place)
     source = _Source.of(folder)
     notes: list[str] = []
@@ -131,9 +131,10 @@ def edit_run(
         outcome.filling = _mend(source, scene, recording, settings or InpaintSettings() if inpainting else None, notes)
         pictures = before_and_after(original, scene.gaussians, changes, source.camera, source.keyframes)
         named_only = all(edit.kind == "rename" for edit in edits)
-        note = {"edits": outcome.changes, "displaced": source.displacement.to_json()}
         with uninterrupted():
-            outcome.pictures = save_edited(folder, written, scene, note, pictures, named_only, sequence)
+            outcome.pictures = save_edited(
+                folder, written, scene, outcome.changes, source.displacement, pictures, named_only, sequence
+            )
     except BaseException:
         written.discard()
         raise
@@ -148,9 +149,9 @@ def _target(folder: RunFolder, out: Path | None, in_place: bool) -> RunFolder:
     """
     path = folder.path if in_place else out or folder.path.with_name(folder.path.name + "-edited")
     if not in_place and path.resolve() == folder.path.resolve():
-        raise ConfigError(f"{path}: is the run itself; use --in-place to edit it there, or another --out")
+        raise ConfigError(f"{path}: is the run itself; use `in_place` to edit it there, or another `out`")
     if folder.path.resolve() in path.resolve().parents:
-        raise ConfigError(f"{path}: lies within the run that is edited; use another --out")
+        raise ConfigError(f"{path}: lies within the run that is edited; use another `out`")
     return RunFolder(path)
 
 
@@ -160,13 +161,13 @@ class _Source:
 
     Attributes:
         camera: it saw with.
-        keyframes: content of keyframes.json.
+        keyframes: where they are, and how frames were tracked.
         views: of the keyframes.
         displacement: by earlier edits; follows this one.
     """
 
     camera: Camera
-    keyframes: dict[str, Any]
+    keyframes: KeyframesRecord
     views: list[View]
     displacement: Displacement
 
@@ -177,22 +178,16 @@ class _Source:
         Raises:
             RunFolderError: a file is missing or damaged, naming it.
         """
-        with as_written(folder.path / MARKER):
-            mark = folder.read_json(MARKER)
-            list(mark.get("edits", []))
-            displacement = Displacement.from_json(mark.get("displaced", {}))
-        with as_written(folder.path / "timing.json"):
-            folder.read_json("timing.json").items()
-        with as_written(folder.path / "sequence.json"):
-            camera = run_camera(folder)
-            folder.read_json("sequence.json")["open"]["path"]
-        with as_written(folder.path / "keyframes.json"):
-            record = folder.read_json("keyframes.json")
-            poses = [(k["frame"], np.array(k["T_world_camera"], float)) for k in record["keyframes"]]
-            # Keyframes of the map that the run began with have no images here.
-            views = [View(camera, inverse(pose), None if frame == ELSEWHERE else frame) for frame, pose in poses]
-            if not views or not frame_poses(record):
-                raise ValueError("it lists no keyframes or no tracked frames")
+        displacement, camera = folder.mark().displacement(), folder.sequence().camera
+        folder.timing()
+        record = folder.keyframes()
+        if not record.keyframes or not record.poses():
+            raise RunFolderError(f"{folder.path / record.FILE}: it lists no keyframes or no tracked frames")
+        # Keyframes of the map that the run began with have no images here.
+        views = [
+            View(camera, inverse(k.T_world_camera), None if k.frame == ELSEWHERE else k.frame)
+            for k in record.keyframes
+        ]  # fmt: skip
         return _Source(camera, record, views, displacement)
 
 
@@ -204,7 +199,7 @@ def _apply_all(scene: SegmentedMap, edits: Sequence[Edit], displacement: Displac
             changes.append(apply_edit(scene, edit))
         except ConfigError as error:
             if changes and set(_named(original, edit)) - set(scene.table.ids()):
-                raise ConfigError(f"--{edit.kind} {edit.objects}: an earlier edit left none of it: {error}") from None
+                raise ConfigError(f"`{edit.kind}` {edit.objects}: an earlier edit left none of it: {error}") from None
             raise
         displacement.follow(changes[-1], scene)
     return changes
@@ -232,32 +227,32 @@ def apply_edit(scene: SegmentedMap, edit: Edit) -> Change:
     if edit.kind == "keep":
         return keep_objects(scene, ids)
     if edit.kind == "move":
-        turn = _vector("--rotate", edit.rotation) if edit.rotation else (0.0, 0.0, 0.0)
-        return move_objects(scene, ids, _vector("--move", edit.value), turn)
+        turn = _vector("rotation", edit.rotation) if edit.rotation else (0.0, 0.0, 0.0)
+        return move_objects(scene, ids, _vector("move", edit.value), turn)
     if edit.kind == "duplicate":
-        return duplicate_objects(scene, ids, _vector("--duplicate", edit.value) if edit.value else None)
+        return duplicate_objects(scene, ids, _vector("duplicate", edit.value) if edit.value else None)
     if edit.kind == "recolor":
         return recolor_objects(scene, ids, parse_color(edit.value))
     if edit.kind == "merge":
-        merged = _single(scene.table, "--merge", edit.value)
-        return merge_objects(scene, _single(scene.table, "--merge", edit.objects), merged)
-    return rename_object(scene, _single(scene.table, "--rename", edit.objects), edit.value)
+        merged = _single(scene.table, "merge", edit.value)
+        return merge_objects(scene, _single(scene.table, "merge", edit.objects), merged)
+    return rename_object(scene, _single(scene.table, "rename", edit.objects), edit.value)
 
 
-def _single(table: ObjectTable, option: str, text: str) -> int:
+def _single(table: ObjectTable, argument: str, text: str) -> int:
     ids = table.select(text)
     if len(ids) != 1:
-        raise ConfigError(f"{option}: expected one object, but {text!r} are {len(ids)}: {', '.join(map(str, ids))}")
+        raise ConfigError(f"`{argument}`: expected one object, but {text!r} are {len(ids)}: {', '.join(map(str, ids))}")
     return ids[0]
 
 
-def _vector(option: str, text: str) -> tuple[float, float, float]:
+def _vector(argument: str, text: str) -> tuple[float, float, float]:
     try:
         x, y, z = (float(part) for part in text.replace(",", " ").split())
     except ValueError:
-        raise ConfigError(f'{option}: expected three numbers like "0.1 0 -0.2", found {text!r}') from None
+        raise ConfigError(f'`{argument}`: expected three numbers like "0.1 0 -0.2", found {text!r}') from None
     if not np.isfinite([x, y, z]).all():
-        raise ConfigError(f"{option}: expected finite numbers, found {text!r}")
+        raise ConfigError(f"`{argument}`: expected finite numbers, found {text!r}")
     return x, y, z
 
 

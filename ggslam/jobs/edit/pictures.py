@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from ggslam.objects.segmented_rows import joined
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import Gaussians
 from ggslam.reporting.pictures import color_to_uint8, compare
-from ggslam.runs.frame_poses import frame_poses
+from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
@@ -25,7 +24,7 @@ _LOOKED_AT = 60
 
 
 def before_and_after(
-    original: GaussianMap, edited: GaussianMap, changes: Sequence[Change], camera: Camera, record: dict[str, Any]
+    original: GaussianMap, edited: GaussianMap, changes: Sequence[Change], camera: Camera, record: KeyframesRecord
 ) -> dict[str, np.ndarray]:
     """Before, after and difference (colour, and depth below) from the frames that show the edits best.
 
@@ -34,7 +33,7 @@ def before_and_after(
         edited: the map after.
         changes: what was done; changes that cannot be seen make no pictures.
         camera: of the run.
-        record: content of the run's keyframes.json.
+        record: of the run.
 
     Returns:
         Pictures uint8 [H, W, 3] by file name.
@@ -42,7 +41,7 @@ def before_and_after(
     visible = [change for change in changes if len(change.before.means) or len(change.after.means)]
     if not visible:
         return {}
-    poses = frame_poses(record)
+    poses = record.poses()
     numbers = np.array(sorted(poses))
     looked_at = numbers[np.unique(np.linspace(0, len(numbers) - 1, _LOOKED_AT).round().astype(int))]
     views = [View(camera, inverse(poses[frame]), frame) for frame in looked_at.tolist()]

@@ -19,8 +19,7 @@ from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.table import ObjectTable
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.reporting.pictures import color_to_uint8
-from ggslam.runs.folder import MARKER, RunFolder
-from ggslam.runs.frame_poses import run_camera
+from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MapInParts
 from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.scene.frame import Frame
@@ -124,7 +123,7 @@ def _fused(folder: RunFolder, views: _Views, voxel: float | None, observer: Obse
 def _views(folder: RunFolder, request: MeshRequest) -> _Views:
     if request.rendered:
         return _rendered(folder)
-    if folder.read_json(MARKER).get("edits"):
+    if folder.mark().edits:
         views = _rendered(folder)
         views.notes.append("the run was edited: depth is rendered from the edited map")
         return views
@@ -141,15 +140,15 @@ def _views(folder: RunFolder, request: MeshRequest) -> _Views:
 
 def _rendered(folder: RunFolder) -> _Views:
     """The map as the keyframes see it."""
-    keyframes = folder.read_json("keyframes.json")["keyframes"]
+    keyframes = folder.keyframes().keyframes
     if not keyframes:
         raise RunFolderError(f"{folder.path}: no frame of this run was located")
-    poses = [np.array(keyframe["T_world_camera"]) for keyframe in keyframes]
+    poses = [keyframe.T_world_camera for keyframe in keyframes]
     return _Views(_renders(folder, poses), len(poses), f"depth rendered at {len(poses)} keyframes")
 
 
 def _renders(folder: RunFolder, poses: list[np.ndarray]) -> Iterator[PosedFrame]:
-    camera, rasterizer = run_camera(folder), CpuRasterizer()
+    camera, rasterizer = folder.sequence().camera, CpuRasterizer()
     objects = ObjectsInParts.of(folder) if folder.has_objects() else None
     parts: MapInParts = folder.map_in_parts() if objects is None else objects.map
     for index, T in enumerate(poses):

@@ -15,7 +15,6 @@ from ggslam.formats.nerfstudio import TransformsFrame, millimetres, write_transf
 from ggslam.formats.point_ply import VoxelCloud, sample_points, write_metric_points
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.frame_poses import frame_poses
 from ggslam.runs.recordings import open_recording_of
 from ggslam.scene.camera import Camera
 from ggslam.sequences import Sequence
@@ -101,10 +100,10 @@ def export_nerfstudio(
 
 
 def _views(folder: RunFolder, keyframes_only: bool, recording: Path | None) -> _Views:
-    record, evaluation = folder.read_json("keyframes.json"), folder.config().evaluation
-    keyframes = {k["frame"] for k in record["keyframes"]}
+    record, evaluation = folder.keyframes(), folder.config().evaluation
+    keyframes = record.keyframe_numbers()
     views = []
-    for index, T_world_camera in sorted(frame_poses(record).items()):
+    for index, T_world_camera in sorted(record.poses().items()):
         held_out = evaluation.is_held_out(index) and index not in keyframes
         if held_out or index in keyframes or not keyframes_only:
             views.append(_View(index, T_world_camera, held_out))
@@ -126,7 +125,7 @@ def _cloud(folder: RunFolder, voxel_size: float) -> VoxelCloud:
 def _make_empty(out: Path) -> None:
     """Images of an earlier export must not stay among new ones."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise RunFolderError(f"{out}: exists and is not an empty folder; choose another one with --out")
+        raise RunFolderError(f"{out}: exists and is not an empty folder; choose another one with `out`")
     make_folder(out)
 
 

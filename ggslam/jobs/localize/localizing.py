@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError, SequenceError
-from ggslam.jobs.localize.report import LocalizationReport, write_report
+from ggslam.jobs.localize.report import LocalizationReport, write_localization
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.stores import INDOORS, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
 from ggslam.localization.frames import FrameTracker
@@ -81,7 +81,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
             on Ctrl-C, what was located is written all the same.
     """
     if request.start is not None and request.no_start:
-        raise ConfigError("--start and --no-start: one of them")
+        raise ConfigError("`start` and `no_start`: one of them")
     out = request.out or Path("localized") / request.sequence.path.resolve().name
     with ExitStack() as opened:
         recording = _open_recording(request)
@@ -89,7 +89,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         if start is None and isinstance(recording, ScanSequence):
             raise ConfigError(
                 f"{recording.path}: laser scans have no images to look the place of the first one up by: give its pose "
-                f'with --start "x y z qx qy qz qw", or --start {GIVEN} where the recording has poses of its own'
+                f'with `start` "x y z qx qy qz qw", or `start` {GIVEN} where the recording has poses of its own'
             )
         store = open_map(request.map, opened, observer)
         context = NativeContext(request.threads)
@@ -111,7 +111,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
             None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
         )  # fmt: skip
     with uninterrupted():
-        write_report(report, out, observer)
+        write_localization(report, out, observer)
     if error is not None:
         observer.note(f"stopped after {len(results)} of {len(recording)} frames, which are in {out}")
         raise error
@@ -166,8 +166,8 @@ def parsed_pose(text: str) -> np.ndarray:
     norm = float(np.linalg.norm(numbers[3:]))
     if len(numbers) != 7 or not (np.abs(numbers) <= _FARTHEST).all() or not 0.9 < norm < 1.1:
         expected = f'"x y z qx qy qz qw", metres and a unit quaternion, or "{GIVEN}"'
-        frame = " (the first frame to use is --first)" if text.strip().isdecimal() else ""
-        raise ConfigError(f"--start: expected {expected}, found {text!r}{frame}")
+        frame = " (the first frame to use is `first`)" if text.strip().isdecimal() else ""
+        raise ConfigError(f"`start`: expected {expected}, found {text!r}{frame}")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = quaternion_to_matrix(numbers[[6, 3, 4, 5]] / norm), numbers[:3]
     return T
@@ -187,7 +187,7 @@ def _start(request: LocalizeRequest, truth: np.ndarray | None) -> np.ndarray | N
     if request.start != GIVEN:
         return parsed_pose(request.start)
     if truth is None or not np.isfinite(truth[0]).all():
-        raise SequenceError(f"{request.sequence.path}: --start {GIVEN}: the first frame has no pose")
+        raise SequenceError(f"{request.sequence.path}: `start` {GIVEN}: the first frame has no pose")
     return truth[0]
 
 
@@ -210,7 +210,7 @@ def _places(
         return None
     if start is None and not len(places):
         reason = f"; left out: {places.damaged[0]}" if places.damaged else ""
-        raise ConfigError(f"{request.map}: has no places to look up: --start is needed{reason}")
+        raise ConfigError(f"{request.map}: has no places to look up: `start` is needed{reason}")
     return places
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,15 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import MissingDependency
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.formats.trajectory import write_tum
 from ggslam.jobs.progress import Observer
 from ggslam.localization.localizer import Localization
-from ggslam.reporting.curves import Curve, Panel, draw_panels
-from ggslam.runs.folder import json_ready, peak_memory_mb
+from ggslam.reporting.plot_files import write_sheet
+from ggslam.reporting.plots import Plot, Series
 from ggslam.scene.poses import turning_angle
-from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.atomic import make_folder
+from ggslam.system.json_files import write_json
+from ggslam.system.process_memory import peak_memory_mb
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,8 @@ class LocalizationReport:
         }
 
 
-def write_report(report: LocalizationReport, out: Path, observer: Observer) -> None:
-    """Writes trajectory.txt, localization.json, and path.png and path.svg if matplotlib is there.
+def write_localization(report: LocalizationReport, out: Path, observer: Observer) -> None:
+    """Writes trajectory.txt, localization.json, and the plots path.png and path.svg.
 
     Raises:
         RunFolderError: a file cannot be written.
@@ -103,14 +103,11 @@ def write_report(report: LocalizationReport, out: Path, observer: Observer) -> N
         for time, r in zip(report.timestamps.tolist(), report.results, strict=False)
     ]  # fmt: skip
     content = {"summary": report.summary(), "frames": frames}
-    write_text(out / "localization.json", json.dumps(json_ready(content), indent=1) + "\n")
-    try:
-        draw_panels(out / "path", _panels(report))
-    except MissingDependency as error:
-        observer.note(str(error))
+    write_json(out / "localization.json", content)
+    write_sheet(out / "path", _plots(report))
 
 
-def _panels(report: LocalizationReport) -> list[Panel]:
+def _plots(report: LocalizationReport) -> list[Plot]:
     paths = {"located": report.poses()[:, :3, 3]}
     if report.truth is not None:
         paths = {"given": report.truth[: len(report.results), :3, 3], **paths}
@@ -118,10 +115,11 @@ def _panels(report: LocalizationReport) -> list[Panel]:
         report.results
     ) and np.isfinite(paths["located"]).any() else np.ones(3)  # fmt: skip
     across, along = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
-    path = [Curve(name, p[:, across].tolist(), p[:, along].tolist()) for name, p in paths.items()]
-    times = (report.timestamps - report.timestamps[0])[: len(report.results)].tolist()
+    path = [Series(name, p[:, across], p[:, along], color=n) for n, (name, p) in enumerate(paths.items())]
+    times = (report.timestamps - report.timestamps[0])[: len(report.results)]
     errors, ms = report.errors_m(), [1e3 * r.seconds for r in report.results]
-    panels = [Panel("path", f"{'xyz'[across]}, m", f"{'xyz'[along]}, m", path)]
+    plots = [Plot("path", "path", f"{'xyz'[across]}, m", f"{'xyz'[along]}, m", path, equal=True)]
     if errors is not None:
-        panels.append(Panel("error", "s", "cm", [Curve("distance", times, (100 * errors).tolist())], from_zero=True))
-    return [*panels, Panel("localisation time", "s", "ms", [Curve("a frame", times, ms)], from_zero=True)]
+        distance = Series("distance", times, 100 * errors)
+        plots.append(Plot("error", "distance from the given poses", "s", "cm", [distance], from_zero=True))
+    return [*plots, Plot("time", "time of a frame", "s", "ms", [Series("a frame", times, ms)], from_zero=True)]

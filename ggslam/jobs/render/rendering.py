@@ -22,7 +22,6 @@ from ggslam.reporting.pictures import (
     write_picture,
 )
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.frame_poses import frame_poses, run_camera
 from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
@@ -40,17 +39,17 @@ def select_frames(folder: RunFolder, numbers: str | None, every: int | None, cou
     Raises:
         ConfigError: not a number, or no such frame in the run.
     """
-    known = sorted(frame_poses(folder.read_json("keyframes.json")))
+    known = sorted(folder.keyframes().poses())
     if not known:
         raise ConfigError(f"{folder.path}: no frame of this run was located, so there is nowhere to look from")
     if numbers is not None:
         try:
             wanted = [int(number) for number in numbers.split(",")]
         except ValueError:
-            raise ConfigError(f"--frames: expected numbers like 0,50,100, found {numbers!r}") from None
+            raise ConfigError(f"`frames`: expected numbers like 0,50,100, found {numbers!r}") from None
         missing = [number for number in wanted if number not in known]
         if missing:
-            raise ConfigError(f"--frames: the run has frames {known[0]} to {known[-1]}, not {missing[0]}")
+            raise ConfigError(f"`frames`: the run has frames {known[0]} to {known[-1]}, not {missing[0]}")
         return wanted
     if every is not None:
         return known[::every]
@@ -69,8 +68,8 @@ def render_frames(
     """
     unknown = [kind for kind in what if kind not in KINDS]
     if unknown:
-        raise ConfigError(f"--what: expected some of {','.join(KINDS)}, found {unknown[0]!r}")
-    camera = run_camera(folder)
+        raise ConfigError(f"`what`: expected some of {','.join(KINDS)}, found {unknown[0]!r}")
+    camera = folder.sequence().camera
     if width is not None:
         camera = camera.resized(width, round(camera.height * width / camera.width))
     objects = ObjectsInParts.of(folder) if set(what) & set(OBJECT_KINDS) else None
@@ -78,7 +77,7 @@ def render_frames(
     make_folder(out)
     rasterizer = CpuRasterizer()
     painters = _painters() if objects is None else {**_painters(), **_object_painters(objects, rasterizer, what)}
-    poses = frame_poses(folder.read_json("keyframes.json"))
+    poses = folder.keyframes().poses()
     written = []
     for done, frame in enumerate(frames):
         T_camera_world = inverse(poses[frame])

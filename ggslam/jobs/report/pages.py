@@ -10,15 +10,14 @@ import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points
-from ggslam.jobs.report.data import has_limit, load_run, save_truth
+from ggslam.jobs.report.comparison_page import by_recording, comparison_page
+from ggslam.jobs.report.gather import has_limit, load_run, save_truth
+from ggslam.jobs.report.run_data import FrameView, RunData
+from ggslam.jobs.report.run_page import run_page
+from ggslam.jobs.report.run_plots import all_plots
 from ggslam.jobs.report.views import RENDER, TRUTH, rendered_views, saved_views, spread
-from ggslam.reporting.comparison_page import by_recording, comparison_page
 from ggslam.reporting.plot_files import write_plots
-from ggslam.reporting.run_data import FrameView, RunData
-from ggslam.reporting.run_page import run_page
-from ggslam.reporting.run_plots import all_plots
 from ggslam.runs.folder import REPORT_FILE, RunFolder, as_written
-from ggslam.runs.frame_poses import frame_poses
 from ggslam.runs.recordings import open_recording_of
 from ggslam.sequences import Sequence
 from ggslam.system.atomic import make_folder, write_text
@@ -43,7 +42,7 @@ def write_report(folder: RunFolder, sequence: Sequence | None = None, plots: Pat
     recording = sequence if sequence is not None else _recording(folder)
     views = saved_views(folder)
     if not views and not has_limit(folder):  # a view may see far more than a run with a limit holds
-        views = rendered_views(folder, recording, spread(frame_poses(folder.read_json("keyframes.json"))))
+        views = rendered_views(folder, recording, spread(folder.keyframes().poses()))
     run = load_run(folder, recording, views)
     path = folder.path / REPORT_FILE
     with as_written(folder.path):

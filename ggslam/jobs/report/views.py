@@ -11,12 +11,11 @@ import cv2
 import numpy as np
 
 from ggslam.errors import FormatError, SequenceError
+from ggslam.jobs.report.run_data import FrameView
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.reporting.pictures import color_of_depth, color_of_error, color_of_ids, color_to_uint8, depth_range
-from ggslam.reporting.run_data import FrameView
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.frame_poses import frame_poses, run_camera
 from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
@@ -40,7 +39,7 @@ def saved_views(folder: RunFolder) -> list[FrameView]:
     """The pictures that scoring left, cut apart."""
     files = sorted(folder.path.glob("renders/compare*.png"))
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, VIEWS).round().astype(int))] if files else []
-    camera = run_camera(folder) if chosen else None
+    camera = folder.sequence().camera if chosen else None
     views = []
     for path in chosen:
         number = re.fullmatch(r"compare(\d+)", path.stem)
@@ -81,7 +80,7 @@ def rendered_views(folder: RunFolder, sequence: Sequence | None, frames: Iterabl
         sequence: its recording, or None.
         frames: indices of frames that were located.
     """
-    camera, poses = run_camera(folder), frame_poses(folder.read_json("keyframes.json"))
+    camera, poses = folder.sequence().camera, folder.keyframes().poses()
     objects = ObjectsInParts.of(folder) if folder.has_objects() else None
     parts = folder.map_in_parts() if objects is None else objects.map
     rasterizer, views = CpuRasterizer(), []

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +18,8 @@ from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.score.scoring import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe, open_recording_of
+from ggslam.runs.records.loops import LoopsRecord
+from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.starting import ancestors, start_in_map
 from ggslam.scene.frame import Frame
 from ggslam.sequences import Sequence
@@ -51,7 +52,7 @@ class RunOutcome:
 
     folder: RunFolder
     result: SlamResult
-    metrics: dict[str, Any] | None = None
+    metrics: MetricsRecord | None = None
     error: BaseException | None = None
 
     def headline(self) -> str:
@@ -87,7 +88,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     observer = observer or SilentObserver()
     config, earlier = load_config(request.config, request.overrides), None
     if request.localize_only and request.map is None:
-        raise ConfigError("--localize-only needs --map: the run in whose map to localize")
+        raise ConfigError("`localize_only` needs `map`: the run in whose map to localize")
     if request.map is not None:
         earlier = RunFolder.open(request.map)
         config = replace(config, sh_degree=earlier.config().sh_degree)
@@ -96,7 +97,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
         raise SequenceError(f"{request.sequence.masks}: none of the masks there belongs to a frame of this run")
     out = request.out if request.out is not None else Path("runs") / sequence.name
     if earlier is not None and out.resolve() in ancestors(earlier):
-        raise ConfigError(f"--out {out}: is the map to start in, or one that this comes from; choose another folder")
+        raise ConfigError(f"`out` {out}: is the map to start in, or one that this comes from; choose another folder")
     folder = RunFolder.create(out, overwrite=request.overwrite)
     for warning in sequence.warnings:
         observer.note(warning)
@@ -109,11 +110,12 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
         folder.discard()
         reason = result.frames[0].reason if result.frames else "no frame could be read"
         raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
-    for text in [*tracking_notes(result), *_notes(sequence, result, config, earlier)]:
+    described = describe(request.sequence, sequence, earlier)
+    lacking = _objects_notes(sequence, result, config, earlier)
+    for text in [*LoopsRecord.of_result(result).notes(), *described.notes(), *lacking, *result.notes]:
         observer.note(text)
     with uninterrupted():
         names = {**_names(earlier), **sequence.instance_names}
-        described = describe(request.sequence, sequence, earlier)
         try:
             folder.save(config, described, result, None if error is None else repr(error), names)
         finally:
@@ -122,45 +124,28 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     kept = sequence if isinstance(sequence, Sequence) else None if error else _kept(folder, sequence)
     if request.evaluate and error is None:
         if kept is None:
-            observer.note("not scored: the frames of a live camera are kept with --record FOLDER only")
+            observer.note("not scored: the frames of a live camera are kept with `record` only")
         else:
             outcome.metrics = score_run(folder, kept, observer)
     write_report(folder, kept)
     return outcome
 
 
-def _notes(
+def _objects_notes(
     sequence: Sequence | LiveSequence, result: SlamResult, config: Config, earlier: RunFolder | None
 ) -> list[str]:
-    """What a user should know of frames, masks and objects, a line each."""
-    notes = [f"skipped: {skipped.reason}" for skipped in sequence.skipped]
-    notes += [f"mask not used: {problem}" for problem in sequence.mask_problems.values()]
-    if sequence.has_masks and config.identity.enabled and config.masks.source != "none" and result.objects is None:
-        reason = "the masks of the keyframes label nothing"
-        if earlier is not None and not earlier.has_objects():
-            reason = f"the map of {earlier.path} has none"
-        notes.append(f"no objects were learned: {reason}")
-    return notes + result.notes
+    """Why no objects were learned although there are masks."""
+    wanted = sequence.has_masks and config.identity.enabled and config.masks.source != "none"
+    if not wanted or result.objects is not None:
+        return []
+    if earlier is not None and not earlier.has_objects():
+        return [f"no objects were learned: the map of {earlier.path} has none"]
+    return ["no objects were learned: the masks of the keyframes label nothing"]
 
 
 def _kept(folder: RunFolder, sequence: LiveSequence) -> Sequence | None:
     """What a live run recorded, if it did."""
     return None if sequence.record is None else open_recording_of(folder)
-
-
-def tracking_notes(result: SlamResult) -> list[str]:
-    """What a user should know of loops and lost stretches, a line each."""
-    notes = [
-        f"loop closed at frame {event.frame}: keyframe {event.keyframe} moved {100 * event.moved_m:.1f} cm to keyframe "
-        f"{event.old_keyframe}"
-        for event in result.loop_events if event.kind == "closed"
-    ]  # fmt: skip
-    found = {event.frame: event.reason for event in result.loop_events if event.kind == "found again"}
-    for stretch in result.lost_stretches():
-        after = f"; found again: {found[stretch.after]}" if stretch.after in found else ""
-        ending = after if stretch.after is not None else " and not found again"
-        notes.append(f"lost for {stretch.frames} frames ({stretch.seconds:.2f} s) from frame {stretch.first}{ending}")
-    return notes
 
 
 def _names(earlier: RunFolder | None) -> dict[int, str]:

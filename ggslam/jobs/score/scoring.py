@@ -22,9 +22,11 @@ from ggslam.jobs.progress import Observer
 from ggslam.jobs.score.objects import ObjectScorer
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.reporting.pictures import color_to_uint8, compare, write_picture
-from ggslam.runs.folder import MARKER, RunFolder, json_ready
-from ggslam.runs.frame_poses import frame_poses
+from ggslam.runs.folder import RunFolder
 from ggslam.runs.objects_in_parts import ObjectsInParts
+from ggslam.runs.records.keyframes import KeyframesRecord
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.timing import TimingRecord
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
@@ -37,7 +39,7 @@ PICTURES = 6
 def score_run(
     folder: RunFolder, sequence: Sequence, observer: Observer, lpips: bool = True, every: int = 1,
     masks: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> MetricsRecord:  # fmt: skip
     """Scores a run against its recording and writes the results into the run folder.
 
     Args:
@@ -49,47 +51,40 @@ def score_run(
         masks: where the masks of `sequence` come from, if they are not those that the run had; for the notes.
 
     Returns:
-        What `metrics.json` holds:
-            trajectory: see `TrajectoryScores`; null without ground truth.
-            images: for `keyframes` (trained on), `held_out` (never trained on) and `all` frames, see `ImageScores`:
-                plain names count pixels with measured depth, `_unmasked` all pixels.
-            segmentation: for the same sets of frames, see `SegmentationScores`, `votes_miou` being that of labels by
-                votes (at a quarter of the pixels); how ids were matched, scores `per_object`, labels of `gaussians`
-                (see `GaussianLabelScores`); null without objects or without masks.
-            speed, map, memory: of the run.
-            notes: what could not be scored, and why.
+        What `metrics.json` holds.
     """
     notes: list[str] = []
     metric = _lpips(notes) if lpips else None
-    record = folder.read_json("keyframes.json")
-    poses = frame_poses(record)
+    record = folder.keyframes()
+    poses = record.poses()
     sets = _sets(folder, record, every)
     scorer = _object_scorer(folder, sequence, sets)
-    metrics: dict[str, Any] = {
+    metrics = MetricsRecord.of({
         "trajectory": _trajectory(sequence, poses),
         "images": _images(folder, record, sequence, sets, scorer, metric, observer),
         "segmentation": None if scorer is None else scorer.to_dict(),
-        "tracking": dict(Counter(f["status"] for f in record["frames"])),
-        **_performance(folder),
+        "tracking": dict(Counter(f.status for f in record.frames)),
+        **_performance(folder.timing()),
         "scored_every": every,
-        "notes": notes,
-    }
-    if not metrics["images"]["held_out"]["frames"]:
+        "notes": [],
+    })  # fmt: skip
+    if metrics.images.held_out is None or not metrics.images.held_out.frames:
         notes.append("no frame was held out; every score is over frames that the map was or could be trained on")
     if len(poses) and max(poses) + 1 < len(sequence):
         notes.append(f"the run ends at frame {max(poses)} of {len(sequence)}; scores are of its part")
-    lost = [f["frame"] for f in record["frames"] if f["status"] == "lost"]
+    lost = [f.frame for f in record.frames if f.lost]
     if lost:
         notes.append(f"{len(lost)} frames were lost (the first: {lost[0]}); they have no pose and are in no score")
-    if metrics["trajectory"] is None:
+    if metrics.trajectory is None:
         known = sequence.ground_truth is not None
         reason = "fewer than 3 frames have both poses" if known else "the recording has no ground-truth poses"
         notes.append(f"{reason}; no trajectory scores")
-    if edits := folder.read_json(MARKER).get("edits"):
+    if edits := folder.mark().edits:
         notes.append(f"the map was edited ({'; '.join(edits)}); the recording was not, so edits count as errors")
-    notes.extend(_segmentation_notes(folder, metrics["segmentation"], masks))
-    folder.write_json("metrics.json", metrics)
-    return json_ready(metrics)
+    notes.extend(_segmentation_notes(folder, metrics.segmentation is not None, masks))
+    metrics = metrics.model_copy(update={"notes": notes})
+    metrics.write(folder.path)
+    return metrics
 
 
 def _lpips(notes: list[str]) -> Lpips | None:
@@ -108,11 +103,11 @@ def _trajectory(sequence: Sequence, poses: dict[int, np.ndarray]) -> dict[str, A
     return None if scores is None else asdict(scores)
 
 
-def _sets(folder: RunFolder, record: dict[str, Any], every: int) -> dict[str, set[int]]:
+def _sets(folder: RunFolder, record: KeyframesRecord, every: int) -> dict[str, set[int]]:
     """Frames that each kind of score is about."""
-    keyframes = {k["frame"] for k in record["keyframes"]}
+    keyframes = record.keyframe_numbers()
     evaluation = folder.config().evaluation
-    chosen = {i for i in range(max(frame_poses(record), default=-1) + 1) if i % every == 0}
+    chosen = {i for i in range(max(record.poses(), default=-1) + 1) if i % every == 0}
     held_out = {i for i in chosen if evaluation.is_held_out(i) and i not in keyframes}
     return {"keyframes": keyframes & chosen, "held_out": held_out, "all": chosen}
 
@@ -123,16 +118,16 @@ def _object_scorer(folder: RunFolder, sequence: Sequence, sets: dict[str, set[in
     return ObjectScorer(ObjectsInParts.of(folder), sets, sequence.instance_names)
 
 
-def _segmentation_notes(folder: RunFolder, scores: dict[str, Any] | None, masks: Path | None) -> list[str]:
+def _segmentation_notes(folder: RunFolder, scored: bool, masks: Path | None) -> list[str]:
     """Which masks served as truth, or why there are no scores of objects."""
     if not folder.has_objects():
         return ["the run has no objects; the masks are not used"] if masks is not None else []
-    if scores is None and masks is not None:
+    if not scored and masks is not None:
         return [f"no scored frame has a mask in {masks}; objects are not scored"]
-    if scores is None:
+    if not scored:
         return ["the recording has no masks; objects are not scored (true masks from elsewhere: ggslam eval --masks)"]
     supervised = folder.object_table().supervision in ("masks", "associated masks")
-    own = folder.read_json("sequence.json")["open"].get("masks")
+    own = folder.sequence().open.masks
     same = masks is None or (own is not None and Path(own).resolve() == masks.resolve())
     if supervised and same:
         return ["objects are scored against the masks that supervised the map: this tells how well they were learned, "
@@ -142,10 +137,10 @@ def _segmentation_notes(folder: RunFolder, scores: dict[str, Any] | None, masks:
 
 
 def _images(
-    folder: RunFolder, record: dict[str, Any], sequence: Sequence, sets: dict[str, set[int]],
+    folder: RunFolder, record: KeyframesRecord, sequence: Sequence, sets: dict[str, set[int]],
     scorer: ObjectScorer | None, lpips: Lpips | None, observer: Observer,
 ) -> dict[str, Any]:  # fmt: skip
-    poses = frame_poses(record)
+    poses = record.poses()
     keyframes, held_out = sets["keyframes"], sets["held_out"]
     spread = np.linspace(0, len(poses) - 1, min(PICTURES, len(poses))).round().astype(int)
     pictured = set(np.array(sorted(poses))[spread].tolist())
@@ -212,16 +207,15 @@ def _write_rows(folder: RunFolder, rows: list[dict[str, Any]]) -> None:
     write_text(folder.path / "frames.csv", text.getvalue())
 
 
-def _performance(folder: RunFolder) -> dict[str, Any]:
-    timing = folder.read_json("timing.json")
-    iterations = timing["mapping"]["iterations"] - timing["refine_iterations"]
+def _performance(timing: TimingRecord) -> dict[str, Any]:
+    iterations = timing.mapping.iterations - timing.refine_iterations
     return {
         "speed": {
-            "frames_per_s": timing["frames_per_s"], "tracking_ms": timing["tracking_ms_per_frame"],
-            "mapping_iteration_ms": timing["mapping_ms_per_iteration"],
-            "iterations_per_frame": iterations / max(1, timing["frames"]),
-            "dropped_frames": len(timing["dropped_frames"]), "refinement_s": timing["refinement_s"],
+            "frames_per_s": timing.frames_per_s, "tracking_ms": timing.tracking_ms_per_frame,
+            "mapping_iteration_ms": timing.mapping_ms_per_iteration,
+            "iterations_per_frame": iterations / max(1, timing.frames),
+            "dropped_frames": len(timing.dropped_frames), "refinement_s": timing.refinement_s,
         },
-        "map": {"gaussians": timing["gaussians"], "keyframes": timing["mapping"]["keyframes"]},
-        "memory": {"peak_rss_mb": timing["peak_rss_mb"]},
+        "map": {"gaussians": timing.gaussians, "keyframes": timing.mapping.keyframes},
+        "memory": {"peak_rss_mb": timing.peak_rss_mb},
     }  # fmt: skip

@@ -95,7 +95,7 @@ def make_store(request: SubmapsRequest, observer: Observer) -> None:
     """
     source = request.source
     if is_store(source):
-        raise ConfigError(f"{source}: is a grid store already; --out wants a run, a cloud or a recording")
+        raise ConfigError(f"{source}: is a grid store already; `out` wants a run, a cloud or a recording")
     if is_cloud(source) and not source.is_file():
         raise FormatError(f"cannot read {source}: no such file")
     recording = None if is_cloud(source) or (source / MARKER).is_file() else _opened(request)
@@ -120,7 +120,7 @@ def list_store(path: Path, since: str | None = None) -> StoreListing:
         ConfigError: there was no such visit.
     """
     if Path(path).exists() and not is_store(path):
-        raise ConfigError(f"{path}: no grid store (no index.sqlite); --out names the store to make of it")
+        raise ConfigError(f"{path}: no grid store (no index.sqlite); `out` names the store to make of it")
     with GridStore.open(path) as store:
         records = [store.cell(key) for key in store.cells()]
         parts: dict[str, PartTotal] = {}
@@ -172,7 +172,7 @@ def _opened(
 def _poses(request: SubmapsRequest, timestamps: np.ndarray, own: np.ndarray | None) -> np.ndarray:
     if request.poses is None:
         if own is None or not np.isfinite(own).all((1, 2)).any():
-            raise SequenceError(f"{request.source}: no poses; `ggslam localize` finds them, --poses names their file")
+            raise SequenceError(f"{request.source}: no poses; `ggslam localize` finds them, `poses` names their file")
         return own
     found = read_trajectory(request.poses)
     poses = np.full((len(timestamps), 4, 4), np.nan)

@@ -21,7 +21,6 @@ from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.table import ObjectRecord
 from ggslam.reporting.pictures import color_of_depth, depth_range
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.frame_poses import frame_poses, run_camera
 from ggslam.runs.recordings import open_recording_of
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -57,10 +56,10 @@ class ViewedRun:
         self._lock = threading.RLock()
         self._edits: list[Edit] = []
         self._texts: list[str] = []
-        record = folder.read_json("keyframes.json")
-        self.camera: Camera = run_camera(folder)
-        self.frame_poses: dict[int, np.ndarray] = dict(sorted(frame_poses(record).items()))
-        self.keyframe_poses = np.array([k["T_world_camera"] for k in record["keyframes"]], float).reshape(-1, 4, 4)
+        record = folder.keyframes()
+        self.camera: Camera = folder.sequence().camera
+        self.frame_poses: dict[int, np.ndarray] = dict(sorted(record.poses().items()))
+        self.keyframe_poses = np.array([k.T_world_camera for k in record.keyframes]).reshape(-1, 4, 4)
         if not self.frame_poses:
             raise RunFolderError(f"{folder.path}: no frame of this run was located, so there is nowhere to look from")
         self.notes: list[str] = []

@@ -14,8 +14,7 @@ from ggslam.errors import ConfigError, RunFolderError
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.runs.folder import MARKER, RunFolder
-from ggslam.runs.frame_poses import frame_poses, run_camera
+from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, open_recording_of
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -84,14 +83,14 @@ def frames_of_run(
         RunFolderError, SequenceError: the run or its recording cannot be read.
     """
     sequence = open_recording_of(folder, recording, scale=scale)
-    record = folder.read_json("keyframes.json")
-    source = FrameSource(str(folder.path), sequence, frame_poses(record))
+    record = folder.keyframes()
+    source = FrameSource(str(folder.path), sequence, record.poses())
     if not source.poses:
         raise RunFolderError(f"{folder.path}: no frame of this run was located")
     lacking = len(sequence) - len(source.poses)
     if lacking:
         source.notes.append(f"{lacking} frames that the run did not locate are left out")
-    if folder.read_json(MARKER).get("edits"):
+    if folder.mark().edits:
         source.notes.append("the run was edited; volumes show what was recorded")
     if objects and folder.has_objects():
         segmented = folder.segmented_map()
@@ -99,8 +98,8 @@ def frames_of_run(
         if segmented.table.supervision == "masks" and sequence.has_masks:
             source.label = _own_mask
         else:
-            keyframes = {k["frame"] for k in record["keyframes"]}
-            source.label = _RenderedIds(segmented, run_camera(folder), keyframes)
+            keyframes = record.keyframe_numbers()
+            source.label = _RenderedIds(segmented, folder.sequence().camera, keyframes)
     return source
 
 
@@ -116,7 +115,7 @@ def frames_of_recording(request: SequenceRequest, objects: bool = True) -> Frame
     poses = {} if truth is None else {i: T for i, T in enumerate(truth) if is_valid_pose(T)}
     if not poses:
         raise ConfigError(
-            f"{sequence.path}: this recording tells no poses; track it with --live, or give the folder of a run of it"
+            f"{sequence.path}: this recording tells no poses; track it with `live`, or give the folder of a run of it"
         )
     source = FrameSource(str(sequence.path), sequence, poses, names=dict(sequence.instance_names))
     source.notes.append(f"poses of the recording itself ({sequence.pose_source})")

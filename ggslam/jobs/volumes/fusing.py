@@ -177,7 +177,7 @@ def _config(request: VolumesRequest) -> Config:
     if request.voxel is None:
         return config
     if request.onto is not None:
-        raise ConfigError("--voxel: with --onto the voxels are those of the file")
+        raise ConfigError("`voxel`: with `onto` the voxels are those of the file")
     tsdf = replace(config.volumes.tsdf, voxel=request.voxel)
     return replace(config, volumes=replace(config.volumes, tsdf=tsdf))
 
@@ -191,28 +191,28 @@ def _paced(settings: VolumeSettings, request: VolumesRequest) -> VolumeSettings:
 def _check(request: VolumesRequest, is_run: bool) -> None:
     """Raises GgslamError for wishes that do not go together."""
     if request.live and is_run:
-        raise ConfigError(f"--live tracks a recording, and {request.source} is a run: leave --live out")
+        raise ConfigError(f"`live` tracks a recording, and {request.source} is a run: leave `live` out")
     if request.live and request.onto is not None:
-        raise ConfigError("--onto needs poses in the frame of that file: of a run or recording, not of --live")
+        raise ConfigError("`onto` needs poses in the frame of that file: of a run or recording, not of `live`")
     if request.realtime is not None and not request.live:
-        raise ConfigError("--realtime needs --live")
+        raise ConfigError("`realtime` needs `live`")
     if request.overwrite and not request.live:
-        raise ConfigError("--overwrite is for the run that --live makes; volumes are replaced without it")
+        raise ConfigError("`overwrite` is for the run that `live` makes; volumes are replaced without it")
     if request.latency and request.device is not None and request.esdf:
-        raise ConfigError("--report: with --device the distance field waits for the end, so its latency is not known")
+        raise ConfigError("`latency`: with `device` the distance field waits for the end, so its latency is not known")
     if request.occupancy is not None and not 1e-3 <= request.occupancy <= 10:
-        raise ConfigError(f"--occupancy: expected a voxel of 0.001 to 10 m, found {request.occupancy:g}")
+        raise ConfigError(f"`occupancy`: expected a voxel of 0.001 to 10 m, found {request.occupancy:g}")
     if request.slice_height is not None:
         if not request.esdf:
-            raise ConfigError("--slice needs --esdf")
+            raise ConfigError("`slice_height` needs `esdf`")
         if not abs(request.slice_height) < 1e4:
-            raise ConfigError(f"--slice: expected a height in metres, found {request.slice_height:g}")
+            raise ConfigError(f"`slice_height`: expected a height in metres, found {request.slice_height:g}")
     if request.recording is not None and not is_run:
-        raise ConfigError(f"--sequence says where the recording of a run is; {request.source} is no run")
+        raise ConfigError(f"`recording` says where the recording of a run is; {request.source} is no run")
     if is_run and request.sequence != SequenceRequest(request.source, scale=request.sequence.scale):
         raise ConfigError(
-            f"{request.source} is a run, read as it was made: --start, --stop, --stride, --format, --depth-scale, "
-            "--pose-convention and --skip-bad-frames are for recordings"
+            f"{request.source} is a run, read as it was made: `start`, `stop`, `stride`, `format`, `depth_scale`, "
+            "`pose_convention` and `on_bad_frame` are for recordings"
         )
     if request.mesh is not None:
         _check_mesh(request.mesh, request.source)
@@ -222,7 +222,7 @@ def _check_mesh(path: Path, source: Path) -> None:
     check_mesh_path(path)
     protected = (path.parent / MARKER).is_file() or source.resolve() in path.resolve().parents
     if path.exists() and protected and path.parent.name != "volumes":
-        raise ConfigError(f"--mesh {path}: is a file of a run or recording; choose another name")
+        raise ConfigError(f"`mesh` {path}: is a file of a run or recording; choose another name")
     make_folder(path.parent)
     RunFolder(path.parent).check_writable()
 
@@ -234,7 +234,7 @@ def _folder(request: VolumesRequest, is_run: bool) -> Path:
     else:
         out = request.source / "volumes" if is_run else Path("volumes") / request.source.resolve().name
     if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
-        raise RunFolderError(f"{out}: not empty and not made by `ggslam volumes`; choose another folder with --out")
+        raise RunFolderError(f"{out}: not empty and not made by `ggslam volumes`; choose another folder with `out`")
     make_folder(out)
     prepare_folder(out)
     return out

@@ -27,8 +27,9 @@ from ggslam.formats.mesh_files import write_mesh
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.volumes.pictures import mesh_picture, occupancy_picture
 from ggslam.reporting.pictures import write_picture
-from ggslam.runs.folder import RunFolder, json_ready
-from ggslam.system.atomic import make_folder, write_text
+from ggslam.runs.folder import RunFolder
+from ggslam.system.atomic import make_folder
+from ggslam.system.json_files import write_json
 from ggslam.system.staging import finish_saving, new_staging, publish
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.maps import VolumeMaps
@@ -276,4 +277,4 @@ def _write_all(writer: _Writer, maps: VolumeMaps, record: dict[str, Any], observ
     observer.advance(4, 4)
     names = [path.name for path in writer.outputs.files if path.parent == writer.out]
     writer.outputs.record = {"complete": True, **record, **writer.outputs.record, "files": names}
-    write_text(writer.path(RECORD), json.dumps(json_ready(writer.outputs.record), indent=1) + "\n")
+    write_json(writer.path(RECORD), writer.outputs.record)

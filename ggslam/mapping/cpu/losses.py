@@ -19,12 +19,13 @@ from typing import Literal, Protocol
 import numpy as np
 import torch
 
-from ggslam.errors import ConfigError, NativeCoreError, RenderError
+from ggslam.errors import NativeCoreError, RenderError
 from ggslam.interface.core.mapping import ImageLossJob
 from ggslam.native.loader import NativeContext, load_library
+from ggslam.system.settings import setting, settings_class
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class LossSettings:
     """Weights and kinds of the terms of the loss.
 
@@ -32,39 +33,29 @@ class LossSettings:
         ConfigError: a value outside its range.
     """
 
-    dssim_weight: float = 0.2
-    """Share of 1 - SSIM in the colour loss, in [0, 1]. 0 skips SSIM, which is most of the work."""
-    depth_weight: float = 0.5
-    """Per metre."""
+    dssim_weight: float = setting(0.2, 0, 1)
+    """Share of 1 - SSIM in the colour loss. 0 skips SSIM, which is most of the work."""
+    depth_weight: float = setting(0.5, 0, 1e6, "1/m")
+    """Weight of the difference in depth."""
     depth_kind: Literal["accumulated", "normalised"] = "accumulated"
     """What is compared with the target: the accumulated depth (so that a transparent pixel is too near), or the
     accumulated depth divided by alpha."""
-    minimum_alpha: float = 0.05
-    """For "normalised": pixels rendered fainter than this have no depth to speak of and are left out, in (0, 1]."""
+    minimum_alpha: float = setting(0.05, 1e-6, 1)
+    """For "normalised": pixels rendered fainter than this have no depth to speak of and are left out."""
     color_kind: Literal["l1", "charbonnier"] = "l1"
     """rho(r) = |r|, or sqrt(r^2 + epsilon^2) - epsilon."""
-    charbonnier_epsilon: float = 1e-3
-    """In units of colour, > 0."""
-    no_depth_weight: float = 1.0
-    """How much colour counts where the keyframe has no depth, in [0, 1]. 0: not at all."""
-    opacity_weight: float = 0.0
+    charbonnier_epsilon: float = setting(1e-3, 1e-6, 1e6)
+    """Epsilon of "charbonnier", in units of colour."""
+    no_depth_weight: float = setting(1.0, 0, 1)
+    """How much colour counts where the keyframe has no depth. 0: not at all."""
+    opacity_weight: float = setting(0.0, 0, 1e6)
     """Weight of 1 - alpha where the keyframe has depth, i.e. where there is a surface."""
 
-    def __post_init__(self) -> None:
-        for name, low, high in _RANGES:
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ConfigError(f"loss.{name}: expected a number in [{low:g}, {high:g}], found {value!r}")
-        for name, kinds in (("depth_kind", ("accumulated", "normalised")), ("color_kind", ("l1", "charbonnier"))):
-            if getattr(self, name) not in kinds:
-                raise ConfigError(f"loss.{name}: expected one of {', '.join(kinds)}, found {getattr(self, name)!r}")
 
-
-_TINY, _HUGE = 1e-6, 1e6
-_RANGES = (
-    ("dssim_weight", 0.0, 1.0), ("depth_weight", 0.0, _HUGE), ("minimum_alpha", _TINY, 1.0),
-    ("charbonnier_epsilon", _TINY, _HUGE), ("no_depth_weight", 0.0, 1.0), ("opacity_weight", 0.0, _HUGE),
+_NUMBERS = (
+    "dssim_weight", "depth_weight", "minimum_alpha", "charbonnier_epsilon", "no_depth_weight", "opacity_weight",
 )  # fmt: skip
+"""Those that the core takes as they are."""
 
 
 class RenderedImages(Protocol):
@@ -189,7 +180,7 @@ class ImageLoss:
         job.exposure[:] = _exposure(target).ravel().tolist()
         job.normalised_depth = settings.depth_kind == "normalised"
         job.charbonnier = settings.color_kind == "charbonnier"
-        for name, _, _ in _RANGES:
+        for name in _NUMBERS:
             setattr(job, name, getattr(settings, name))
         d_image, d_depth, d_alpha = self._gradient_buffers(height, width)
         job.d_image, job.d_depth, job.d_alpha = d_image.data_ptr(), d_depth.data_ptr(), d_alpha.data_ptr()

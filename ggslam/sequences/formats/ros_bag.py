@@ -132,7 +132,7 @@ def _place_depth(recording: Recording, bag: Bag, topics: Topics, camera: Camera)
         return
     recording.warnings.append(
         f"depth ({depth_frame}) is of another camera than colour ({color_frame}), and /tf_static does not tell where "
-        "it is: taken as if both stood at one place (--depth-camera FILE tells it)"
+        "it is: taken as if both stood at one place (`depth_camera` tells it)"
     )
     recording.depth_camera = DepthCamera(depth_camera, np.eye(4))
 

@@ -52,7 +52,7 @@ def find_topics(bag: Bag, given: Mapping[str, str]) -> Topics:
     depth = given.get("depth") or _best(bag, "depth", depths)
     color_info = given.get("color_info") or _info(bag, color)
     if color_info is None:
-        raise SequenceError(f"{bag.path}: no camera_info belongs to {color}; give it with --topic color_info=TOPIC")
+        raise SequenceError(f"{bag.path}: no camera_info belongs to {color}; give it with `topics` color_info=TOPIC")
     return Topics(color, depth, color_info, given.get("depth_info") or _info(bag, depth), given.get("pose"))
 
 
@@ -82,7 +82,7 @@ def _best(bag: Bag, role: str, scores: dict[str, float]) -> str:
     ranked = sorted(scores, key=lambda topic: (-scores[topic], topic))
     if len(ranked) > 1 and scores[ranked[0]] == scores[ranked[1]]:
         raise SequenceError(
-            f"{bag.path}: several topics may be {role}: {', '.join(ranked[:4])}; choose with --topic {role}=TOPIC"
+            f"{bag.path}: several topics may be {role}: {', '.join(ranked[:4])}; choose with `topics` {role}=TOPIC"
         )
     return ranked[0]
 

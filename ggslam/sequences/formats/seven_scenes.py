@@ -73,7 +73,7 @@ class SevenScenesFormat:
         warning = (
             "plain 7-Scenes depth is not registered to the colour image (two cameras, several centimetres apart): "
             "colours are off by some pixels; intrinsics 585 585 320 240 of the depth camera are used "
-            "(--depth-camera FILE registers it)"
+            "(`depth_camera` registers it)"
         )
         return DEPTH_CALIBRATION, [warning]
 

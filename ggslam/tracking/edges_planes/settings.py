@@ -6,158 +6,140 @@ The defaults are for depth cameras indoors; `LIDAR` are those for a spinning LiD
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
-from ggslam.errors import ConfigError, check_ranges
+from ggslam.system.settings import Conflict, setting, settings_class
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class ExtractionSettings:
     """How edges and planes are taken from scan lines (rows and columns of a depth image, rings of a LiDAR)."""
 
-    row_step: int = 8
+    row_step: int = setting(8, 1, 100, "px")
     """Every so many rows of a 320-pixel-wide image are scanned, for edges and planes."""
-    column_step: int = 10
-    """Likewise columns, for edges only: a row does not see an edge along itself. 0: none."""
-    segments: int = 8
+    column_step: int = setting(10, 0, 100, "px")
+    """Every so many columns are scanned, for edges only: a row does not see an edge along itself. 0: none."""
+    segments: int = setting(8, 1, 1000)
     """Parts of a line that features are chosen from separately, so that they are spread out."""
-    edges_per_segment: int = 2
-    planes_per_segment: int = 7
-    """Most features of a segment; a feature is the most curved (edge) or flattest (plane) of its 11 neighbours."""
-    roughness: float = 0.001
+    edges_per_segment: int = setting(2, 0, 100)
+    """Most edges of a segment; an edge is the most curved of its 11 neighbours."""
+    planes_per_segment: int = setting(7, 1, 100)
+    """Most planes of a segment; a plane is the flattest of its 11 neighbours."""
+    roughness: float = setting(0.001, 0, 1)
     """Share of the distance added to the depth noise as standard deviation: how even real surfaces are."""
-    edge_sigmas: float = 6.0
+    edge_sigmas: float = setting(6.0, 0, 1e3)
     """An edge's curvature is above this many standard deviations of what noise makes of a straight line."""
-    plane_sigmas: float = 6.0
-    """A plane's is below this many."""
-    edge_angle_deg: float = 35.0
-    """At an edge the line turns by at least this angle (equation 2), degrees."""
-    gap: float = 0.03
+    plane_sigmas: float = setting(6.0, 0, 1e3)
+    """A plane's curvature is below this many."""
+    edge_angle_deg: float = setting(35.0, 0, 180, "deg")
+    """At an edge the line turns by at least this angle (equation 2)."""
+    gap: float = setting(0.03, 0, 1)
     """Neighbours whose distances differ by more than this share, and by more than noise allows, are not on one
     surface: an occlusion border."""
     occluding_edges: bool = True
     """Whether the near side of an occlusion border is an edge. The far side never is."""
-    patch_step: int = 2
+    patch_step: int = setting(2, 1, 20, "px")
     """In depth images the surface about a plane feature is fitted to 5 x 5 pixels this far apart (of a 320-pixel-wide
     image)."""
-    min_cosine: float = 0.15
+    min_cosine: float = setting(0.15, 0, 1)
     """Planes seen at a flatter angle (cosine between normal and ray) are left out."""
-    min_depth: float = 0.1
-    max_depth: float = 8.0
-    """Depth range of depth images in metres."""
+    min_depth: float = setting(0.1, 0, 1e4, "m")
+    """Of depth images nearer depth is not used..."""
+    max_depth: float = setting(8.0, 0.01, 1e4, "m")
+    """...nor is farther depth."""
 
     def __post_init__(self) -> None:
-        ranges = {
-            "row_step": (1, 100), "column_step": (0, 100), "segments": (1, 1000), "edges_per_segment": (0, 100),
-            "planes_per_segment": (1, 100), "roughness": (0, 1), "edge_sigmas": (0, 1e3), "plane_sigmas": (0, 1e3),
-            "edge_angle_deg": (0, 180), "gap": (0, 1), "patch_step": (1, 20), "min_cosine": (0, 1),
-            "min_depth": (0, 1e4), "max_depth": (0, 1e4),
-        }  # fmt: skip
-        check_ranges(self, ranges)
+        if self.min_depth >= self.max_depth:
+            raise Conflict("max_depth", f"expected more than min_depth, {self.min_depth:g}, found {self.max_depth:g}")
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class FeatureMapSettings:
     """The local map: voxels of planes and of edges in a table of fixed size."""
 
-    plane_voxel: float = 0.08
-    edge_voxel: float = 0.1
-    """Edges of the voxels in metres."""
-    slots: int = 1 << 17
+    plane_voxel: float = setting(0.08, 1e-3, 100, "m")
+    """Edge of the voxels of planes."""
+    edge_voxel: float = setting(0.1, 1e-3, 100, "m")
+    """Edge of the voxels of edges."""
+    slots: int = setting(1 << 17, 2, 1 << 24)
     """Places for voxels, a power of two. Of two voxels with the same place the newer one stays."""
-    match_voxels: float = 1.7
+    match_voxels: float = setting(1.7, 0.1, 2, "voxels")
     """A point is matched to a voxel whose mean is nearer than this many voxels."""
-    min_normal_dot: float = 0.5
+    min_normal_dot: float = setting(0.5, -1, 1)
     """The normals of a plane and its match agree to this cosine, where both are known."""
-    max_weight: float = 200.0
+    max_weight: float = setting(200.0, 1, 1e9)
     """A voxel's weight grows no further than this, in measurements: later ones keep some influence."""
-    min_plane_points: float = 5.0
+    min_plane_points: float = setting(5.0, 1, 1e6)
     """A voxel is a plane from this many measurements without a fitted patch; one patch is enough."""
-    min_edge_points: float = 4.0
+    min_edge_points: float = setting(4.0, 2, 1e6)
     """A voxel is an edge from this many measurements."""
-    plane_ratio: float = 8.0
+    plane_ratio: float = setting(8.0, 1, 1e6)
     """A plane's second variance is at least this many times its smallest."""
-    edge_ratio: float = 6.0
+    edge_ratio: float = setting(6.0, 1, 1e6)
     """An edge's largest variance is at least this many times its second."""
 
     def __post_init__(self) -> None:
-        ranges = {
-            "plane_voxel": (1e-3, 100), "edge_voxel": (1e-3, 100), "slots": (2, 1 << 28), "match_voxels": (0.1, 2),
-            "min_normal_dot": (-1, 1), "max_weight": (1, 1e9), "min_plane_points": (1, 1e6),
-            "min_edge_points": (2, 1e6), "plane_ratio": (1, 1e6), "edge_ratio": (1, 1e6),
-        }  # fmt: skip
-        check_ranges(self, ranges)
         if self.slots & (self.slots - 1):
-            raise ConfigError(f"FeatureMapSettings.slots: expected a power of two, found {self.slots}")
+            raise Conflict("slots", f"expected a power of two, found {self.slots}")
 
 
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class FeatureAlignSettings:
     """How a scan's features are aligned to the local map."""
 
-    planes: int = 2500
-    edges: int = 1000
-    """Features aligned at most, evenly chosen; all go into the map."""
-    outer_iterations: int = 2
+    planes: int = setting(2500, 6, 10**7)
+    """Planes aligned at most, evenly chosen; all go into the map."""
+    edges: int = setting(1000, 0, 10**7)
+    """Edges aligned at most, likewise."""
+    outer_iterations: int = setting(2, 1, 1000)
     """Times that features are matched anew."""
-    inner_iterations: int = 2
+    inner_iterations: int = setting(2, 1, 1000)
     """Levenberg-Marquardt steps per matching at most."""
-    rematch_share: float = 0.05
+    rematch_share: float = setting(0.05, 0, 1)
     """A matching that moved the features by less than this share of a plane voxel is the last one."""
-    budget_ms: float = 10.0
+    budget_ms: float = setting(10.0, 0, 1e6, "ms")
     """Wall-clock time for a frame, from the image to the pose and the map; 0: no limit. It is looked at between steps:
     one that usually takes longer than what is left is not begun (the first matching always is). A frame that would
     be lost may take longer."""
-    translation_tolerance: float = 1e-4
-    rotation_tolerance: float = 5e-5
-    """The iteration stops at a step below both (metres, radians)."""
-    huber_sigmas: float = 1.5
+    translation_tolerance: float = setting(1e-4, 0, 1, "m")
+    """The iteration stops at a step below this..."""
+    rotation_tolerance: float = setting(5e-5, 0, 1, "rad")
+    """...and below this."""
+    huber_sigmas: float = setting(1.5, 0.01, 1e3)
     """From this many standard deviations on a residual counts linearly."""
-    gate_constant: float = 0.02
-    gate_sigmas: float = 4.0
-    """In the last matching, residuals above constant + sigmas sigma(z) metres are outliers."""
-    edge_weight: float = 1.0
+    gate_constant: float = setting(0.02, 0, 1e3, "m")
+    """In the last matching, residuals above this..."""
+    gate_sigmas: float = setting(4.0, 0, 1e3)
+    """...plus this many standard deviations sigma(z) are outliers."""
+    edge_weight: float = setting(1.0, 0, 1e3)
     """Of an edge's residual against a plane's, when both are weighed by their noise."""
-    overlap_constant: float = 0.01
-    overlap_sigmas: float = 2.0
-    """A match is an inlier if its point-to-plane distance is below constant + sigmas sigma(z), metres."""
-    min_matches: int = 60
+    overlap_constant: float = setting(0.01, 0, 1e3, "m")
+    """A match is an inlier if its point-to-plane distance is below this..."""
+    overlap_sigmas: float = setting(2.0, 0, 1e3)
+    """...plus this many standard deviations sigma(z)."""
+    min_matches: int = setting(60, 6, 10**6)
     """Features that need a match."""
-    convincing_overlap: float = 0.6
+    convincing_overlap: float = setting(0.6, 0, 1)
     """Under this overlap a pose is not believed."""
-    degenerate_below: float = 0.01
+    degenerate_below: float = setting(0.01, 0, 1)
     """Geometry is degenerate if some direction of motion is seen by less than this share of the features."""
 
-    def __post_init__(self) -> None:
-        ranges = {
-            "planes": (6, 10**7), "edges": (0, 10**7), "outer_iterations": (1, 1000), "rematch_share": (0, 1),
-            "inner_iterations": (1, 1000), "budget_ms": (0, 1e6), "translation_tolerance": (0, 1),
-            "rotation_tolerance": (0, 1), "huber_sigmas": (0.01, 1e3), "gate_constant": (0, 1e3),
-            "gate_sigmas": (0, 1e3), "edge_weight": (0, 1e3), "overlap_constant": (0, 1e3), "overlap_sigmas": (0, 1e3),
-            "min_matches": (6, 10**6), "convincing_overlap": (0, 1), "degenerate_below": (0, 1),
-        }  # fmt: skip
-        check_ranges(self, ranges)
 
-
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class FeatureUpdateSettings:
     """When a located scan goes into the local map."""
 
-    translation: float = 0.05
+    translation: float = setting(0.05, 0, 1e6)
     """After a motion of this many times the features' median distance since the last one."""
-    rotation_deg: float = 4.0
-    """Likewise, degrees."""
-    overlap: float = 0.85
+    rotation_deg: float = setting(4.0, 0, 360, "deg")
+    """After a turn by this since the last one."""
+    overlap: float = setting(0.85, 0, 1)
     """Or when less of the scan than this matches the map."""
-    urgent_overlap: float = 0.7
+    urgent_overlap: float = setting(0.7, 0, 1)
     """When less than this matches, the budget does not count: the map must not run dry."""
 
-    def __post_init__(self) -> None:
-        ranges = {"translation": (0, 1e6), "rotation_deg": (0, 360), "overlap": (0, 1), "urgent_overlap": (0, 1)}
-        check_ranges(self, ranges)
 
-
-@dataclass(frozen=True)
+@settings_class(frozen=True)
 class FeatureTrackerSettings:
     """Everything the edge/plane front-end needs to know."""
 

@@ -8,6 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.runs.records.timing import TimingRecord
+
 
 @dataclass(frozen=True)
 class LevelAxes:
@@ -68,12 +73,12 @@ class RunData:
         keyframes: int [K], frames that became keyframes.
         steps: columns of steps.csv.
         scores: columns of frames.csv, scores frame by frame.
-        metrics: metrics.json.
-        timing: timing.json.
+        metrics: the scores; None: it was not scored.
+        timing: where its time went.
         settings: name -> value, all of them.
         defaults: name -> value that a fresh run would have.
-        recording: sequence.json.
-        mark: run.json.
+        recording: where its recording is and how it was read.
+        mark: what it was made with.
         warnings: what a user should know.
         views: pictures.
     """
@@ -85,21 +90,18 @@ class RunData:
     keyframes: np.ndarray
     steps: dict[str, np.ndarray] = field(default_factory=dict)
     scores: dict[str, np.ndarray] = field(default_factory=dict)
-    metrics: dict[str, Any] = field(default_factory=dict)
-    timing: dict[str, Any] = field(default_factory=dict)
+    metrics: MetricsRecord | None = None
+    timing: TimingRecord | None = None
     settings: dict[str, Any] = field(default_factory=dict)
     defaults: dict[str, Any] = field(default_factory=dict)
-    recording: dict[str, Any] = field(default_factory=dict)
-    mark: dict[str, Any] = field(default_factory=dict)
+    recording: SequenceRecord | None = None
+    mark: RunRecord = field(default_factory=RunRecord)
     warnings: list[str] = field(default_factory=list)
     views: list[FrameView] = field(default_factory=list)
 
-
-def number_at(values: Any, *keys: str) -> float | None:
-    """A number deep in nested dictionaries, or None."""
-    for key in keys:
-        values = values.get(key) if isinstance(values, dict) else None
-    return float(values) if isinstance(values, (int, float)) and not isinstance(values, bool) else None
+    def recording_name(self) -> str:
+        """Where its recording is."""
+        return "an unknown recording" if self.recording is None else self.recording.open.path
 
 
 STAGES = (
@@ -114,14 +116,16 @@ STAGES = (
 )
 
 
-def stage_seconds(timing: dict[str, Any]) -> list[tuple[str, str, float]]:
+def stage_seconds(timing: TimingRecord | None) -> list[tuple[str, str, float]]:
     """Where a run's time went: (stage, what it does, seconds), nothing that took no time.
 
     In a real-time run stages of tracker and mapper go on side by side: they may add up to more than wall time.
     """
-    wall = sum(number_at(timing, key) or 0.0 for key in ("wall_s", "refinement_s"))
-    spent = {"tracking": number_at(timing, "tracking_s") or 0.0}
-    spent |= {key: number_at(timing, "mapping", key) or 0.0 for key, *_ in STAGES[1:-1]}
+    if timing is None:
+        return []
+    wall = timing.wall_s + timing.refinement_s
+    spent = {"tracking": timing.tracking_s}
+    spent |= {key: getattr(timing.mapping, key) for key, *_ in STAGES[1:-1]}
     within = sum(seconds for key, seconds in spent.items() if key != "identity_finish")
     spent["other"] = max(0.0, wall - within)
     return [(name, words, spent[key]) for key, name, words in STAGES if spent[key] > 0]

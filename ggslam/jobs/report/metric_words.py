@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from ggslam.reporting.run_data import RunData, number_at
+from ggslam.jobs.report.run_data import RunData
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,9 @@ class Metric:
 
     def of(self, run: RunData) -> float | None:
         """The value in the shown unit; None if the run does not have it."""
-        value = number_at({**run.metrics, "timing": run.timing}, *self.keys)
+        timed = self.keys[0] == "timing"
+        record, keys = (run.timing, self.keys[1:]) if timed else (run.metrics, self.keys)
+        value = None if record is None else record.number(*keys)
         return None if value is None else self.factor * value
 
     def text(self, value: float | None) -> str:

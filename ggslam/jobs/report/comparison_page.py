@@ -7,13 +7,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from ggslam.reporting import page as p
-from ggslam.reporting.metric_words import MEANINGS, METRICS, Metric
-from ggslam.reporting.page import Html
-from ggslam.reporting.plots import Plot
-from ggslam.reporting.run_data import FrameView, RunData
-from ggslam.reporting.run_page import FOOTER
-from ggslam.reporting.run_plots import (
+from ggslam.jobs.report.metric_words import MEANINGS, METRICS, Metric
+from ggslam.jobs.report.run_data import FrameView, RunData
+from ggslam.jobs.report.run_page import FOOTER
+from ggslam.jobs.report.run_plots import (
     error_plot,
     loss_plots,
     map_plots,
@@ -22,6 +19,9 @@ from ggslam.reporting.run_plots import (
     tracking_plots,
     trajectory_plots,
 )
+from ggslam.reporting import page as p
+from ggslam.reporting.page import Html
+from ggslam.reporting.plots import Plot
 
 _ABSENT = "not there"
 
@@ -30,7 +30,7 @@ def by_recording(runs: Sequence[RunData]) -> list[list[int]]:
     """Numbers of the runs of each recording, recordings and runs in the order given."""
     groups: dict[str, list[int]] = {}
     for number, run in enumerate(runs):
-        groups.setdefault(_recording(run), []).append(number)
+        groups.setdefault(run.recording_name(), []).append(number)
     return list(groups.values())
 
 
@@ -64,12 +64,8 @@ def _lead(runs: Sequence[RunData]) -> str:
     return f"{len(runs)} runs of {'one recording' if count == 1 else f'{count} recordings'}"
 
 
-def _recording(run: RunData) -> str:
-    return str(run.recording.get("open", {}).get("path", "an unknown recording"))
-
-
 def _recordings(runs: Sequence[RunData]) -> set[str]:
-    return {_recording(run) for run in runs}
+    return {run.recording_name() for run in runs}
 
 
 def _each(groups: Sequence[Sequence[RunData]], contents: Sequence[Html]) -> Html:
@@ -77,7 +73,7 @@ def _each(groups: Sequence[Sequence[RunData]], contents: Sequence[Html]) -> Html
     if len(groups) == 1:
         return contents[0]
     return p.joined(
-        p.tag("div", p.tag("h3", f"{', '.join(run.name for run in group)}: {_recording(group[0])}"), content,
+        p.tag("div", p.tag("h3", f"{', '.join(run.name for run in group)}: {group[0].recording_name()}"), content,
               class_="recording")
         for group, content in zip(groups, contents, strict=True)
     )  # fmt: skip
@@ -93,7 +89,7 @@ def _scores(runs: Sequence[RunData]) -> Html:
             rows.append([f"{metric.name}{unit}", *(_marked(metric, values) if one else texts)])
     if not rows:
         return p.tag("p", "None of these runs was scored; ggslam eval does that.")
-    unscored = [run.name for run in runs if not run.metrics]
+    unscored = [run.name for run in runs if run.metrics is None]
     note = [p.tag("p", f"Not scored: {', '.join(unscored)}.")] if unscored else []
     if not one:
         note.append(p.tag("p", "The runs are of different recordings: their scores cannot be held against each other."))
@@ -123,7 +119,7 @@ def _settings(runs: Sequence[RunData]) -> Html:
         if len(set(values)) > 1:
             rows.append([name, *values])
     for key in ("scale", "start", "stop", "stride", "masks"):
-        opened = [run.recording.get("open", {}).get(key) for run in runs]
+        opened = [None if run.recording is None else getattr(run.recording.open, key) for run in runs]
         values = ["-" if value is None else str(value) for value in opened]
         if len(set(values)) > 1:
             rows.append([f"recording: {key}", *values])
@@ -155,7 +151,6 @@ def _figures(plots: Sequence[Plot], several: bool) -> Html:
 def _folders(runs: Sequence[RunData]) -> Html:
     rows = []
     for run in runs:
-        known = run.mark.get("environment") or {}
-        rows.append([run.name, run.path, str(known.get("ggslam", run.mark.get("ggslam", "unknown"))),
-                     str(known.get("processor", "unknown"))])  # fmt: skip
+        known = run.mark.versions()
+        rows.append([run.name, run.path, *(str(known.get(key, "unknown")) for key in ("ggslam", "processor"))])
     return p.table(["run", "folder", "ggslam", "processor"], rows, text_columns=(1, 2, 3))

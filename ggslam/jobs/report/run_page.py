@@ -3,13 +3,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from ggslam.reporting import page as p
-from ggslam.reporting.metric_words import MEANINGS, METRICS, TILES
-from ggslam.reporting.page import Html
-from ggslam.reporting.run_data import RunData, number_at, stage_seconds
-from ggslam.reporting.run_plots import (
+from ggslam.jobs.report.metric_words import MEANINGS, METRICS, TILES
+from ggslam.jobs.report.run_data import RunData, stage_seconds
+from ggslam.jobs.report.run_plots import (
     error_plot,
     loss_plots,
     map_plots,
@@ -18,6 +14,10 @@ from ggslam.reporting.run_plots import (
     tracking_plots,
     trajectory_plots,
 )
+from ggslam.reporting import page as p
+from ggslam.reporting.page import Html
+from ggslam.runs.records.metrics import SETS, MetricsRecord, SegmentationRecord
+from ggslam.runs.records.record import Record
 
 FOOTER = "Written by ggslam. The page needs nothing but itself: no network, no other files."
 _OPEN_VIEWS = 2
@@ -40,14 +40,9 @@ def run_page(run: RunData) -> str:
 
 
 def _lead(run: RunData) -> str:
-    camera = run.recording.get("camera", {})
-    size = f" at {camera['width']}x{camera['height']}" if "width" in camera else ""
+    size = "" if run.recording is None else f" at {run.recording.camera.width}x{run.recording.camera.height}"
     frames = len(run.tracked.get("frame", ()))
-    return f"{frames} frames of {_recording(run)}{size}, {len(run.keyframes)} keyframes"
-
-
-def _recording(run: RunData) -> str:
-    return str(run.recording.get("open", {}).get("path", "an unknown recording"))
+    return f"{frames} frames of {run.recording_name()}{size}, {len(run.keyframes)} keyframes"
 
 
 def _tiles(run: RunData) -> Html:
@@ -68,28 +63,28 @@ _IMAGE_COLUMNS = (
 
 
 def _scores(run: RunData) -> Html:
-    if not run.metrics:
+    if run.metrics is None:
         return p.tag("p", "This run was not scored; ggslam eval does that, and writes this page anew.")
-    parts = [_image_scores(run), _trajectory_scores(run)]
-    if run.metrics.get("segmentation"):
-        parts.append(_object_scores(run.metrics["segmentation"]))
+    parts = [_image_scores(run.metrics), _trajectory_scores(run, run.metrics)]
+    if run.metrics.segmentation is not None:
+        parts.append(_object_scores(run.metrics.segmentation))
     return p.joined(parts)
 
 
-def _numbers(values: dict[str, Any], columns: tuple[tuple[str, str, float, str], ...]) -> list[str]:
-    found = [(number_at(values, key), factor, form) for _, key, factor, form in columns]
+def _numbers(scores: Record | None, columns: tuple[tuple[str, str, float, str], ...]) -> list[str]:
+    found = [(None if scores is None else scores.number(key), factor, form) for _, key, factor, form in columns]
     return ["-" if value is None else format(factor * value, form) for value, factor, form in found]
 
 
-def _image_scores(run: RunData) -> Html:
-    images = run.metrics.get("images") or {}
-    rows = [[name.replace("_", " "), *_numbers(scores, _IMAGE_COLUMNS)] for name, scores in images.items()]
+def _image_scores(metrics: MetricsRecord) -> Html:
+    sets = metrics.images.sets()
+    rows = [[name.replace("_", " "), *_numbers(scores, _IMAGE_COLUMNS)] for name, scores in sets.items()]
     return p.table(["images of", *(title for title, *_ in _IMAGE_COLUMNS)], rows)
 
 
-def _trajectory_scores(run: RunData) -> Html:
-    scores = run.metrics.get("trajectory")
-    if not scores:
+def _trajectory_scores(run: RunData, metrics: MetricsRecord) -> Html:
+    scores = metrics.trajectory
+    if scores is None:
         return p.tag("p", f"No trajectory scores: {run.camera_path.reason or 'too few frames have both poses'}.")
     columns = (
         ("ATE RMSE, cm", "ate_rmse_m", 100.0, ".2f"), ("mean", "ate_mean_m", 100.0, ".2f"),
@@ -100,17 +95,16 @@ def _trajectory_scores(run: RunData) -> Html:
     return p.table(["", *(title for title, *_ in columns)], [["trajectory", *_numbers(scores, columns)]])
 
 
-def _object_scores(scores: dict[str, Any]) -> Html:
+def _object_scores(scores: SegmentationRecord) -> Html:
     columns = (
         ("objects", "objects", 1.0, ".0f"), ("mIoU, %", "miou", 100.0, ".1f"),
         ("boundary", "boundary_miou", 100.0, ".1f"), ("pixels right, %", "accuracy", 100.0, ".1f"),
         ("mIoU by votes", "votes_miou", 100.0, ".1f"),
     )  # fmt: skip
-    rows = [[n.replace("_", " "), *_numbers(scores.get(n, {}), columns)] for n in ("keyframes", "held_out", "all")]
+    rows = [[n.replace("_", " "), *_numbers(getattr(scores, n), columns)] for n in SETS]
     overall = p.table(["objects of", *(title for title, *_ in columns)], rows)
     each = [
-        [str(i), str(o.get("name") or ""), *_numbers(o, (("", "iou", 100.0, ".1f"),))]
-        for i, o in (scores.get("per_object") or {}).items()
+        [i, o.name or "", *_numbers(o, (("", "iou", 100.0, ".1f"),))] for i, o in scores.per_object.items()
     ]
     listed = p.table(["id", "name", "IoU, %"], each, sorts=True, text_columns=(1,))
     return p.joined([overall, p.tag("details", p.tag("summary", f"{len(each)} objects one by one"), listed)])
@@ -163,7 +157,7 @@ def _time(run: RunData) -> Html:
         p.tag("i", class_=f"fill{n}", style=f"flex:{seconds:.4f} 0 0", title=f"{name}: {seconds:.2f} s")
         for n, (name, _, seconds) in enumerate(stages)
     ), class_="bar")  # fmt: skip
-    frames = max(1, int(number_at(run.timing, "frames") or 1))
+    frames = 1 if run.timing is None else max(1, run.timing.frames)
     rows = [
         [p.joined([p.tag("span", class_=f"swatch fill{n}"), name]), f"{seconds:.2f}", f"{1000 * seconds / frames:.1f}",
          f"{100 * seconds / total:.0f}", words] for n, (name, words, seconds) in enumerate(stages)
@@ -201,8 +195,7 @@ def _settings(run: RunData) -> Html:
 
 
 def _versions(run: RunData) -> Html:
-    opened = {k: v for k, v in run.recording.get("open", {}).items() if v is not None}
+    opened = {} if run.recording is None else {k: v for k, v in run.recording.open if v is not None}
     rows = [["run folder", run.path], *([name, str(value)] for name, value in opened.items())]
-    known = run.mark.get("environment") or {"ggslam": run.mark.get("ggslam", "unknown")}
-    rows += [[name, str(value)] for name, value in known.items()]
+    rows += [[name, str(value)] for name, value in run.mark.versions().items()]
     return p.table(["", ""], rows, text_columns=(1,))

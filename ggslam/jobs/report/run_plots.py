@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from ggslam.jobs.report.run_data import RunData
 from ggslam.reporting.plots import COLORS, Band, Plot, Series
-from ggslam.reporting.run_data import RunData
 
 FRAME = "frame"
 _TRUTH = 7

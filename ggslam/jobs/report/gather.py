@@ -11,10 +11,15 @@ import yaml
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points, associate
 from ggslam.formats.trajectory import read_tum, write_tum
-from ggslam.reporting.run_data import FrameView, LevelAxes, Path3D, RunData
-from ggslam.runs.folder import MARKER, TRUTH_FILE, RunFolder
-from ggslam.runs.frame_poses import frame_poses
+from ggslam.jobs.report.run_data import FrameView, LevelAxes, Path3D, RunData
+from ggslam.runs.folder import TRUTH_FILE, RunFolder
 from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.keyframes import KeyframesRecord
+from ggslam.runs.records.loops import LoopsRecord
+from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.runs.records.timing import TimingRecord
 from ggslam.sequences import Sequence
 from ggslam.slam.config import Config, config_to_dict
 from ggslam.slam.step_log import STEPS_FILE, read_table
@@ -40,27 +45,16 @@ def load_run(folder: RunFolder, sequence: Sequence | None = None, views: list[Fr
 
 
 def _load(folder: RunFolder, sequence: Sequence | None, views: list[FrameView]) -> RunData:
-    record = folder.read_json("keyframes.json")
-    metrics, timing = _optional(folder, "metrics.json"), _optional(folder, "timing.json")
-    recording, loops = _optional(folder, "sequence.json"), _optional(folder, "loops.json")
-    mark = folder.read_json(MARKER)
+    record, mark, metrics, loops = folder.keyframes(), folder.mark(), folder.metrics(), folder.loops()
+    timing, recording = TimingRecord.read_if_there(folder.path), SequenceRecord.read_if_there(folder.path)
     path = folder.path.absolute()
     return RunData(
-        name=path.name, path=str(path), camera_path=camera_path(folder, record, sequence), tracked=_tracked(record),
-        keyframes=np.array([k["frame"] for k in record["keyframes"] if k["frame"] is not None], int),
+        name=path.name, path=str(path), camera_path=camera_path(folder, record, sequence), tracked=_columns(record),
+        keyframes=np.array([k.frame for k in record.keyframes], int),
         steps=_table(folder, STEPS_FILE), scores=_table(folder, "frames.csv"), metrics=metrics, timing=timing,
         settings=_settings(folder), defaults=flat(config_to_dict(Config())), recording=recording, mark=mark,
         warnings=run_warnings(mark, recording, timing, loops, record, metrics), views=views,
     )  # fmt: skip
-
-
-def _optional(folder: RunFolder, name: str) -> dict[str, Any]:
-    if not (folder.path / name).is_file():
-        return {}
-    values = folder.read_json(name)
-    if not isinstance(values, dict):
-        raise RunFolderError(f"{folder.path / name}: damaged: expected an object")
-    return values
 
 
 def _table(folder: RunFolder, name: str) -> dict[str, np.ndarray]:
@@ -88,17 +82,15 @@ def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return out
 
 
-def _tracked(record: dict[str, Any]) -> dict[str, np.ndarray]:
-    frames = record["frames"]
-    columns = {"frame": "frame", "overlap": "overlap", "rmse_m": "rmse_m"}
-    numbers = {
-        name: np.array([np.nan if f.get(key) is None else f[key] for f in frames], float)
-        for name, key in columns.items()
-    }
-    status = np.array([f["status"] for f in frames], str)
+def _columns(record: KeyframesRecord) -> dict[str, np.ndarray]:
+    """How each frame was tracked."""
+    frame = np.array([f.frame for f in record.frames], float)
+    overlap = np.array([f.overlap for f in record.frames], float)  # None becomes NaN
+    rmse_m = np.array([f.rmse_m for f in record.frames], float)
+    status = np.array([f.status for f in record.frames], str)
     unmatched = np.isin(status, ("lost", "first"))  # matched with nothing, or not well
-    numbers["overlap"][unmatched] = numbers["rmse_m"][unmatched] = np.nan
-    return {**numbers, "status": status}
+    overlap[unmatched] = rmse_m[unmatched] = np.nan
+    return {"frame": frame, "overlap": overlap, "rmse_m": rmse_m, "status": status}
 
 
 # --- where the camera was --------------------------------------------------------------------------------------------
@@ -109,10 +101,10 @@ def has_limit(folder: RunFolder) -> bool:
     return (folder.path / "config.yaml").is_file() and folder.config().memory_limit_mb > 0
 
 
-def level_axes(folder: RunFolder, record: dict[str, Any]) -> LevelAxes:
+def level_axes(folder: RunFolder, record: KeyframesRecord) -> LevelAxes:
     """Level directions: up from the surfaces of the map, or, if it is too large to be read as a whole or has no level
     surfaces, from how the cameras were held; right and forward those of the first camera."""
-    poses = np.array([T for _, T in sorted(frame_poses(record).items())]).reshape(-1, 4, 4)
+    poses = np.array([T for _, T in sorted(record.poses().items())]).reshape(-1, 4, 4)
     if not len(poses):
         return LevelAxes()
     none = np.zeros((0, 3))
@@ -124,18 +116,18 @@ def level_axes(folder: RunFolder, record: dict[str, Any]) -> LevelAxes:
     return LevelAxes(np.stack([np.cross(forward, found.up), forward, found.up]), source, found.floor)
 
 
-def camera_path(folder: RunFolder, record: dict[str, Any], sequence: Sequence | None = None) -> Path3D:
+def camera_path(folder: RunFolder, record: KeyframesRecord, sequence: Sequence | None = None) -> Path3D:
     """The camera's path from keyframes.json, with the truth laid upon it if it is known.
 
     Args:
         folder: of the run.
-        record: content of keyframes.json.
+        record: its keyframes and frames.
         sequence: the recording, if it is at hand.
     """
-    poses = frame_poses(record)
+    poses = record.poses()
     frames = np.array(sorted(poses), int)
     positions = np.array([poses[f][:3, 3] for f in frames]).reshape(-1, 3)
-    times = {f["frame"]: f["timestamp"] for f in record["frames"]}
+    times = {f.frame: f.timestamp for f in record.frames}
     seconds = np.array([times[f] for f in frames], float)
     start = seconds[0] if len(seconds) else 0.0
     truth, reason = _truth(folder, frames, seconds, sequence)
@@ -177,42 +169,24 @@ def save_truth(folder: RunFolder, sequence: Sequence) -> None:
     """Writes the true poses of the run's frames, if the recording knows any, with the times of trajectory.txt."""
     if sequence.ground_truth is None:
         return
-    frames = [f for f in folder.read_json("keyframes.json")["frames"] if f["frame"] < len(sequence.ground_truth)]
-    poses = np.array([sequence.ground_truth[f["frame"]] for f in frames]).reshape(-1, 4, 4)
+    frames = [f for f in folder.keyframes().frames if f.frame < len(sequence.ground_truth)]
+    poses = np.array([sequence.ground_truth[f.frame] for f in frames]).reshape(-1, 4, 4)
     if np.isfinite(poses).all((1, 2)).any():
-        write_tum(folder.path / TRUTH_FILE, [f["timestamp"] for f in frames], poses)
+        write_tum(folder.path / TRUTH_FILE, np.array([f.timestamp for f in frames], float), poses)
 
 
 # --- what a user should know -----------------------------------------------------------------------------------------
 
 
 def run_warnings(
-    mark: dict[str, Any], recording: dict[str, Any], timing: dict[str, Any], loops: dict[str, Any],
-    record: dict[str, Any], metrics: dict[str, Any],
+    mark: RunRecord, recording: SequenceRecord | None, timing: TimingRecord | None, loops: LoopsRecord | None,
+    record: KeyframesRecord, metrics: MetricsRecord | None,
 ) -> list[str]:  # fmt: skip
-    """Everything unusual of a run, a sentence each, from the files of these names."""
-    lines = []
-    if mark.get("stopped_by"):
-        lines.append(f"The run stopped early: {mark['stopped_by']}.")
-    if mark.get("edits"):
-        lines.append(f"The map was edited: {'; '.join(mark['edits'])}.")
-    lines += [
-        f"Lost for {s['frames']} frames ({s['seconds']:.2f} s) from frame {s['first']}"
-        + ("." if s["after"] is None else f", found again at frame {s['after']}.")
-        for s in loops.get("lost", [])
-    ]
-    recovered = sum(f["status"] == "recovered" for f in record["frames"])
-    if recovered:
-        lines.append(f"{recovered} frames were located only after another start was tried (recovered).")
-    dropped = timing.get("dropped_frames") or []
-    if dropped:
-        lines.append(f"{len(dropped)} frames were dropped because the run fell behind (the first: {dropped[0]}).")
-    lines += [
-        f"Loop closed at frame {e['frame']}: keyframe {e['keyframe']} moved {100 * e['moved_m']:.1f} cm to keyframe "
-        f"{e['old_keyframe']}."
-        for e in loops.get("events", []) if e["kind"] == "closed"
-    ]  # fmt: skip
-    lines += [str(warning) for warning in recording.get("warnings", [])]
-    lines += [f"Skipped: {skipped['reason']}" for skipped in recording.get("skipped", [])]
-    lines += [f"Mask not used: {problem}" for problem in (recording.get("mask_problems") or {}).values()]
-    return lines + [note[:1].upper() + note[1:] + "." for note in metrics.get("notes", [])]
+    """Everything unusual of a run, a sentence each."""
+    before = [*mark.notes(), *(loops.notes() if loops else []), *record.notes(), *(timing.notes() if timing else [])]
+    after = [*(recording.notes() if recording else []), *(metrics.notes if metrics else [])]
+    return [*map(_sentence, before), *(recording.warnings if recording else []), *map(_sentence, after)]
+
+
+def _sentence(note: str) -> str:
+    return note[:1].upper() + note[1:] + "."

@@ -4,16 +4,21 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
-from ggslam.reporting.comparison_page import by_recording, comparison_page
-from ggslam.reporting.run_data import FrameView, LevelAxes, Path3D, RunData, stage_seconds
-from ggslam.reporting.run_page import run_page
-from ggslam.reporting.run_plots import all_plots, trajectory_plots
+from ggslam.jobs.report.comparison_page import by_recording, comparison_page
+from ggslam.jobs.report.run_data import FrameView, LevelAxes, Path3D, RunData, stage_seconds
+from ggslam.jobs.report.run_page import run_page
+from ggslam.jobs.report.run_plots import all_plots, trajectory_plots
+from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.runs.records.timing import TimingRecord
+from ggslam.scene.camera import Camera
 
 VOID = {"meta", "img", "br", "link", "input"}
 ADDRESSES = ("src", "href", "xlink:href", "srcset", "data", "action")
@@ -60,6 +65,10 @@ def checked(page: str) -> Checker:
     return checker
 
 
+def recording(path: str) -> SequenceRecord:
+    return SequenceRecord.of({"open": {"path": path}, "camera": asdict(Camera(320, 240, 240.0, 240.0, 160.0, 120.0))})
+
+
 def some_run(name: str = "kitchen", psnr: float = 30.0) -> RunData:
     frames = np.arange(20)
     positions = np.stack([np.cos(frames / 5), np.zeros(20), np.sin(frames / 5)], 1)
@@ -74,13 +83,14 @@ def some_run(name: str = "kitchen", psnr: float = 30.0) -> RunData:
                "resident_mb": 100 * step, "loss_total": step / 10, "loss_color": step / 20, "loss_depth": step / 30},
         scores={"frame": frames, "kind": np.array(["keyframe", "other"] * 10), "psnr": 20 + step, "ssim": step / 2,
                 "lpips": np.full(20, np.nan), "depth_l1_m": step / 100},
-        metrics={"images": {"held_out": {"frames": 3, "psnr": psnr, "ssim": 0.9, "lpips": None}},
-                 "trajectory": {"ate_rmse_m": 0.01}, "notes": []},
-        timing={"frames": 20, "frames_per_s": 12.5, "wall_s": 2.0, "tracking_s": 0.5, "refinement_s": 0.0,
-                "gaussians": 2000, "peak_rss_mb": 432.0, "mapping": {"insertion": 0.25, "forward": 0.75}},
+        metrics=MetricsRecord.of({"images": {"held_out": {"frames": 3, "psnr": psnr, "ssim": 0.9, "lpips": None}},
+                                  "trajectory": {"ate_rmse_m": 0.01}, "notes": []}),
+        timing=TimingRecord.of({"frames": 20, "frames_per_s": 12.5, "wall_s": 2.0, "tracking_s": 0.5,
+                                "refinement_s": 0.0, "gaussians": 2000, "peak_rss_mb": 432.0,
+                                "mapping": {"insertion": 0.25, "forward": 0.75}}),
         settings={"seed": 1, "mapping.rate": 0.5}, defaults={"seed": 0, "mapping.rate": 0.5},
-        recording={"open": {"path": "/data/kitchen"}, "camera": {"width": 320, "height": 240}},
-        mark={"ggslam": "0.1.0", "environment": {"python": "3.11", "processor": "a processor"}},
+        recording=recording("/data/kitchen"),
+        mark=RunRecord(ggslam="0.1.0", environment={"python": "3.11", "processor": "a processor"}),
         warnings=["Lost for 4 frames (0.13 s) from frame 16."],
         views=[FrameView(3, {"recorded": np.zeros((6, 8, 3), np.uint8), "rendered": np.ones((6, 8, 3), np.uint8)})],
     )  # fmt: skip
@@ -137,7 +147,7 @@ def test_a_comparison_marks_the_best_and_lists_what_differs() -> None:
 
 
 def test_runs_of_different_recordings_are_not_laid_over_each_other() -> None:
-    other = replace(some_run("c"), recording={"open": {"path": "/data/office"}})
+    other = replace(some_run("c"), recording=recording("/data/office"))
     runs = [some_run("a"), other, some_run("b")]
     assert by_recording(runs) == [[0, 2], [1]]
     page = comparison_page([[runs[0], runs[2]], [other]], [[], []])
@@ -161,4 +171,4 @@ def test_paths_are_shown_level() -> None:
 def test_stages_add_up_to_the_wall_time() -> None:
     stages = {name: seconds for name, _, seconds in stage_seconds(some_run().timing)}
     assert stages == {"tracking": 0.5, "inserting": 0.25, "rendering": 0.75, "other": 0.5}
-    assert stage_seconds({}) == []
+    assert stage_seconds(None) == [] == stage_seconds(TimingRecord())

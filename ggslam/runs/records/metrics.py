@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""metrics.json: the scores of a run."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from ggslam.runs.records.record import NumberOrNone, Record, RecordFile
+
+SETS = ("keyframes", "held_out", "all")
+"""Frames that scores are about: trained on, never trained on, every one."""
+
+
+class TrajectoryScoresRecord(Record):
+    """See `evaluation.trajectory.TrajectoryScores`."""
+
+    ate_rmse_m: NumberOrNone = None
+    ate_mean_m: NumberOrNone = None
+    ate_median_m: NumberOrNone = None
+    ate_max_m: NumberOrNone = None
+    ate_raw_rmse_m: NumberOrNone = None
+    rpe_trans_m: NumberOrNone = None
+    rpe_rot_deg: NumberOrNone = None
+    rpe_delta: int | None = None
+    frames_compared: int | None = None
+
+
+class ImageScoresRecord(Record):
+    """Means over a set of frames, see `evaluation.images.ImageScores`; `frames` were scored."""
+
+    psnr: NumberOrNone = None
+    psnr_unmasked: NumberOrNone = None
+    psnr_affine: NumberOrNone = None
+    ssim: NumberOrNone = None
+    ssim_unmasked: NumberOrNone = None
+    lpips: NumberOrNone = None
+    lpips_unmasked: NumberOrNone = None
+    depth_l1_m: NumberOrNone = None
+    depth_l1_median_m: NumberOrNone = None
+    depth_coverage: NumberOrNone = None
+    frames: int = 0
+    frames_without_pose: int = 0
+
+
+class ImagesRecord(Record):
+    """Image scores of each set of frames."""
+
+    keyframes: ImageScoresRecord | None = None
+    held_out: ImageScoresRecord | None = None
+    all: ImageScoresRecord | None = None
+
+    def sets(self) -> dict[str, ImageScoresRecord]:
+        """The sets that were scored, by name."""
+        return {name: scores for name in SETS if (scores := getattr(self, name)) is not None}
+
+
+class ObjectsScoresRecord(Record):
+    """Of a set of frames, see `evaluation.segmentation.SegmentationScores`; `votes_miou` of labels by votes."""
+
+    frames: int = 0
+    objects: int = 0
+    predicted_objects: int = 0
+    miou: NumberOrNone = None
+    boundary_miou: NumberOrNone = None
+    accuracy: NumberOrNone = None
+    precision: NumberOrNone = None
+    recall: NumberOrNone = None
+    f1: NumberOrNone = None
+    panoptic_quality: NumberOrNone = None
+    votes_miou: NumberOrNone = None
+
+
+class ObjectScoreRecord(Record):
+    """Of one object, see `evaluation.segmentation.ObjectScore`."""
+
+    name: str | None = None
+    iou: NumberOrNone = None
+    boundary_iou: NumberOrNone = None
+    matched: int | None = None
+    pixels: int | None = None
+
+
+class GaussiansScoresRecord(Record):
+    """Labels of the Gaussians, see `evaluation.gaussian_labels.GaussianLabelScores`."""
+
+    accuracy: NumberOrNone = None
+    accuracy_by_opacity: NumberOrNone = None
+    labelled: int = 0
+    gaussians: int = 0
+    votes_accuracy: NumberOrNone = None
+
+
+class SegmentationRecord(Record):
+    """Scores of the objects: of each set of frames, how ids were matched, what supervised them, and one by one."""
+
+    keyframes: ObjectsScoresRecord | None = None
+    held_out: ObjectsScoresRecord | None = None
+    all: ObjectsScoresRecord | None = None
+    matching: str | None = None
+    supervision: str | None = None
+    per_object: dict[str, ObjectScoreRecord] = {}
+    gaussians: GaussiansScoresRecord | None = None
+
+    def sets(self) -> dict[str, ObjectsScoresRecord]:
+        """The sets that were scored, by name."""
+        return {name: scores for name in SETS if (scores := getattr(self, name)) is not None}
+
+
+class SpeedRecord(Record):
+    """How fast the run was; see `records.timing`."""
+
+    frames_per_s: NumberOrNone = None
+    tracking_ms: NumberOrNone = None
+    mapping_iteration_ms: NumberOrNone = None
+    iterations_per_frame: NumberOrNone = None
+    dropped_frames: int = 0
+    refinement_s: NumberOrNone = None
+
+
+class MapRecord(Record):
+    """How large the map is."""
+
+    gaussians: int | None = None
+    keyframes: int | None = None
+
+
+class MemoryRecord(Record):
+    """Largest resident memory of the run, MB (10^6 bytes)."""
+
+    peak_rss_mb: NumberOrNone = None
+
+
+class MetricsRecord(RecordFile):
+    """All scores of a run.
+
+    Attributes:
+        trajectory: None without ground truth.
+        images: plain names count pixels with measured depth, `_unmasked` all pixels.
+        segmentation: None without objects or without masks.
+        tracking: number of frames of each status.
+        speed, map, memory: of the run.
+        scored_every: the images of every n-th frame were scored.
+        notes: what could not be scored, and why.
+    """
+
+    FILE: ClassVar[str] = "metrics.json"
+    trajectory: TrajectoryScoresRecord | None = None
+    images: ImagesRecord = ImagesRecord()
+    segmentation: SegmentationRecord | None = None
+    tracking: dict[str, int] = {}
+    speed: SpeedRecord = SpeedRecord()
+    map: MapRecord = MapRecord()
+    memory: MemoryRecord = MemoryRecord()
+    scored_every: int = 1
+    notes: list[str] = []

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""timing.json: where the time of a run went, and how large it became."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import ClassVar
+
+from ggslam.runs.records.record import Number, NumberOrNone, Record, RecordFile
+from ggslam.slam.result import SlamResult
+from ggslam.system.process_memory import peak_memory_mb
+
+
+class MappingTimes(Record):
+    """See `mapping.mapper.MapperTimes`."""
+
+    insertion: Number = 0.0
+    forward: Number = 0.0
+    loss: Number = 0.0
+    backward: Number = 0.0
+    identity: Number = 0.0
+    identity_finish: Number = 0.0
+    iterations: int = 0
+    keyframes: int = 0
+
+
+class TimingRecord(RecordFile):
+    """Seconds by part; see `slam.result.SlamTimes`. `peak_rss_mb` is in MB (10^6 bytes)."""
+
+    FILE: ClassVar[str] = "timing.json"
+    frames: int = 0
+    dropped_frames: list[int] = []
+    frames_per_s: NumberOrNone = None
+    wall_s: Number = 0.0
+    tracking_s: Number = 0.0
+    loops_s: Number = 0.0
+    refinement_s: Number = 0.0
+    tracking_ms_per_frame: NumberOrNone = None
+    tracking_ms_per_100_frames: list[NumberOrNone] = []
+    mapping_ms_per_iteration: NumberOrNone = None
+    refine_iterations: int = 0
+    mapping: MappingTimes = MappingTimes()
+    gaussians: int | None = None
+    peak_rss_mb: NumberOrNone = None
+    paging: dict[str, NumberOrNone] | None = None
+
+    @staticmethod
+    def of_result(result: SlamResult) -> TimingRecord:
+        """Of a run that ended; memory is that of this process so far."""
+        frames, t, m = max(1, len(result.frames)), result.times, result.mapper_times
+        return TimingRecord.of({
+            "frames": len(result.frames), "dropped_frames": result.dropped_frames,
+            "frames_per_s": result.frames_per_second(),
+            "wall_s": t.wall, "tracking_s": t.tracking, "loops_s": t.loops, "refinement_s": t.refinement,
+            "tracking_ms_per_frame": 1e3 * t.tracking / frames,
+            "tracking_ms_per_100_frames": t.tracking_ms_by_window(), "mapping_ms_per_iteration": m.iteration_ms,
+            "refine_iterations": result.refine_iterations, "mapping": asdict(m), "gaussians": result.gaussian_count,
+            "peak_rss_mb": peak_memory_mb(), "paging": result.paging,
+        })  # fmt: skip
+
+    def notes(self) -> list[str]:
+        """What a user should know, a line each."""
+        if not self.dropped_frames:
+            return []
+        first = self.dropped_frames[0]
+        return [f"{len(self.dropped_frames)} frames were dropped because the run fell behind (the first: {first})"]

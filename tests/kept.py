@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What tests need and few of them change: made once for all processes that share the tests."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).parents[1]
+
+
+@contextmanager
+def one_at_a_time(place: Path) -> Iterator[None]:
+    """While one process builds what belongs at a place, others that want it wait."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with place.with_name(place.name + ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def build_once(folder: Path, build: Callable[[Path], object]) -> Path:
+    """The folder, built by whoever comes first; the others wait. A build that broke off is begun again."""
+    done = folder.with_name(folder.name + ".done")
+    with one_at_a_time(folder):
+        if not done.exists():
+            if folder.exists():
+                folder.rename(folder.with_name(f"{folder.name}.broken-{os.getpid()}"))
+            build(folder)
+            done.touch()
+    return folder
+
+
+def session_folder(factory: pytest.TempPathFactory) -> Path:
+    """A folder of this run of the tests, the same for all its processes."""
+    base = factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+def cached_folder(name: str, *sources: Path) -> Path:
+    """A folder that outlives this run of the tests, until one of these sources changes."""
+    digest = hashlib.sha256()
+    for source in sources:
+        digest.update(source.read_bytes())
+    return CHECKOUT / "build" / "tests" / f"{name}-{digest.hexdigest()[:16]}"
