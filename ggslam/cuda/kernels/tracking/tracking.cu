@@ -7,6 +7,7 @@
 #include "tracking/voxel_shapes.cuh"
 
 using namespace ggslam::cuda;
+using ggslam::AlignSettings;
 
 GGSLAM_EXPORT std::int64_t ggslam_cuda_depth_points_bytes(const DepthPointsJob* job) {
   const std::int64_t cells = static_cast<std::int64_t>(job->columns) * job->rows;
