@@ -128,7 +128,7 @@ class OccupancyMap:
         """
         points = contiguous_points(points)
         core = self._library.ggslam_occupancy_insert
-        return self._inserted(
+        return self._insert(
             lambda settings, result: core(
                 self.context.handle, self.handle, points.ctypes.data, len(points), settings, result
             ),
@@ -166,7 +166,7 @@ class OccupancyMap:
             max(min_depth, 1e-6), max_depth, (ctypes.c_float * 12)(*T[:3].ravel()),
         )  # fmt: skip
         core = self._library.ggslam_occupancy_insert_depth
-        return self._inserted(
+        return self._insert(
             lambda settings, result: core(self.context.handle, self.handle, ctypes.byref(image), settings, result),
             T[:3, 3],
             max_range,
@@ -221,7 +221,7 @@ class OccupancyMap:
             -1.0 if max_range is None else max_range, where, *map(log_odds, limits), int(s.quantize)
         )
 
-    def _inserted(
+    def _insert(
         self, insert: Callable[[object, object], int], origin: np.ndarray, max_range: float | None
     ) -> ScanCounts:
         settings, result = self.native_settings(origin, max_range), InsertResult()

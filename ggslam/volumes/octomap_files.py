@@ -114,20 +114,20 @@ def write_octomap(occupancy: OccupancyMap, path: str | Path) -> None:
     formats = {".bt": _BINARY, ".ot": _FULL}
     if path.suffix.lower() not in formats:
         raise FormatError(f"{path}: expected the ending .bt (free or occupied) or .ot (log-odds)")
-    write_bytes(path, _encoded(occupancy, formats[path.suffix.lower()]))
+    write_bytes(path, _encode(occupancy, formats[path.suffix.lower()]))
 
 
 def binary_octomap(occupancy: OccupancyMap) -> bytes:
     """The map as the bytes of a `.bt` file."""
-    return _encoded(occupancy, _BINARY)
+    return _encode(occupancy, _BINARY)
 
 
 def full_octomap(occupancy: OccupancyMap) -> bytes:
     """The map as the bytes of an `.ot` file."""
-    return _encoded(occupancy, _FULL)
+    return _encode(occupancy, _FULL)
 
 
-def _encoded(occupancy: OccupancyMap, kind: int) -> bytes:
+def _encode(occupancy: OccupancyMap, kind: int) -> bytes:
     nodes = ctypes.c_uint64()
     size = load_library().ggslam_occupancy_write(
         occupancy.handle, kind, occupancy.settings.threshold, ctypes.byref(nodes)

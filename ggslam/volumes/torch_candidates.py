@@ -19,7 +19,7 @@ _CHUNK = 1 << 22
 
 
 @dataclass(frozen=True)
-class View:
+class DepthView:
     """A view on the device: depth float32 [H, W] with 0 for none, camera, rotation [3, 3] and translation [3] of
     T_camera_world (float64)."""
 
@@ -51,7 +51,7 @@ class _Tiles:
     sums: Tensor
 
 
-def find_candidates(view: View, block: float, truncation: float, free_share: float) -> Candidates:
+def find_candidates(view: DepthView, block: float, truncation: float, free_share: float) -> Candidates:
     """Blocks of edge `block` metres that show a surface, are free throughout, or are in view otherwise."""
     device = view.depth.device
     if not bool((view.depth > 0).any()):
@@ -102,7 +102,7 @@ def _tiles(depth: Tensor) -> _Tiles:
     )  # fmt: skip
 
 
-def _frustum_blocks(view: View, block: float, far: float) -> Tensor:
+def _frustum_blocks(view: DepthView, block: float, far: float) -> Tensor:
     c, rotation, translation = view.camera, view.rotation, view.translation
     x = torch.tensor([-0.5 - c.cx, c.width - 0.5 - c.cx], dtype=torch.float64) / c.fx
     y = torch.tensor([-0.5 - c.cy, c.height - 0.5 - c.cy], dtype=torch.float64) / c.fy
@@ -146,7 +146,8 @@ def _range_over(tiles: _Tiles, area: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _look(
-    view: View, tiles: _Tiles, area: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float, truncation: float
+    view: DepthView, tiles: _Tiles, area: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float,
+    truncation: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Whether depth lies behind, in front of, and at blocks, tile by tile of their footprints; bool [n] each."""
     n, device = len(area), area.device
@@ -177,7 +178,7 @@ def _look(
 
 
 def _meeting(
-    view: View, u: Tensor, v: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float
+    view: DepthView, u: Tensor, v: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Whether rays through tiles (u, v) meet cubes, and the stretch of depth in which they do."""
     c = view.camera

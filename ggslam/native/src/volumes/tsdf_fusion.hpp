@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "common/vector.hpp"
 #include "interface/core/volumes.hpp"
 #include "volumes/tsdf.hpp"
 
@@ -73,8 +74,10 @@ class CandidateSearch {
     bool whole;          // nothing is cut off at the image's border or near the camera
   };
   struct Cube {
-    float centre[3], near, far;  // in the camera's frame, with the depth of its nearest and farthest corner
-    float offset[3], half;       // centre from the camera along the map's axes, half of the edge
+    Vec3f centre;     // in the camera's frame
+    float near, far;  // depth of its nearest and farthest corner
+    Vec3f offset;     // centre from the camera along the map's axes
+    float half;       // of the edge
   };
   const Tsdf& map_;
   const FusionInput& in_;
@@ -83,7 +86,9 @@ class CandidateSearch {
   double block_;         // edge, metres
   int cell_ = 4;         // edge of a cell in blocks
   float extent_[3];      // half extents of a block along the camera's axes
-  double position_[3];   // of the camera
+  Mat3d rotation_;       // of T_camera_map
+  Vec3d translation_;
+  Vec3d position_;       // of the camera
   float axes_[3][3];     // of the camera in the map
   float spread_[3];      // along the map's axes at z = 1, of one pixel
   int32_t first_[3], count_[3];
