@@ -4,7 +4,7 @@
     python examples/own_camera.py
     PYTHONPATH=examples ggslam run python:own_camera:DrawnRoom --stop 20 --record demo/walk --out demo/walk_run
 
-This one looks at a drawn room; in your own, `frames` asks the driver for the newest pair of images.
+This one looks into the corner of a drawn room; in your own, `frames` asks the driver for the newest pair of images.
 """
 
 from __future__ import annotations
@@ -13,29 +13,36 @@ import sys
 import time
 from collections.abc import Iterator
 
-from ggslam.scene.camera import Camera
-from ggslam.scene.frame import Frame
-from ggslam.sequences.live import LiveSequence
-from ggslam.slam.config import load_config
-from ggslam.slam.slam import Slam
-from ggslam.synthetic import RayCaster, camera_path, furnished_room
+import numpy as np
+
+from ggslam import Camera, Frame, LiveSequence, Slam, load_config
+
+HALF_SIZE = np.array([2.0, 1.4, 2.4])
+"""Of the room, metres; the world's origin is its middle."""
 
 
 class DrawnRoom:
-    """A camera that walks through a room of polygons."""
+    """A camera that walks through an empty room with coloured walls."""
 
     name = "drawn_room"
     camera = Camera(width=160, height=120, fx=120.0, fy=120.0, cx=79.5, cy=59.5)
 
-    def __init__(self) -> None:
-        scene = furnished_room()
-        self._poses, self._caster = camera_path(scene, frames=60), RayCaster(scene)
-
     def frames(self) -> Iterator[Frame]:
         """Colour uint8 [H, W, 3] RGB and depth float32 [H, W] in metres, 0 = none, of the same pixels."""
-        for index, T_world_camera in enumerate(self._poses):
-            images = self._caster.render(self.camera, T_world_camera)
-            yield Frame(index, index, time.monotonic(), images.color, images.depth, self.camera)
+        for index in range(60):
+            color, depth = self.draw(position=np.array([0.02 * index, 0.1, 0.01 * index]), turn=0.7, nod=0.4)
+            yield Frame(index, index, time.monotonic(), color, depth, self.camera)
+
+    def draw(self, position: np.ndarray, turn: float, nod: float) -> tuple[np.ndarray, np.ndarray]:
+        """What is seen from a place, metres, looking by `turn` to the right and `nod` down, radians."""
+        s, c = np.sin([turn, nod]), np.cos([turn, nod])
+        R = np.array([[c[0], 0, s[0]], [0, 1, 0], [-s[0], 0, c[0]]]) @ [[1, 0, 0], [0, c[1], s[1]], [0, -s[1], c[1]]]
+        rays = self.camera.rays() @ R.T  # [H, W, 3], 1 m deep each
+        with np.errstate(divide="ignore"):
+            depth = ((np.sign(rays) * HALF_SIZE - position) / rays).min(-1)  # to the nearest wall
+        points = position + depth[..., None] * rays
+        waves = np.sin(7 * points) + np.sin(points @ [[3, 11, 5], [9, 4, 13], [6, 8, 10]])
+        return (128 + 60 * waves).clip(0, 255).astype(np.uint8), depth.astype(np.float32)
 
     def close(self) -> None:
         """There is no driver to stop."""

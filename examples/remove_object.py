@@ -10,20 +10,17 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ggslam.jobs.edit.editing import Edit, edit_run
-from ggslam.jobs.render.rendering import render_frames, select_frames
-from ggslam.runs.folder import RunFolder
+import ggslam
 
 
 def main(run: str, name: str, out: str) -> None:
     """`name`: a name or id of objects.json, or several: "mug,7"."""
-    folder = RunFolder.open(run)
+    folder = ggslam.RunFolder.open(Path(run))
     print("objects:", ", ".join(record.label() for record in folder.object_table().objects))
-    outcome = edit_run(folder, [Edit("remove", name)], Path(out), inpainting=True, overwrite=True)
+    outcome = ggslam.edit_run(folder, [ggslam.Edit("remove", name)], Path(out), inpainting=True, overwrite=True)
     for line in [*outcome.changes, *outcome.notes]:
         print(line)
-    frames = select_frames(outcome.folder, None, every=None, count=3)
-    for path in render_frames(outcome.folder, frames, ["color", "depth"], Path(out) / "renders", width=None):
+    for path in ggslam.render_run(outcome.folder, Path(out) / "renders", count=3):
         print(f"wrote {path}")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SLAM frame by frame, then trajectory and map as files.
+"""SLAM frame by frame, then everything as a run folder that `ggslam view`, `eval` and `export` take.
 
 ggslam synth demo/room
 python examples/run_slam.py demo/room demo/out
@@ -8,29 +8,24 @@ python examples/run_slam.py demo/room demo/out
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
-from ggslam.formats.gaussian_ply import write_gaussian_ply
-from ggslam.formats.trajectory import write_tum
-from ggslam.sequences import open_sequence
-from ggslam.slam.config import load_config
-from ggslam.slam.slam import Slam
+import ggslam
 
 
 def main(recording: str, out: str) -> None:
     """Tracks and maps a recording."""
-    sequence = open_sequence(recording)
-    slam = Slam(sequence.camera, load_config("fast-cpu"))
-    for frame in sequence.stream(masks=False):
+    sequence = ggslam.open_sequence(recording)
+    slam = ggslam.Slam(sequence.camera, ggslam.load_config("fast-cpu"), sequence.has_masks)
+    for frame in sequence:
         report = slam.step(frame)
         if report.is_keyframe:
-            print(f"frame {frame.index}: keyframe, {report.gaussians} Gaussians, overlap {report.frame.overlap:.0%}")
+            place = report.T_world_camera[:3, 3].round(2)
+            print(f"frame {frame.index}: keyframe at {place}, {report.gaussians} Gaussians")
     result = slam.finish()
-    folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_tum(folder / "trajectory.txt", result.timestamps(), result.trajectory())
-    write_gaussian_ply(folder / "map.ply", result.gaussians)
-    print(f"{len(result.frames)} frames, {len(result.gaussians)} Gaussians in {folder / 'map.ply'}")
+    for record in result.object_table(sequence.instance_names).objects:
+        print(f"{record.label()}: {record.gaussians} Gaussians")
+    folder = ggslam.save_run(result, out, sequence, overwrite=True)
+    print(f"{len(result.frames)} frames, {result.gaussian_count} Gaussians in {folder.path}")
 
 
 if __name__ == "__main__":

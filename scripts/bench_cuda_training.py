@@ -22,13 +22,15 @@ from bench_cuda_render import SIZES, make_workload
 from bench_loss import View, make_view
 from timing import seconds
 
-from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
-from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages
-from ggslam.mapping.losses_reference import ssim
+from ggslam.mapping.cpu.losses import CpuImageLoss
+from ggslam.mapping.cuda.losses import CudaImageLoss
+from ggslam.mapping.losses import LossTarget
+from ggslam.mapping.settings import LossSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
+from ggslam.rendering.losses import ssim_map
 from ggslam.rendering.types import PARAMETERS, GaussianTensors
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -63,7 +65,7 @@ def report(label: str, calls: dict[str, Call], device: torch.device, repeat: int
     print(f"{label:>34} {first} {median[first]:8.3f}{text}", flush=True)
 
 
-def torch_loss(view: View, target: DeviceKeyframeImages, settings: LossSettings, device: torch.device) -> Call:
+def torch_loss(view: View, target: LossTarget, settings: LossSettings, device: torch.device) -> Call:
     """The default terms of the loss, by autograd."""
     leaves = [value.to(device).requires_grad_() for value in (view.image, view.depth)]
     y = target.color.permute(2, 0, 1).float() / 255
@@ -73,16 +75,16 @@ def torch_loss(view: View, target: DeviceKeyframeImages, settings: LossSettings,
     def call() -> None:
         image, depth = leaves
         with torch.device(device):  # the window is made there
-            loss = (1 - w) * (image - y).abs().mean() + w * (1 - ssim(image, y).mean())
+            loss = (1 - w) * (image - y).abs().mean() + w * (1 - ssim_map(image, y).mean())
         error = torch.where(valid, (depth - target_depth).abs(), 0.0).sum() / valid.sum()
         torch.autograd.grad(loss + settings.depth_weight * error, leaves)
 
     return call
 
 
-def on_device(target: KeyframeImages, device: torch.device) -> DeviceKeyframeImages:
+def on_device(target: LossTarget, device: torch.device) -> LossTarget:
     color, depth = torch.from_numpy(target.color).to(device), torch.from_numpy(target.depth).to(device)
-    return DeviceKeyframeImages(color, depth, target.depth_scale)
+    return LossTarget(color, depth, target.depth_scale)
 
 
 def bench_loss(label: str, size: tuple[int, int], fused: CudaImageLoss, repeat: int) -> None:
@@ -91,7 +93,7 @@ def bench_loss(label: str, size: tuple[int, int], fused: CudaImageLoss, repeat: 
         View(*(value.to(fused.device) for value in vars(view).values())),
         on_device(target, fused.device),
     )
-    cpu, settings = ImageLoss(NativeContext()), LossSettings()
+    cpu, settings = CpuImageLoss(NativeContext()), LossSettings()
     calls: dict[str, Call] = {
         "cuda": lambda: fused.evaluate(moved, device_target, settings),
         "torch": torch_loss(view, device_target, settings, fused.device),
@@ -118,7 +120,7 @@ def bench_step(
     leaves = [torch.nn.Parameter(getattr(theirs, name)) for name in PARAMETERS if getattr(theirs, name).numel()]
     adam = torch.optim.Adam(leaves, lr=RATE, eps=1e-15, fused=True)
     mine, cpu_map = View(*(value.to(rasterizer.device) for value in vars(view).values())), make_map(scene, CPU)
-    cpu, cpu_loss = CpuRasterizer(), ImageLoss(NativeContext())
+    cpu, cpu_loss = CpuRasterizer(), CpuImageLoss(NativeContext())
 
     def fused() -> None:
         view = rasterizer.forward(ours, camera, T_camera_world)

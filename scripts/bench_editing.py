@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What edits change where they should change nothing, as stated in the README.
+"""What edits change where they should change nothing, as stated in docs/objects.md.
 
     python scripts/bench_editing.py RUN --remove 7 8 10 11 --move 7 --shift "0.2 0.05 -0.15"
 

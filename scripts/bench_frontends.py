@@ -28,10 +28,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 import torch
 
-from ggslam.evaluation.geometry import estimate_normals, register
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.raw_points import read_pose_graph, read_raw_points
+from ggslam.geometry.icp import register
+from ggslam.geometry.normals import estimate_normals
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, so3_log
@@ -42,6 +43,7 @@ from ggslam.tracking.edges_planes.scans import LidarFeatures, split_features
 from ggslam.tracking.edges_planes.settings import LIDAR, FeatureTrackerSettings
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
 from ggslam.tracking.gicp import GicpTarget, align
+from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise, TargetSettings, TrackerSettings
@@ -92,7 +94,7 @@ def track_frames(frames: Iterable[Frame], tracker: Tracker, context: NativeConte
             run.lost += 1
         elif policy.decide(frame.index, result):
             T = result.T_world_camera
-            run.cloud.append(result.points.points @ T[:3, :3].T + T[:3, 3])
+            run.cloud.append(result.points.read().points @ T[:3, :3].T + T[:3, 3])
             if not isinstance(tracker, FeatureTracker):
                 start = time.perf_counter()
                 tracker.set_target(surface.add(result.points, T))
@@ -111,7 +113,7 @@ def run_recording(path: Path, arguments: argparse.Namespace) -> None:
     features = with_budget(FeatureTrackerSettings(device=arguments.device), arguments.budget_ms)
     runs = []
     for name, tracker in (
-        ("gicp", Tracker(sequence.camera, context=context)),
+        ("gicp", GicpTracker(sequence.camera, context=context)),
         ("features", FeatureTracker(sequence.camera, features=features, context=context)),
     ):
         run = track_frames(frames, tracker, context)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What learning objects costs and brings, as printed in the README.
+"""What learning objects costs and brings, as printed in docs/objects.md.
 
     python scripts/bench_identity.py                     # no identity, the published schedule, ours, votes only
     python scripts/bench_identity.py --ablation          # and single choices of ours

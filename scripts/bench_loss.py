@@ -21,8 +21,10 @@ import torch
 from timing import seconds
 from torch.nn.functional import avg_pool2d
 
-from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
+from ggslam.mapping.cpu.losses import CpuImageLoss
+from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.losses_reference import reference_loss
+from ggslam.mapping.settings import LossSettings
 from ggslam.native.loader import NativeContext, available_instruction_sets, available_processors
 
 
@@ -33,7 +35,7 @@ class View:
     alpha: torch.Tensor
 
 
-def make_view(width: int, height: int) -> tuple[View, KeyframeImages]:
+def make_view(width: int, height: int) -> tuple[View, LossTarget]:
     """A smooth random image with a fifth of its depth missing, and a noisy rendering of it."""
     generator = torch.Generator().manual_seed(0)
     noise = torch.rand(1, 3, height + 8, width + 8, generator=generator)
@@ -44,7 +46,7 @@ def make_view(width: int, height: int) -> tuple[View, KeyframeImages]:
     image = (smooth + 0.03 * torch.randn(smooth.shape, generator=generator)).contiguous()
     color = (255 * smooth).to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
     view = View(image, units.float() / 5000 + 0.01, torch.full((height, width), 0.97))
-    return view, KeyframeImages(color, units.numpy().astype(np.uint16), 1 / 5000)
+    return view, LossTarget(color, units.numpy().astype(np.uint16), 1 / 5000)
 
 
 def median_ms(call: Callable[[], object], repeats: int) -> float:
@@ -52,7 +54,7 @@ def median_ms(call: Callable[[], object], repeats: int) -> float:
     return 1e3 * statistics.median(seconds(call, repeats))
 
 
-def torch_call(view: View, target: KeyframeImages, settings: LossSettings) -> Callable[[], object]:
+def torch_call(view: View, target: LossTarget, settings: LossSettings) -> Callable[[], object]:
     leaves = [value.clone().requires_grad_() for value in (view.image, view.depth, view.alpha)]
     exposure = torch.tensor([[1.0, 0.0]] * 3, requires_grad=True)
 
@@ -62,7 +64,7 @@ def torch_call(view: View, target: KeyframeImages, settings: LossSettings) -> Ca
     return call
 
 
-def prototype_call(path: str, threads: int, view: View, target: KeyframeImages) -> Callable[[], object]:
+def prototype_call(path: str, threads: int, view: View, target: LossTarget) -> Callable[[], object]:
     library = ctypes.CDLL(path)
     library.gg_create.restype = ctypes.c_void_p
     library.gg_l1ssim.restype = ctypes.c_double
@@ -98,7 +100,7 @@ def main() -> None:
             ms = median_ms(prototype_call(arguments.prototype, threads, view, target), arguments.repeats)
             print(row.format("prototype, L1 + SSIM only", threads, ms, reference / ms))
         for instruction_set in available_instruction_sets():
-            loss = ImageLoss(NativeContext(threads, instruction_set))
+            loss = CpuImageLoss(NativeContext(threads, instruction_set))
             for name, setting in settings.items():
                 ms = median_ms(lambda loss=loss, s=setting: loss.evaluate(view, target, s), arguments.repeats)  # type: ignore[misc]
                 print(row.format(f"{instruction_set}: {name}", threads, ms, reference / ms))

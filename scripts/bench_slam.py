@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Speed and quality of whole runs, as printed in the README.
+"""Speed and quality of whole runs, as printed in docs/results.md.
 
     python scripts/bench_slam.py                       # the table: every recording, k = 1, 2, 4, 8
     python scripts/bench_slam.py --only livingroom --iterations 4 --refine 1000

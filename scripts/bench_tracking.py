@@ -33,16 +33,17 @@ import torch
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import inverse
+from ggslam.scene.poses import fit_similarity, inverse, transformed
 from ggslam.sequences.factory import open_sequence
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
 from ggslam.tracking.gicp import GicpTarget
+from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import extract_points
 from ggslam.tracking.settings import DepthNoise, TrackerSettings
 from ggslam.tracking.surface import MeasuredSurface, quaternions_from_normals
-from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 HELD_OUT_EVERY, HELD_OUT_OFFSET = 8, 4
 
@@ -136,7 +137,7 @@ def track_recording(
     """Tracks every frame; keyframes (never the held-out frames) extend the target."""
     sequence, context = open_sequence(path, scale=scale), NativeContext(threads)
     engine = CudaTrackingEngine(sequence.camera) if device == "cuda" else None
-    tracker, policy, run = Tracker(sequence.camera, settings, context, engine=engine), KeyframePolicy(), Run()
+    tracker, policy, run = GicpTracker(sequence.camera, settings, context, engine=engine), KeyframePolicy(), Run()
     surface, discs = MeasuredSurface(settings.target, context), None
     surface.finish = engine is None
     previous: PhotometricReference | None = None
@@ -165,7 +166,7 @@ def track_recording(
     return run
 
 
-def time_parts(run: Run, frame: Frame, tracker: Tracker, target: GicpTarget, result: TrackingResult) -> None:
+def time_parts(run: Run, frame: Frame, tracker: GicpTracker, target: GicpTarget, result: TrackingResult) -> None:
     """Times point extraction and one alignment by themselves (from the pose found, moved by half a centimetre)."""
     assert tracker.noise is not None
     s = tracker.settings
@@ -215,9 +216,7 @@ def mean_difference(points: np.ndarray, grey: np.ndarray, reference: Photometric
 def ate_rmse(estimated: np.ndarray, true: np.ndarray) -> float:
     """Root mean square distance of camera centres [n, 4, 4] after the best rigid alignment, metres."""
     x, y = estimated[:, :3, 3], true[:, :3, 3]
-    U, _, Vt = np.linalg.svd((y - y.mean(0)).T @ (x - x.mean(0)))
-    R = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return float(np.sqrt((((x - x.mean(0)) @ R.T + y.mean(0) - y) ** 2).sum(1).mean()))
+    return float(np.sqrt(((transformed(x, fit_similarity(x, y)[0]) - y) ** 2).sum(1).mean()))
 
 
 # --- table -----------------------------------------------------------------------------------------------------------

@@ -78,7 +78,7 @@ FAULTS = (
           "channel_major = gaussians.sh[:, 1:].transpose(1, 2).reshape(count, 3 * rest)",
           "channel_major = gaussians.sh[:, 1:].reshape(count, 3 * rest)", ("formats/test_gaussian_ply.py",)),
     Fault("sequences", "ggslam/sequences/pose_files.py", "stack[i] = T if reason is None else np.nan", "stack[i] = T",
-          ("sequences/test_bad_input.py",)),
+          ("sequences/test_pose_files.py",)),
     Fault("scores", "ggslam/evaluation/trajectory.py", "T[:3, 3] = target_mean - scale * R @ source_mean",
           "T[:3, 3] = target_mean - source_mean", ("evaluation/test_trajectory_scores.py",)),
     Fault("records", "ggslam/runs/folder.py", '"complete": error is None, "stopped_by": error})',

@@ -32,7 +32,7 @@ IRREGULAR = re.compile(
 )
 REGULAR = re.compile("[a-z]{2,}(ed|ing)")
 NO_PARTICIPLES = re.compile(
-    "need|feed|seed|speed|embed|exceed|proceed|string|ring|king|thing|spring|sing|wing|bring|swing|ping|timing|recording"
+    "need|feed|seed|speed|embed|exceed|proceed|string|ring|king|thing|spring|sing|wing|bring|swing|ping|timing|recording|setting"
 )
 PREPOSITIONS = re.compile(
     "by|to|of|in|on|at|from|with|for|into|as|out|up|down|off|over|onto|and|or|not|within|around"

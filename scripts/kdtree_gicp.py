@@ -61,7 +61,7 @@ class TreeSurface:
 
     def __init__(self, store: GridStore, submaps: SubmapSettings, full: bool) -> None:
         self.target: TreeTarget | None = None
-        self.sided, self.damaged = True, ()
+        self.has_sides, self.damage = True, ()
         everything = replace(submaps, partial_radius=1e7, lookahead=0.0, cache_megabytes=0.0)
         self.map = PartialMap(store, everything if full else submaps, _load)
         self._done, self._full = False, full

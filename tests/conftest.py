@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +13,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # processes that share the tests share 
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
-from kept import build_once, cached_folder, session_folder
+from kept import build_once, generated_recording, session_folder
 
 if TYPE_CHECKING:
     from ggslam.cuda.library import CudaLibrary
@@ -43,18 +42,8 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A generated recording: 24 frames of a furnished room, 160x120, with depth noise, exact poses and masks. Drawing
-    it takes longest of all that tests need; it is kept until what draws it changes."""
-    import ggslam
-    from ggslam.synthetic import write_synthetic_sequence
-
-    package = Path(ggslam.__file__).parent
-    sources = sorted([*package.glob("synthetic/*.py"), *package.glob("scene/*.py")])
-    cached = build_once(
-        cached_folder("room-24x160x120", *sources),
-        lambda folder: write_synthetic_sequence(folder, frames=24, width=160, height=120, seed=0, noise=True),
-    )
-    return build_once(session_folder(tmp_path_factory) / "recordings" / "room", lambda to: shutil.copytree(cached, to))
+    """A generated recording: 24 frames of a furnished room, 160x120, with depth noise, exact poses and masks."""
+    return generated_recording(tmp_path_factory, "room", frames=24, width=160, height=120, seed=0, noise=True)
 
 
 @pytest.fixture(scope="session")

@@ -6,9 +6,11 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -48,3 +50,18 @@ def cached_folder(name: str, *sources: Path) -> Path:
     for source in sources:
         digest.update(source.read_bytes())
     return CHECKOUT / "build" / "tests" / f"{name}-{digest.hexdigest()[:16]}"
+
+
+def generated_recording(factory: pytest.TempPathFactory, name: str, **options: Any) -> Path:
+    """A recording as `write_synthetic_sequence` draws it with these options, not to be changed. Drawing takes longest
+    of all that tests need; it is kept until what draws changes, and every run of the tests has a copy."""
+    import ggslam
+    from ggslam.synthetic import write_synthetic_sequence
+
+    package = Path(ggslam.__file__).parent
+    words = "-".join([name, *(f"{key}={value}" for key, value in sorted(options.items()))])
+    cached = build_once(
+        cached_folder(words, *sorted([*package.glob("synthetic/*.py"), *package.glob("scene/*.py")])),
+        lambda folder: write_synthetic_sequence(folder, **options),
+    )
+    return build_once(session_folder(factory) / "recordings" / name, lambda to: shutil.copytree(cached, to))

@@ -53,9 +53,16 @@ def finished(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> P
 
 def test_run_slam(run: Program, room: Path, tmp_path: Path) -> None:
     said = run("run_slam.py", room, "out")
-    assert "frame 0: keyframe" in said and "24 frames" in said
+    assert "frame 0: keyframe at [0. 0. 0.]" in said and "24 frames" in said and "sofa (" in said
     assert len(read_trajectory(tmp_path / "out" / "trajectory.txt")) == 24
     assert len(read_gaussian_ply(tmp_path / "out" / "map.ply")) > 1000
+
+
+def test_train_gaussians(run: Program, room: Path, tmp_path: Path) -> None:
+    said = run("train_gaussians.py", room, "trained.ply", 4, 12)
+    before, after = map(float, re.findall(r"PSNR ([\d.]+) dB before, ([\d.]+) dB after", said)[0])
+    assert after > before + 4
+    assert len(read_gaussian_ply(tmp_path / "trained.ply")) > 1000
 
 
 def test_own_camera(run: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,6 +32,7 @@ def run(recording: Path, out: Path, overrides: list[str], **selection: Any) -> t
     return outcome.metrics, [frame.status for frame in outcome.result.frames]
 
 
+@pytest.mark.long("a true recording shows what a generated one does not")
 def test_livingroom_begins_well(shared_data: Path, tmp_path: Path) -> None:
     m, status = run(shared_data / "livingroom", tmp_path / "run", [], stop=30)
     assert "lost" not in status
@@ -39,6 +40,7 @@ def test_livingroom_begins_well(shared_data: Path, tmp_path: Path) -> None:
     assert m.images.held_out.psnr > 31 and m.images.all.depth_l1_m < 0.012
 
 
+@pytest.mark.long("a true recording shows what a generated one does not")
 def test_redkitchen_begins_well(shared_data: Path, tmp_path: Path) -> None:
     m, status = run(shared_data / "redkitchen", tmp_path / "run", [], stop=30)
     assert "lost" not in status
@@ -46,6 +48,7 @@ def test_redkitchen_begins_well(shared_data: Path, tmp_path: Path) -> None:
     assert m.images.held_out.psnr > 21 and m.images.all.psnr_unmasked > 20
 
 
+@pytest.mark.long("a true recording shows what a generated one does not")
 def test_shelf_is_tracked_to_the_end(shared_data: Path, tmp_path: Path) -> None:
     m, status = run(shared_data / "shelf", tmp_path / "run", ["mapping.iterations_per_frame=8"])
     assert len(status) == 15 and "lost" not in status

@@ -14,7 +14,7 @@ from ggslam.cli.console import console, table
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.evaluation.geometry import Overlap
+    from ggslam.geometry.clouds import Overlap
     from ggslam.jobs.compare.comparison import Comparison
     from ggslam.runs.records.metrics import MetricsRecord
 
@@ -25,7 +25,7 @@ EPILOG = """
 
   ggslam compare runs/kitchen scan_of_kitchen.ply --align icp
 
-  ggslam compare runs/a runs/b --align trajectory --thresholds 0.01,0.03 --json difference.json
+  ggslam compare runs/a runs/b --align trajectory --thresholds 0.01,0.03 --out difference.json
 """
 
 
@@ -38,7 +38,7 @@ class AlignmentName(str, Enum):
 
 
 SidePath = Annotated[Path, typer.Argument(metavar="A", help="Folder of a run, or PLY or PCD file: a cloud or a mesh.")]
-ReferencePath = Annotated[Path, typer.Argument(metavar="B", help="The same; the reference.")]
+ReferencePath = Annotated[Path, typer.Argument(metavar="B", help="The reference: a run, cloud or mesh likewise.")]
 
 
 def compare(
@@ -46,15 +46,15 @@ def compare(
     b: ReferencePath,
     align: Annotated[
         AlignmentName,
-        typer.Option(help="none: both are in one frame, as runs of one recording are; icp: A is registered upon B; "
-                     "trajectory: by camera positions at common times."),
+        typer.Option(help="none: both share a world, as runs of one recording do; icp: register A onto B; "
+                     "trajectory: align camera positions at common times."),
     ] = AlignmentName.none,
     max_distance: Annotated[
-        float, typer.Option(help="Metres up to which points are partners, for fitness, RMSE and ICP.")
+        float, typer.Option(help="Farthest partners that fitness, RMSE and ICP count, metres.")
     ] = 0.05,
-    thresholds: Annotated[str, typer.Option(help="Metres, for precision, recall and F1.")] = "0.01,0.02,0.05",
-    seed: Annotated[int, typer.Option(help="Of random samples.", min=0)] = 0,
-    json_path: Annotated[Path | None, typer.Option("--json", help="File to write all numbers to.")] = None,
+    thresholds: Annotated[str, typer.Option(help="Distances for precision, recall and F1, metres.")] = "0.01,0.02,0.05",
+    seed: Annotated[int, typer.Option(help="Seed of the random samples.", min=0)] = 0,
+    out: Annotated[Path | None, typer.Option(help="JSON file to write all numbers to.")] = None,
 ) -> None:  # fmt: skip
     """Compare two maps: how far apart trajectories and surfaces are, and scores side by side. B is the reference."""
     from ggslam.jobs.compare.comparison import compare as compare_sides
@@ -62,9 +62,9 @@ def compare(
 
     found = compare_sides(a, b, align.value, max_distance, _numbers(thresholds), seed)
     _print(found, max_distance)
-    if json_path is not None:
-        write_text(json_path, json.dumps(found.to_dict(), indent=1) + "\n")
-        console.print(f"wrote {json_path}", highlight=False, markup=False)
+    if out is not None:
+        write_text(out, json.dumps(found.to_dict(), indent=1) + "\n")
+        console.print(f"wrote {out}", highlight=False, markup=False)
 
 
 def _numbers(text: str) -> list[float]:

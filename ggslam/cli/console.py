@@ -3,10 +3,20 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -23,6 +33,9 @@ class CommandConsole(Console):
 
 console = CommandConsole()
 
+LINE_EVERY_S = 10.0
+"""Seconds between two lines of progress where output is no terminal."""
+
 
 class RateColumn(ProgressColumn):
     """Steps a second, lately while running, on average when done."""
@@ -33,8 +46,50 @@ class RateColumn(ProgressColumn):
         return Text("" if rate is None else f"{rate:.1f}/s")
 
 
+class ProgressLines(Progress):
+    """Progress where output is no terminal (a log, `nohup`, CI): a line every 10 s, and one when a task is done."""
+
+    def __init__(self, output: Console) -> None:
+        super().__init__(console=output, disable=True)  # draws no bar
+        self._due = time.monotonic() + LINE_EVERY_S
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:  # type: ignore[override]
+        """As `Progress.update`; prints a line when one is due."""
+        was_finished = self._tasks[task_id].finished
+        super().update(task_id, **changes)
+        task, now = self._tasks[task_id], time.monotonic()
+        if now >= self._due or (task.finished and not was_finished):
+            self._due = now + LINE_EVERY_S
+            self.console.print(progress_line(task), highlight=False, markup=False, soft_wrap=True)
+
+
+def progress_line(task: Task) -> str:
+    """A task in words: `track + map 120/250, 14.2/s, 9 s left, 98k Gaussians`."""
+    total = "" if task.total is None else f"/{task.total:.0f}"
+    parts = [f"{task.description} {task.completed:.0f}{total}"]
+    rate = task.finished_speed or task.speed
+    parts += [] if rate is None else [f"{rate:.1f}/s"]
+    if not task.finished and task.time_remaining is not None:
+        parts.append(f"{duration(task.time_remaining)} left")
+    info = Text.from_markup(str(task.fields.get("info", ""))).plain
+    return ", ".join([*parts, *([" ".join(info.split())] if info.strip() else [])])
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people: `9 s`, `2 min 5 s`, `1 h 20 min`."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
 def progress_bar() -> Progress:
-    """A one-line progress bar with rate and time left; the task's field `info` is free text."""
+    """A one-line progress bar with rate and time left; the task's field `info` is free text. Where output is no
+    terminal, lines take its place."""
+    if not console.is_terminal:
+        return ProgressLines(console)
     return Progress(
         TextColumn("{task.description}"), BarColumn(bar_width=20), MofNCompleteColumn(), RateColumn(),
         TextColumn("{task.fields[info]}"), TimeRemainingColumn(compact=True), console=console, refresh_per_second=4,

@@ -24,8 +24,8 @@ _MARKS = {"ok": ("ok", "green"), "missing": ("--", "dim"), "warning": ("!!", "ye
 
 
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print findings as JSON.")] = False,
-    self_test: Annotated[bool, typer.Option("--self-test/--no-self-test", help="Render and track, a second.")] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    self_test: Annotated[bool, typer.Option("--self-test/--no-self-test", help="Also render and track.")] = True,
 ) -> None:
     """Check the installation: versions, compiled core, GPU, extras, weights. Exit code 1 if ggslam cannot work."""
     from ggslam.jobs.doctor.checkup import examine, works

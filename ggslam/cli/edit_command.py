@@ -41,7 +41,7 @@ def _is_vector(word: str) -> bool:
 
 
 def _edit_option(values: str, text: str) -> Any:
-    return typer.Option(metavar=values, help=text, rich_help_panel="Edits, each as often as wanted")
+    return typer.Option(metavar=values, help=text, rich_help_panel="Edits, repeatable, done in the order given")
 
 
 class EditCommand(TyperCommand):
@@ -73,30 +73,28 @@ class EditCommand(TyperCommand):
 def edit(
     ctx: typer.Context,
     run: options.RunPath,
-    remove: Annotated[str | None, _edit_option("OBJECTS", "Remove them.")] = None,
-    keep: Annotated[str | None, _edit_option("OBJECTS", "Remove everything else.")] = None,
-    move: Annotated[str | None, _edit_option('OBJECTS "DX DY DZ"', "Move them by metres.")] = None,
+    remove: Annotated[str | None, _edit_option("OBJECTS", "Remove objects.")] = None,
+    keep: Annotated[str | None, _edit_option("OBJECTS", "Keep these objects and remove everything else.")] = None,
+    move: Annotated[str | None, _edit_option('OBJECTS "DX DY DZ"', "Move objects by so many metres.")] = None,
     rotate: Annotated[
         str | None,
         _edit_option(
-            '"RX RY RZ"', "After --move: also turn them about their middle, by degrees about x, then y, then z."
+            '"RX RY RZ"', "After --move: also turn them about their centre, by degrees about x, then y, then z."
         ),
     ] = None,
     duplicate: Annotated[
-        str | None, _edit_option('OBJECTS ["DX DY DZ"]', "Put copies of them there, or just beside.")
+        str | None, _edit_option('OBJECTS ["DX DY DZ"]', "Put copies of objects there, or just beside.")
     ] = None,
-    recolor: Annotated[str | None, _edit_option("OBJECTS COLOR", "Give them a colour: #rrggbb or a name.")] = None,
-    merge: Annotated[str | None, _edit_option("OBJECT OTHER", "Make the other a part of the first.")] = None,
-    rename: Annotated[str | None, _edit_option("OBJECT NAME", "Name it.")] = None,
+    recolor: Annotated[str | None, _edit_option("OBJECTS COLOR", "Give objects a colour: #rrggbb or a name.")] = None,
+    merge: Annotated[str | None, _edit_option("OBJECT OTHER", "Make the other object a part of the first.")] = None,
+    rename: Annotated[str | None, _edit_option("OBJECT NAME", "Give an object a name.")] = None,
     inpaint: Annotated[
         bool, typer.Option("--inpaint", help="Close the holes that removed and moved objects leave.")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for the edited run; default: RUN-edited.")] = None,
     in_place: Annotated[bool, typer.Option("--in-place", help="Change the run itself.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already at --out.")] = False,
-    sequence: Annotated[
-        Path | None, typer.Option(help="Where the recording is now, if it was moved (for --inpaint).")
-    ] = None,
+    sequence: options.MovedSequence = None,
 ) -> None:
     """Edit a run's map: remove, keep, move, duplicate, recolour, merge and rename objects."""
     from ggslam.jobs.edit.editing import edit_run

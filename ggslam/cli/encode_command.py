@@ -67,7 +67,9 @@ def encode(
         Path, typer.Argument(metavar="INPUT", help="PLY, 3DGS PLY or PCD file, or folder that `ggslam run` wrote.")
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Stream to write; with --sweep a folder.")],
-    qp: Annotated[int, typer.Option(help="Quantiser of the colours; 6 more double the step.", min=4, max=51)] = 22,
+    qp: Annotated[
+        int, typer.Option(help="Quantiser of colours and reflectance; 6 more double the step.", min=4, max=51)
+    ] = 22,
     chroma_offset: Annotated[int, typer.Option(help="Added to --qp for chroma.", min=-51, max=51)] = 0,
     geometry_scale: Annotated[float, typer.Option(help="Resolution of the positions; 0.5: half.", min=1e-6)] = 1.0,
     voxel: Annotated[
@@ -82,9 +84,12 @@ def encode(
     ] = Split.by_count,
     workers: Annotated[int | None, typer.Option(help="Threads; default: one per processor.", min=1, max=1024)] = None,
     preset: Annotated[
-        Preset, typer.Option(help="pointcloud: positions, colours, labels; splat: whole Gaussians of a 3DGS PLY.")
+        Preset, typer.Option(help="pointcloud: positions and what they carry; splat: whole Gaussians of a 3DGS PLY.")
     ] = Preset.pointcloud,
     rate: Annotated[Rate, typer.Option(help="Quality of splat, r01 smallest; instead of --qp and --bits.")] = Rate.r03,
+    ids: Annotated[
+        bool, typer.Option("--ids/--no-ids", help="Code object ids and other whole numbers (exactly).")
+    ] = True,
     sweep: Annotated[
         Sweep | None, typer.Option(help="Write a study over QPs or geometry scales: tables, plots, pictures.")
     ] = None,
@@ -102,7 +107,7 @@ def encode(
     if sweep is not None:
         _study(source, out, settings, ["qp", "geometry"] if sweep is Sweep.both else [sweep.value], plots)
         return
-    done = encode_file(source, out, settings, preset.value, rate.value)
+    done = encode_file(source, out, settings, preset.value, rate.value, ids)
     _print_report(done.report)
     for note in done.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
@@ -122,6 +127,8 @@ def _refuse_ignored(context: typer.Context, preset: Preset, sweep: Sweep | None)
         raise ConfigError("--rate goes with --preset splat; the quality of --preset pointcloud is --qp")
     if sweep is not None and given & {"qp", "geometry_scale"}:
         raise ConfigError("--qp and --geometry-scale are what --sweep varies")
+    if sweep is not None and "ids" in given:
+        raise ConfigError("--sweep codes no ids: leave --ids and --no-ids out")
     if sweep is None and "plots" in given:
         raise ConfigError("--plots goes with --sweep")
 

@@ -26,11 +26,11 @@ EPILOG = """
 
 def evaluate(
     run: options.RunPath,
-    sequence: Annotated[Path | None, typer.Option(help="The recording, if it is not where it was.")] = None,
-    lpips: Annotated[bool, typer.Option("--lpips/--no-lpips", help="Also LPIPS (needs its weights).")] = True,
-    every: Annotated[int, typer.Option(help="Score every n-th frame only.", min=1)] = 1,
+    sequence: options.MovedSequence = None,
+    lpips: Annotated[bool, typer.Option("--lpips/--no-lpips", help="Also score LPIPS (needs its weights).")] = True,
+    every: Annotated[int, typer.Option(help="Score only every n-th frame.", min=1)] = 1,
     masks: Annotated[
-        Path | None, typer.Option(help="Folder with true instance masks, if not the recording's own.")
+        Path | None, typer.Option(help="Folder with true instance masks, instead of the recording's own.")
     ] = None,
 ) -> None:
     """Score a run against its recording: trajectory, images and objects of keyframes, held-out and all frames."""

@@ -47,8 +47,8 @@ def inspect(
     depth_camera: options.DepthCamera = None,
     min_confidence: options.MinConfidence = None,
     topics: options.Topics = None,
-    formats: Annotated[bool, typer.Option("--formats", help="Print the formats of recordings that are read.")] = False,
-    samples: int = typer.Option(8, help="Frames to read and look at.", min=1),
+    formats: Annotated[bool, typer.Option("--formats", help="List the formats that ggslam reads.")] = False,
+    samples: int = typer.Option(8, help="Number of frames to read and check.", min=1),
 ) -> None:
     """Print what was recognised in a recording, and likely mistakes; of a G-PCC stream, print every unit."""
     from ggslam.sequences import open_sequence, recognise_format

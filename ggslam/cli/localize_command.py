@@ -20,9 +20,9 @@ EPILOG = """
 
   ggslam localize runs/kitchen data/second_visit
 
-  ggslam localize office.grid scans/tuesday --start "12.5 3 1.3 0 0 0 1"
+  ggslam localize office.grid scans/tuesday --start-pose "12.5 3 1.3 0 0 0 1"
 
-  ggslam localize campus.pcd scans/tuesday --start given --full-map --out localized/full
+  ggslam localize campus.pcd scans/tuesday --start-pose given --full-map --out localized/full
 """
 
 _OTHER_WORLD = 4.0
@@ -38,38 +38,48 @@ RecordingPath = Annotated[
 ]
 
 
+StartPose = Annotated[
+    str | None,
+    typer.Option(metavar="POSE", help='Pose of the first frame: "x y z qx qy qz qw", sensor to map; or the word given: '
+                 "the recording's own pose."),
+]  # fmt: skip
+NoStartPose = Annotated[
+    bool,
+    typer.Option("--no-start-pose", help="Look the first frame up among the map's places (the default for images)."),
+]
+FullMap = Annotated[bool, typer.Option("--full-map", help="Align to the whole map, for comparison.")]
+Out = Annotated[Path | None, typer.Option(help="Folder for the results; default localized/NAME.")]
+Radius = Annotated[
+    float | None,
+    typer.Option(help="R': align to cells whose centres are so near, metres; default: the map's.", min=0, max=1e7),
+]
+Voxel = Annotated[
+    float | None,
+    typer.Option(help="Edge of the voxels to align to, metres; default 0.03, of scans 0.15.", min=1e-3, max=10),
+]
+Threads = Annotated[int | None, typer.Option(help="Number of threads; default: one per processor.", min=1, max=1024)]
+
+
 def localize(
     map_path: MapPath,
     sequence: RecordingPath,
-    start_pose: Annotated[
-        str | None,
-        typer.Option("--start", metavar="POSE", help='Pose of the first frame: "x y z qx qy qz qw", sensor to map; or '
-                     "given: the recording's own."),
-    ] = None,
-    no_start: Annotated[
-        bool, typer.Option("--no-start", help="Look the first frame up among the map's places (default for images).")
-    ] = False,
-    full_map: Annotated[bool, typer.Option("--full-map", help="Align to the whole map, for comparison.")] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; default localized/NAME.")] = None,
-    radius: Annotated[
-        float | None, typer.Option(help="R': cells with centres so near are aligned to, metres; default: the map's.",
-                                   min=0, max=1e7)
-    ] = None,
-    voxel: Annotated[
-        float | None, typer.Option(help="Edge of the voxels that are aligned to, metres; default 0.03, of scans 0.15.",
-                                   min=1e-3, max=10)
-    ] = None,
-    first: Annotated[int, typer.Option("--first", help="First frame to use.", min=0)] = 0,
+    start_pose: StartPose = None,
+    no_start_pose: NoStartPose = False,
+    full_map: FullMap = False,
+    out: Out = None,
+    radius: Radius = None,
+    voxel: Voxel = None,
+    start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
     scale: options.Scale = 1.0,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
-    columns: Annotated[int, typer.Option(help="Numbers of a point in .bin scans.", min=3)] = 4,
-    skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
-    threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.", min=1, max=1024)] = None,
-) -> None:  # fmt: skip
+    columns: options.Columns = 4,
+    skip_bad_frames: options.SkipBadFrames = False,
+    threads: Threads = None,
+) -> None:
     """Locate each frame or scan of a recording in a map, of which only the surroundings are in memory."""
     from ggslam.jobs.localize.localizing import LocalizeRequest
     from ggslam.jobs.localize.localizing import localize as locate_all
@@ -78,11 +88,11 @@ def localize(
     request = LocalizeRequest(
         map=map_path,
         sequence=SequenceRequest(
-            sequence, format=format_name, start=first, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
+            sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
             on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
         ),
-        start=start_pose, no_start=no_start, full=full_map, out=out, radius=radius, voxel=voxel, columns=columns,
-        threads=threads,
+        start_pose=start_pose, no_start_pose=no_start_pose, full=full_map, out=out, radius=radius, voxel=voxel,
+        columns=columns, threads=threads,
     )  # fmt: skip
     with progress_bar() as bar:
         report = locate_all(request, ProgressObserver(bar))

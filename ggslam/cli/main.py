@@ -32,6 +32,7 @@ from ggslam.cli import (
     volumes_command,
 )
 from ggslam.cli.argument_names import with_options
+from ggslam.cli.old_names import Command
 from ggslam.errors import GgslamError
 
 
@@ -83,7 +84,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
 }  # fmt: skip
 for _name, (_function, _epilog) in _COMMANDS.items():
-    _class = edit_command.EditCommand if _name == "edit" else None
+    _class = edit_command.EditCommand if _name == "edit" else Command
     app.command(_name, cls=_class, epilog=_epilog, no_args_is_help=_name != "doctor")(_function)
 
 

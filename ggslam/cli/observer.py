@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shows how a run goes on."""
+"""Shows the progress of long commands."""
 
 from __future__ import annotations
 

@@ -11,6 +11,15 @@ import typer
 SequencePath = Annotated[
     Path, typer.Argument(metavar="SEQUENCE", help="Folder or file of the recording; its format is recognised.")
 ]
+MovedSequence = Annotated[
+    Path | None, typer.Option("--sequence", help="Where the recording is now, if it was moved after the run.")
+]
+SkipBadFrames = Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at the first one.")]
+ConfigName = Annotated[str | None, typer.Option("--config", help="Preset name, or YAML file with settings.")]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Override one setting; repeatable.")
+]
+Columns = Annotated[int, typer.Option(help="Numbers that a .bin scan stores for each point.", min=3)]
 LivePath = Annotated[
     Path,
     typer.Argument(
@@ -19,30 +28,33 @@ LivePath = Annotated[
     ),
 ]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `ggslam run` wrote.")]
-Start = Annotated[int, typer.Option(help="First frame to use.")]
-Stop = Annotated[int | None, typer.Option(help="Frame to stop before.")]
-Stride = Annotated[int, typer.Option(help="Use every n-th frame.")]
+Start = Annotated[int, typer.Option("--start", help="First frame to use.")]
+Stop = Annotated[int | None, typer.Option(help="Stop before this frame.")]
+Stride = Annotated[int, typer.Option(help="Use only every n-th frame.")]
 Scale = Annotated[float, typer.Option(help="Resize the images by this factor, e.g. 0.5.")]
-Format = Annotated[str | None, typer.Option("--format", help="Recording format, if it is not recognised.")]
-DepthScale = Annotated[float | None, typer.Option(help="Raw depth units per metre, to override the recording's.")]
-Masks = Annotated[Path | None, typer.Option(help="Folder with instance masks, if not the recording's own.")]
-Host = Annotated[str, typer.Option(help="Address of the page; 0.0.0.0: other machines can connect, too.")]
-Port = Annotated[int, typer.Option(help="Port of the page; 0: any free one.", min=0, max=65535)]
+Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
+DepthScale = Annotated[
+    float | None, typer.Option(help="Units of the depth images per metre, instead of the recording's own.")
+]
+Masks = Annotated[Path | None, typer.Option(help="Folder with instance masks to use instead of the recording's own.")]
+Host = Annotated[str, typer.Option(help="Address to serve the page at; 0.0.0.0 lets other machines connect.")]
+Port = Annotated[int, typer.Option(help="Port to serve the page at; 0 takes any free one.", min=0, max=65535)]
 DepthCamera = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="YAML with the calibration of a depth camera beside the colour camera."),
+    typer.Option(metavar="FILE", help="YAML file with the calibration of a separate depth camera."),
 ]
 MinConfidence = Annotated[
-    int | None, typer.Option(help="Drop depth less sure than 0, 1 or 2, where the recording tells (default 1).")
+    int | None, typer.Option(help="Drop depth of lower confidence (0, 1, 2; default 1), where the recording stores it.")
 ]
 Topics = Annotated[
-    list[str] | None, typer.Option("--topic", metavar="ROLE=TOPIC", help="Of a ROS bag: color, depth, color_info, ...")
+    list[str] | None,
+    typer.Option("--topic", metavar="ROLE=TOPIC", help="ROS topic of color, depth, color_info, ...; repeatable."),
 ]
 PoseConvention = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        help="What the recording's poses are, if not camera to world with OpenCV axes: world-to-camera, opengl, "
+        help="How the recording's poses are written, if not camera to world with OpenCV axes: world-to-camera, opengl, "
         "world-to-camera-opengl, wxyz, world-to-camera-wxyz.",
     ),
 ]

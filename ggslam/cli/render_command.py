@@ -25,11 +25,11 @@ EPILOG = """
 def render(
     run: options.RunPath,
     out: Annotated[Path | None, typer.Option(help="Folder for the pictures; default RUN/renders.")] = None,
-    frames: Annotated[str | None, typer.Option(help="Frame numbers, e.g. 0,50,100; default: 8 spread evenly.")] = None,
-    every: Annotated[int | None, typer.Option(help="Every n-th frame instead.", min=1)] = None,
-    what: Annotated[str, typer.Option(help="Of color, depth, alpha, ids, pca; by commas.")] = "color,depth",
+    frames: Annotated[str | None, typer.Option(help="Frames, e.g. 0,50,100; default: 8, spread evenly.")] = None,
+    every: Annotated[int | None, typer.Option(help="Render every n-th frame instead.", min=1)] = None,
+    what: Annotated[str, typer.Option(help="Some of color, depth, alpha, ids, pca; by commas.")] = "color,depth",
     width: Annotated[
-        int | None, typer.Option(help="Width of the pictures; default: as the run saw them.", min=16, max=8192)
+        int | None, typer.Option(help="Width of the pictures; default: that of the run's images.", min=16, max=8192)
     ] = None,
 ) -> None:
     """Render a run's map from the poses of its frames."""

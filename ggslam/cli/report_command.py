@@ -23,13 +23,13 @@ EPILOG = """
 
 
 def report(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs; of several: a comparison.")],
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs; several are compared.")],
     out: Annotated[
-        Path | None, typer.Option(help="Of several runs: the page; default comparison.html in this folder.")
+        Path | None, typer.Option(help="Page that compares several runs; default comparison.html in this folder.")
     ] = None,
     plots: Annotated[Path | None, typer.Option(help="Folder to write the plots to, as SVG and PNG.")] = None,
 ) -> None:
-    """Write RUN/report.html anew, or one page that compares several runs. Pages need no network and no server."""
+    """Write RUN/report.html again, or one page that compares several runs. Pages open from disk, without a network."""
     from ggslam.jobs.report.pages import write_comparison, write_report
     from ggslam.runs.folder import RunFolder
 

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from enum import Enum
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +20,7 @@ from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
     from ggslam.jobs.run.pipeline import RunOutcome, RunRequest
+    from ggslam.runs.recordings import SequenceRequest
 
 EPILOG = """
 [bold]Examples[/]
@@ -57,13 +60,45 @@ class TrackerName(str, Enum):
     features = "features"
 
 
+Out = Annotated[Path | None, typer.Option(help="Folder for the results; default runs/NAME.")]
+Record = Annotated[
+    Path | None, typer.Option(metavar="FOLDER", help="Keep the frames of a live camera in this folder, as a recording.")
+]
+Iterations = Annotated[int | None, typer.Option(help="Mapping iterations per frame (default 4).")]
+Refine = Annotated[int | None, typer.Option(help="Mapping iterations after the last frame (default 0).")]
+Realtime = Annotated[
+    float | None, typer.Option(metavar="FPS", help="Deliver frames at this rate; tracker and mapper run side by side.")
+]
+Tracker = Annotated[
+    TrackerName | None, typer.Option(help="Track by generalised ICP (default), or by edge and plane features.")
+]
+Device = Annotated[
+    DeviceName | None, typer.Option(help="Compute on the CPU (default), on an NVIDIA GPU, or on a GPU if there is one.")
+]
+EarlierRun = Annotated[
+    Path | None, typer.Option("--map", metavar="RUN", help="Start in the map of this run instead of an empty one.")
+]
+LocalizeOnly = Annotated[
+    bool, typer.Option("--localize-only", help="With --map: locate the frames and leave the map as it is.")
+]
+Loops = Annotated[
+    bool | None, typer.Option("--loops/--no-loops", help="Close loops and look lost frames up (default: yes).")
+]
+Threads = Annotated[int | None, typer.Option(help="Number of threads; default: one per processor.")]
+Seed = Annotated[int | None, typer.Option(help="Seed of all random draws.", min=0)]
+Log = Annotated[
+    str | None, typer.Option(metavar="rerun|FILE.rrd", help="Stream poses, images and map to rerun, or to a file.")
+]
+ShowPage = Annotated[bool, typer.Option("--view", help="Show the map in a browser while it grows, and afterwards.")]
+Evaluate = Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in the output folder.")]
+
+
 def run(
     sequence: options.LivePath,
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; default runs/NAME.")] = None,
-    config: Annotated[str | None, typer.Option(help="Preset name or YAML file with settings.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Override one setting; repeatable.")
-    ] = None,
+    out: Out = None,
+    config: options.ConfigName = None,
+    settings: options.Settings = None,
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
@@ -75,69 +110,63 @@ def run(
     depth_camera: options.DepthCamera = None,
     min_confidence: options.MinConfidence = None,
     topics: options.Topics = None,
-    record: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Keep the frames of a live camera here, as a recording.")
-    ] = None,
-    iterations: Annotated[int | None, typer.Option(help="Mapping iterations per frame (default 4).")] = None,
-    refine: Annotated[int | None, typer.Option(help="Iterations of final refinement after the last frame.")] = None,
-    realtime: Annotated[
-        float | None, typer.Option(metavar="FPS", help="Frames arrive at this rate; tracker and mapper side by side.")
-    ] = None,
-    tracker: Annotated[
-        TrackerName | None, typer.Option(help="How frames are located: G-ICP (default), or edge and plane features.")
-    ] = None,
-    device: Annotated[
-        DeviceName | None, typer.Option(help="Compute on the CPU (default), on an NVIDIA GPU, or on one if there is.")
-    ] = None,
-    earlier: Annotated[
-        Path | None, typer.Option("--map", metavar="RUN", help="Start in the map of this run instead of an empty one.")
-    ] = None,
-    localize_only: Annotated[
-        bool, typer.Option("--localize-only", help="With --map: locate the frames, leave the map as it is.")
-    ] = False,
-    loops: Annotated[
-        bool | None, typer.Option("--loops/--no-loops", help="Close loops and look lost frames up (default: yes).")
-    ] = None,
-    threads: Annotated[int | None, typer.Option(help="Threads; default: all processors.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of all random draws.", min=0)] = None,
-    skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
-    log: Annotated[
-        str | None, typer.Option(metavar="rerun|FILE.rrd", help="Stream poses, images and map to rerun, or to a file.")
-    ] = None,
-    view: Annotated[bool, typer.Option("--view", help="Show the map in a browser while it grows, and after")] = False,
+    record: Record = None,
+    iterations: Iterations = None,
+    refine: Refine = None,
+    realtime: Realtime = None,
+    tracker: Tracker = None,
+    device: Device = None,
+    earlier: EarlierRun = None,
+    localize_only: LocalizeOnly = False,
+    loops: Loops = None,
+    threads: Threads = None,
+    seed: Seed = None,
+    skip_bad_frames: options.SkipBadFrames = False,
+    log: Log = None,
+    view: ShowPage = False,
     host: options.Host = "127.0.0.1",
     port: options.Port = 8080,
-    evaluate: Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")] = True,
-    overwrite: Annotated[bool, typer.Option(help="Replace a finished run in the output folder.")] = False,
+    evaluate: Evaluate = True,
+    overwrite: Overwrite = False,
     help_settings: settings_help.HelpSettings = False,
     help_setting: settings_help.HelpSetting = None,
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
-    from ggslam.jobs.run.pipeline import RunRequest  # imports torch: only when needed
-    from ggslam.runs.recordings import LiveRequest, SequenceRequest
-    from ggslam.sequences.live import is_live
+    from ggslam.runs.recordings import SequenceRequest
 
+    reading = SequenceRequest(
+        sequence, format_name, start, stop, stride, scale, masks, depth_scale, "skip" if skip_bad_frames else "error",
+        depth_camera, min_confidence, tuple(topics or ()), pose_convention,
+    )  # fmt: skip
     shortcuts = {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
         "threads": threads, "seed": seed, "loops.enabled": loops,
         "tracker": None if tracker is None else tracker.value, "device": None if device is None else device.value,
     }  # fmt: skip
     overrides = [*(settings or []), *(f"{name}={value}" for name, value in shortcuts.items() if value is not None)]
-    reading: dict[str, Any] = {
-        "path": sequence, "format": format_name, "start": start, "stop": stop, "stride": stride, "scale": scale,
-        "masks": masks, "depth_scale": depth_scale, "on_bad_frame": "skip" if skip_bad_frames else "error",
-        "depth_camera": depth_camera, "min_confidence": min_confidence, "topics": tuple(topics or ()),
-        "pose_convention": pose_convention,
-    }  # fmt: skip
-    live = is_live(sequence)
-    if record is not None and not live:
-        raise ConfigError("--record is for live cameras: a recording is kept already")
-    request = RunRequest(
-        sequence=LiveRequest(**reading, record=record) if live else SequenceRequest(**reading),
-        out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite, map=earlier,
+    request = _request(reading, record)
+    request = replace(
+        request, out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite, map=earlier,
         localize_only=localize_only,
     )  # fmt: skip
     _run_and_show(request, log, (host, port) if view else None)
+
+
+def _request(reading: SequenceRequest, record: Path | None) -> RunRequest:
+    """A run of a recording, or of a live camera.
+
+    Raises:
+        ConfigError: what is no live camera is to be recorded.
+    """
+    from ggslam.jobs.run.pipeline import RunRequest
+    from ggslam.runs.recordings import LiveRequest
+    from ggslam.sequences.live import is_live
+
+    if is_live(reading.path):
+        return RunRequest(LiveRequest(**vars(reading), record=record))
+    if record is not None:
+        raise ConfigError("--record is for live cameras: a recording is kept already")
+    return RunRequest(reading)
 
 
 def _run_and_show(request: RunRequest, log: str | None, address: tuple[str, int] | None) -> None:
@@ -166,6 +195,15 @@ def _print(outcome: RunOutcome) -> None:
     if outcome.metrics is not None:
         print_scores(outcome.metrics)
     if outcome.error is None:
-        path = shlex.quote(str(outcome.folder.path))
-        for hint in (f"next: ggslam view {path}", f"      ggslam export {path} --format mesh --out mesh.ply"):
+        for hint in next_commands(outcome.folder.path):
             console.print(hint, highlight=False, markup=False, soft_wrap=True)  # commands are copied: no line breaks
+
+
+def next_commands(run: Path) -> list[str]:
+    """What to try next, in words that can be copied; only what works with the packages that are installed."""
+    path, page = shlex.quote(str(run)), shlex.quote(str(run / "map.html"))
+    if find_spec("viser") is not None:
+        view = f"next: ggslam view {path}"
+    else:
+        view = f"next: ggslam view {path} --html {page}     # one page; to browse live: pip install 'ggslam[viewer]'"
+    return [view, f"      ggslam export {path} --format mesh --out mesh.ply"]

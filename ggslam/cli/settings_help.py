@@ -60,7 +60,7 @@ def print_settings(part: str | None) -> None:
         raise ConfigError(f"--help-setting {part}: no setting has this in its name")
     width = max(60, min(120, shutil.get_terminal_size().columns))
     for one in chosen:
-        values = one.expected()
+        values = one.values()
         default = str(one.default).lower() if isinstance(one.default, bool) else one.default
         typer.echo(f"{one.path}={default}" + f"   ({values})" * bool(values))
         typer.echo(textwrap.fill(one.text, width, initial_indent="    ", subsequent_indent="    "))

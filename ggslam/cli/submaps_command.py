@@ -38,35 +38,35 @@ SourcePath = Annotated[
 def submaps(
     source: SourcePath,
     out: Annotated[Path | None, typer.Option(metavar="STORE", help="Grid store to make, or to add a visit to.")] = None,
-    visit: Annotated[str | None, typer.Option(help="Name of the visit; default: of the source.")] = None,
+    visit: Annotated[str | None, typer.Option(help="Name of the visit; default: the source's name.")] = None,
     since: Annotated[str | None, typer.Option(metavar="VISIT", help="List what changed since this visit.")] = None,
     poses: Annotated[
-        Path | None, typer.Option(help="Trajectory file of the recording, if not its own poses; in the map's world.")
+        Path | None, typer.Option(help="Trajectory file in the map's world, instead of the recording's own poses.")
     ] = None,
     at: Annotated[
-        float | None, typer.Option(help="Seconds on the clock of all visits at which this one began; T counts by it.")
+        float | None, typer.Option(help="When this visit began, seconds on a clock that all visits share.")
     ] = None,
     spacing: Annotated[
-        float | None, typer.Option(help="S of a new store: edge of a cell, metres (2).", min=1e-3, max=1e6)
+        float | None, typer.Option(help="S: edge of a cell of a new store, metres (default 2).", min=1e-3, max=1e6)
     ] = None,
-    axes: Annotated[str | None, typer.Option(help="World axes of a new store's grid: xyz, xz, xy (xyz).")] = None,
+    axes: Annotated[str | None, typer.Option(help="World axes of a new store's grid: xyz (default), xz or xy.")] = None,
     voxel: Annotated[
-        float | None, typer.Option(help="One point a cube of this edge is kept, metres; 0: all.", min=0)
+        float | None, typer.Option(help="Keep one point in each cube of this edge, metres; 0 keeps all.", min=0)
     ] = None,
     radius: Annotated[
-        float | None, typer.Option(help="R: a cell is recorded from so near its centre, metres (1).", min=0)
+        float | None, typer.Option(help="R: record a cell from so near its centre, metres (default 1).", min=0)
     ] = None,
     refresh: Annotated[
-        float | None, typer.Option(help="T: seconds before a cell is recorded again (300).", min=0)
+        float | None, typer.Option(help="T: seconds before a cell is recorded again (default 300).", min=0)
     ] = None,
     sensor_range: Annotated[
-        float | None, typer.Option(help="Farther points are not recorded, metres (10).", min=1e-3)
+        float | None, typer.Option(help="Leave out points farther than this, metres (default 10).", min=1e-3)
     ] = None,
-    first: Annotated[int, typer.Option("--first", help="First frame to use.", min=0)] = 0,
+    start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
     scale: options.Scale = 1.0,
-    columns: Annotated[int, typer.Option(help="Numbers of a point in .bin scans.", min=3)] = 4,
+    columns: options.Columns = 4,
 ) -> None:  # fmt: skip
     """Make a grid store, add a visit to one, or list its cells, parts, visits and changes."""
     from ggslam.jobs.submaps.visiting import SubmapsRequest, list_store, make_store
@@ -77,7 +77,7 @@ def submaps(
                     "sensor_range": sensor_range}  # fmt: skip
         request = SubmapsRequest(
             source, out, visit, poses, at, {name: value for name, value in settings.items() if value is not None},
-            SequenceRequest(source, start=first, stop=stop, stride=stride, scale=scale), columns,
+            SequenceRequest(source, start=start, stop=stop, stride=stride, scale=scale), columns,
         )  # fmt: skip
         with progress_bar() as bar:
             make_store(request, ProgressObserver(bar))

@@ -31,25 +31,25 @@ class SceneName(str, Enum):
 
 
 def synth(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to write the recording.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write the recording to.")],
     scene: Annotated[
         SceneName,
         typer.Option(
             help="room: one furnished room; loop: a walk through four rooms and four corridors, back into the first; "
-            "corridor: a walk along a furnished corridor, longer with more frames, that never sees anything again."
+            "corridor: a walk along a furnished corridor, longer with more frames, without a loop."
         ),
     ] = SceneName.room,
     frames: Annotated[
-        int | None, typer.Option(help="Number of frames; default 60, of the loop 480, of the corridor 720.", min=2)
+        int | None, typer.Option(help="Number of frames; default: room 60, loop 480, corridor 720.", min=2)
     ] = None,
     width: Annotated[int, typer.Option(help="Image width.", min=16)] = 320,
     height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
-    seed: Annotated[int, typer.Option(help="Of textures, camera path and noise.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of textures, camera path and noise.", min=0)] = 0,
     depth_distortion: Annotated[
         float | None,
-        typer.Option(help="Fixed error of the depth camera, steps of disparity; default 0, of the loop 0.3."),
+        typer.Option(help="Fixed error of the depth camera, steps of disparity; default 0, for the loop 0.3."),
     ] = None,
-    noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Depth noise of a Kinect-like sensor.")] = True,
+    noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Add depth noise like a Kinect's.")] = True,
 ) -> None:
     """Generate a recording: textured, furnished rooms with exact poses and instance masks."""
     from ggslam.synthetic import SCENES, write_synthetic_sequence

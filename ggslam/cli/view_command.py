@@ -30,10 +30,12 @@ def view(
     host: options.Host = "127.0.0.1",
     port: options.Port = 8080,
     page: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="Serve nothing; write one file that opens from disk.")
+        Path | None, typer.Option("--html", metavar="FILE", help="Write one file that opens from disk; serve nothing.")
     ] = None,
-    max_splats: Annotated[int, typer.Option(help="Show no more Gaussians, the most visible ones.", min=1000)] = 400_000,
-    sequence: Annotated[Path | None, typer.Option(help="Where the recording is now, if it was moved.")] = None,
+    max_splats: Annotated[
+        int, typer.Option(help="Show the most visible Gaussians, at most so many.", min=1000)
+    ] = 400_000,
+    sequence: options.MovedSequence = None,
 ) -> None:
     """Look at a run in the browser: map, camera, frames; select, name, move, delete and export objects."""
     from ggslam.jobs.view.viewing import serve_run, wait_for_interrupt, write_page

@@ -14,7 +14,7 @@ from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.jobs.volumes.fusing import VolumesOutcome
+    from ggslam.jobs.volumes.fusing import VolumesOutcome, VolumesRequest
     from ggslam.volumes.safety import Braking
 
 EPILOG = """
@@ -22,7 +22,7 @@ EPILOG = """
 
   ggslam volumes runs/kitchen
 
-  ggslam volumes runs/kitchen --voxel 0.04 --esdf --occupancy 0.08 --mesh kitchen.glb --report
+  ggslam volumes runs/kitchen --voxel 0.04 --esdf --occupancy 0.08 --mesh kitchen.ply --driving
 
   ggslam volumes data/livingroom --esdf --slice 0.5        (poses of the recording itself)
 
@@ -34,90 +34,114 @@ SourcePath = Annotated[
 ]
 
 
+Out = Annotated[
+    Path | None, typer.Option(help="Folder for the results; default RUN/volumes, or volumes/NAME of a recording.")
+]
+Voxel = Annotated[float | None, typer.Option(help="Edge of the TSDF's voxels, metres (default 0.02).")]
+Esdf = Annotated[bool, typer.Option("--esdf", help="Also make a distance field, with a slice and a ROS map.")]
+Occupancy = Annotated[
+    float | None, typer.Option(metavar="VOXEL", help="Also make an occupancy map (.bt, .ot), voxels of so many metres.")
+]
+Mesh = Annotated[
+    Path | None, typer.Option(help="Mesh file, .ply, .obj or .glb; default mesh.ply in the folder of the results.")
+]
+ObjectMeshes = Annotated[bool, typer.Option("--object-meshes", help="Also write a mesh of each object.")]
+Objects = Annotated[bool, typer.Option("--objects/--no-objects", help="Vote for object ids (default: yes).")]
+Live = Annotated[
+    bool, typer.Option("--live", help="Track the recording as `ggslam run` does and fuse frames as they come.")
+]
+Realtime = Annotated[float | None, typer.Option(metavar="FPS", help="With --live: deliver frames at this rate.")]
+Onto = Annotated[
+    Path | None, typer.Option(metavar="TSDF", help="Add to this tsdf.npz; decay leaves what is in it alone.")
+]
+SliceHeight = Annotated[
+    float | None,
+    typer.Option("--slice", metavar="HEIGHT", help="Height of the slice through the distance field, metres above the "
+                 "floor; default: where the camera was."),
+]  # fmt: skip
+Band = Annotated[
+    str, typer.Option(metavar="LOW,HIGH", help="Heights, metres above the floor, between which the ROS map looks for "
+                      "obstacles."),
+]  # fmt: skip
+Driving = Annotated[bool, typer.Option("--driving", help="Print how fast a robot may drive with these maps.")]
+Speeds = Annotated[str, typer.Option(help="With --driving: speeds to list, m/s.")]
+Friction = Annotated[float, typer.Option(help="With --driving: friction between wheels and ground.")]
+SensorMs = Annotated[float, typer.Option(help="With --driving: delay of the sensor, ms.")]
+PlanMs = Annotated[float, typer.Option(help="With --driving: time that the planner takes, ms.")]
+NetworkMs = Annotated[float, typer.Option(help="With --driving: time between machines, ms.")]
+Scale = Annotated[
+    float | None, typer.Option(help="Resize the images by this factor; default: as the run did, or not at all.")
+]
+Device = Annotated[
+    str | None, typer.Option(help="Torch device to fuse the TSDF on, e.g. cuda; default: the compiled core.")
+]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="With --live: replace a finished run in the output folder.")
+]
+
+
 def volumes(
     source: SourcePath,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for the results; default RUN/volumes, or volumes/NAME of a recording.")
-    ] = None,
-    voxel: Annotated[float | None, typer.Option(help="Edge of the TSDF's voxels, metres (default 0.02).")] = None,
-    esdf: Annotated[bool, typer.Option("--esdf", help="Distance field with slice and ROS map.")]
-    = False,
-    occupancy: Annotated[
-        float | None, typer.Option(metavar="VOXEL", help="Occupancy map with voxels of this edge in metres: .bt, .ot.")
-    ] = None,
-    mesh: Annotated[
-        Path | None, typer.Option(help="Mesh file, .ply, .obj or .glb; default mesh.ply in the folder of the results.")
-    ] = None,
-    object_meshes: Annotated[bool, typer.Option("--object-meshes", help="Also one mesh an object.")] = False,
-    objects: Annotated[bool, typer.Option("--objects/--no-objects", help="Vote for object ids (default: yes).")] = True,
-    live: Annotated[
-        bool, typer.Option("--live", help="Track the recording as `ggslam run` does and fuse frames as they come.")
-    ] = False,
-    realtime: Annotated[
-        float | None, typer.Option(metavar="FPS", help="With --live: frames arrive at this rate.")
-    ] = None,
-    onto: Annotated[
-        Path | None, typer.Option(metavar="TSDF", help="Go on in this tsdf.npz; decay leaves what is in it alone.")
-    ] = None,
-    slice_height: Annotated[
-        float | None, typer.Option("--slice", metavar="HEIGHT", help="Metres above the floor of the slice through the "
-                                   "distance field; default: where the camera was.")
-    ] = None,
-    band: Annotated[
-        str, typer.Option(metavar="LOW,HIGH", help="Metres above the floor in which obstacles count in the ROS map.")
-    ] = "0.1,1.5",
-    report: Annotated[bool, typer.Option("--report", help="Print how fast a robot may drive with this map.")] = False,
-    speeds: Annotated[str, typer.Option(help="With --report: m/s.")] = "0.5,1,2,4",
-    friction: Annotated[float, typer.Option(help="With --report: between wheels and ground.")] = 0.5,
-    sensor_ms: Annotated[float, typer.Option(help="With --report: delay of the sensor.")] = 33.0,
-    plan_ms: Annotated[float, typer.Option(help="With --report: time that the planner takes.")] = 50.0,
-    network_ms: Annotated[float, typer.Option(help="With --report: on the way between machines.")] = 0.0,
-    config: Annotated[str | None, typer.Option(help="Preset name or YAML file with settings.")] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Override one setting (volumes.tsdf.max_depth=4); repeatable.")
-    ] = None,
+    out: Out = None,
+    voxel: Voxel = None,
+    esdf: Esdf = False,
+    occupancy: Occupancy = None,
+    mesh: Mesh = None,
+    object_meshes: ObjectMeshes = False,
+    objects: Objects = True,
+    live: Live = False,
+    realtime: Realtime = None,
+    onto: Onto = None,
+    slice_height: SliceHeight = None,
+    band: Band = "0.1,1.5",
+    driving: Driving = False,
+    speeds: Speeds = "0.5,1,2,4",
+    friction: Friction = 0.5,
+    sensor_ms: SensorMs = 33.0,
+    plan_ms: PlanMs = 50.0,
+    network_ms: NetworkMs = 0.0,
+    config: options.ConfigName = None,
+    settings: options.Settings = None,
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
-    scale: Annotated[
-        float | None, typer.Option(help="Resize the images by this factor; default: as the run did, or not at all.")
-    ] = None,
+    scale: Scale = None,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
-    sequence: Annotated[Path | None, typer.Option(help="Where the recording of the run is now, if it was moved.")]
-    = None,
-    skip_bad_frames: Annotated[bool, typer.Option(help="Skip damaged frames instead of stopping at them.")] = False,
-    device: Annotated[
-        str | None, typer.Option(help="Torch device to fuse the TSDF on, e.g. cuda; default: the compiled core.")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option(help="With --live: replace a finished run in the output folder.")] = False,
-) -> None:  # fmt: skip
-    """Maps that planners read: TSDF with mesh, distance field, occupancy; each with a picture."""
-    from ggslam.jobs.volumes.fusing import VolumesRequest, make_volumes
+    sequence: options.MovedSequence = None,
+    skip_bad_frames: options.SkipBadFrames = False,
+    device: Device = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make maps that planners read, each with a picture: TSDF with mesh, distance field, occupancy."""
+    from ggslam.jobs.volumes.fusing import VolumesRequest
     from ggslam.runs.recordings import SequenceRequest
     from ggslam.volumes.safety import Braking, Latencies
 
-    wanted_speeds = _numbers("--speeds", speeds)
     braking = Braking(Latencies(sensor_ms / 1e3, 0.0, plan_ms / 1e3, network_ms / 1e3), friction)
+    reading = SequenceRequest(
+        source, format=format_name, start=start, stop=stop, stride=stride, scale=1.0 if scale is None else scale,
+        depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
+    )  # fmt: skip
     request = VolumesRequest(
-        source=source,
-        sequence=SequenceRequest(
-            source, format=format_name, start=start, stop=stop, stride=stride, scale=1.0 if scale is None else scale,
-            depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error",
-            pose_convention=pose_convention,
-        ),
-        scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf, occupancy=occupancy, mesh=mesh,
-        object_meshes=object_meshes, objects=objects, live=live, realtime=realtime, onto=onto,
-        slice_height=slice_height, band=_band(band), latency=report, device=device, config=config,
+        source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,
+        occupancy=occupancy, mesh=mesh, object_meshes=object_meshes, objects=objects, live=live, realtime=realtime,
+        onto=onto, slice_height=slice_height, band=_band(band), latency=driving, device=device, config=config,
         overrides=settings or [], overwrite=overwrite,
     )  # fmt: skip
+    _make_and_show(request, _numbers("--speeds", speeds), braking)
+
+
+def _make_and_show(request: VolumesRequest, speeds: list[float], braking: Braking) -> None:
+    """Makes the maps and prints times, files and, where it was asked for, how fast a robot may drive."""
+    from ggslam.jobs.volumes.fusing import make_volumes
+
     with progress_bar() as bar:
         outcome = make_volumes(request, ProgressObserver(bar))
     _print(outcome)
-    if report:
-        _print_safety(outcome, braking, wanted_speeds)
+    if request.latency:
+        _print_safety(outcome, braking, speeds)
     if outcome.error is not None:
         raise outcome.error
 

@@ -70,6 +70,9 @@ class CodedAttribute:
         picked = values[rows].reshape(len(rows), -1)
         if self.table is not None:
             return self.table.components(picked)
+        if self.description.scaled:
+            scale = self.description.scale
+            picked = (picked.astype(np.int64) - self.description.offset + scale // 2) // scale
         if self.description.matrix == MATRIX_IDENTITY:
             picked = picked[:, _GBR]
         return np.ascontiguousarray(picked, np.int32)
@@ -84,7 +87,7 @@ class CodedAttribute:
         return self.components(means.astype(values.dtype), np.arange(len(counts), dtype=np.uint32))
 
     def values(self, components: np.ndarray, corrections: Mapping[str, Any] | None = None) -> np.ndarray:
-        """What the caller sees: uint8, above 8 bits uint16, [N, 3] or [N].
+        """What the caller sees: uint8, above 8 bits uint16, of values that do not fit int64, [N, 3] or [N].
 
         Raises:
             FormatError: corrections of ids that are none.
@@ -92,12 +95,21 @@ class CodedAttribute:
         description = self.description
         if self.table is not None:
             return self._ids(components[:, 0], corrections)
+        if description.scaled:
+            components = (components.astype(np.int64) * description.scale >> description.fraction_bits)
+            components += description.offset
         if description.matrix == MATRIX_BT709:
-            return ycbcr_to_rgb(components)
-        values = components.astype(np.uint8 if description.bit_depth <= 8 else np.uint16)
+            return ycbcr_to_rgb(components.clip(0, 255).astype(np.int32) if description.scaled else components)
+        values = components.astype(self.dtype)
         if description.components == 1:
             return values[:, 0]
         return np.ascontiguousarray(values[:, _RGB]) if description.matrix == MATRIX_IDENTITY else values
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Of the values."""
+        low, high = self.description.reach()
+        return np.dtype(np.int64 if low < 0 or high > 65535 else np.uint8 if high <= 255 else np.uint16)
 
     def corrections(self, components: np.ndarray, reconstructed: np.ndarray) -> dict[str, list[int]] | None:
         """The ids that a decoder would get wrong; None if there are none."""
@@ -210,6 +222,7 @@ def _check_array(name: str, values: np.ndarray, count: int) -> None:
 
 def _describe(name: str, values: AttributeSummary, own: AttributeSettings) -> AttributeDescription:
     components = values.components
+    low, high = (round((value - own.offset) / own.scale) for value in (values.low, values.high))
     depth = own.bit_depth or (8 if values.dtype == np.uint8 else 16)
     space = own.color_space or ("ycbcr" if components == 3 and values.dtype == np.uint8 and depth == 8 else "none")
     if own.lossless:
@@ -220,15 +233,15 @@ def _describe(name: str, values: AttributeSummary, own: AttributeSettings) -> At
         raise ConfigError(f"attribute {name!r}: colour space {space} needs 3 components")
     if space == "ycbcr" and depth != 8:
         raise ConfigError(f"attribute {name!r}: colour space ycbcr needs 8 bits, found {depth}")
-    narrow = values.dtype == np.uint8 and depth >= 8
-    if not narrow and (values.low < 0 or values.high >= 1 << depth):
+    if low < 0 or high >= 1 << depth:
         raise ConfigError(f"attribute {name!r}: values {values.low} to {values.high} do not fit in {depth} bits")
-    default = "material" if own.lossless else "color" if components == 3 else "reflectance"
-    label = own.label or (name if name in KNOWN_LABELS else default)
+    label = own.label or ("color" if components == 3 else "reflectance")
     if label not in KNOWN_LABELS:
         raise ConfigError(f"attribute {name!r}: label {label!r} is none of {', '.join(KNOWN_LABELS)}")
     matrix = {"ycbcr": MATRIX_BT709, "identity": MATRIX_IDENTITY}.get(space)
-    return AttributeDescription(label, components, depth, 0, matrix)
+    if matrix is not None and (own.scale, own.offset) != (1, 0):
+        raise ConfigError(f"attribute {name!r}: colour space {space} goes without scale and offset")
+    return AttributeDescription(label, components, depth, 0, matrix, True, own.offset, own.scale)
 
 
 def _parameters(own: AttributeSettings, settings: CodecSettings, table: IdTable | None) -> AttributeParameters:

@@ -22,11 +22,13 @@ import numpy as np
 from ggslam.coding.attribute_values import AttributeSummary, plan_summaries
 from ggslam.coding.cloud import CodingReport
 from ggslam.coding.encoder import checked_points, encode_cloud, parameter_units, sequence_parameters
+from ggslam.coding.geometry_tools import DensitySample, geometry_parameters
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.settings import CodecSettings
 from ggslam.coding.side_by_side import in_order
 from ggslam.coding.slice_encoder import CloudToCode, CodedSlice, encode_slice
 from ggslam.coding.slices import PlaneCuts, Points, slices_wanted
+from ggslam.coding.syntax import GeometryParameters
 from ggslam.errors import FormatError
 from ggslam.system.atomic import atomic_write, write_failure
 
@@ -124,7 +126,16 @@ class _Spool:
     def quantization(self) -> Quantization:
         """The grid."""
         s = self.settings
-        return choose_quantization(self.corners, s.voxel_size, s.geometry_bits, s.geometry_scale, s.box)
+        return choose_quantization(
+            self.corners, s.voxel_size, s.geometry_bits, s.geometry_scale, s.box, s.unit, s.shift
+        )
+
+    def geometry(self, grid: Quantization) -> GeometryParameters:
+        """The parameter set of all slices."""
+        sample = DensitySample(self.count)
+        for rows in self.blocks():
+            sample.add(grid.of(np.ascontiguousarray(rows[_POINTS])))
+        return geometry_parameters(self.settings, sample)
 
     def cut(self, file: IO[bytes]) -> _Cut | None:
         """Sorts the rows by slice into a file; None if they are better coded as a whole."""
@@ -185,7 +196,8 @@ def _encode_whole(cloud: _Spool, out: Path) -> CodingReport:
 def _encode_cut(cloud: _Spool, cut: _Cut, coded: IO[bytes], out: Path) -> CodingReport:
     plans, grid = plan_summaries(cloud.summaries, cloud.settings), cloud.quantization()
     sequence = sequence_parameters(grid, [plan for plan, _ in plans])
-    shared = CloudToCode(np.empty((0, 3)), {}, None, plans, sequence, grid, cloud.settings, False)
+    geometry = cloud.geometry(grid)
+    shared = CloudToCode(np.empty((0, 3)), {}, None, plans, sequence, geometry, grid, cloud.settings, False)
 
     def code(number: int) -> CodedSlice:
         points, attributes = cloud.split(cloud.rows(cut.file, cut.begins[number], cut.counts[number]))
@@ -196,7 +208,7 @@ def _encode_cut(cloud: _Spool, cut: _Cut, coded: IO[bytes], out: Path) -> Coding
         coded.write(done.data)
         slices.append(replace(done, data=b""))
     with atomic_write(out) as temporary, temporary.open("wb") as file:
-        file.write(parameter_units(shared, slices))
+        file.write(parameter_units(shared))
         coded.seek(0)
         shutil.copyfileobj(coded, file, 1 << 20)
         size = file.tell()

@@ -9,37 +9,6 @@ from typing import Any
 import numpy as np
 
 from ggslam.coding.quantization import Quantization
-from ggslam.errors import FormatError
-
-
-@dataclass(frozen=True)
-class WorldGrid:
-    """Where the integers of a cloud that was on a grid lie in the world: metres = origin + voxel_size * integers."""
-
-    voxel_size: float
-    origin: np.ndarray
-
-    @staticmethod
-    def of(metadata: Any) -> WorldGrid | None:
-        """That of a stream's metadata (key "grid"); None if the stream says nothing of the kind.
-
-        Raises:
-            FormatError: damaged.
-        """
-        grid = metadata.get("grid") if isinstance(metadata, dict) else None
-        if grid is None:
-            return None
-        try:
-            voxel_size, origin = float(grid["voxel_size"]), np.array(grid["origin"], np.float64)
-        except (KeyError, TypeError, ValueError, OverflowError):
-            raise FormatError("the place of the grid in the stream's metadata is damaged") from None
-        if origin.shape != (3,) or not (np.abs(origin) < 1e12).all() or not 1e-12 < voxel_size < 1e12:
-            raise FormatError("the place of the grid in the stream's metadata is damaged")
-        return WorldGrid(voxel_size, origin)
-
-    def place(self, points: np.ndarray) -> np.ndarray:
-        """Metres of positions [N, 3] in voxels."""
-        return self.origin + self.voxel_size * points
 
 
 @dataclass(frozen=True)
@@ -49,23 +18,19 @@ class PointCloud:
     grid_points: int32 [N, 3], positions as coded.
     attributes: by name; uint8 (uint16 above 8 bits), [N, 3], or [N] for attributes of one component.
     metadata: what the encoder's caller put into the stream.
+    ids: names of the attributes that were coded losslessly.
     """
 
     grid_points: np.ndarray
     attributes: dict[str, np.ndarray]
     quantization: Quantization
     metadata: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def world_grid(self) -> WorldGrid | None:
-        """Of a cloud that was coded as voxels of a grid whose place is known."""
-        return WorldGrid.of(self.metadata)
+    ids: frozenset[str] = frozenset()
 
     @property
     def points(self) -> np.ndarray:
         """Positions float64 [N, 3] in metres; of integers that nothing is said about, in their unit."""
-        points, grid = self.quantization.restore(self.grid_points), self.world_grid
-        return points if grid is None else grid.place(points)
+        return self.quantization.restore(self.grid_points)
 
     def __len__(self) -> int:
         return len(self.grid_points)

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ggslam.coding.cloud import PointCloud, WorldGrid
+from ggslam.coding.cloud import PointCloud
 from ggslam.coding.side_by_side import in_order
 from ggslam.coding.slice_coder import SliceCoder, raht_settings
 from ggslam.coding.stream import CodedSliceUnits, CodedStream, read_stream
@@ -93,20 +93,18 @@ def decode_box(data: bytes | memoryview, low: Sequence[float], high: Sequence[fl
     """The points within a box, metres, both ends included (and a millionth of a voxel more, for corners that lie on
     the grid); slices that lie outside are not decoded."""
     stream = read_stream(data)
-    grid = WorldGrid.of(stream.side.get("metadata"))
-    reach = 1e-6 / stream.quantization.scale * (1.0 if grid is None else grid.voxel_size)
+    reach = 1e-6 * stream.quantization.voxel_size
     first, last = np.asarray(low, np.float64) - reach, np.asarray(high, np.float64) + reach
     chosen = []
     for units in stream.slices:
         corners = stream.quantization.restore(np.stack(units.grid_box))
-        corners = corners if grid is None else grid.place(corners)
         if (corners[0] <= last).all() and (corners[1] >= first).all():
             chosen.append(units)
     cloud = _decode(stream, chosen, None)
     points = cloud.points
     inside = ((points >= first) & (points <= last)).all(1)
     attributes = {name: values[inside] for name, values in cloud.attributes.items()}
-    return PointCloud(cloud.grid_points[inside], attributes, cloud.quantization, cloud.metadata)
+    return replace(cloud, grid_points=cloud.grid_points[inside], attributes=attributes)
 
 
 def _decode(stream: CodedStream, slices: list[CodedSliceUnits], workers: int | None) -> PointCloud:
@@ -118,16 +116,14 @@ def _joined(stream: CodedStream, parts: Sequence[tuple[np.ndarray, dict[str, np.
     grid = _concatenate([part[0] for part in parts], (0, 3), np.int32)
     attributes = {}
     for attribute in stream.attributes:
-        wide = np.uint16 if attribute.description.bit_depth > 8 else np.uint8
         shape = (0,) if attribute.description.components == 1 else (0, 3)
-        attributes[attribute.name] = _concatenate([part[1][attribute.name] for part in parts], shape, wide)
+        attributes[attribute.name] = _concatenate([part[1][attribute.name] for part in parts], shape, attribute.dtype)
     metadata = stream.side.get("metadata")
-    cloud = PointCloud(grid, attributes, stream.quantization, metadata if isinstance(metadata, dict) else {})
-    _ = cloud.world_grid  # FormatError if it is damaged
-    return cloud
+    ids = frozenset(attribute.name for attribute in stream.attributes if attribute.table is not None)
+    return PointCloud(grid, attributes, stream.quantization, metadata if isinstance(metadata, dict) else {}, ids)
 
 
-def _concatenate(parts: list[np.ndarray], empty: tuple[int, ...], dtype: type) -> np.ndarray:
+def _concatenate(parts: list[np.ndarray], empty: tuple[int, ...], dtype: type | np.dtype) -> np.ndarray:
     if len(parts) == 1:
         return parts[0]
     return np.concatenate(parts) if parts else np.empty(empty, dtype)
@@ -143,8 +139,9 @@ def _decode_slice(stream: CodedStream, units: CodedSliceUnits) -> tuple[np.ndarr
         for attribute in stream.attributes:
             coded, description = units.attributes[attribute.index], attribute.description
             settings = raht_settings(
-                coded.parameters, description.components, description.bit_depth, coded.header.qp_deltas
-            )
+                coded.parameters, description.components, description.bit_depth, coded.header.qp_deltas,
+                first_version=stream.first_version,
+            )  # fmt: skip
             components = coder.decode_attribute(settings, coded.payload)
             attributes[attribute.name] = attribute.values(components, units.corrections.get(attribute.name))
     except FormatError as error:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from ggslam.coding.attribute_values import CodedAttribute, plan_attributes
 from ggslam.coding.cloud import CodingReport, EncodedCloud, PointCloud
 from ggslam.coding.container import UnitType, unit_bytes
+from ggslam.coding.geometry_tools import DensitySample, geometry_parameters
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.sequence_parameters import SequenceParameters
 from ggslam.coding.settings import CodecSettings
@@ -47,14 +48,18 @@ def encode_cloud(
     arrays = {name: np.asarray(values) for name, values in (attributes or {}).items()}
     plans = plan_attributes(arrays, len(points), settings)
     quantization = choose_quantization(
-        points, settings.voxel_size, settings.geometry_bits, settings.geometry_scale, settings.box
-    )
+        points, settings.voxel_size, settings.geometry_bits, settings.geometry_scale, settings.box, settings.unit,
+        settings.shift,
+    )  # fmt: skip
+    sample = DensitySample(len(points))
+    sample.add(quantization.of(points))
     numbers = assign_slices(points, quantization, settings)
     sequence = sequence_parameters(quantization, [plan for plan, _ in plans])
-    cloud = CloudToCode(points, arrays, numbers, plans, sequence, quantization, settings, reconstruct)
+    geometry = geometry_parameters(settings, sample)
+    cloud = CloudToCode(points, arrays, numbers, plans, sequence, geometry, quantization, settings, reconstruct)
     count = 1 if numbers is None else int(numbers.max()) + 1
     slices = list(in_order(lambda number: encode_slice(cloud, number), count, settings.workers))
-    data = parameter_units(cloud, slices) + b"".join(coded.data for coded in slices)
+    data = parameter_units(cloud) + b"".join(coded.data for coded in slices)
     report = CodingReport(
         len(points), sum(coded.report.points for coded in slices), len(data),
         tuple(coded.report for coded in slices), time.perf_counter() - start,
@@ -79,16 +84,15 @@ def sequence_parameters(quantization: Quantization, plans: list[CodedAttribute])
     resolution, _ = quantization.resolution()
     return SequenceParameters(
         tuple(plan.description for plan in plans), False, quantization.origin, 0, quantization.size,
-        resolution, quantization.metres,
+        resolution, quantization.metres, frame_counter_bits=1,
     )  # fmt: skip
 
 
-def parameter_units(cloud: CloudToCode, slices: Sequence[CodedSlice]) -> bytes:
+def parameter_units(cloud: CloudToCode) -> bytes:
     """Parameter sets, once for all slices, and the unit of what they cannot hold."""
-    geometry = {coded.geometry.geometry_id: coded.geometry for coded in slices}
     attribute = {parameters.attribute_id: parameters for _, parameters in cloud.plans}
     units = [unit_bytes(UnitType.SEQUENCE_PARAMETERS, cloud.sequence.write())]
-    units += [unit_bytes(UnitType.GEOMETRY_PARAMETERS, geometry[identity].write()) for identity in sorted(geometry)]
+    units.append(unit_bytes(UnitType.GEOMETRY_PARAMETERS, cloud.geometry.write()))
     units += [unit_bytes(UnitType.ATTRIBUTE_PARAMETERS, attribute[identity].write()) for identity in sorted(attribute)]
     content = _side_information(cloud)
     if content:
@@ -99,9 +103,11 @@ def parameter_units(cloud: CloudToCode, slices: Sequence[CodedSlice]) -> bytes:
 def _side_information(cloud: CloudToCode) -> dict[str, Any]:
     content: dict[str, Any] = {}
     if not cloud.quantization.resolution()[1]:
-        content["scale"] = cloud.quantization.scale
+        content["scale"] = cloud.quantization.scale / cloud.quantization.unit
     if cloud.quantization.centre:
         content["centre"] = cloud.quantization.centre
+    if any(cloud.quantization.shift):
+        content["shift"] = list(cloud.quantization.shift)
     if any(plan.name != plan.description.label or plan.description.instance for plan, _ in cloud.plans):
         content["names"] = [plan.name for plan, _ in cloud.plans]
     tables = {
@@ -122,4 +128,5 @@ def _reconstruction(cloud: CloudToCode, slices: list[CodedSlice]) -> PointCloud:
         plan.name: np.concatenate([coded.attributes[plan.name] for coded in slices if coded.attributes is not None])
         for plan, _ in cloud.plans
     }
-    return PointCloud(grid, attributes, cloud.quantization, dict(cloud.settings.metadata))
+    ids = frozenset(plan.name for plan, _ in cloud.plans if plan.table is not None)
+    return PointCloud(grid, attributes, cloud.quantization, dict(cloud.settings.metadata), ids)

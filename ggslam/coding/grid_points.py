@@ -50,6 +50,13 @@ class GridPoints:
         load_library().ggslam_gpcc_along_axis(chosen, self._grid, axis, out.ctypes.data)
         return out
 
+    def sample_cubes(self, one_in: int) -> np.ndarray:
+        """Codes uint64 [M] of 21 bits a coordinate, x first, of the points in one of so many (a power of two) cubes of
+        4 x 4 x 4 voxels."""
+        codes = np.empty(len(self), np.uint64)
+        count = load_library().ggslam_gpcc_sample_cubes(self._chosen(None), self._grid, one_in - 1, codes.ctypes.data)
+        return codes[:count].copy()
+
     def plane_counts(self, axis: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Number of points in each plane across an axis, uint32 [size of the axis]."""
         counts = np.zeros(self.size[axis], np.uint32)

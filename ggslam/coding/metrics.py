@@ -18,6 +18,8 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ggslam.geometry.normals import estimate_normals
+
 _CHUNK = 1 << 17
 _TIES = 8
 """Neighbours looked at for equal distances: a voxel's centre between coarser voxels has at most 8."""
@@ -88,21 +90,6 @@ def matching_rows(reference: np.ndarray, decoded: np.ndarray) -> np.ndarray | No
     rows = np.empty(len(first), np.int64)
     rows[first] = second
     return rows
-
-
-def estimate_normals(points: np.ndarray, neighbours: int = 16) -> np.ndarray:
-    """Unit normals float64 [N, 3] of points [N, 3]: the direction of least variance among the nearest neighbours, the
-    point itself included. Their sign is arbitrary (D2 does not depend on it)."""
-    points = np.asarray(points, np.float64)
-    tree = cKDTree(points)
-    count = min(neighbours, len(points))
-    normals = np.empty(points.shape)
-    for start in range(0, len(points), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        index = tree.query(points[part], count, workers=-1)[1].reshape(-1, count)
-        offsets = points[index] - points[index].mean(1, keepdims=True)
-        normals[part] = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
-    return normals
 
 
 class CloudPair:

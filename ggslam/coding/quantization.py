@@ -2,8 +2,8 @@
 """Positions to grid and back: p~ = clip(floor(s p) - o, c_min, c_max), as in the slice-parallel G-PCC encoder for
 embedded systems whose equations 4 and 5 these are. The scale s is a number of voxels per metre, o an integer origin.
 
-The sequence parameter set holds s as a quotient of integers and o as the offset of its box. A scale that is no such
-quotient, and the place of a point within its voxel, travel exactly in a user data unit.
+The sequence parameter set holds s as a quotient of integers and o as the offset of its box: every decoder can place the
+points. A scale that is no such quotient, and the place of a point within its voxel, travel exactly in a user data unit.
 """
 
 from __future__ import annotations
@@ -31,7 +31,10 @@ class Quantization:
     origin: subtracted from floor(scale p), voxels.
     size: voxels along each axis; grid positions are clipped to [0, size - 1].
     centre: added to grid positions when they are restored, in voxels: 0.5 for the centres of the voxels.
-    metres: whether the unit is a metre.
+    metres: whether restored positions are metres.
+    unit: length of a step of the positions, in metres if `metres`.
+    shift: added to restored positions.
+    global_scale: grid positions are multiplied by it before the origin is added; 1 but in foreign streams.
     """
 
     scale: float
@@ -39,6 +42,19 @@ class Quantization:
     size: tuple[int, int, int] | None = None
     centre: float = 0.0
     metres: bool = False
+    unit: float = 1.0
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    global_scale: float = 1.0
+
+    @property
+    def voxel_size(self) -> float:
+        """Edge of a voxel, in the unit of restored positions."""
+        return self.unit / self.scale * self.global_scale
+
+    @property
+    def first(self) -> np.ndarray:
+        """Where grid position 0 is restored to, float64 [3]."""
+        return self.restore(np.zeros((1, 3), np.int32))[0]
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Grid positions int32 [N, 3] of points [N, 3]."""
@@ -53,18 +69,26 @@ class Quantization:
     def restore(self, grid: np.ndarray) -> np.ndarray:
         """Positions float64 [N, 3] of grid positions."""
         points = grid.astype(np.float64)
+        if self.global_scale != 1:
+            points *= self.global_scale
         points += np.asarray(self.origin, np.float64) + self.centre
         points /= self.scale
+        if self.unit != 1:
+            points *= self.unit
+        if any(self.shift):
+            points += self.shift
         return points
 
     def resolution(self) -> tuple[Fraction, bool]:
-        """The scale as the sequence parameter set holds it, and whether that is exact."""
-        exact = Fraction(self.scale)
+        """Voxels per unit of length as the sequence parameter set holds them, and whether that is exact."""
+        scale = self.scale / self.unit
+        exact = Fraction(scale)
         if max(exact.numerator, exact.denominator) <= _MAX_FIELD:
             return exact, True
-        if not 1 / _MAX_FIELD <= self.scale <= _MAX_FIELD / 2:
-            raise ConfigError(f"{self.scale:g} voxels per unit of length is outside the range of the format")
-        return exact.limit_denominator(min(_MAX_FIELD, int(_MAX_FIELD / 2 / self.scale))), False
+        if not 1 / _MAX_FIELD <= scale <= _MAX_FIELD / 2:
+            raise ConfigError(f"{scale:g} voxels per unit of length is outside the range of the format")
+        near = exact.limit_denominator(min(_MAX_FIELD, int(_MAX_FIELD / 2 / scale)))
+        return near, float(near) == scale
 
 
 def _extent(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -86,6 +110,8 @@ def choose_quantization(
     bits: int,
     geometry_scale: float,
     box: tuple[tuple[float, float, float], tuple[float, float, float]] | None,
+    unit: float | None = None,
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Quantization:
     """The grid for points [N, 3], float (metres) or integer (voxels already).
 
@@ -93,10 +119,14 @@ def choose_quantization(
         voxel_size: edge of a voxel before scaling; None: 1 for integers, else the cloud's longest side over 2^bits - 1.
         geometry_scale: finer (above 1) or coarser.
         box: lowest and highest corner to clip to; None: that of the points.
+        unit: length of a step of integer positions, metres; None: they are no lengths.
+        shift: where integer position 0 stands, metres.
 
     Raises:
-        ConfigError: a grid of more than 21 bits.
+        ConfigError: a grid of more than 21 bits, or a unit for positions that are no integers.
     """
+    if unit is not None and not np.issubdtype(points.dtype, np.integer):
+        raise ConfigError("CodecSettings.unit goes with integer positions")
     low, high = (np.asarray(corner, np.float64) for corner in box or _extent(points))
     integers = np.issubdtype(points.dtype, np.integer)
     if voxel_size is None:
@@ -118,4 +148,5 @@ def choose_quantization(
     # A point of an integer grid stands for itself; at a coarser scale, a voxel for the mean of the integers in it.
     centre = max(0.0, 0.5 * (1 - scale)) if integers else 0.5
     x, y, z = (int(v) for v in first)
-    return Quantization(scale, (x, y, z), (int(extent[0]), int(extent[1]), int(extent[2])), centre, not integers)
+    return Quantization(scale, (x, y, z), (int(extent[0]), int(extent[1]), int(extent[2])), centre,
+                        unit is not None or not integers, unit or 1.0, shift)  # fmt: skip

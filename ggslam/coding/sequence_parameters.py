@@ -12,7 +12,7 @@ from ggslam.errors import FormatError
 KNOWN_LABELS = ("color", "reflectance", "opacity", "frame_index", "frame_number", "material", "normal")
 MAX_ATTRIBUTES = 255
 """Attributes of a stream that are supported."""
-CICP_PARAMETER = 2
+CICP_PARAMETER, SCALING_PARAMETER = 2, 3
 MATRIX_IDENTITY, MATRIX_BT709 = 0, 1
 _SECOND_EDITION = "a damaged stream, or one of a draft of the second edition, which is not supported"
 
@@ -22,6 +22,7 @@ class AttributeDescription:
     """One attribute as the sequence parameter set lists it.
 
     `matrix` is the colour matrix (ISO/IEC 23091-2): 0 components are G, B, R; 1 BT.709 Y, Cb, Cr; None: not said.
+    A value is offset + (coded scale >> fraction_bits).
     """
 
     label: str
@@ -30,6 +31,18 @@ class AttributeDescription:
     instance: int = 0
     matrix: int | None = None
     full_range: bool = True
+    offset: int = 0
+    scale: int = 1
+    fraction_bits: int = 0
+
+    @property
+    def scaled(self) -> bool:
+        """Whether values differ from what is coded."""
+        return (self.offset, self.scale, self.fraction_bits) != (0, 1, 0)
+
+    def reach(self) -> tuple[int, int]:
+        """Lowest and highest value."""
+        return self.offset, self.offset + (((1 << self.bit_depth) - 1) * self.scale >> self.fraction_bits)
 
 
 @dataclass(frozen=True)
@@ -164,7 +177,7 @@ def _write_attribute(w: BitWriter, attribute: AttributeDescription) -> None:
     w.ue(attribute.bit_depth - 1)
     w.flag(True)
     w.ue(KNOWN_LABELS.index(attribute.label))
-    w.ue(0 if attribute.matrix is None else 1)
+    w.ue((attribute.matrix is not None) + attribute.scaled)
     w.align()
     if attribute.matrix is not None:
         body = BitWriter()
@@ -172,10 +185,23 @@ def _write_attribute(w: BitWriter, attribute: AttributeDescription) -> None:
         body.ue(2)
         body.ue(attribute.matrix)
         body.flag(attribute.full_range)
-        w.u(8, CICP_PARAMETER)
-        w.u(8, len(body.data()))
-        for byte in body.data():
-            w.u(8, byte)
+        _write_parameter(w, CICP_PARAMETER, body)
+    if attribute.scaled:
+        body = BitWriter()
+        for value, sign in ((attribute.offset, True), (attribute.scale - 1, False)):
+            bits = abs(value).bit_length()
+            body.ue(bits)
+            body.s(bits, value) if sign else body.u(bits, value)
+        body.ue(attribute.fraction_bits)
+        _write_parameter(w, SCALING_PARAMETER, body)
+
+
+def _write_parameter(w: BitWriter, kind: int, body: BitWriter) -> None:
+    data = body.data()
+    w.u(8, kind)
+    w.u(8, len(data))
+    for byte in data:
+        w.u(8, byte)
 
 
 def _read_attribute(r: BitReader) -> AttributeDescription:
@@ -191,15 +217,17 @@ def _read_attribute(r: BitReader) -> AttributeDescription:
     if count > 255:
         raise FormatError(f"attribute {name} has {count} parameters: {_SECOND_EDITION}")
     r.align()
-    matrix, full_range = None, True
+    description = AttributeDescription(name, components, bit_depth, instance)
     for _ in range(count):
-        kind, body = r.u(8), b""
+        kind = r.u(8)
         body = bytes(r.u(8) for _ in range(r.u(8)))
         if kind == CICP_PARAMETER:
             matrix, full_range = _read_cicp(body)
-        elif kind == 3:
-            raise FormatError(f"attribute {name} is scaled by the stream (attribute scaling), which is not supported")
-    return AttributeDescription(name, components, bit_depth, instance, matrix, full_range)
+            description = replace(description, matrix=matrix, full_range=full_range)
+        elif kind == SCALING_PARAMETER:
+            offset, scale, fraction_bits = _read_scaling(body)
+            description = replace(description, offset=offset, scale=scale, fraction_bits=fraction_bits)
+    return description
 
 
 def _read_cicp(body: bytes) -> tuple[int, bool]:
@@ -209,3 +237,17 @@ def _read_cicp(body: bytes) -> tuple[int, bool]:
     matrix, full_range = r.ue(), r.flag()
     r.finish()
     return matrix, full_range
+
+
+def _read_scaling(body: bytes) -> tuple[int, int, int]:
+    """Offset, scale, bits of the fraction."""
+    r = BitReader(body, "the scale of an attribute")
+    bits = r.ue()
+    offset = r.s(bits) if bits <= 31 else 1 << 31
+    bits = r.ue()
+    scale = 1 + r.u(bits) if bits <= 31 else 1 << 31
+    fraction_bits = r.ue()
+    r.finish()
+    if max(abs(offset), scale) > 1 << 30 or fraction_bits > 30:
+        raise FormatError(f"an attribute has an impossible scale: {_SECOND_EDITION}")
+    return offset, scale, fraction_bits

@@ -32,10 +32,19 @@ class AttributeSettings:
     """ycbcr: BT.709, 8 bits; identity: components G, B, R; none: components as they are. None: ycbcr for 3 components
     of uint8, else none."""
     label: str | None = None
-    """The standard's label: color, reflectance, opacity, frame_index, frame_number, material or normal. None: the
-    attribute's name if it is one of them, else color for 3 components and reflectance for 1."""
+    """The standard's label: color, reflectance, opacity, frame_index, frame_number, material or normal. None: color
+    for 3 components, reflectance for 1, which other decoders read (the reference decoder breaks at the others). The
+    attribute's name travels beside it."""
+    offset: int = setting(0, -(1 << 30), 1 << 30)
+    """Values are `offset` + `scale` times what is coded; every decoder undoes that."""
+    scale: int = setting(1, 1, 1 << 24)
+    """See `offset`; above 1 values are rounded to multiples."""
     lossless: bool = False
     """Whole values of one component (ids) that come back exactly; `qp` and `bit_depth` are then not used."""
+
+    def __post_init__(self) -> None:
+        if self.lossless and (self.scale, self.offset) != (1, 0):
+            raise Conflict("lossless", "goes without scale and offset")
 
 
 @settings_class(frozen=True)
@@ -50,6 +59,10 @@ class CodecSettings:
     """Voxels per input voxel, along an axis: 0.5 codes positions at half the resolution."""
     voxel_size: float | None = setting(None, 1e-12, 1e12, "m")
     """Edge of an input voxel; None: 1 for integer positions, else from `geometry_bits`."""
+    unit: float | None = setting(None, 1e-12, 1e12, "m")
+    """Length of a step of integer positions; None: they are no lengths. The stream tells it."""
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where integer position 0 stands, metres (with `unit`)."""
     geometry_bits: int = setting(10, 1, 21, "bits")
     """Bits of the longest side of a cloud whose positions are no whole numbers, if `voxel_size` is None."""
     box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
@@ -73,9 +86,9 @@ class CodecSettings:
     """Nodes with an edge below 2^this are predicted from their 26 neighbours; 0: none."""
     raht_prediction: bool = True
     """Attributes are predicted from the octree level above."""
-    rdoq: float = setting(0.0, 0, 100)
+    rdoq: float = setting(1.0, 0, 100)
     """Rate-distortion optimised quantisation: weight of a bit against the squared error when the encoder drops
-    coefficients; 0: it drops none."""
+    coefficients, 1 as the reference encoder has it; 0: it drops none."""
     attributes: Mapping[str, AttributeSettings] = field(default_factory=dict)
     """Settings of single attributes, by name."""
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -86,6 +99,8 @@ class CodecSettings:
             corners = np.asarray(self.box, np.float64)
             if corners.shape != (2, 3) or not np.isfinite(corners).all() or not (corners[0] <= corners[1]).all():
                 raise Conflict("box", f"expected a lowest and a highest corner, found {self.box!r}")
+        if not np.isfinite(self.shift).all():
+            raise Conflict("shift", f"expected finite numbers, found {self.shift!r}")
 
     def attribute(self, name: str) -> AttributeSettings:
         """Settings of one attribute."""

@@ -158,11 +158,19 @@ def raht_settings(
     bit_depth: int,
     deltas: tuple[int, int] = (0, 0),
     rdoq: float = 0.0,
+    first_version: bool = False,
 ) -> RahtSettings:
-    """What the attribute coder depends on, of an attribute with these components."""
+    """What the attribute coder depends on, of an attribute with these components.
+
+    Args:
+        deltas: of a slice, added to the quantiser parameters.
+        rdoq: `CodecSettings.rdoq`.
+        first_version: the stream has the first version's square roots of large weights.
+    """
     first, others = parameters.qps(bit_depth, deltas)
     return RahtSettings(
-        components, bit_depth, first, others, int(parameters.prediction), *parameters.thresholds, rdoq
+        components, bit_depth, first, others, int(parameters.prediction), *parameters.thresholds,
+        int(first_version), rdoq,
     )  # fmt: skip
 
 

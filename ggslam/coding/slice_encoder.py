@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,9 +21,6 @@ from ggslam.coding.syntax import AttributeHeader, AttributeParameters, GeometryH
 from ggslam.coding.user_data import write_user_data
 from ggslam.errors import ConfigError
 
-DENSE_POINTS_PER_NODE = 1.5
-"""Occupied voxels per occupied cube of 4 x 4 x 4 above which neighbours give useful contexts."""
-
 
 @dataclass(frozen=True)
 class CloudToCode:
@@ -34,6 +31,7 @@ class CloudToCode:
     slice_numbers: np.ndarray | None
     plans: list[tuple[CodedAttribute, AttributeParameters]]
     sequence: SequenceParameters
+    geometry: GeometryParameters
     quantization: Quantization
     settings: CodecSettings
     reconstruct: bool
@@ -45,21 +43,8 @@ class CodedSlice:
 
     data: bytes
     report: SliceReport
-    geometry: GeometryParameters
     grid_points: np.ndarray | None
     attributes: dict[str, np.ndarray] | None
-
-
-def geometry_parameters(settings: CodecSettings, unique: bool, dense: bool) -> GeometryParameters:
-    """The parameter set for slices of a kind; each kind has its own id."""
-    boundary = settings.neighbour_boundary
-    if boundary is None:
-        boundary = 8 if dense else 0
-    near = boundary > 0
-    identity = 2 * int(not unique) + int(not near)
-    return GeometryParameters(
-        unique, boundary, near and settings.adjacent_child, settings.intra_prediction_size if near else 0, identity
-    )
 
 
 def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
@@ -80,9 +65,8 @@ def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
         coder.merge()
     if coder.points > MAX_SLICE_POINTS:
         raise ConfigError(f"{coder.points} points lie in one voxel: merge duplicates or choose smaller voxels")
-    geometry = geometry_parameters(settings, coder.leaves == coder.points, _is_dense(coder))
+    geometry = cloud.geometry
     header = GeometryHeader(number, (int(origin[0]), int(origin[1]), int(origin[2])), depth, coder.points)
-    header = replace(header, geometry_id=geometry.geometry_id)
     payload = header.write(cloud.sequence, geometry) + coder.encode_geometry(geometry) + header.footer()
     units = [unit_bytes(UnitType.GEOMETRY, payload)]
     if rows is not None:
@@ -99,11 +83,7 @@ def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
     report = SliceReport(
         number, coder.points, len(units[0]), sizes, len(data) - attribute_end, time.perf_counter() - start
     )
-    return CodedSlice(data, report, geometry, positions, reconstructed if cloud.reconstruct else None)
-
-
-def _is_dense(coder: SliceCoder) -> bool:
-    return coder.depth < 3 or coder.leaves > DENSE_POINTS_PER_NODE * coder.nodes(coder.depth - 2)
+    return CodedSlice(data, report, positions, reconstructed if cloud.reconstruct else None)
 
 
 def _encode_attributes(

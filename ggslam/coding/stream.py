@@ -14,7 +14,7 @@ from ggslam.coding.quantization import Quantization
 from ggslam.coding.sequence_parameters import MATRIX_BT709, MATRIX_IDENTITY, SequenceParameters
 from ggslam.coding.slice_coder import MAX_SLICE_POINTS
 from ggslam.coding.syntax import AttributeHeader, AttributeParameters, GeometryHeader, GeometryParameters
-from ggslam.coding.user_data import read_user_data
+from ggslam.coding.user_data import read_user_data, version_of
 from ggslam.errors import FormatError
 
 # An adaptive bin costs at least 0.0056 bits, and a point of a slice without duplicates at least a bin: no stream can
@@ -59,6 +59,12 @@ class CodedStream:
     side: dict[str, Any]
     attributes: list[CodedAttribute]
     quantization: Quantization
+    version: int | None
+
+    @property
+    def first_version(self) -> bool:
+        """Whether the first version of this codec wrote it."""
+        return self.version == 1
 
 
 class _Parser:
@@ -68,6 +74,7 @@ class _Parser:
         self.attribute: dict[int, AttributeParameters] = {}
         self.slices: list[CodedSliceUnits] = []
         self.side: dict[str, Any] = {}
+        self.version: int | None = None
 
     def unit(self, unit: Unit) -> None:
         kind = unit.kind
@@ -123,6 +130,7 @@ class _Parser:
 
     def _user_data(self, unit: Unit) -> None:
         content = read_user_data(unit.payload)
+        self.version = version_of(unit.payload) or self.version
         corrections = content.get("corrections")
         if not isinstance(corrections, dict):
             self.side.update(content)
@@ -152,8 +160,12 @@ def read_stream(data: bytes | memoryview) -> CodedStream:
         if missing:
             raise FormatError(f"slice {units.header.slice_id} lacks attribute {min(missing)}")
     attributes = _attributes(parser.sequence, parser.side)
+    version = parser.version
+    # The reference encoder counts frames in one bit, as this codec does since its second version.
+    if version is None and parser.sequence.frame_counter_bits == parser.sequence.slice_tag_bits == 0:
+        version = 1
     return CodedStream(
-        parser.sequence, parser.slices, parser.side, attributes, _quantization(parser.sequence, parser.side)
+        parser.sequence, parser.slices, parser.side, attributes, _quantization(parser.sequence, parser.side), version
     )
 
 
@@ -186,8 +198,38 @@ def _table(name: str, content: Any) -> IdTable:
 def _quantization(sequence: SequenceParameters, side: dict[str, Any]) -> Quantization:
     scale, centre = side.get("scale"), side.get("centre", 0.0)
     if scale is None:
-        scale = float(sequence.resolution / sequence.global_scale)
+        scale = float(sequence.resolution)
     if not isinstance(scale, float) or not isinstance(centre, float) or not 0 < scale < 1e300 or abs(centre) > 1:
         raise FormatError("the scale of the positions is damaged")
     x, y, z = (v << sequence.offset_log2_scale for v in sequence.offset)
-    return Quantization(scale, (x, y, z), sequence.size, centre, sequence.metres)
+    unit, shift, metres = 1.0, _numbers(side.get("shift"), "the origin of the positions"), sequence.metres
+    metadata = side.get("metadata")
+    if isinstance(metadata, dict) and metadata.get("grid") is not None:  # streams of the first version
+        unit, shift, metres = *_place(metadata["grid"]), True
+    return Quantization(
+        scale, (x, y, z), sequence.size, centre, metres, unit, shift, float(sequence.global_scale)
+    )  # fmt: skip
+
+
+def _place(grid: Any) -> tuple[float, tuple[float, float, float]]:
+    """Voxel size and origin."""
+    what = "the place of the grid in the stream's metadata"
+    if not isinstance(grid, dict) or "origin" not in grid:
+        raise FormatError(f"{what} is damaged")
+    voxel_size = grid.get("voxel_size")
+    if not isinstance(voxel_size, (int, float)) or not 1e-12 < voxel_size < 1e12:
+        raise FormatError(f"{what} is damaged")
+    return float(voxel_size), _numbers(grid["origin"], what)
+
+
+def _numbers(values: Any, what: str) -> tuple[float, float, float]:
+    """Three numbers; zeros for None."""
+    if values is None:
+        return 0.0, 0.0, 0.0
+    try:
+        x, y, z = (float(value) for value in values)
+    except (TypeError, ValueError, OverflowError):
+        raise FormatError(f"{what} is damaged") from None
+    if not all(abs(value) < 1e12 for value in (x, y, z)):
+        raise FormatError(f"{what} is damaged")
+    return x, y, z

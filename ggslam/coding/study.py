@@ -20,10 +20,11 @@ from ggslam.coding.cloud import PointCloud
 from ggslam.coding.decoder import decode_cloud
 from ggslam.coding.encoder import encode_cloud
 from ggslam.coding.energy import EnergyMeter
-from ggslam.coding.metrics import CloudPair, ColorQuality, color_quality, estimate_normals, matching_rows
+from ggslam.coding.metrics import CloudPair, ColorQuality, color_quality, matching_rows
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.settings import CodecSettings
 from ggslam.errors import ConfigError
+from ggslam.geometry.normals import estimate_normals
 
 Result = TypeVar("Result")
 FINEST_QP = 4

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the standard has no field for, in user data units: names of attributes, the exact scale, tables of ids.
 
-A unit is a signature, then deflated JSON. Decoders that do not know the signature skip the unit.
+A unit is a signature with the version of the stream, then deflated JSON. Decoders that do not know the signature skip
+the unit. Streams of version 1 have square roots of their own for weights above 65,536 (see fixed_point.hpp).
 """
 
 from __future__ import annotations
@@ -12,13 +13,21 @@ from typing import Any
 
 from ggslam.errors import FormatError
 
-_SIGNATURE = b"ggslam-1"
+VERSION = 2
+_SIGNATURES = {b"ggslam-1": 1, b"ggslam-2": VERSION}
+_SIGNATURE_BYTES = 8
+_SIGNATURE = b"ggslam-2"
 _MAX_BYTES = 1 << 24
 
 
 def write_user_data(content: dict[str, Any]) -> bytes:
     """Payload of a unit with this content."""
     return _SIGNATURE + zlib.compress(json.dumps(content, separators=(",", ":")).encode(), 9)
+
+
+def version_of(payload: bytes | memoryview) -> int | None:
+    """Version of the stream that a unit belongs to; None if the unit is somebody else's."""
+    return _SIGNATURES.get(bytes(payload[:_SIGNATURE_BYTES]))
 
 
 def read_user_data(payload: bytes | memoryview) -> dict[str, Any]:
@@ -28,11 +37,11 @@ def read_user_data(payload: bytes | memoryview) -> dict[str, Any]:
         FormatError: ours, but damaged.
     """
     data = bytes(payload)
-    if not data.startswith(_SIGNATURE):
+    if version_of(data) is None:
         return {}
     inflater = zlib.decompressobj()
     try:
-        content = json.loads(inflater.decompress(data[len(_SIGNATURE) :], _MAX_BYTES))
+        content = json.loads(inflater.decompress(data[_SIGNATURE_BYTES:], _MAX_BYTES))
     except (zlib.error, ValueError, RecursionError) as error:
         raise FormatError(f"a user data unit is damaged: {error}") from None
     if not isinstance(content, dict) or not inflater.eof:

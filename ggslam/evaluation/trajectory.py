@@ -16,7 +16,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.trajectory import read_trajectory
-from ggslam.scene.poses import inverse
+from ggslam.scene.poses import fit_similarity, inverse
 
 FEWEST_POSES = 3
 """Fewer positions than this can be laid upon anything."""
@@ -64,17 +64,8 @@ def align_points(source: np.ndarray, target: np.ndarray, with_scale: bool = Fals
     """
     if source.shape != target.shape or source.ndim != 2 or len(source) < FEWEST_POSES:
         raise ValueError(f"expected two sets of at least {FEWEST_POSES} points, found {source.shape}, {target.shape}")
-    source_mean, target_mean = source.mean(0), target.mean(0)
-    a, b = source - source_mean, target - target_mean
-    U, singular, Vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])  # no reflections
-    R = U @ np.diag(signs) @ Vt
-    spread = float((a * a).sum())
-    scale = float(singular @ signs) / spread if with_scale and spread > 0 else 1.0
-    T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = target_mean - scale * R @ source_mean
-    return T, scale
+    T, scale = fit_similarity(source, target, with_scale)
+    return T, float(scale)
 
 
 def score_trajectory(

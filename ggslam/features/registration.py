@@ -16,7 +16,7 @@ import numpy as np
 
 from ggslam.features.orb import Landmarks
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import inverse
+from ggslam.scene.poses import fit_similarity, inverse
 from ggslam.system.settings import setting, settings_class
 
 FEWEST = 6
@@ -56,7 +56,7 @@ class Matches:
     def __len__(self) -> int:
         return len(self.old)
 
-    def agreeing(
+    def agree(
         self, T_old_new: np.ndarray, camera: Camera, settings: RegistrationSettings, slack: float = 1.0
     ) -> np.ndarray:
         """Which matches a pose [..., 4, 4] explains, bool [..., m]; `slack` widens both limits."""
@@ -120,14 +120,14 @@ def register(old: Landmarks, new: Landmarks, camera: Camera, settings: Registrat
     hypotheses = _hypotheses(matches, settings) if len(matches) >= FEWEST else np.zeros((0, 4, 4))
     if not len(hypotheses):
         return nothing
-    agreeing = matches.agreeing(hypotheses, camera, settings, slack=2.0)
+    agreeing = matches.agree(hypotheses, camera, settings, slack=2.0)
     best = int(agreeing.sum(1).argmax())
     T, inliers = hypotheses[best], agreeing[best]
     for _ in range(3):
         if inliers.sum() < FEWEST:
             return nothing
-        T = _refined(T, matches, inliers, camera)
-        inliers = matches.agreeing(T, camera, settings)
+        T = _refine(T, matches, inliers, camera)
+        inliers = matches.agree(T, camera, settings)
     return Registration(T, matches, inliers)
 
 
@@ -139,16 +139,10 @@ def _hypotheses(matches: Matches, settings: RegistrationSettings) -> np.ndarray:
     alike = np.abs(sides - others) < _ALIKE_SHARE * np.maximum(sides, others) + _ALIKE_CONSTANT
     chosen = alike.all(1) & (sides.min(1) > 0.1)  # a small triangle says little about rotation
     a, b = a[chosen], b[chosen]
-    a_mean, b_mean = a.mean(1, keepdims=True), b.mean(1, keepdims=True)
-    U, _, Vt = np.linalg.svd(np.swapaxes(a - a_mean, 1, 2) @ (b - b_mean))
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]  # no reflections
-    T = np.tile(np.eye(4), (len(a), 1, 1))
-    T[:, :3, :3] = U @ Vt
-    T[:, :3, 3] = a_mean[:, 0] - np.einsum("nij,nj->ni", T[:, :3, :3], b_mean[:, 0])
-    return T
+    return fit_similarity(b, a)[0]
 
 
-def _refined(T_old_new: np.ndarray, matches: Matches, inliers: np.ndarray, camera: Camera) -> np.ndarray:
+def _refine(T_old_new: np.ndarray, matches: Matches, inliers: np.ndarray, camera: Camera) -> np.ndarray:
     """The pose with the smallest reprojection error of the inliers near a first one."""
     T = inverse(T_old_new)
     rotation, translation = cv2.solvePnPRefineLM(

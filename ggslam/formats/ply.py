@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.formats.ply_header import FORMATS, PLY_NAMES, Element, Header, read_header
+from ggslam.formats.ply_header import FORMATS, PLY_NAMES, SIZED_NAMES, Element, Header, read_header
 from ggslam.formats.text_numbers import fit, parse_numbers
 from ggslam.system.atomic import atomic_write
 
@@ -54,8 +54,9 @@ def read_ply(path: str | Path) -> PlyFile:
 
 
 def write_ply(
-    path: str | Path, elements: Mapping[str, np.ndarray], comments: Sequence[str] = (), fsync: bool = False
-) -> None:
+    path: str | Path, elements: Mapping[str, np.ndarray], comments: Sequence[str] = (), fsync: bool = False,
+    sized_names: bool = False,
+) -> None:  # fmt: skip
     """Writes a binary little-endian PLY file, atomically (see `ggslam.system.atomic.atomic_write`).
 
     Args:
@@ -64,25 +65,28 @@ def write_ply(
             scalar properties; a field of shape [k], k < 256, becomes a list property.
         comments: single lines for the header, ASCII.
         fsync: also waits for the disk.
+        sized_names: types are called int32 and float64, not int and double, as tools for point clouds want them; splat
+            viewers want the others.
 
     Raises:
         ValueError: a name, type or comment that PLY cannot express.
         RunFolderError: the file cannot be written.
     """
     with atomic_write(path, fsync) as temporary, temporary.open("wb") as file:
-        file.write(_header({name: (len(rows), rows.dtype) for name, rows in elements.items()}, comments))
+        kinds = {name: (len(rows), rows.dtype) for name, rows in elements.items()}
+        file.write(_header(kinds, comments, sized_names))
         for rows in elements.values():
             file.write(_pack(rows).tobytes())
 
 
 def write_ply_parts(
     path: str | Path, element: str, count: int, parts: Iterable[np.ndarray], dtype: np.dtype,
-    comments: Sequence[str] = (),
+    comments: Sequence[str] = (), sized_names: bool = False,
 ) -> None:  # fmt: skip
     """Writes a file of one element whose rows come in parts, atomically, so that they are never all in memory.
 
     Args:
-        path, comments: as in `write_ply`.
+        path, comments, sized_names: as in `write_ply`.
         element: its name ("vertex").
         count: rows of all parts together.
         parts: structured arrays of type `dtype`.
@@ -93,7 +97,7 @@ def write_ply_parts(
     """
     written = 0
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(_header({element: (count, dtype)}, comments))
+        file.write(_header({element: (count, dtype)}, comments, sized_names))
         for rows in parts:
             file.write(_pack(rows).tobytes())
             written += len(rows)
@@ -101,13 +105,14 @@ def write_ply_parts(
             raise ValueError(f"{path}: {written} rows were given, {count} were announced")
 
 
-def _header(elements: Mapping[str, tuple[int, np.dtype]], comments: Sequence[str]) -> bytes:
+def _header(elements: Mapping[str, tuple[int, np.dtype]], comments: Sequence[str], sized_names: bool) -> bytes:
     for text in comments:
         if not text.isascii() or not text.isprintable():
             raise ValueError(f"a PLY comment must be one line of ASCII, found {text!r}")
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    types = SIZED_NAMES if sized_names else PLY_NAMES
     for name, (count, dtype) in elements.items():
-        lines += [f"element {_checked_name(name)} {count}", *_declarations(dtype)]
+        lines += [f"element {_checked_name(name)} {count}", *_declarations(dtype, types)]
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
@@ -117,17 +122,17 @@ def _checked_name(name: str) -> str:
     return name
 
 
-def _declarations(dtype: np.dtype) -> Iterator[str]:
-    """Property lines of a structured type."""
+def _declarations(dtype: np.dtype, names: Mapping[str, str]) -> Iterator[str]:
+    """Property lines of a structured type, whose types have these names."""
     if not dtype.names:
         raise ValueError(f"a PLY element needs a structured array, found {dtype}")
     for name in dtype.names:
         base, shape = dtype[name].base, dtype[name].shape
         code = base.str[1:]
-        if code not in PLY_NAMES or len(shape) > 1 or (shape and shape[0] > 255):
+        if code not in names or len(shape) > 1 or (shape and shape[0] > 255):
             raise ValueError(f"PLY has no type for field '{name}' ({dtype[name]})")
         listed = "list uchar " if shape else ""
-        yield f"property {listed}{PLY_NAMES[code]} {_checked_name(name)}"
+        yield f"property {listed}{names[code]} {_checked_name(name)}"
 
 
 def _pack(rows: np.ndarray) -> np.ndarray:

@@ -25,6 +25,9 @@ NUMPY_CODES = {
 PLY_NAMES = {code: name for name, code in reversed(NUMPY_CODES.items())}
 """The classic name of each numpy type code."""
 
+SIZED_NAMES = {**PLY_NAMES, "i2": "int16", "u2": "uint16", "i4": "int32", "u4": "uint32", "f8": "float64"}
+"""Names that every reader of point clouds knows: the G-PCC reference software has no other ones of these types."""
+
 
 @dataclass(frozen=True)
 class Property:

@@ -24,6 +24,7 @@ COLORS = ("red", "green", "blue")
 _COLOR_NAMES = (COLORS, ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _GAUSSIAN_COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
 _PACKED_COLORS = ("rgb", "rgba")
+_REFLECTANCE = ("reflectance", "refc", "intensity", "scalar_intensity")
 _ALPHA = {"alpha", "a", "diffuse_alpha"}
 _WRITTEN_INTEGERS = ("u1", "i2", "u2", "i4", "u4")
 
@@ -36,6 +37,7 @@ class ColoredCloud:
         points: float64 [N, 3], metres (or the file's own unit), all finite.
         colors: uint8 [N, 3] RGB, or None.
         labels: whole numbers by name, each [N].
+        reflectance: numbers [N] that say how much light came back, or None; `reflectance_name` is the file's own name.
         grid: int32 [N, 3], where the points lie on their grid, if the file is a voxelised cloud that ggslam wrote.
         voxel_size: edge of the grid's voxels in metres; points = origin + voxel_size * grid.
         origin: float64 [3], metres.
@@ -51,6 +53,8 @@ class ColoredCloud:
     origin: np.ndarray | None = None
     left_out: tuple[str, ...] = ()
     nowhere: int = 0
+    reflectance: np.ndarray | None = None
+    reflectance_name: str = "reflectance"
 
     def __len__(self) -> int:
         return len(self.points)
@@ -115,7 +119,7 @@ def write_point_cloud(
     rows = np.empty(len(points), [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         rows[name] = values
-    write_ply(path, {"vertex": rows}, comments)
+    write_ply(path, {"vertex": rows}, comments, sized_names=True)
 
 
 def _to_written_type(path: str | Path, name: str, values: np.ndarray) -> np.ndarray:
@@ -145,14 +149,18 @@ def _cloud(path: Path, rows: np.ndarray, comments: list[str]) -> ColoredCloud:
         raise FormatError(f"{path}: point {row} is {points[row].tolist()}, expected finite numbers")
     color_names = _color_names(rows)
     colors = None if color_names is None else _colors(path, rows, color_names)
-    used = {"x", "y", "z", *(color_names or ())}
+    reflectance = _reflectance_name(rows)
+    used = {"x", "y", "z", *(color_names or ()), *((reflectance,) if reflectance else ())}
     others = [n for n in rows.dtype.names or () if n not in used]
     labels = {n: rows[n] for n in others if rows.dtype[n].kind in "iu" and n.lower() not in _ALPHA}
     left_out = tuple(n for n in others if n not in labels)
+    cloud = ColoredCloud(points, colors, labels, left_out=left_out)
+    if reflectance is not None:
+        cloud = replace(cloud, reflectance=rows[reflectance], reflectance_name=reflectance)
     if not any(text.split()[:1] == ["voxel_size"] for text in comments):
-        return ColoredCloud(points, colors, labels, left_out=left_out)
+        return cloud
     grid, voxel_size, origin = grid_positions(path, comments, position)
-    return ColoredCloud(origin + voxel_size * grid, colors, labels, grid, voxel_size, origin, left_out)
+    return replace(cloud, points=origin + voxel_size * grid, grid=grid, voxel_size=voxel_size, origin=origin)
 
 
 def _columns_of(path: Path, rows: np.ndarray, names: Sequence[str], reason: str) -> list[np.ndarray]:
@@ -168,6 +176,14 @@ def _color_names(rows: np.ndarray) -> tuple[str, ...] | None:
     for names in (*_COLOR_NAMES, _GAUSSIAN_COLOR, *((name,) for name in _PACKED_COLORS)):
         if all(name in present for name in names):
             return tuple(present[name] for name in names)
+    return None
+
+
+def _reflectance_name(rows: np.ndarray) -> str | None:
+    """Which of the properties is the reflectance: finite numbers."""
+    for name in rows.dtype.names or ():
+        if name.lower() in _REFLECTANCE and not rows.dtype[name].shape and rows.dtype[name].kind in "fiu":
+            return name if np.isfinite(rows[name]).all() else None
     return None
 
 

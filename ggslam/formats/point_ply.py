@@ -49,10 +49,11 @@ def write_points_in_parts(folder: str | Path, clouds: Iterable[VoxelCloud]) -> i
     folder = Path(folder)
     with _temporary_file(folder) as raw:  # until all parts are there, the corner is not known
         whole, count, dtype = _gathered(raw, clouds)
-        for name, meaning, code in ((METRIC_FILE, _METRIC, "f4"), (GRID_FILE, _GRID, "i4")):
-            rows = (_vertices(c.points if code == "f4" else c.grid, code, c) for c in _read_back(raw, whole, dtype))
-            empty = _vertices(np.empty((0, 3)), code, whole)
-            write_ply_parts(folder / name, "vertex", count, rows, empty.dtype, _comments(whole, meaning))
+        for name, meaning, in_cells in ((METRIC_FILE, _METRIC, False), (GRID_FILE, _GRID, True)):
+            clouds_again = _read_back(raw, whole, dtype)
+            rows = (_vertices(c.grid if in_cells else c.points, "f4", c) for c in clouds_again)
+            empty = _vertices(np.empty((0, 3)), "f4", whole)
+            write_ply_parts(folder / name, "vertex", count, rows, empty.dtype, _comments(whole, meaning), True)
     return count
 
 
@@ -94,16 +95,17 @@ def _read_back(raw: IO[bytes], whole: VoxelCloud, dtype: np.dtype) -> Iterator[V
 
 def write_metric_points(path: str | Path, cloud: VoxelCloud) -> None:
     """Writes positions as float32 metres with uint8 colours; raises RunFolderError if that fails."""
-    write_ply(path, {"vertex": _vertices(cloud.points, "f4", cloud)}, _comments(cloud, _METRIC))
+    write_ply(path, {"vertex": _vertices(cloud.points, "f4", cloud)}, _comments(cloud, _METRIC), sized_names=True)
 
 
 def write_grid_points(path: str | Path, cloud: VoxelCloud) -> None:
-    """Writes positions as int32 grid coordinates with uint8 colours; raises RunFolderError if that fails."""
-    write_ply(path, {"vertex": _vertices(cloud.grid, "i4", cloud)}, _comments(cloud, _GRID))
+    """Writes positions as grid coordinates, whole numbers in float32, with uint8 colours; raises RunFolderError if that
+    fails."""
+    write_ply(path, {"vertex": _vertices(cloud.grid, "f4", cloud)}, _comments(cloud, _GRID), sized_names=True)
 
 
 def read_points(path: str | Path) -> VoxelCloud:
-    """Reads either variant back; which one it is follows from the type of the coordinates.
+    """Reads either variant back; which one it is follows from the header.
 
     Raises:
         FormatError: not a cloud written by ggslam (properties or the comments with scale and origin missing).
@@ -124,16 +126,16 @@ def grid_positions(path: str | Path, comments: list[str], position: np.ndarray) 
     Args:
         path: the file, for messages.
         comments: of its header.
-        position: [N, 3] as stored: metres if floating-point numbers, else grid coordinates.
+        position: [N, 3] as stored: grid coordinates if they are integers or a comment says so, else metres.
 
     Raises:
         FormatError: the comments with scale and origin are missing or damaged.
     """
     voxel_size = float(_comment(path, comments, "voxel_size", 1)[0])
     origin = _comment(path, comments, "origin", 3)
-    if position.dtype.kind == "f":
-        position = np.rint((position - origin) / voxel_size)
-    return position.astype(np.int32), voxel_size, origin
+    if position.dtype.kind == "f" and _GRID not in comments:
+        position = (position - origin) / voxel_size
+    return np.rint(position).astype(np.int32), voxel_size, origin
 
 
 def _vertices(position: np.ndarray, code: str, cloud: VoxelCloud) -> np.ndarray:

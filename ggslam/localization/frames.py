@@ -20,10 +20,11 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transformed
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
+from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.noise import estimate_noise
-from ggslam.tracking.points import FramePoints, extract_points
+from ggslam.tracking.points import FramePoints, PointSource, extract_points
 from ggslam.tracking.settings import DepthNoise, TrackerSettings
-from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 _OUTCOMES = {
     TrackingStatus.FIRST: LocalizationStatus.LOST,
@@ -46,7 +47,7 @@ class LookUpSettings:
 
 
 class FrameTracker:
-    """Locates frames; see `Tracker`.
+    """Locates frames; see `GicpTracker`.
 
     Args:
         camera: of all frames.
@@ -61,17 +62,17 @@ class FrameTracker:
         self, camera: Camera, settings: TrackerSettings, context: NativeContext, T_world_camera: np.ndarray | None,
         places: StoredPlaces | None = None, look_up: LookUpSettings | None = None,
     ) -> None:  # fmt: skip
-        self.tracker = Tracker(camera, settings, context, T_world_camera)
+        self.tracker = GicpTracker(camera, settings, context, T_world_camera)
         self._places = places
         self._look_up = look_up or LookUpSettings()
-        self._tracked: tuple[Frame, FramePoints] | None = None
+        self._tracked: tuple[Frame, PointSource] | None = None
 
     def track(self, item: Frame, surface: Surface, target: GicpTarget) -> Tracked:
         """See `FrontEnd`."""
         self._aim(surface, target)
         found = self.tracker.track(item)
         self._tracked = item, found.points
-        return _tracked(found)
+        return _as_tracked(found)
 
     def look_up(self, item: Frame, surface: Surface) -> Tracked | None:
         """See `FrontEnd`."""
@@ -83,30 +84,30 @@ class FrameTracker:
         view = View(item.color, item.depth, np.eye(4))
         place = self._places.describe(view)
         for match, known in self._places.query(place, self._look_up.candidates):
-            alignment = self._verified(surface, LocalMap(place.landmarks, points.points), points, known)
+            alignment = self._verify(surface, LocalMap(place.landmarks, points.points), points, known)
             if alignment is None or surface.target is None:
                 continue
             self._aim(surface, surface.target)
-            return _tracked(self.tracker.relocate(view, points, alignment, f"looks like view {match.number // 2}"))
+            return _as_tracked(self.tracker.relocate(view, points, alignment, f"looks like view {match.number // 2}"))
         return None
 
     def _aim(self, surface: Surface, target: GicpTarget) -> None:
         self.tracker.set_target(target)
         settings = self.tracker.settings
-        if not surface.sided and settings.align.min_normal_dot > ANY_NORMAL:
+        if not surface.has_sides and settings.align.min_normal_dot > ANY_NORMAL:
             self.tracker.settings = replace(settings, align=replace(settings.align, min_normal_dot=ANY_NORMAL))
 
     def _points_of(self, frame: Frame) -> FramePoints:
         """The frame's points, as just tracked, or extracted now."""
         if self._tracked is not None and self._tracked[0] is frame:
-            return self._tracked[1]
+            return self._tracked[1].read()
         tracker = self.tracker
         if tracker.noise is None:
             tracker.noise = estimate_noise(frame.depth, tracker.camera)
         noise = tracker.noise or DepthNoise()
         return extract_points(frame.depth, tracker.camera, tracker.settings.points, noise, tracker.context)
 
-    def _verified(
+    def _verify(
         self, surface: Surface, new: LocalMap, points: FramePoints, known: StoredView
     ) -> AlignmentResult | None:
         """The frame's alignment to the map around a view, if it really is there."""
@@ -118,7 +119,7 @@ class FrameTracker:
         T_view_world, last = inverse(T_world_view), None
         noise = self.tracker.noise or DepthNoise()
 
-        def aligned(T_view_new: np.ndarray) -> AlignmentResult:
+        def align_at(T_view_new: np.ndarray) -> AlignmentResult:
             nonlocal last
             tracker = self.tracker
             guess = T_world_view @ T_view_new
@@ -129,9 +130,9 @@ class FrameTracker:
         voxels = target.voxels()["means"]
         near = voxels[np.linalg.norm(voxels - T_world_view[:3, 3], axis=1) <= self._look_up.reach]
         old = LocalMap(known.place.landmarks, transformed(near, T_view_world))
-        found = verify(old, new, self.tracker.camera, noise.sigma, aligned, self._look_up.verification)
+        found = verify(old, new, self.tracker.camera, noise.sigma, align_at, self._look_up.verification)
         return last if found.accepted else None
 
 
-def _tracked(found: TrackingResult) -> Tracked:
+def _as_tracked(found: TrackingResult) -> Tracked:
     return Tracked(found.T_world_camera, _OUTCOMES[found.status], found.overlap, found.rmse_m, found.reason)

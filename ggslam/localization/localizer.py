@@ -42,7 +42,7 @@ class LocalizationStatus(Enum):
     """The map has nothing within reach of where the sensor is believed to be."""
 
     @property
-    def located(self) -> bool:
+    def is_located(self) -> bool:
         """Whether the pose is one that was measured."""
         return self not in (LocalizationStatus.LOST, LocalizationStatus.OUTSIDE)
 
@@ -121,13 +121,13 @@ class Localizer(Generic[Item]):
         """Locates the next frame or scan.
 
         Raises:
-            FormatError: the index of the store is damaged. (Damaged cells are left out; see `Surface.damaged`.)
+            FormatError: the index of the store is damaged. (Damaged cells are left out; see `Surface.damage`.)
         """
         began = time.perf_counter()
         changed, map_seconds = self._move(), time.perf_counter() - began
         target = self.surface.target if self._pose is not None else None
         found = None if target is None else self.front_end.track(item, self.surface, target)
-        if found is None or not found.status.located:
+        if found is None or not found.status.is_located:
             found = self.front_end.look_up(item, self.surface) or found or self._outside()
         self._follow(found)
         spent = time.perf_counter() - began
@@ -152,7 +152,7 @@ class Localizer(Generic[Item]):
         return Tracked(self._pose.copy(), LocalizationStatus.OUTSIDE, 0.0, 0.0, reason)
 
     def _follow(self, found: Tracked) -> None:
-        if not found.status.located:
+        if not found.status.is_located:
             self._velocity, self._lost = np.eye(4), True
             return
         T = found.T_world_sensor
@@ -194,14 +194,14 @@ class ScanTracker:
         """See `FrontEnd`. Tries constant velocity, and if that does not convince, standing still."""
         best: AlignmentResult | None = None
         source = scan_points(item, self.settings.scan)
-        dot = self.settings.align.min_normal_dot if surface.sided else ANY_NORMAL
+        dot = self.settings.align.min_normal_dot if surface.has_sides else ANY_NORMAL
         settings = replace(self.settings.align, min_normal_dot=dot)
         noise = DepthNoise(self.settings.sigma, 0.0)
         for guess in (self._pose @ self._velocity, self._pose):
             found = align(source, target, guess, settings, noise, self._context)
             if best is None or (found.status is not AlignmentStatus.LOST and found.overlap > best.overlap):
                 best = found
-            if self._convincing(best):
+            if self._convinces(best):
                 break
         assert best is not None
         return self._outcome(best, len(source))
@@ -210,11 +210,11 @@ class ScanTracker:
         """See `FrontEnd`."""
         return None
 
-    def _convincing(self, found: AlignmentResult) -> bool:
+    def _convinces(self, found: AlignmentResult) -> bool:
         return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.min_overlap
 
     def _outcome(self, found: AlignmentResult, count: int) -> Tracked:
-        if not self._convincing(found):
+        if not self._convinces(found):
             self._velocity = np.eye(4)
             reason = f"{found.overlap:.0%} of {count} points match the map, {self.settings.min_overlap:.0%} needed"
             return Tracked(self._pose.copy(), LocalizationStatus.LOST, found.overlap, found.rmse, reason)

@@ -15,9 +15,9 @@ from types import TracebackType
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ggslam.errors import FormatError
+from ggslam.geometry.normals import estimate_normals
 from ggslam.native.loader import NativeContext
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import POINTS
@@ -59,7 +59,7 @@ def load_surface(store: GridStore, key: CellKey) -> tuple[np.ndarray, np.ndarray
     arrays = load_points(store, key)
     points = np.ascontiguousarray(arrays["points"], np.float32)
     if NORMAL not in arrays:
-        normals = estimated_normals(points)
+        normals = surface_normals(points)
         return points, np.where(normals @ _ANYWHERE < 0, -1, 1).astype(np.float32)[:, None] * normals, False
     stored = arrays[NORMAL].astype(np.float32)
     if stored.shape != points.shape:
@@ -71,10 +71,10 @@ def load_surface(store: GridStore, key: CellKey) -> tuple[np.ndarray, np.ndarray
 
 @dataclass(frozen=True)
 class SurfaceCell:
-    """A cell of the map as part of targets; `sided`: see `Surface`."""
+    """A cell of the map as part of targets; `has_sides`: see `Surface`."""
 
     part: TargetPart
-    sided: bool
+    has_sides: bool
 
 
 class SurfaceLoader:
@@ -85,13 +85,13 @@ class SurfaceLoader:
 
     def __call__(self, store: GridStore, key: CellKey) -> SurfaceCell:
         """Raises what `load_surface` raises."""
-        points, normals, sided = load_surface(store, key)
+        points, normals, has_sides = load_surface(store, key)
         turn = np.ascontiguousarray(quaternions_from_normals(normals), np.float32)
         flat = np.log(self.settings.voxel * np.array([1, 1, FLATNESS])).astype(np.float32)
         log_scales, opacity_logits = np.tile(flat, (len(points), 1)), np.full(len(points), _OPACITY_LOGIT, np.float32)
         rank = _rank(key)
         return SurfaceCell(
-            TargetPart(points, turn, log_scales, opacity_logits, self.settings, self.context, rank), sided
+            TargetPart(points, turn, log_scales, opacity_logits, self.settings, self.context, rank), has_sides
         )
 
 
@@ -101,14 +101,11 @@ def _rank(key: CellKey) -> int:
     return sum((coordinate & mask) << (_RANK_BITS * axis) for axis, coordinate in enumerate(key))
 
 
-def estimated_normals(points: np.ndarray) -> np.ndarray:
+def surface_normals(points: np.ndarray) -> np.ndarray:
     """Unit normals float32 [n, 3] of points [n, 3] from each one's nearest neighbours, of either sign."""
-    count = min(_NEIGHBOURS, len(points))
-    if count < 3:
+    if min(_NEIGHBOURS, len(points)) < 3:
         return np.tile(np.array([0, 0, 1], np.float32), (len(points), 1))
-    neighbours = points[cKDTree(points).query(points, count)[1]].astype(np.float64)
-    centred = neighbours - neighbours.mean(1, keepdims=True)
-    return np.linalg.eigh(centred.transpose(0, 2, 1) @ centred)[1][:, :, 0].astype(np.float32)
+    return estimate_normals(points, neighbours=_NEIGHBOURS).astype(np.float32)
 
 
 class Surface(Protocol):
@@ -123,11 +120,11 @@ class Surface(Protocol):
         """Points of the cells that the target is composed of."""
 
     @property
-    def sided(self) -> bool:
+    def has_sides(self) -> bool:
         """Whether normals point to the side that the sensor sees; else their signs mean nothing."""
 
     @property
-    def damaged(self) -> Iterable[str]:
+    def damage(self) -> Iterable[str]:
         """What is wrong with cells that were left out."""
 
     def move_to(self, position: np.ndarray, velocity: np.ndarray | None = None) -> bool:
@@ -153,10 +150,10 @@ class PartialSurface:
         loader = SurfaceLoader(settings, context)
         self.map = CellsAround(store, loader, POINTS, lambda cell: cell.part.nbytes, submaps)
         self.target: GicpTarget | None = None
-        self.sided = True
+        self.has_sides = True
         self.points = 0
         self._settings, self._context = settings, context
-        self.damaged: set[str] = set()
+        self.damage: set[str] = set()
         """What is wrong with cells that were within R' and cannot be read."""
 
     def move_to(self, position: np.ndarray, velocity: np.ndarray | None = None) -> bool:
@@ -164,10 +161,10 @@ class PartialSurface:
         status = self.map.update(position, velocity)
         if status is MapStatus.UNCHANGED:
             return False
-        self.damaged.update(self.map.damaged.values())
+        self.damage.update(self.map.damaged.values())
         cells = self.map.cells.values()
         self.points = sum(cell.part.count for cell in cells)
-        self.sided = all(cell.sided for cell in cells)
+        self.has_sides = all(cell.has_sides for cell in cells)
         before = self.target
         parts = [cell.part for cell in cells]
         self.target = composed_target(parts, self._settings, self._context, before) if self.points else None
@@ -192,8 +189,8 @@ class FullSurface:
     def __init__(self, store: GridStore, settings: TargetSettings, context: NativeContext) -> None:
         self.target: GicpTarget | None = None
         self.points = 0
-        self.sided = True
-        self.damaged: list[str] = []
+        self.has_sides = True
+        self.damage: list[str] = []
         self._store, self._settings, self._context = store, settings, context
         self._read = False
 
@@ -207,7 +204,7 @@ class FullSurface:
         self.points = sum(cell.part.count for cell in cells)
         if not self.points:
             return False
-        self.sided = all(cell.sided for cell in cells)
+        self.has_sides = all(cell.has_sides for cell in cells)
         self.target = composed_target([cell.part for cell in cells], self._settings, self._context)
         return True
 
@@ -218,7 +215,7 @@ class FullSurface:
         try:
             return loader(self._store, key)
         except FormatError as error:
-            self.damaged.append(str(error))
+            self.damage.append(str(error))
         except KeyError:  # a cell without points
             pass
         return None

@@ -17,7 +17,7 @@ import numpy as np
 from ggslam.features.orb import View
 from ggslam.localization.places import PLACES, StoredView, places_to_bytes, stored_views
 from ggslam.localization.scans import LaserScan
-from ggslam.localization.surface import NORMAL, estimated_normals, packed_normals
+from ggslam.localization.surface import NORMAL, packed_normals, surface_normals
 from ggslam.loops.places import PlaceIndex
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
@@ -90,7 +90,7 @@ class FrameSights:
         place = self._places.describe(View(item.color, item.depth, T_world_sensor))
         normals = found.normals @ T_world_sensor[:3, :3].T
         small = item.depth[::_STEP, ::_STEP].copy()
-        looked_at = partial(_looked_at, small, self.camera, inverse(T_world_sensor))
+        looked_at = partial(_in_view, small, self.camera, inverse(T_world_sensor))
         points = transformed(found.points, T_world_sensor)
         return Sight(points, normals, looked_at, StoredView(place, T_world_sensor))
 
@@ -105,13 +105,13 @@ class ScanSights:
         """What a scan adds."""
         seen = item.points[np.isfinite(item.points).all(1)].astype(np.float64)
         points = transformed(seen, T_world_sensor)
-        normals = estimated_normals(points)
+        normals = surface_normals(points)
         away = ((points - T_world_sensor[:3, 3]) * normals).sum(1) > 0
         normals[away] *= -1
         return Sight(points, normals, lambda others: np.ones(len(others), bool))
 
 
-def _looked_at(depth: np.ndarray, camera: Camera, T_camera_world: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _in_view(depth: np.ndarray, camera: Camera, T_camera_world: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Whether world points [n, 3] are in view of every `_STEP`-th pixel of a depth image and not behind what is there,
     bool [n]."""
     x, y, z = transformed(points.astype(np.float64), T_camera_world).T

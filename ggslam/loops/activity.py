@@ -69,7 +69,7 @@ class ActiveKeyframes:
         self._cameras = T_world_camera[:, :3, 3].copy()
         self._middles = self._cameras + self._depths[:, None] * T_world_camera[:, :3, 2]
 
-    def changed(self) -> bool:
+    def update(self) -> bool:
         """Puts aside and takes back what is due; whether the set changed."""
         s, before = self.settings, set(self.active)
         limit = s.forget_after * float(np.median(self._depths[-20:]))

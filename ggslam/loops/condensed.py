@@ -66,7 +66,7 @@ class CondensedGraph:
                 steps[node] += steps[self.parents[node]]
         return steps
 
-    def believed(self, gtsam: ModuleType, probability: float) -> tuple[np.ndarray, float, np.ndarray]:
+    def agreement(self, gtsam: ModuleType, probability: float) -> tuple[np.ndarray, float, np.ndarray]:
         """Which closures agree (bool [m]), the limit of a residual's Mahalanobis length, and the lengths found [m]."""
         limit = chi_squared_limit(probability) ** 0.5
         if not self.loops:

@@ -25,7 +25,7 @@ class OdometryTree:
     steps: list[np.ndarray] = field(default_factory=list)
 
     @classmethod
-    def rooted(cls) -> OdometryTree:
+    def root(cls) -> OdometryTree:
         """The first node alone."""
         return cls([-1], [np.eye(4)], [np.zeros((6, 6))], [np.zeros((6, 6))])
 
@@ -41,7 +41,7 @@ class OdometryTree:
         self.covariances.append(self.covariances[parent] + moved)
         self.steps.append(covariance)
 
-    def meeting(self, i: int, j: int) -> int:
+    def common_ancestor(self, i: int, j: int) -> int:
         """The last node that the ways from the first to i and to j share."""
         while i != j:  # a node comes after its parent
             if i > j:
@@ -52,5 +52,5 @@ class OdometryTree:
 
     def covariance_between(self, i: int, j: int) -> np.ndarray:
         """Covariance [6, 6] of the motion T_i_j by odometry alone, left twist in frame i."""
-        summed = self.covariances[i] + self.covariances[j] - 2 * self.covariances[self.meeting(i, j)]
+        summed = self.covariances[i] + self.covariances[j] - 2 * self.covariances[self.common_ancestor(i, j)]
         return covariance_in_frame(summed, inverse(self.poses[i]))

@@ -73,7 +73,7 @@ class PoseGraph:
             raise ValueError(f"node {len(self.poses) - 1} has no odometry yet")
         self.poses.append(np.array(T_world_camera, float))
         if len(self.poses) == 1:
-            self._tree = OdometryTree.rooted()
+            self._tree = OdometryTree.root()
         return len(self.poses) - 1
 
     def add_odometry(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> None:
@@ -116,7 +116,7 @@ class PoseGraph:
         gtsam = _gtsam()
         far = self._beyond_drift(self.poses, self._beyond_drift(self._tree.poses, range(len(self.loops))))
         while True:
-            condensed, disagreeing, errors = self._settled(gtsam, far)
+            condensed, disagreeing, errors = self._settle(gtsam, far)
             poses = condensed.all_poses()
             nearer = self._beyond_drift(poses, far)
             if len(nearer) == len(far):
@@ -146,13 +146,13 @@ class PoseGraph:
                 )
         return rejected
 
-    def _settled(
+    def _settle(
         self, gtsam: ModuleType, far: Mapping[int, str]
     ) -> tuple[CondensedGraph, dict[int, str], tuple[float, float]]:
         """The graph settled on those closures not too far that agree; the others' reasons; errors before and after."""
         candidates = [k for k in range(len(self.loops)) if k not in far]
         condensed = CondensedGraph(self._tree, self.poses, [self.loops[k] for k in candidates])
-        believed, limit, lengths = condensed.believed(gtsam, self.settings.inlier_probability)
+        believed, limit, lengths = condensed.agreement(gtsam, self.settings.inlier_probability)
         disagreeing = {
             number: f"disagrees with other closures: {length:.1f} standard deviations, limit {limit:.1f}"
             for number, ok, length in zip(candidates, believed, lengths, strict=True)

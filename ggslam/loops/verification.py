@@ -115,9 +115,9 @@ def verify(
     registration = register(old.landmarks, new.landmarks, camera, settings.registration)
     reason = _doubt_about_features(registration, camera, settings)
     if reason:
-        return _refused(reason, registration)
+        return _refusal(reason, registration)
     refined = align(registration.T_old_new)
-    kept = registration.matches.agreeing(refined.T_world_camera, camera, settings.registration, slack=2.0)
+    kept = registration.matches.agree(refined.T_world_camera, camera, settings.registration, slack=2.0)
     agreeing = int((kept & registration.inliers).sum())
     depth = float(np.median(new.points[:, 2])) if len(new.points) else 0.0
     noise = sigma(depth)
@@ -182,7 +182,7 @@ def _doubt_about_geometry(
     return ""
 
 
-def _refused(reason: str, found: Registration) -> Verification:
+def _refusal(reason: str, found: Registration) -> Verification:
     return Verification(
         False, reason, found.T_old_new, len(found.matches), found.count, 0, 0.0, 0.0, 0.0, np.zeros((6, 6))
     )

@@ -4,29 +4,14 @@
 from __future__ import annotations
 
 import torch
-from torch.nn.functional import conv2d
 
-from ggslam.mapping.cpu.losses import KeyframeImages, LossSettings
-
-
-def blur(images: torch.Tensor) -> torch.Tensor:
-    """Convolution of [N, H, W] with the 11x11 Gaussian window of SSIM, sigma 1.5, zero padding."""
-    offsets = torch.arange(-5, 6, dtype=images.dtype)
-    window = torch.exp(-(offsets**2) / (2 * 1.5**2))
-    window = window / window.sum()
-    return conv2d(images[:, None], torch.outer(window, window)[None, None], padding=5)[:, 0]
-
-
-def ssim(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-    """Structural similarity of each value of x and y [N, H, W] (Wang et al. 2004)."""
-    c1, c2 = 0.01**2, 0.03**2
-    mx, my = blur(x), blur(y)
-    vx, vy, vxy = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
-    return (2 * mx * my + c1) * (2 * vxy + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
+from ggslam.mapping.losses import LossTarget
+from ggslam.mapping.settings import LossSettings
+from ggslam.rendering.losses import ssim_map
 
 
 def reference_loss(
-    image: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, exposure: torch.Tensor, target: KeyframeImages,
+    image: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, exposure: torch.Tensor, target: LossTarget,
     settings: LossSettings,
 ) -> dict[str, torch.Tensor]:  # fmt: skip
     """The values of `LossValues` by name, as scalars that carry their graph. Computes in the type of `image`.
@@ -48,7 +33,7 @@ def reference_loss(
     if settings.color_kind == "charbonnier":
         epsilon = settings.charbonnier_epsilon
         color = (torch.sqrt((x - y) ** 2 + epsilon**2) - epsilon).mean()
-    similarity = ssim(x, y).mean()
+    similarity = ssim_map(x, y).mean()
 
     used = valid
     if settings.depth_kind == "normalised":

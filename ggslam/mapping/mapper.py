@@ -8,19 +8,24 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
+import torch
 
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
-from ggslam.mapping.identity_objects import IdentityObjects
+from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
+from ggslam.mapping.losses import LossGradients
 from ggslam.mapping.pruning import prune
 from ggslam.mapping.residency import Residency
 from ggslam.mapping.sampling import KeyframeSampler
 from ggslam.mapping.settings import MapperSettings
+from ggslam.mapping.votes import vote_labels
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
+from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
@@ -61,9 +66,32 @@ class LossSums:
     depth: float = 0.0
 
 
+class TrainingRasterizer(Protocol):
+    """What the mapper needs of a rasterizer besides rendering: the backward pass with the optimizer in it."""
+
+    def backward_step(
+        self, map: GaussianMap, grad_image: torch.Tensor | None, grad_depth: torch.Tensor | None = None,
+        grad_alpha: torch.Tensor | None = None, grad_features: torch.Tensor | None = None, *, optimizer: AdamSettings,
+        detach_features: bool = False,
+    ) -> Any:  # fmt: skip
+        """See `CpuRasterizer.backward_step`; the result has the pose's gradient as `twist`."""
+
+
+class _Stopwatch:
+    """Seconds from lap to lap."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+
+    def lap(self) -> float:
+        now = time.perf_counter()
+        seconds, self._last = now - self._last, now
+        return seconds
+
+
 class Mapper(ABC):
-    """Holds the map and its keyframes. What is done with them is here, on what it is computed in `CpuMapper` and
-    `mapping.cuda`.
+    """Holds the map and its keyframes. The schedule and the order of the steps are here; `CpuMapper` and `CudaMapper`
+    say how each step is computed.
 
     Args:
         gaussians: the map; empty or loaded.
@@ -73,17 +101,18 @@ class Mapper(ABC):
     """
 
     def __init__(
-        self, gaussians: GaussianMap, settings: MapperSettings, seed: int = 0, identity: IdentityObjects | None = None
+        self, gaussians: GaussianMap, settings: MapperSettings, seed: int = 0, identity: IdentityLearner | None = None
     ) -> None:
         self.map = gaussians
         self.settings = settings
-        self.identity: IdentityObjects | None = identity
+        self.identity: IdentityLearner | None = identity
         self.keyframes: list[Keyframe] = []
         self.times = MapperTimes()
         self.depth_sigma = 0.004
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
         self.residency: Residency | None = None
         """Who keeps a part of the map on disk; None: all of it is in memory."""
+        self._rasterizer: TrainingRasterizer
         self._standard_adam = self._adam(1.0)
         self._sampler = KeyframeSampler(float(np.random.default_rng(seed).random()))
 
@@ -97,9 +126,9 @@ class Mapper(ABC):
     def last_psnr(self) -> float:
         """Of the last iteration's view before its step, dB; NaN before the first."""
 
-    @abstractmethod
     def vote_labels(self) -> np.ndarray:
-        """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none."""
+        """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none. Waits for the device."""
+        return vote_labels(self.map).cpu().numpy().astype(np.uint16)
 
     def beside_others(self) -> AbstractContextManager[object]:
         """Within, which may be entered again and again, a thread works on the device beside the mapper, which is in
@@ -181,9 +210,10 @@ class Mapper(ABC):
         for whole, part in labels.splits:
             self._split(labels.mask, whole, part)
 
-    @abstractmethod
     def _split(self, mask: np.ndarray, whole: int, part: int) -> None:
         """What the last rendering shows of `whole` where `mask` [H, W] has `part` becomes the part."""
+        assert self.identity is not None
+        self.identity.split(self.map, self._rasterizer, mask, whole, part)
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 
@@ -191,12 +221,12 @@ class Mapper(ABC):
         """Optimisation steps, see `KeyframeSampler` for their order."""
         numbers = self._trainable()
         for _ in range(iterations):
-            self.iterate(self._drawn(numbers))
+            self.iterate(self._draw(numbers))
 
     def _trainable(self) -> Sequence[int]:
         return range(len(self.keyframes)) if self.residency is None else self.residency.trainable()
 
-    def _drawn(self, numbers: Sequence[int]) -> Keyframe:
+    def _draw(self, numbers: Sequence[int]) -> Keyframe:
         return self.keyframes[numbers[self._sampler.draw(len(numbers))]]
 
     def _stages(self, steps: int) -> Iterator[tuple[Sequence[int], int]]:
@@ -209,13 +239,58 @@ class Mapper(ABC):
             before, done = done, done + len(numbers)
             yield numbers, steps * done // len(self.keyframes) - steps * before // len(self.keyframes)
 
-    @abstractmethod
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
-        """One optimisation step on one keyframe: forward, loss, backward with the optimizer fused in.
+        """One optimisation step on one keyframe: forward, loss, identity, backward with the optimizer fused in.
 
         Args:
             keyframe: what to train on.
             rate_factor: multiplies every learning rate.
+        """
+        times, watch, identity = self.times, _Stopwatch(), self.identity
+        learns = identity is not None and identity.due(keyframe)
+        dense = learns and identity is not None and identity.settings.schedule == "dense"
+        view = self._render(keyframe, features=dense)
+        times.forward += watch.lap()
+        loss = self._evaluate_loss(keyframe, view)
+        times.loss += watch.lap()
+        grad_features = None
+        if learns and identity is not None:
+            grad_features = identity.step(self.map, self._rasterizer, keyframe, view)
+        times.identity += watch.lap()
+        step = self._rasterizer.backward_step(
+            self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features,
+            optimizer=self._standard_adam if rate_factor == 1 else self._adam(rate_factor),
+            detach_features=identity is None or identity.settings.detach,
+        )  # fmt: skip
+        pose_rate = rate_factor * self._pose_rate if keyframe.index > 0 else 0.0  # the first keyframe is the world
+        self._finish_step(keyframe, step.twist, loss, pose_rate)
+        times.backward += watch.lap()
+        times.iterations += 1
+        keyframe.iterations += 1
+
+    @property
+    def _pose_rate(self) -> float:
+        """Step size of keyframes' poses, metres and radians; 0: they stay."""
+        refinement = self.settings.pose_refinement
+        return min(refinement.rate_sigmas * self.depth_sigma, refinement.max_rate) if refinement.enabled else 0.0
+
+    @abstractmethod
+    def _render(self, keyframe: Keyframe, features: bool) -> RenderBuffers:
+        """The map as a keyframe sees it, with or without identities."""
+
+    @abstractmethod
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> LossGradients:
+        """The loss of a rendered view against its keyframe's images."""
+
+    @abstractmethod
+    def _finish_step(self, keyframe: Keyframe, twist: Any, loss: Any, pose_rate: float) -> None:
+        """The pose and, of all keyframes but the first, the exposure follow their gradients; the loss joins the sums.
+
+        Args:
+            keyframe: that was trained on.
+            twist: gradient of its pose [6], as the rasterizer gave it.
+            loss: as `_evaluate_loss` gave it.
+            pose_rate: size of the pose's step, metres and radians; 0: it stays.
         """
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None) -> None:
@@ -224,7 +299,7 @@ class Mapper(ABC):
         for numbers, steps in self._stages(iterations):
             for i in range(steps):
                 factor = self.settings.refine_decay ** (i / max(1, steps - 1))
-                self.iterate(self._drawn(numbers), factor)
+                self.iterate(self._draw(numbers), factor)
                 done += 1
                 if progress is not None and (done % 20 == 0 or done == iterations):
                     progress(done, iterations)
@@ -238,16 +313,19 @@ class Mapper(ABC):
         total = settings.final_passes * len(self.keyframes) if settings.schedule == "sampled" else 0
         for numbers, steps in self._stages(total) if total else ():
             for i in range(0, steps, FINAL_STEPS_A_VIEW):
-                keyframe = self._drawn(numbers)
+                keyframe = self._draw(numbers)
                 if keyframe.mask is None:
                     continue
                 self._train_identity(keyframe, FINAL_STEPS_A_VIEW, FINAL_DECAY ** (i / steps))
         self.identity.label(self.map)
         self.times.identity_finish += time.perf_counter() - start
 
-    @abstractmethod
     def _train_identity(self, keyframe: Keyframe, steps: int, rate_factor: float) -> None:
         """Identity steps on one rendering of a keyframe that has a mask."""
+        assert self.identity is not None
+        view = self._render(keyframe, features=False)
+        for _ in range(steps):
+            self.identity.step(self.map, self._rasterizer, keyframe, view, rate_factor)
 
     def _adam(self, rate_factor: float) -> AdamSettings:
         r = self.settings.rates

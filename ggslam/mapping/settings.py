@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from dataclasses import field
+from typing import Literal
 
-from ggslam.mapping.cpu.losses import LossSettings
 from ggslam.system.settings import setting, settings_class
 
 
@@ -108,6 +108,33 @@ class ExposureSettings:
     """Learning rate of gains and offsets."""
     regularization: float = setting(1e-2, 0, 1e6)
     """Weight of half the squared distance from the identity in the loss."""
+
+
+@settings_class(frozen=True)
+class LossSettings:
+    """Weights and kinds of the terms of the loss.
+
+    Raises:
+        ConfigError: a value outside its range.
+    """
+
+    dssim_weight: float = setting(0.2, 0, 1)
+    """Share of 1 - SSIM in the colour loss. 0 skips SSIM, which is most of the work."""
+    depth_weight: float = setting(0.5, 0, 1e6, "1/m")
+    """Weight of the difference in depth."""
+    depth_kind: Literal["accumulated", "normalised"] = "accumulated"
+    """What is compared with the target: the accumulated depth (so that a transparent pixel is too near), or the
+    accumulated depth divided by alpha."""
+    minimum_alpha: float = setting(0.05, 1e-6, 1)
+    """For "normalised": pixels rendered fainter than this have no depth to speak of and are left out."""
+    color_kind: Literal["l1", "charbonnier"] = "l1"
+    """rho(r) = |r|, or sqrt(r^2 + epsilon^2) - epsilon."""
+    charbonnier_epsilon: float = setting(1e-3, 1e-6, 1e6)
+    """Epsilon of "charbonnier", in units of colour."""
+    no_depth_weight: float = setting(1.0, 0, 1)
+    """How much colour counts where the keyframe has no depth. 0: not at all."""
+    opacity_weight: float = setting(0.0, 0, 1e6)
+    """Weight of 1 - alpha where the keyframe has depth, i.e. where there is a surface."""
 
 
 @settings_class(frozen=True)

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differentiable rendering of Gaussians: `render` for library users, `CpuRasterizer` and `CudaRasterizer` for
-inner loops."""
+"""Differentiable rendering of Gaussians: `render` and `GaussianModel` for library users, `CpuRasterizer` and
+`CudaRasterizer` for inner loops."""
 
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.api import backends, choose_backend, register_backend, render
 from ggslam.rendering.cpu import CpuRasterizer, StepResult
 from ggslam.rendering.cuda import CudaGradients, CudaRasterizer
+from ggslam.rendering.losses import color_loss, depth_loss, identity_loss, neighbour_loss, ssim_map
+from ggslam.rendering.model import GaussianModel
 from ggslam.rendering.types import Gaussians, GaussianTensors, Gradients, RenderBuffers
 
 __all__ = [
@@ -13,6 +15,7 @@ __all__ = [
     "CpuRasterizer",
     "CudaGradients",
     "CudaRasterizer",
+    "GaussianModel",
     "GaussianTensors",
     "Gaussians",
     "Gradients",
@@ -20,6 +23,11 @@ __all__ = [
     "StepResult",
     "backends",
     "choose_backend",
+    "color_loss",
+    "depth_loss",
+    "identity_loss",
+    "neighbour_loss",
     "register_backend",
     "render",
+    "ssim_map",
 ]

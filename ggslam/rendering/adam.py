@@ -76,11 +76,11 @@ def _schedule(
     decay: float,
     decay_floor: float,
 ) -> torch.Tensor:
-    def settled(factor: float, limit: float) -> int:
+    def rows_until(factor: float, limit: float) -> int:
         return 1 if factor in (0.0, 1.0) else math.ceil(math.log(limit) / math.log(factor))
 
     # Long enough for everything to have settled within float32, or to where it no longer matters.
-    rows = max(settled(beta1, 1e-8), settled(beta2, 1e-8), settled(decay, max(decay_floor, 1e-6)))
+    rows = max(rows_until(beta1, 1e-8), rows_until(beta2, 1e-8), rows_until(decay, max(decay_floor, 1e-6)))
     update = torch.arange(1, min(rows, _MAX_ROWS) + 1, dtype=torch.float64)
     factor = (decay ** (update - 1)).clamp_min(decay_floor)
     columns = [

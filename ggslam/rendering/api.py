@@ -58,9 +58,10 @@ def choose_backend(device: torch.device | None = None) -> str:
 def render(
     gaussians: Gaussians,
     camera: Camera,
-    T_world_camera: torch.Tensor | np.ndarray,
+    T_camera_world: torch.Tensor | np.ndarray | None = None,
     *,
-    backend: str = "cpu",
+    T_world_camera: torch.Tensor | np.ndarray | None = None,
+    backend: str = "auto",
     features: bool = True,
     median_depth: bool = False,
     active_sh_degree: int | None = None,
@@ -70,11 +71,12 @@ def render(
     """Renders Gaussians, differentiable with respect to their parameters and to the pose.
 
     Args:
-        gaussians: see `Gaussians`; float32 on the CPU for "cpu", on a CUDA device for "cuda" and "gsplat", any
-            float for "reference".
+        gaussians: a `GaussianModel`, a `GaussianMap` or anything else with the tensors of `Gaussians`; float32 on the
+            CPU for "cpu", on a CUDA device for "cuda" and "gsplat", any float for "reference".
         camera: the camera.
-        T_world_camera: [4, 4] rigid transform, camera to world; a tensor may require gradients. The gradient of "cpu"
+        T_camera_world: [4, 4] rigid transform, world to camera; a tensor may require gradients. The gradient of "cpu"
             and "cuda" is the part along rigid motions.
+        T_world_camera: its inverse, camera to world, as trajectories and frames have it. One of the two is given.
         backend: one of `backends()`, or "auto": "cuda" for Gaussians on a CUDA device, else "cpu".
         features: render the feature channels, if there are any.
         median_depth: render the median depth, too.
@@ -83,26 +85,37 @@ def render(
         low_pass: pixels^2 added to both variances of a projected Gaussian.
 
     Returns:
-        Images of the caller's own.
+        `.image` [3, H, W], `.depth` [H, W], `.alpha` [H, W], `.features` [F, H, W] or None, see `RenderBuffers`; the
+        caller's own.
 
     Raises:
         RenderError: unknown backend, wrong shapes, dtypes or devices, an impossible pose or degree.
         MissingDependency: the backend's package is not installed, or it cannot be compiled.
     """
     if backend == "auto":
-        backend = choose_backend(gaussians.means.device)
+        backend = "cuda" if gaussians.means.device.type == "cuda" else "cpu"
     if backend not in _BACKENDS:
         raise RenderError(f"unknown rendering backend {backend!r}; available: {', '.join(_BACKENDS)}")
-    if not isinstance(T_world_camera, torch.Tensor):
-        T_world_camera = torch.as_tensor(np.asarray(T_world_camera, np.float64))
-    check_pose(T_world_camera.detach().cpu().numpy(), "T_world_camera")
     return _BACKENDS[backend](
         gaussians,
         camera,
-        T_world_camera,
+        _camera_to_world(T_camera_world, T_world_camera),
         features=features,
         median_depth=median_depth,
         active_sh_degree=active_sh_degree,
         near_plane=near_plane,
         low_pass=low_pass,
     )
+
+
+def _camera_to_world(
+    T_camera_world: torch.Tensor | np.ndarray | None, T_world_camera: torch.Tensor | np.ndarray | None
+) -> torch.Tensor:
+    """T_world_camera as a tensor, whichever of the two was given."""
+    if (T_camera_world is None) == (T_world_camera is None):
+        raise RenderError("render: expected one of T_camera_world and T_world_camera")
+    name = "T_camera_world" if T_world_camera is None else "T_world_camera"
+    given = T_camera_world if T_world_camera is None else T_world_camera
+    pose = given if isinstance(given, torch.Tensor) else torch.as_tensor(np.asarray(given, np.float64))
+    check_pose(pose.detach().cpu().numpy(), name)
+    return rigid_inverse(pose) if T_world_camera is None else pose

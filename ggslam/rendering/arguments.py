@@ -44,7 +44,19 @@ def check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shape: t
 
 
 def checked_parameters(gaussians: Gaussians, device: torch.device) -> GaussianTensors:
-    """The parameter arrays without their history; raises RenderError as `check_gaussians` and `check_tensor`."""
+    """The parameter arrays without their history.
+
+    Raises:
+        RenderError: as `check_gaussians` and `check_tensor`; or a parameter requires gradients, which autograd would
+            never get from here.
+    """
+    if torch.is_grad_enabled():
+        for name in PARAMETERS:
+            if getattr(gaussians, name).requires_grad:
+                raise RenderError(
+                    f"{name} requires gradients, which rasterizers do not record: call ggslam.render, or render the "
+                    "detached parameters or under torch.no_grad()"
+                )
     parameters = GaussianTensors(**{name: getattr(gaussians, name).detach() for name in PARAMETERS})
     check_gaussians(parameters)
     for name in PARAMETERS:

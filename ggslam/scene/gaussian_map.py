@@ -34,7 +34,8 @@ def sh_to_rgb(sh: torch.Tensor) -> torch.Tensor:
 class GaussianMap:
     """3D Gaussians as arrays whose first `count` rows are in use. Float32 unless said otherwise.
 
-    Properties give views of the used rows:
+    Properties give views of the used rows, the same tensor until rows are added or removed, so that one keeps the
+    gradient that `requires_grad_` asks for:
         means: [N, 3] metres, world frame.
         quaternions: [N, 4] wxyz, not necessarily of unit length.
         log_scales: [N, 3], natural logarithm of the standard deviations in metres.
@@ -69,6 +70,7 @@ class GaussianMap:
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
         self._storage: dict[str, torch.Tensor] = {}
+        self._views: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
         self._allocate(0)
 
     # --- storage -------------------------------------------------------------------------------------------------
@@ -97,6 +99,7 @@ class GaussianMap:
             if name in self._storage:
                 new[: self.count] = self._storage[name][: self.count]
             self._storage[name] = new
+            self._views.pop(name, None)  # it would keep the old array in memory
 
     @property
     def capacity(self) -> int:
@@ -122,9 +125,13 @@ class GaussianMap:
         return self.count
 
     def __getattr__(self, name: str) -> torch.Tensor:
-        if name in _PARAMETERS or name in _BOOKKEEPING:
-            return self._storage[name][: self.count]
-        raise AttributeError(name)
+        if name not in _PARAMETERS and name not in _BOOKKEEPING:
+            raise AttributeError(name)
+        storage, count = self._storage[name], self.count
+        found = self._views.get(name)
+        if found is None or found[0] is not storage or found[1].shape[0] != count:
+            found = self._views[name] = (storage, storage[:count])
+        return found[1]
 
     @property
     def moments(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:

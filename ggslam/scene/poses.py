@@ -86,6 +86,33 @@ def orthonormalized(T: np.ndarray) -> np.ndarray:
     return out
 
 
+def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """The similarities that bring points nearest to their partners in the least-squares sense (S. Umeyama,
+    "Least-Squares Estimation of Transformation Parameters Between Two Point Patterns", 1991).
+
+    Args:
+        source, target: [..., N, 3], corresponding points, N >= 3.
+        with_scale: also estimates a scale; else it is 1.
+
+    Returns:
+        (T_target_source [..., 4, 4] rigid, scale s [...]): target ~ R (s source) + t.
+    """
+    source_mean, target_mean = source.mean(-2), target.mean(-2)
+    a, b = source - source_mean[..., None, :], target - target_mean[..., None, :]
+    U, singular, Vt = np.linalg.svd(np.swapaxes(b, -1, -2) @ a)
+    signs = np.ones_like(singular)
+    signs[..., 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))  # no reflections
+    R = (U * signs[..., None, :]) @ Vt
+    spread = (a * a).sum((-2, -1))
+    scale = np.ones_like(spread)
+    if with_scale:
+        scale = np.where(spread > 0, (singular * signs).sum(-1) / np.maximum(spread, 1e-300), 1.0)
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., 3, 3] = R, 1
+    T[..., :3, 3] = target_mean - (scale[..., None, None] * R @ source_mean[..., None])[..., 0]
+    return T, scale
+
+
 def quaternion_to_matrix(q: np.ndarray) -> np.ndarray:
     """Rotation matrices [..., 3, 3] of quaternions wxyz [..., 4] (normalised here)."""
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 from ggslam.errors import SequenceError
@@ -90,8 +91,30 @@ def open_sequence(
         MissingDependency: a package is needed to read the recording.
         SequenceError: the recording cannot be read; the message names the file, what was expected and what was found.
     """
-    folder = _existing(Path(path).expanduser())
-    options = _options(depth_camera, min_confidence, topics)
+    topics = tuple(topics)
+    read = partial(
+        _read_recording, Path(path).expanduser(), format, None if masks is None else Path(masks).expanduser(),
+        depth_scale, _options(depth_camera, min_confidence, topics), pose_convention,
+    )  # fmt: skip
+    recording = read()
+    selection = _selection(recording, start, stop, stride)
+    sequence = Sequence(recording, selection, scale=scale, on_bad_frame=on_bad_frame, reopen=read)
+    sequence.options = {
+        "path": Path(path).expanduser(), "format": format, "scale": scale,
+        "masks": None if masks is None else Path(masks).expanduser(), "depth_scale": depth_scale,
+        "on_bad_frame": on_bad_frame, "depth_camera": None if depth_camera is None else Path(depth_camera).expanduser(),
+        "min_confidence": min_confidence, "topics": topics, "pose_convention": pose_convention,
+    }  # fmt: skip
+    return sequence
+
+
+def _read_recording(
+    folder: Path, format: str | None, masks: Path | None, depth_scale: float | None, options: ReadOptions,
+    pose_convention: str | None,
+) -> Recording:  # fmt: skip
+    """The description of a recording with what the user says of it; arguments and errors as in `open_sequence`."""
+    if not folder.exists():
+        raise SequenceError(f"{folder}: no such folder or file")
     recording = _find_format(folder, format).read(folder, options)
     if not recording.files:
         raise SequenceError(f"{folder}: holds no frames")
@@ -100,7 +123,7 @@ def open_sequence(
     if options.min_confidence is not None:
         recording.min_confidence = options.min_confidence
     if masks is not None:
-        _use_masks(recording, Path(masks).expanduser())
+        _use_masks(recording, masks)
     if depth_scale is not None:
         recording.depth_scale = depth_scale
     if pose_convention is not None:
@@ -109,7 +132,7 @@ def open_sequence(
         recording.poses = convert_poses(recording.poses, pose_convention)
     if not (math.isfinite(recording.depth_scale) and recording.depth_scale > 0):
         raise SequenceError(f"{folder}: depth scale must be a positive number, found {recording.depth_scale}")
-    return Sequence(recording, _selection(recording, start, stop, stride), scale=scale, on_bad_frame=on_bad_frame)
+    return recording
 
 
 def _use_masks(recording: Recording, folder: Path) -> None:
@@ -137,12 +160,6 @@ def recognise_format(path: str | Path) -> str | None:
     """Name of the format of a folder or file, None when it is none of the known ones."""
     place = Path(path)
     return next((f.name for f in FORMATS if place.exists() and f.matches(place)), None)
-
-
-def _existing(path: Path) -> Path:
-    if not path.exists():
-        raise SequenceError(f"{path}: no such folder or file")
-    return path
 
 
 def _find_format(folder: Path, name: str | None) -> RecordingFormat:

@@ -65,13 +65,13 @@ def read_id_table(files: list[Path]) -> IdTable:
     folder = files[0].parent
     for path in (folder / "pred.json", folder.parent / "pred.json"):
         if path.is_file() and (listed := _listed_codes(path)) is not None:
-            return _checked(IdTable(listed, str(path)), folder)
+            return _check_size(IdTable(listed, str(path)), folder)
     _log.info("reading all %d masks in %s once for their ids", len(files), folder)
     codes, coded = _occurring_codes(files)
-    return _checked(IdTable(codes, "the masks themselves", coded), folder)
+    return _check_size(IdTable(codes, "the masks themselves", coded), folder)
 
 
-def _checked(table: IdTable, folder: Path) -> IdTable:
+def _check_size(table: IdTable, folder: Path) -> IdTable:
     if len(table.codes) > LARGEST_ID:
         raise SequenceError(
             f"masks folder {folder}: expected at most {LARGEST_ID} different ids, found {len(table.codes)} by "

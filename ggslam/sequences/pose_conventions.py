@@ -15,7 +15,7 @@ AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 OURS = "opencv"
 
 
-def _reordered(T: np.ndarray) -> np.ndarray:
+def _reorder_quaternion(T: np.ndarray) -> np.ndarray:
     """The pose whose quaternion was written wxyz and read as xyzw."""
     w, x, y, z = matrix_to_quaternion(T[:3, :3])
     result = T.copy()
@@ -41,9 +41,9 @@ CONVENTIONS: dict[str, PoseConvention] = {
     "world-to-camera": PoseConvention("world to camera", inverse),
     "opengl": PoseConvention("OpenGL camera axes (y up, z back)", lambda T: T @ AXES),
     "world-to-camera-opengl": PoseConvention("world to camera with OpenGL axes", lambda T: inverse(AXES @ T)),
-    "wxyz": PoseConvention("quaternions in the order wxyz", _reordered),
+    "wxyz": PoseConvention("quaternions in the order wxyz", _reorder_quaternion),
     "world-to-camera-wxyz": PoseConvention(
-        "world to camera with quaternions in the order wxyz", lambda T: inverse(_reordered(T))
+        "world to camera with quaternions in the order wxyz", lambda T: inverse(_reorder_quaternion(T))
     ),
 }
 """By the name that a user gives them."""

@@ -38,7 +38,7 @@ def invalid_pose_reason(T: np.ndarray) -> str | None:
     return None
 
 
-def _checked(poses: list[np.ndarray], places: list[str]) -> tuple[np.ndarray, dict[int, str]]:
+def _stack_valid(poses: list[np.ndarray], places: list[str]) -> tuple[np.ndarray, dict[int, str]]:
     """Stacks poses; bad ones become rows of NaN and are named in the second result."""
     problems = {}
     stack = np.empty((len(poses), 4, 4))
@@ -66,7 +66,7 @@ def read_matrix_rows(path: Path) -> tuple[np.ndarray, dict[int, str]]:
         T[: len(values) // 4] = values.reshape(-1, 4)
         poses.append(T)
         places.append(f"{path}, line {number}")
-    return _checked(poses, places)
+    return _stack_valid(poses, places)
 
 
 def add_row_poses(recording: Recording, path: Path) -> None:
@@ -114,7 +114,7 @@ def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
         stamps.append(values[0])
         poses.append(T)
         places.append(f"{path}, line {number}")
-    stack, problems = _checked(poses, places)
+    stack, problems = _stack_valid(poses, places)
     return np.array(stamps), stack, problems
 
 

@@ -44,8 +44,8 @@ class DepthRegistration:
         millimetres = np.minimum(z[usable] * 1000, 65535).astype(np.uint16)
         order = usable[np.argsort(65535 - millimetres, kind="stable")]
         x, y, z = x[order], y[order], z[order]
-        columns = _covered(t.fx * x / z + t.cx, self._side[0], t.width)
-        rows = _covered(t.fy * y / z + t.cy, self._side[1], t.height)
+        columns = _cells_covered(t.fx * x / z + t.cx, self._side[0], t.width)
+        rows = _cells_covered(t.fy * y / z + t.cy, self._side[1], t.height)
         far = np.float32(1e9)
         image = np.full(t.height * t.width, far, np.float32)
         for row, hit_row in rows:
@@ -58,7 +58,7 @@ class DepthRegistration:
         return image.reshape(t.height, t.width)
 
 
-def _covered(centre: np.ndarray, side: float, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def _cells_covered(centre: np.ndarray, side: float, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Rows (or columns) within `side` / 2 of `centre`: the first, the second, ..., and whether each is one."""
     first = np.ceil(np.clip(centre, -2 * side, count + side) - side / 2)
     found = []

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import logging
 import math
+import operator
+import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, SupportsIndex, overload
 
 import cv2
 import numpy as np
@@ -28,6 +30,9 @@ OnBadFrame = Literal["error", "skip"]
 ReadMasks = bool | Literal["lazy"]
 """True: masks are read with the frame; "lazy": when `Frame.load_mask` is called; False: never."""
 
+SMALLEST_SIDE = 8
+"""Pixels that `scale` has to leave of both sides of an image: windows of trackers and filters need so many."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -42,6 +47,11 @@ class SkippedFrame:
 
 class Sequence:
     """A recording read as a stream. Made by `open_sequence`; holds no images.
+
+    It is indexed like a list: `sequence[0]` and `sequence[-1]` read a frame, `sequence[10:20]` is a sequence of these
+    frames with the same camera, `for frame in sequence` streams. It can be pickled and sent to other processes, which
+    open the recording for themselves; so `torch.utils.data.DataLoader(sequence, collate_fn=collate_frames)` works with
+    any number of workers.
 
     Attributes:
         name: name of the folder, or of the file without suffix.
@@ -62,18 +72,20 @@ class Sequence:
             index of the frame -> reason.
         instance_names: mask id -> name, as far as known.
         pose_source, time_source: what told poses and times, for reports.
+        options: arguments of `open_sequence` besides the selection; None if it was made otherwise.
         warnings: what a user should know about this recording.
         skipped: damaged frames passed over so far (only with on_bad_frame="skip").
     """
 
     def __init__(
-        self, recording: Recording, selection: range, *, scale: float = 1.0, on_bad_frame: OnBadFrame = "error"
-    ) -> None:
-        """Prepares the frames `selection` of a recording.
+        self, recording: Recording, selection: range, *, scale: float = 1.0, on_bad_frame: OnBadFrame = "error",
+        reopen: Callable[[], Recording] | None = None,
+    ) -> None:  # fmt: skip
+        """Prepares the frames `selection` of a recording; `reopen` reads its description again, in another process.
 
         Raises:
             SequenceError: the first frame is damaged (with on_bad_frame="skip": every frame is), files are missing, or
-                `scale` is not in (0, 1].
+                `scale` is not in (0, 1] or leaves hardly an image.
         """
         if on_bad_frame not in ("error", "skip"):
             raise SequenceError(f"on_bad_frame: expected 'error' or 'skip', found '{on_bad_frame}'")
@@ -84,7 +96,9 @@ class Sequence:
             self.min_confidence = recording.min_confidence
         self.lens: str = _lens(recording)
         self.registered: bool = recording.depth_camera is not None
-        self._recording, self._selection, self._on_bad_frame = recording, selection, on_bad_frame
+        self._recording, self._on_bad_frame = recording, on_bad_frame
+        self._reopen, self._process = reopen, os.getpid()
+        self.options: dict[str, Any] | None = None
         self.path: Path = recording.path
         self.name: str = recording.path.stem if recording.path.is_file() else recording.path.name
         self.format: str = recording.format
@@ -93,16 +107,10 @@ class Sequence:
         self.pose_source: str = recording.pose_source
         self.time_source: str = recording.time_source
         self.warnings: list[str] = list(recording.warnings)
-        chosen = np.arange(len(recording.files))[selection.start : selection.stop : selection.step]
-        self.timestamps: np.ndarray = recording.timestamps[chosen].astype(np.float64)
-        self.ground_truth: np.ndarray | None = None if recording.poses is None else recording.poses[chosen]
-        masked = sum(recording.files[i].mask is not None for i in selection)
-        self.has_masks: bool = masked > 0
-        self.mask_problems: dict[int, str] = {}
         self._masks = MaskReader(entry.mask for entry in recording.files)
+        masked = self._select(selection)
         if masked < len(self) and any(entry.mask is not None for entry in recording.files):
             self.warnings.append(f"{len(self) - masked} of {len(self)} frames have no mask")
-        self._skipped: dict[int, SkippedFrame] = {}
         known = [i for i in selection if i in recording.problems]
         if on_bad_frame == "error" and known:
             more = f" (and {len(known) - 1} more damaged frames)" if len(known) > 1 else ""
@@ -111,10 +119,80 @@ class Sequence:
         self.color_size: tuple[int, int] = self._geometry.color_size
         self.depth_size: tuple[int, int] = self._geometry.depth_size
         self.camera: Camera = self._geometry.camera
+        if scale < 1 and min(self.camera.width, self.camera.height) < SMALLEST_SIDE:
+            size = f"{self.camera.width}x{self.camera.height}"
+            raise SequenceError(f"scale: {scale:g} leaves images of {size}, needed are {SMALLEST_SIDE} pixels a side")
         self.native_camera: Camera = self._geometry.native_camera
+
+    def _select(self, selection: range) -> int:
+        """Takes these frames of the recording; returns how many of them have masks."""
+        recording, chosen = self._recording, np.array(selection, int)
+        self._selection = selection
+        self.timestamps: np.ndarray = recording.timestamps[chosen].astype(np.float64)
+        self.ground_truth: np.ndarray | None = None if recording.poses is None else recording.poses[chosen]
+        masked = sum(recording.files[i].mask is not None for i in selection)
+        self.has_masks: bool = masked > 0
+        self.mask_problems: dict[int, str] = {}
+        self._skipped: dict[int, SkippedFrame] = {}
+        return masked
+
+    # --- as a list ---------------------------------------------------------------------------------------------------
 
     def __len__(self) -> int:
         return len(self._selection)
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence: ...
+    def __getitem__(self, index: SupportsIndex | slice) -> Frame | Sequence:
+        """Frame `index`, counted from the end if negative; or the sequence of a slice's frames, whose `Frame.index`
+        counts from 0 again.
+
+        Raises:
+            IndexError: no such frame.
+            SequenceError: the frame or its mask is damaged, or the slice goes backwards.
+        """
+        if isinstance(index, slice):
+            if index.step is not None and index.step < 1:
+                raise SequenceError(f"{self.path}: the step of a slice must be at least 1, found {index.step}")
+            part = object.__new__(Sequence)
+            vars(part).update(vars(self), warnings=list(self.warnings))
+            part._select(self._selection[index])
+            return part
+        number = operator.index(index)
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"{self.path}: expected a frame from {-len(self)} to {len(self) - 1}, found {number}")
+        return self.frame(number % len(self))
+
+    def __iter__(self) -> Iterator[Frame]:
+        """All frames in order with their masks, read ahead; see `stream`."""
+        return self.stream()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but what other processes open for themselves: archives, videos, bags."""
+        state = dict(vars(self))
+        if self._reopen is not None:
+            del state["_recording"], state["_masks"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._open_again()
+
+    def _open_again(self) -> None:
+        """Opens archives, videos and bags for this process."""
+        self._process = os.getpid()
+        if self._reopen is not None:
+            self._recording = self._reopen()
+            self._masks = MaskReader(entry.mask for entry in self._recording.files)
+
+    @property
+    def selection(self) -> range:
+        """Numbers of the frames in the whole recording."""
+        return self._selection
+
+    # --- frame by frame ----------------------------------------------------------------------------------------------
 
     @property
     def skipped(self) -> list[SkippedFrame]:
@@ -147,6 +225,8 @@ class Sequence:
             SequenceError: no such frame, or it is damaged (whatever `on_bad_frame` says), or, unless
                 on_bad_frame="skip", its mask is.
         """
+        if self._process != os.getpid():  # a fork shares open files and their positions with its parent
+            self._open_again()
         files = self.files(index)
         source = self._selection[index]
         if source in self._recording.problems:
@@ -177,11 +257,11 @@ class Sequence:
         """
         if prefetch < 1:
             for index in range(len(self)):
-                yield from self._passed(self._attempt(index, masks))
+                yield from self._deliver(self._attempt(index, masks))
             return
         with ReadAhead(partial(self._attempt, masks=masks), len(self), prefetch) as attempts:
             for attempt in attempts:
-                yield from self._passed(attempt)
+                yield from self._deliver(attempt)
 
     def _attempt(self, index: int, masks: ReadMasks) -> Frame | SkippedFrame:
         try:
@@ -191,7 +271,7 @@ class Sequence:
                 raise
             return SkippedFrame(index, self._selection[index], str(error))
 
-    def _passed(self, attempt: Frame | SkippedFrame) -> Iterator[Frame]:
+    def _deliver(self, attempt: Frame | SkippedFrame) -> Iterator[Frame]:
         if isinstance(attempt, SkippedFrame):
             self._skipped[attempt.index] = attempt
         else:

@@ -25,7 +25,7 @@ from ggslam.system.atomic import write_text
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
-from ggslam.tracking.tracker import TrackerSettings
+from ggslam.tracking.settings import TrackerSettings
 from ggslam.volumes.volume_settings import VolumeSettings
 
 

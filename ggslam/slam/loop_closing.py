@@ -24,7 +24,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation, transformed
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
-from ggslam.tracking.points import FramePoints
+from ggslam.tracking.points import FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult
@@ -177,7 +177,7 @@ class LoopCloser:
             if belated:
                 self.activity.active.discard(len(self.poses) - 1)
             correction = None if belated else self._look_back(frame, place, tracking)
-            if correction is None and (self.activity.changed() or belated):
+            if correction is None and (self.activity.update() or belated):
                 self._surface.arrange(self.activity.active)
         self.seconds += time.perf_counter() - start
         return correction
@@ -223,14 +223,15 @@ class LoopCloser:
         return None
 
     def _verify(
-        self, points: FramePoints, place: Place, old: int
+        self, source: PointSource, place: Place, old: int
     ) -> tuple[Verification, AlignmentResult | None]:
         """Whether a frame sees what keyframe `old` saw, and the last alignment to the surface there."""
+        points = source.read()
         around = self._around(old)
         T_world_old, last = self.poses[old], None
         T_old_world = inverse(T_world_old)
 
-        def aligned(T_old_new: np.ndarray) -> AlignmentResult:
+        def align_at(T_old_new: np.ndarray) -> AlignmentResult:
             nonlocal last  # most candidates are refused before it comes to this: the target is gathered here
             last = self._align(points, self._surface.of(around), T_world_old @ T_old_new)
             information = information_in_frame(last.information, T_old_world)
@@ -239,7 +240,7 @@ class LoopCloser:
         surface = transformed(self._surface.points(around), T_old_world)
         found = verify(
             LocalMap(self.places[old].landmarks, surface), LocalMap(place.landmarks, points.points),
-            self._camera, self._noise().sigma, aligned, self.settings.verification,
+            self._camera, self._noise().sigma, align_at, self.settings.verification,
         )  # fmt: skip
         return found, last
 

@@ -24,10 +24,10 @@ import torch
 
 from ggslam.formats.array_archive import ArrayArchive
 from ggslam.geometry.frustums import Frustums, depth_reach
-from ggslam.mapping.cpu.votes import vote_labels
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper
+from ggslam.mapping.votes import vote_labels
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
@@ -161,7 +161,7 @@ class MapPager:
         found = []
         for begin in range(0, len(numbers), _AT_ONCE):
             asked = numbers[begin : begin + _AT_ONCE]
-            lacking = self.cells.needed(self._frustums(self._views(asked)))
+            lacking = self.cells.visible_cells(self._frustums(self._views(asked)))
             found += [number for number, keys in zip(asked, lacking, strict=True) if not keys]
         return found or [numbers[-1]]  # the budget is less than one view: the newest is trained on what there is
 
@@ -184,7 +184,7 @@ class MapPager:
     def _bring_while_there_is_room(self, numbers: Iterable[int]) -> None:
         assert self.cells is not None
         for number in numbers:
-            keys = self.cells.needed(self._frustums(self._views([number])))[0]
+            keys = self.cells.visible_cells(self._frustums(self._views([number])))[0]
             if len(self.map) + self.cells.count_in(keys) > self._rows():
                 return
             self._move_in(keys)
@@ -216,7 +216,7 @@ class MapPager:
         for _, part in () if self.cells is None else self.cells.parts():
             if self.mapper.identity is not None:
                 self.mapper.identity.catch_up(part)
-            sizes += np.bincount(vote_labels(part), minlength=65536)
+            sizes += np.bincount(vote_labels(part).numpy(), minlength=65536)
         return sizes
 
     def settle(self) -> GaussianCells | None:
@@ -284,7 +284,7 @@ class MapPager:
         frustums = self._frustums(views)
         wanted: list[CellKey] = []
         if self.cells is not None:
-            wanted = sorted({key for keys in self.cells.needed(frustums) for key in keys})
+            wanted = sorted({key for keys in self.cells.visible_cells(frustums) for key in keys})
         incoming = 0 if self.cells is None else self.cells.count_in(wanted)
         excess = len(self.map) + incoming + room - self._rows()
         if excess > 0:

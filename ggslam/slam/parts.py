@@ -12,7 +12,7 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary, library_for_device
 from ggslam.errors import ConfigError, MissingDependency
-from ggslam.mapping.cpu.identity import IdentityLearner
+from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.mapper import CudaMapper
@@ -26,6 +26,7 @@ from ggslam.slam.map_paging import MapPager
 from ggslam.slam.memory_budget import MB, MemoryBudget
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
+from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.tracker import Tracker
 
 
@@ -65,7 +66,7 @@ def make_mapper(config: Config, learns: bool, context: NativeContext, library: C
     learns = learns and config.identity.enabled
     channels = IDENTITY_CHANNELS if learns else 0
     if library is None:
-        learner = IdentityLearner(config.identity, config.seed) if learns else None
+        learner = CpuIdentityLearner(config.identity, config.seed) if learns else None
         return CpuMapper(GaussianMap(config.sh_degree, channels), config.mapping, context, config.seed, learner)
     device = library.whole_device(None)
     device_learner = CudaIdentityLearner(config.identity, config.seed, device, library) if learns else None
@@ -86,7 +87,7 @@ def make_tracker(camera: Camera, config: Config, context: NativeContext, library
     if config.tracker == "features":
         return FeatureTracker(camera, config.tracking, config.features, context)
     engine = None if library is None else CudaTrackingEngine(camera, library.whole_device(None), library)
-    return Tracker(camera, config.tracking, context, engine=engine)
+    return GicpTracker(camera, config.tracking, context, engine=engine)
 
 
 def make_pager(camera: Camera, config: Config, folder: Path | None) -> MapPager | None:

@@ -5,16 +5,19 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from ggslam.errors import ConfigError
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import MapperTimes
-from ggslam.objects.table import Observation, Supervision
+from ggslam.objects.lookup import objects_at
+from ggslam.objects.table import ObjectTable, Observation, Supervision
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.slam.config import Config
 from ggslam.slam.loop_closing import LoopEvent
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.tracking.tracker import TrackingStatus
@@ -47,8 +50,18 @@ class TrackedFrame:
 
 @dataclass
 class StepReport:
-    """What one step did, for the progress line; `seconds` is how long it took, `loss` the mean over its optimisation
-    steps (NaN without any)."""
+    """What one step did.
+
+    Attributes:
+        frame: how the frame was tracked.
+        is_keyframe: whether it became one.
+        gaussians: of the map.
+        psnr: of the last view that was trained on, before its step, dB.
+        seconds: that the step took.
+        loss: mean over its optimisation steps, NaN without any.
+        T_world_camera: float64 [4, 4], the frame's pose as tracked, NaN if it was lost. `SlamResult.trajectory` has
+            the poses after all corrections.
+    """
 
     frame: TrackedFrame
     is_keyframe: bool
@@ -56,6 +69,7 @@ class StepReport:
     psnr: float
     seconds: float
     loss: float = float("nan")
+    T_world_camera: np.ndarray = field(default_factory=lambda: np.full((4, 4), np.nan))
 
 
 @dataclass
@@ -140,6 +154,7 @@ class SlamResult:
         release: removes its files.
         steps: what was noted of every step, content of `steps.csv`.
         device: what it was computed on: "cpu", or the GPU's name.
+        config: settings of the run.
     """
 
     gaussians: GaussianMap
@@ -158,6 +173,7 @@ class SlamResult:
     release: Callable[[], None] | None = None
     steps: str | None = None
     device: str = "cpu"
+    config: Config | None = None
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, if anything is; it cannot be read any more."""
@@ -175,6 +191,32 @@ class SlamResult:
             yield self.gaussians
         else:
             yield from (part for _, part in self.cells.parts())
+
+    def object_table(self, names: Mapping[int, str] | None = None) -> ObjectTable:
+        """Names, places, sizes of the objects: of a run without objects an empty table.
+
+        Args:
+            names: of object ids, where known (`Sequence.instance_names`).
+        """
+        if self.objects is None:
+            return ObjectTable("masks", self.gaussian_count)
+        found = self.objects
+        return ObjectTable.of_parts(self.parts(), found.classifier, found.supervision, names, found.observations)
+
+    def objects_at(self, points: np.ndarray, radius: float = 0.05) -> np.ndarray:
+        """Object at each place, uint16 [n], 0 = none: that of the nearest Gaussian within `radius` metres.
+
+        Args:
+            points: [n, 3] or [3], metres, world frame.
+            radius: metres.
+
+        Raises:
+            ValueError: points of another shape, or that are not finite.
+            ConfigError: the map did not fit into the run's limit of memory.
+        """
+        if self.cells is not None:
+            raise ConfigError("objects_at: the map is on disk (memory_limit_mb); save the run and read a part of it")
+        return objects_at(self.gaussians, points, radius)
 
     def trajectory(self) -> np.ndarray:
         """T_world_camera of every frame, float64 [n, 4, 4], NaN for lost ones; the world is the first keyframe's

@@ -169,9 +169,11 @@ class Slam:
     def note_step(self, is_keyframe: bool, seconds: float) -> StepReport:
         """What the step did that has just ended and took `seconds`; `steps` remembers it."""
         loops_s = 0.0 if self.loops is None else self.loops.seconds
-        return self.steps.add(
-            self.frames[-1], is_keyframe, seconds, self.times, loops_s, self.mapper, self.gaussian_count
-        )
+        frame = self.frames[-1]
+        report = self.steps.add(frame, is_keyframe, seconds, self.times, loops_s, self.mapper, self.gaussian_count)
+        if frame.status != TrackingStatus.LOST.value:
+            report.T_world_camera = self._anchor.T_world_camera @ frame.T_keyframe_camera
+        return report
 
     @property
     def gaussian_count(self) -> int:
@@ -201,6 +203,7 @@ class Slam:
             self._places(gaussians, cells), cells, None if self.pager is None else self.pager.report(),
             [*self._notes, *([] if self.pager is None else self.pager.budget.notes)],
             None if self.pager is None else self.pager.close, self.steps.to_csv(), device_name(self.map.device),
+            self.config,
         )  # fmt: skip
 
     def _places(self, gaussians: GaussianMap, cells: GaussianCells | None) -> bytes | None:

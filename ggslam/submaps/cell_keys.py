@@ -26,7 +26,7 @@ class Grid:
     axes: GridAxes
 
     @property
-    def spanned(self) -> np.ndarray:
+    def spans(self) -> np.ndarray:
         """bool [3]: which world axes the grid spans."""
         return np.array([name in self.axes for name in "xyz"])
 
@@ -36,7 +36,7 @@ class Grid:
         Raises:
             ConfigError: a coordinate is not finite or more than 2^31 cells away.
         """
-        cells = np.floor(np.asarray(points, np.float64) / self.spacing + 0.5) * self.spanned
+        cells = np.floor(np.asarray(points, np.float64) / self.spacing + 0.5) * self.spans
         if not (np.abs(cells) < _LIMIT).all():  # NaN is not
             raise ConfigError(f"positions must be finite and within 2^31 cells of {self.spacing:g} m of the origin")
         return cells.astype(np.int64)
@@ -56,12 +56,12 @@ class Grid:
 
     def distances(self, keys: np.ndarray, position: np.ndarray) -> np.ndarray:
         """Metres, float64 [N], along the grid's axes from a position [3] to the centres of cells [N, 3]."""
-        return np.linalg.norm((self.centres_of(keys) - position) * self.spanned, axis=1)
+        return np.linalg.norm((self.centres_of(keys) - position) * self.spans, axis=1)
 
     def box(self, position: np.ndarray, radius: float) -> tuple[CellKey, CellKey]:
         """Least and greatest coordinates of the cells whose centres can lie within `radius` metres of a position."""
-        position = np.asarray(position, np.float64) * self.spanned
-        reach = radius * self.spanned
+        position = np.asarray(position, np.float64) * self.spans
+        reach = radius * self.spans
         low = np.ceil((position - reach) / self.spacing - 1e-9).clip(-_LIMIT, _LIMIT)
         high = np.floor((position + reach) / self.spacing + 1e-9).clip(-_LIMIT, _LIMIT)
         (x, y, z), (u, v, w) = low.astype(np.int64).tolist(), high.astype(np.int64).tolist()

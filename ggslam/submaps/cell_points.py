@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points of a cell: as bytes (PCD, world coordinates) and back, thinned out, and compared with an earlier recording."""
+"""Points of a cell: as bytes (PCD, world coordinates) and back; thinning, and comparison with an earlier recording."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def decode_points(data: bytes, path: str | Path) -> dict[str, np.ndarray]:
     return arrays | {name: np.ascontiguousarray(rows[name]) for name in names if name not in ("x", "y", "z")}
 
 
-def selected(arrays: CellArrays, rows: np.ndarray) -> dict[str, np.ndarray]:
+def select(arrays: CellArrays, rows: np.ndarray) -> dict[str, np.ndarray]:
     """The rows (indices or bool mask) of every array."""
     return {name: values[rows] for name, values in arrays.items()}
 
 
-def thinned(arrays: CellArrays, voxel: float, ratio: float) -> dict[str, np.ndarray]:
+def thin(arrays: CellArrays, voxel: float, ratio: float) -> dict[str, np.ndarray]:
     """At most one point per cube of edge `voxel` (metres; 0: all), then the share `ratio` of them, evenly taken.
 
     A cube's points become their mean, in the order of the cubes; attributes of floating-point type too, others are
@@ -71,7 +71,7 @@ def thinned(arrays: CellArrays, voxel: float, ratio: float) -> dict[str, np.ndar
     kept = round(len(arrays["points"]) * ratio)
     if kept == len(arrays["points"]):
         return dict(arrays)
-    return selected(arrays, (np.arange(kept) * (len(arrays["points"]) / max(kept, 1))).astype(np.int64))
+    return select(arrays, (np.arange(kept) * (len(arrays["points"]) / max(kept, 1))).astype(np.int64))
 
 
 def _voxel_means(arrays: CellArrays, voxel: float) -> dict[str, np.ndarray]:

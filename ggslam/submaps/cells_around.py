@@ -135,10 +135,10 @@ class CellsAround(Generic[Cell]):
             except KeyError:  # removed since
                 continue
         self._versions = wanted
-        self.cells, self.damaged = self._held(cells), damaged
+        self.cells, self.damaged = self._to_keep(cells), damaged
         return True
 
-    def _held(self, cells: Mapping[CellKey, Cell]) -> Mapping[CellKey, Cell]:
+    def _to_keep(self, cells: Mapping[CellKey, Cell]) -> Mapping[CellKey, Cell]:
         """What to keep as `cells`."""
         return cells
 

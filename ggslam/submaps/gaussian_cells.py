@@ -17,7 +17,7 @@ from ggslam.geometry.frustums import Frustums
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_records import CellWrite
-from ggslam.submaps.gaussian_rows import Rows, decode_rows, encode_rows, joined, map_like
+from ggslam.submaps.gaussian_rows import Rows, decode_rows, encode_rows, join, map_like
 from ggslam.submaps.grid import GridStore
 
 PART, ARRIVALS = "gaussians.npz", "arrivals.npz"
@@ -69,7 +69,7 @@ class GaussianCells:
         """Cells that have Gaussians on disk, sorted."""
         return sorted(self._cells)
 
-    def needed(self, frustums: Frustums) -> list[list[CellKey]]:
+    def visible_cells(self, frustums: Frustums) -> list[list[CellKey]]:
         """Of each camera, the cells on disk with Gaussians that it may see, sorted."""
         keys = self.sorted_keys()
         if not keys:
@@ -81,12 +81,12 @@ class GaussianCells:
 
     def cells_of(self, gaussians: GaussianMap) -> dict[CellKey, np.ndarray]:
         """The rows of a map in memory by cell, int64 [n] each, rising."""
-        packed = self._packed(gaussians.means.numpy())
+        packed = self._pack(gaussians.means.numpy())
         order = np.argsort(packed, kind="stable")
         packed = packed[order]
         starts = np.flatnonzero(np.diff(packed, prepend=-1))
         groups = np.split(order, starts[1:]) if len(order) else []
-        rows = {_unpacked(packed[start]): index for start, index in zip(starts, groups, strict=True)}
+        rows = {_key_of(packed[start]): index for start, index in zip(starts, groups, strict=True)}
         rows.pop(_NOWHERE, None)
         return rows
 
@@ -101,7 +101,7 @@ class GaussianCells:
             np.maximum.reduceat(means + reach, starts).astype(np.float64),
         )
 
-    def _packed(self, means: np.ndarray) -> np.ndarray:
+    def _pack(self, means: np.ndarray) -> np.ndarray:
         """The cell of each mean as one number, a block at a time: the map may take most of the memory there is."""
         out = np.empty(len(means), np.int64)
         reach = _HALF * self.store.grid.spacing * 0.99
@@ -186,7 +186,7 @@ class GaussianCells:
 
     def _add_arrivals(self, key: CellKey, rows: Rows, more: bool) -> None:
         if more:
-            rows = joined([decode_rows(self.store.get(key, ARRIVALS), self._name(key)), rows])
+            rows = join([decode_rows(self.store.get(key, ARRIVALS), self._name(key)), rows])
         self.store.put(key, {ARRIVALS: encode_rows(rows)})
 
     def box(self, key: CellKey) -> tuple[np.ndarray, np.ndarray]:
@@ -218,9 +218,9 @@ class GaussianCells:
         batch: list[tuple[CellWrite, _Held]] = []
         size = 0
         for key, added in cells:
-            rows = joined([self._rows(key), added]) if key in self._cells else added
+            rows = join([self._rows(key), added]) if key in self._cells else added
             data = encode_rows(rows)
-            held = _held(rows)
+            held = _summarise(rows)
             batch.append((CellWrite(key, {PART: data, **(others or {})}, counts={PART: held.count}), held))
             size += len(data)
             if size > _BATCH_BYTES:
@@ -239,13 +239,13 @@ class GaussianCells:
                 written.append(write.key)
 
 
-def _unpacked(number: int) -> CellKey:
+def _key_of(number: int) -> CellKey:
     limit = (1 << _BITS) - 1
     number = int(number)
     return (number >> 2 * _BITS) - _HALF, ((number >> _BITS) & limit) - _HALF, (number & limit) - _HALF
 
 
-def _held(rows: Rows) -> _Held:
+def _summarise(rows: Rows) -> _Held:
     means, reach = rows["means"].numpy(), _reach(rows["log_scales"].numpy())
     low, high = (means - reach).min(0).astype(np.float64), (means + reach).max(0).astype(np.float64)
     return _Held(len(means), low, high, np.unique(rows["birth_keyframe"].numpy()))

@@ -45,6 +45,6 @@ def map_like(gaussians: GaussianMap, rows: Rows | None = None) -> GaussianMap:
     return out
 
 
-def joined(parts: list[Rows]) -> Rows:
+def join(parts: list[Rows]) -> Rows:
     """Rows one after the other."""
     return parts[0] if len(parts) == 1 else {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

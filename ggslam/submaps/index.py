@@ -55,7 +55,7 @@ class CellIndex:
     @staticmethod
     def create(path: Path, settings: SubmapSettings) -> None:
         """Writes an empty index. Raises RunFolderError if it cannot be written."""
-        with _explained(path):
+        with _explain_errors(path):
             connection = sqlite3.connect(path, isolation_level=None)
             try:
                 connection.execute("PRAGMA journal_mode = WAL")
@@ -78,7 +78,7 @@ class CellIndex:
         """
         if not path.is_file():
             raise FormatError(f"{path.parent}: no grid store: there is no file {path.name}")
-        with _explained(path):
+        with _explain_errors(path):
             connection = _connect(path, write)
             try:
                 _check_size(path, connection)
@@ -193,12 +193,12 @@ class CellIndex:
                 connection.execute(f"DELETE FROM {table} WHERE x = ? AND y = ? AND z = ?", key)
 
     def _rows(self, query: str, values: Sequence[Any] = ()) -> list[tuple]:
-        with self._lock, _explained(self.path):
+        with self._lock, _explain_errors(self.path):
             return self._connection.execute(query, values).fetchall()
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._lock, _explained(self.path):
+        with self._lock, _explain_errors(self.path):
             self._connection.execute("BEGIN IMMEDIATE")
             try:
                 yield self._connection
@@ -256,7 +256,7 @@ def _read_settings(path: Path, connection: sqlite3.Connection) -> SubmapSettings
 
 
 @contextmanager
-def _explained(path: Path) -> Iterator[None]:
+def _explain_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.Error as error:

@@ -48,7 +48,7 @@ class PartialMap(CellsAround[CellArrays]):
         """Points of the union, [N, 3] in metres, world."""
         return self.arrays["points"]
 
-    def _held(self, cells: Mapping[CellKey, CellArrays]) -> Mapping[CellKey, CellArrays]:
+    def _to_keep(self, cells: Mapping[CellKey, CellArrays]) -> Mapping[CellKey, CellArrays]:
         self.arrays, self.slices = _union(cells)
         return {key: {name: v[rows] for name, v in self.arrays.items()} for key, rows in self.slices.items()}
 

@@ -14,8 +14,8 @@ from ggslam.submaps.cell_points import (
     changed_share,
     decode_points,
     encode_points,
-    selected,
-    thinned,
+    select,
+    thin,
 )
 from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.grid import GridStore, check_same_grid
@@ -78,8 +78,8 @@ class SubmapRecorder:
             return None
         arrays = {"points": points_world, **(attributes or {})}
         within = np.linalg.norm(points_world - position, axis=1) <= self.settings.sensor_range  # NaN is not
-        arrays = thinned(selected(arrays, within), self.settings.voxel, self.settings.ratio)
-        changed = self._changed(key, arrays["points"], position)
+        arrays = thin(select(arrays, within), self.settings.voxel, self.settings.ratio)
+        changed = self._changed_share(key, arrays["points"], position)
         self.store.put(
             key,
             {POINTS: encode_points(arrays), **(parts or {})},
@@ -89,11 +89,11 @@ class SubmapRecorder:
         )
         return key
 
-    def _changed(self, key: CellKey, points: np.ndarray, position: np.ndarray) -> float | None:
+    def _changed_share(self, key: CellKey, points: np.ndarray, position: np.ndarray) -> float | None:
         """Share that differs from the last recording, where both sensors, within R of the centre, could see."""
         if key not in self.store or POINTS not in self.store.cell(key).parts:
             return None
-        centre = np.where(self.store.grid.spanned, self.store.centre_of(key), position)
+        centre = np.where(self.store.grid.spans, self.store.centre_of(key), position)
         reach = max(self.settings.sensor_range - self.settings.radius, 0.0)
         old = load_points(self.store, key)["points"]
         return changed_share(old, points, self.settings.change_distance, centre, reach)
@@ -129,11 +129,11 @@ def store_cloud(
     arrays: CellArrays = {"points": points, **(attributes or {})}
     finite = np.isfinite(points).all(1)
     if not finite.all():
-        arrays = selected(arrays, finite)
+        arrays = select(arrays, finite)
     keys: list[CellKey] = []
     waiting: list[CellWrite] = []
     for key, indices in partition(arrays["points"], store.grid):
-        cell = thinned(selected(arrays, indices), store.settings.voxel, store.settings.ratio)
+        cell = thin(select(arrays, indices), store.settings.voxel, store.settings.ratio)
         changed = None
         if key in store and POINTS in store.cell(key).parts:
             changed = changed_share(load_points(store, key)["points"], cell["points"], store.settings.change_distance)

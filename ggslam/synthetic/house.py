@@ -79,7 +79,7 @@ def ring_of_rooms(seed: int = 0) -> Scene:
     house_rooms.kitchen(b, m, rng)
     house_rooms.corridors(b, m)
     scene = b.scene
-    scene.lights = [_kept_in(light, spaces) for light in scene.lights]
+    scene.lights = [_bound_light(light, spaces) for light in scene.lights]
     scene.bounds = ((-HALF_WALL, -HALF_WALL, 0.0), (WIDTH + HALF_WALL, DEPTH + HALF_WALL, HEIGHT))
     scene.route = np.array(ROUTE, float)
     return scene
@@ -106,7 +106,7 @@ def _spaces(m: HousePalette) -> tuple[Space, ...]:
     )  # fmt: skip
 
 
-def _kept_in(light: Light, spaces: tuple[Space, ...]) -> Light:
+def _bound_light(light: Light, spaces: tuple[Space, ...]) -> Light:
     """The light, ending in the openings of the space it is in: what it sends further is little and costly."""
     x, y = light.points[:, :2].mean(0)
     t = HALF_WALL

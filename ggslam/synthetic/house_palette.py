@@ -17,18 +17,18 @@ class HousePalette(Palette):
         super().__init__(seed)
         make = MaterialMaker(np.random.default_rng([seed, 5]))
         # walls of rooms
-        self.slate = make.clouded((0.42, 0.50, 0.58), 0.10)
+        self.slate = make.limewash((0.42, 0.50, 0.58), 0.10)
         self.lilac = make.wallpaper((0.78, 0.72, 0.80), (0.50, 0.38, 0.56), 0.36)
         self.rosy = make.stripes((0.84, 0.70, 0.68), (0.76, 0.58, 0.58), 3, 0.9)
-        self.sage = make.clouded((0.62, 0.70, 0.56), 0.08)
+        self.sage = make.limewash((0.62, 0.70, 0.56), 0.08)
         self.wall_tiles = make.tiles((0.86, 0.88, 0.84), (0.72, 0.82, 0.80), (0.62, 0.62, 0.60), 4, 0.8)
         # walls of corridors: much to see, nothing to feel
-        self.ochre = make.clouded((0.80, 0.64, 0.38), 0.14)
+        self.ochre = make.limewash((0.80, 0.64, 0.38), 0.14)
         self.panels = make.planks((0.34, 0.24, 0.18), (0.58, 0.42, 0.28), 6, 1.9)
-        self.teal = make.clouded((0.36, 0.60, 0.60), 0.15)
+        self.teal = make.limewash((0.36, 0.60, 0.60), 0.15)
         self.brickwork = make.bricks((0.66, 0.60, 0.52), (0.52, 0.48, 0.44), 1.6)
         # floors
-        self.carpet = make.clouded((0.34, 0.36, 0.42), 0.20, 1.1)
+        self.carpet = make.limewash((0.34, 0.36, 0.42), 0.20, 1.1)
         self.parquet = make.planks((0.58, 0.42, 0.24), (0.82, 0.66, 0.44), 12, 1.3)
         self.kitchen_floor = make.tiles((0.88, 0.86, 0.80), (0.24, 0.26, 0.28), (0.5, 0.5, 0.5), 4, 1.3)
         self.flagstones = make.tiles((0.58, 0.55, 0.50), (0.48, 0.46, 0.44), (0.34, 0.33, 0.32), 5, 2.1)
@@ -43,7 +43,7 @@ class HousePalette(Palette):
         self.wardrobe_front = pictures.door(make, (0.66, 0.50, 0.34))
         self.cabinet_front = pictures.drawers(make, (0.50, 0.54, 0.60), 1, 4)
         self.dresser_front = pictures.drawers(make, (0.70, 0.54, 0.40), 2, 3)
-        self.worktop = make.clouded((0.30, 0.28, 0.27), 0.30, 0.5)
+        self.worktop = make.limewash((0.30, 0.28, 0.27), 0.30, 0.5)
         self.whiteboard = pictures.diagram(make)
         self.posters = [
             pictures.abstract(make, [(0.12, 0.16, 0.24), (0.92, 0.78, 0.30), (0.80, 0.30, 0.28), (0.90, 0.90, 0.86)]),

@@ -92,10 +92,10 @@ class _Patches:
     def near(self, number: int, shape: Shape, reach: float) -> np.ndarray:
         """Numbers of the patches that look at a shape and may be within `reach` metres of it."""
         apart = np.linalg.norm(self._centre - shape.T_world_shape[:3, 3], axis=1)
-        chosen = self._looking(number, shape, apart < reach + shape.radius() + self._radius)
+        chosen = self._patches_facing(number, shape, apart < reach + shape.radius() + self._radius)
         return chosen[shape.distance(self.position[chosen]) < reach]
 
-    def shaded(self, number: int, shape: Shape, light: np.ndarray, spread: float) -> np.ndarray:
+    def find_shaded(self, number: int, shape: Shape, light: np.ndarray, spread: float) -> np.ndarray:
         """Numbers of the patches that look at a shape which may hide part of a ball of radius `spread` at `light`."""
         centre, way = shape.T_world_shape[:3, 3], light - self._centre
         length = np.linalg.norm(way, axis=1)
@@ -103,9 +103,9 @@ class _Patches:
         apart = np.linalg.norm(self._centre + share[:, None] * way - centre, axis=1)
         # The ways to the ball form a cone: they spread only towards the light.
         farthest = np.minimum(share + (shape.radius() + spread) / length, 1)
-        return self._looking(number, shape, apart < shape.radius() + farthest * spread + self._radius)
+        return self._patches_facing(number, shape, apart < shape.radius() + farthest * spread + self._radius)
 
-    def _looking(self, number: int, shape: Shape, strips: np.ndarray) -> np.ndarray:
+    def _patches_facing(self, number: int, shape: Shape, strips: np.ndarray) -> np.ndarray:
         """Of the patches in some strips (bool), those with some of the shape above their plane. A convex shape hides
         nothing from itself."""
         chosen = np.nonzero(strips[self._strip])[0]
@@ -185,7 +185,7 @@ def _direct(shapes: Sequence[Shape | None], light: Light, patches: _Patches) -> 
     spread = float(np.linalg.norm(light.points - centre, axis=1).max())
     for number, shape in enumerate(shapes):
         if shape is not None and shape.casts_shadow:
-            chosen = patches.shaded(number, shape, centre, spread)
+            chosen = patches.find_shaded(number, shape, centre, spread)
             chosen = chosen[lit[chosen]]
             visible[chosen] &= _first_hits(shape, patches.position[chosen], to_light[:, chosen]) > 1
     return (strength * visible).mean(1)[:, None] * np.array(light.power)

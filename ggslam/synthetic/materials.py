@@ -137,7 +137,7 @@ class MaterialMaker:
         strength = np.broadcast_to(_step(np.sin(2 * np.pi * count * x) * 12), (256, 256))
         return self.finish(_mix(first, second, strength) * (1 + 0.03 * self.noise(256, 256, 0.6))[..., None], tile)
 
-    def clouded(self, color: Color, contrast: float, tile: float = 2.4) -> Material:
+    def limewash(self, color: Color, contrast: float, tile: float = 2.4) -> Material:
         """Limewash, carpet, stone: irregular patches of all sizes, no two alike within a tile."""
         shade = contrast * (0.7 * self.noise(slope=1.1) + 0.5 * self.noise(slope=0.6))
         hue = 0.25 * contrast * np.stack([self.noise(slope=1.3) for _ in range(3)], -1)

@@ -22,7 +22,14 @@ class Palette:
 
     def __init__(self, seed: int) -> None:
         make = MaterialMaker(np.random.default_rng([seed, 1]))
-        # shell
+        self._make_shell(make)
+        self._make_hard(make)
+        self._make_cloth(make)
+        self._make_pictures(make)
+        self._make_small(make)
+
+    def _make_shell(self, make: MaterialMaker) -> None:
+        """Floor, walls, ceiling."""
         self.floor = make.planks((0.36, 0.23, 0.14), (0.66, 0.48, 0.31))
         self.ceiling = make.plaster((0.90, 0.89, 0.86))
         self.wallpaper = make.wallpaper((0.80, 0.77, 0.68), (0.52, 0.62, 0.58))
@@ -30,7 +37,9 @@ class Palette:
         self.brick = make.bricks((0.60, 0.33, 0.25), (0.72, 0.69, 0.64))
         self.stripes = make.stripes((0.62, 0.70, 0.76), (0.74, 0.80, 0.83))
         self.white = make.plain((0.90, 0.89, 0.87))
-        # wood, metal, stone
+
+    def _make_hard(self, make: MaterialMaker) -> None:
+        """Wood, metal, stone."""
         self.oak = make.wood((0.55, 0.37, 0.21), (0.78, 0.59, 0.37))
         self.walnut = make.wood((0.25, 0.15, 0.09), (0.47, 0.31, 0.20))
         self.pine = make.wood((0.74, 0.58, 0.36), (0.90, 0.77, 0.55))
@@ -40,7 +49,9 @@ class Palette:
         self.terracotta = make.plain((0.70, 0.38, 0.25), 0.08, 0.3)
         self.earth = make.plain((0.22, 0.15, 0.10), 0.3, 0.12)
         self.porcelain = make.plain((0.90, 0.90, 0.91), 0.03)
-        # cloth
+
+    def _make_cloth(self, make: MaterialMaker) -> None:
+        """Cloth and wickerwork."""
         self.sofa = make.fabric((0.24, 0.40, 0.46))
         self.sofa_seat = make.fabric((0.30, 0.48, 0.54))
         self.mustard = make.fabric((0.84, 0.62, 0.20))
@@ -51,7 +62,9 @@ class Palette:
         self.curtain = make.folds((0.72, 0.28, 0.24))
         self.rug = make.rug((0.58, 0.20, 0.18), (0.88, 0.78, 0.60), (0.16, 0.22, 0.38))
         self.wicker = make.checker((0.70, 0.53, 0.33), (0.52, 0.36, 0.20), 24)
-        # pictures and screens
+
+    def _make_pictures(self, make: MaterialMaker) -> None:
+        """Pictures, screens, fronts."""
         self.window = pictures.landscape(make, (0.52, 0.72, 0.95), emission=1.9)
         self.paintings = [
             pictures.landscape(make, (0.95, 0.70, 0.45)),
@@ -68,7 +81,9 @@ class Palette:
         self.desk_drawers = pictures.drawers(make, (0.80, 0.66, 0.44), 1, 3)
         self.clock = pictures.clock(make)
         self.globe = pictures.globe(make)
-        # small things
+
+    def _make_small(self, make: MaterialMaker) -> None:
+        """Lamps, plants, fruit, toys, dishes, books."""
         self.shade = make.plain((0.99, 0.90, 0.70), 0.04, emission=1.25)
         self.bulb = make.plain((0.99, 0.96, 0.88), 0.01, emission=2.2)
         self.leaves = [make.plain((0.16 + 0.05 * k, 0.38 + 0.08 * k, 0.15), 0.22, 0.1) for k in range(3)]

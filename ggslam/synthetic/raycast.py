@@ -148,10 +148,10 @@ class RayCaster:
             face, a, b, normal = locate(kind, points, self._half[number], self._top[number])
             cosine = np.abs((normal * turned).sum(1)) / np.sqrt((normal**2).sum(1) * (turned**2).sum(1))
             face = face + self._first_face[number]
-            light[pixels] = self._reflected(face, a, b, t * np.float32(angle) / np.sqrt(np.maximum(cosine, 0.05)))
+            light[pixels] = self._light_of_faces(face, a, b, t * np.float32(angle) / np.sqrt(np.maximum(cosine, 0.05)))
         return light.reshape(*depth.shape, 3)
 
-    def _reflected(self, face: np.ndarray, u: np.ndarray, v: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+    def _light_of_faces(self, face: np.ndarray, u: np.ndarray, v: np.ndarray, footprint: np.ndarray) -> np.ndarray:
         """Light [n, 3] from points (u, v) on faces, `footprint` metres wide."""
         maps = self._lights
         columns, rows = maps.size[face].T.astype(np.float32)

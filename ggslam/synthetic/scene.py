@@ -124,7 +124,7 @@ class SceneBuilder:
         """A new instance with its own mask id, placed at `at` and turned about z by `turn` degrees."""
         identifier = len(self.scene.instance_names) + 1
         self.scene.instance_names[identifier] = name
-        return Placer(self.scene, identifier, _placed(at, (0.0, 0.0, turn)))
+        return Placer(self.scene, identifier, _make_transform(at, (0.0, 0.0, turn)))
 
     def light(self, points: np.ndarray, power: Vector, normal: Vector | None = None) -> None:
         """Adds an area light; see `Light`."""
@@ -139,9 +139,9 @@ class Placer:
     identifier: int
     T_world_own: np.ndarray
 
-    def moved(self, at: Vector, turn: float = 0.0) -> Placer:
+    def shift(self, at: Vector, turn: float = 0.0) -> Placer:
         """The same instance with its origin shifted and turned, for repeated parts."""
-        return replace(self, T_world_own=self.T_world_own @ _placed(at, (0.0, 0.0, turn)))
+        return replace(self, T_world_own=self.T_world_own @ _make_transform(at, (0.0, 0.0, turn)))
 
     def box(
         self, centre: Vector, size: Vector, material: Material, angles: Vector = (0.0, 0.0, 0.0),
@@ -149,13 +149,14 @@ class Placer:
     ) -> None:  # fmt: skip
         """A box; `faces` gives some faces (-x, +x, -y, +y, -z, +z) another material."""
         half = (size[0] / 2, size[1] / 2, size[2] / 2)
-        self._add(Shape(Kind.BOX, half, _placed(centre, angles), material, self.identifier, faces or {}))
+        self._add(Shape(Kind.BOX, half, _make_transform(centre, angles), material, self.identifier, faces or {}))
 
     def ellipsoid(
         self, centre: Vector, radii: Vector, material: Material, angles: Vector = (0.0, 0.0, 0.0), shadow: bool = True
     ) -> None:
         """An ellipsoid (a ball for equal radii)."""
-        self._add(Shape(Kind.ELLIPSOID, radii, _placed(centre, angles), material, self.identifier, casts_shadow=shadow))
+        pose = _make_transform(centre, angles)
+        self._add(Shape(Kind.ELLIPSOID, radii, pose, material, self.identifier, casts_shadow=shadow))
 
     def cylinder(
         self, centre: Vector, radius: float, height: float, material: Material, angles: Vector = (0.0, 0.0, 0.0),
@@ -164,14 +165,14 @@ class Placer:
         """A cylinder about z, or a truncated cone of upper radius `top` times `radius`; `cap` is for the upper cap."""
         faces = {1: cap} if cap is not None else {}
         half = (radius, radius, height / 2)
-        pose = _placed(centre, angles)
+        pose = _make_transform(centre, angles)
         self._add(Shape(Kind.FRUSTUM, half, pose, material, self.identifier, faces, top, shadow))
 
     def _add(self, shape: Shape) -> None:
         self.scene.shapes.append(replace(shape, T_world_shape=self.T_world_own @ shape.T_world_shape))
 
 
-def _placed(at: Vector, angles: Vector) -> np.ndarray:
+def _make_transform(at: Vector, angles: Vector) -> np.ndarray:
     """Transform [4, 4]: rotation about x, then y, then z in degrees, then translation."""
     (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(angles)), np.sin(np.radians(angles))
     x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])

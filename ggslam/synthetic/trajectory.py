@@ -81,11 +81,11 @@ def _path(scene: Scene, frames: int, trajectory: str, seed: int, size: float) ->
     for i in range(frames):
         angle, tilt = heading[i] + 0.012 * unrest[i, 3], pitch[i] + 0.010 * unrest[i, 4]
         forward = np.array([np.cos(angle) * np.cos(tilt), np.sin(angle) * np.cos(tilt), np.sin(tilt)])
-        poses[i] = _looking(position[i], forward, 0.012 * unrest[i, 5])
+        poses[i] = _look_along(position[i], forward, 0.012 * unrest[i, 5])
     return poses
 
 
-def _looking(position: np.ndarray, forward: np.ndarray, roll: float) -> np.ndarray:
+def _look_along(position: np.ndarray, forward: np.ndarray, roll: float) -> np.ndarray:
     """Pose of a camera at `position` with its z axis along `forward`, turned about it by `roll` radians."""
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -125,7 +125,7 @@ def _route(scene: Scene, frames: int, seed: int, closed: bool) -> np.ndarray:
     forward = np.stack([np.cos(heading) * np.cos(tilt), np.sin(heading) * np.cos(tilt), np.sin(tilt)], 1)
     if not _is_clear(scene, position, ROUTE_CLEARANCE):
         raise SequenceError(f"the route leads nearer than {ROUTE_CLEARANCE} m to something")
-    return np.stack([_looking(p, f, 0.012 * u) for p, f, u in zip(position, forward, unrest[:, 5], strict=True)])
+    return np.stack([_look_along(p, f, 0.012 * u) for p, f, u in zip(position, forward, unrest[:, 5], strict=True)])
 
 
 def _circuit(route: np.ndarray, frames: int) -> np.ndarray:

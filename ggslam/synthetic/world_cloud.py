@@ -40,7 +40,7 @@ def cloud_tiles(world: World, spacing: float = 0.1, seed: int = 0) -> Iterator[t
     for tile in range(count**2):
         rng = np.random.default_rng([world.seed, seed, 9, tile])
         faces = [_box_faces(world.boxes[order[start[tile] : start[tile + 1]]]), _level_faces(world, tile, count)]
-        points, normals = _sampled(np.concatenate(faces), spacing, rng)
+        points, normals = _sample(np.concatenate(faces), spacing, rng)
         seen = _free(world, points + _ABOVE * normals)
         yield points[seen].astype(np.float32), normals[seen].astype(np.float32)
 
@@ -68,7 +68,7 @@ def _level_faces(world: World, tile: int, count: int) -> np.ndarray:
     return np.array([[(x, y, 0.0), *edges, (0.0, 0.0, 1.0)], [(x, y, world.height), *edges, (0.0, 0.0, -1.0)]])
 
 
-def _sampled(faces: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _sample(faces: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """A point at random in each field of a lattice over each face: points and normals, float64 [n, 3]."""
     across, down = np.maximum(np.rint(2 * np.linalg.norm(faces[:, 1:3], axis=2) / spacing), 1).astype(np.int64).T
     face, index = spread(across * down)

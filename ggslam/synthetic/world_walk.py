@@ -32,7 +32,7 @@ def walk(world: World, length: float, seed: int = 0) -> np.ndarray:
     if not length >= 1:
         raise SequenceError(f"length: expected at least 1 m, found {length}")
     rng = np.random.default_rng([world.seed, seed, 11])
-    path = _evenly(_smoothed(_tour(world, 1.2 * length + 5, rng)))  # rounded corners are shorter
+    path = _evenly(_round_corners(_tour(world, 1.2 * length + 5, rng)))  # rounded corners are shorter
     tangent = np.gradient(path, axis=0)
     heading = gaussian_filter1d(np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])), _LOOKING / _FINE, mode="nearest")
     at = np.arange(int(length * RATE / SPEED)) * (SPEED / RATE / _FINE)
@@ -67,7 +67,7 @@ def _tour(world: World, length: float, rng: np.random.Generator) -> np.ndarray:
     return np.array(corners)
 
 
-def _smoothed(corners: np.ndarray) -> np.ndarray:
+def _round_corners(corners: np.ndarray) -> np.ndarray:
     """Places [n, 2] along a path with its corners [k, 2] rounded."""
     return gaussian_filter1d(_evenly(corners), _ROUNDING / _FINE, axis=0, mode="nearest")
 
@@ -89,12 +89,12 @@ def _poses(places: np.ndarray, heading: np.ndarray, rng: np.random.Generator) ->
     pitch = np.radians(0.8 * np.sin(step + 1) + 1.0 * slow[:, 2])
     yaw = heading + np.radians(1.0 * slow[:, 3])
     poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = _turned(yaw, 2) @ _turned(pitch, 1) @ _turned(roll, 0)
+    poses[:, :3, :3] = _rotations(yaw, 2) @ _rotations(pitch, 1) @ _rotations(roll, 0)
     poses[:, :2, 3], poses[:, 2, 3] = places, height
     return poses
 
 
-def _turned(angle: np.ndarray, axis: int) -> np.ndarray:
+def _rotations(angle: np.ndarray, axis: int) -> np.ndarray:
     """Rotations [n, 3, 3] by angles [n] about one of the axes."""
     a, b = (axis + 1) % 3, (axis + 2) % 3
     R = np.zeros((len(angle), 3, 3))

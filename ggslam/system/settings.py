@@ -132,7 +132,7 @@ def explain(error: pydantic_core.ValidationError, kind: type) -> str:
         return _unknown(path, kind)
     if first["type"] in ("dataclass_type", "dict_type"):
         return f"{name}: expected names with values, found {found!r}"
-    expected = _expected(path, kind) or first["msg"]
+    expected = _values_at(path, kind) or first["msg"]
     if first["type"].startswith("int_"):
         expected = f"a whole number, {expected}"
     return f"{name}: expected {expected}, found {found!r}"
@@ -149,11 +149,11 @@ def _unknown(path: list[Any], kind: type) -> str:
     return f"unknown setting {prefix}{name}; {hint}"
 
 
-def _expected(path: list[Any], kind: type) -> str:
+def _values_at(path: list[Any], kind: type) -> str:
     """What a setting may be, in words; empty where only its type can tell."""
     for known in walk(kind):
         if known.path.split(".") == path:
-            return known.expected()
+            return known.values()
     return ""
 
 
@@ -195,7 +195,7 @@ class Known:
         low, high = (str(bound) if isinstance(bound, int) else f"{bound:.12g}" for bound in (d.low, d.high))
         return f"{low} to {high} {d.unit}".rstrip()
 
-    def expected(self) -> str:
+    def values(self) -> str:
         """What it may be, in words; empty where only the type can tell."""
         if self.choices:
             *first, last = map(str, self.choices)

@@ -11,14 +11,14 @@ import numpy as np
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, PhotometricPart, align
-from ggslam.tracking.points import FramePoints, extract_points
+from ggslam.tracking.points import FramePoints, PointSource, extract_points
 from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings
 
 
 class TrackingEngine(Protocol):
     """Where a tracker's work is done."""
 
-    def points(self, depth: np.ndarray, settings: PointSettings, noise: DepthNoise) -> FramePoints:
+    def points(self, depth: np.ndarray, settings: PointSettings, noise: DepthNoise) -> PointSource:
         """Points of a depth image, float32 [H, W] in metres; see `points.extract_points`.
 
         Raises:
@@ -26,14 +26,14 @@ class TrackingEngine(Protocol):
         """
 
     def align(
-        self, source: FramePoints, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
+        self, source: PointSource, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
         noise: DepthNoise, photometric: PhotometricPart | None = None,
     ) -> AlignmentResult:  # fmt: skip
         """Aligns points that this engine gave; see `gicp.align`."""
 
 
 @dataclass(frozen=True)
-class NativeEngine:
+class CpuTrackingEngine:
     """The compiled core.
 
     Attributes:
@@ -49,8 +49,8 @@ class NativeEngine:
         return extract_points(depth, self.camera, settings, noise, self.context)
 
     def align(
-        self, source: FramePoints, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
+        self, source: PointSource, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
         noise: DepthNoise, photometric: PhotometricPart | None = None,
     ) -> AlignmentResult:  # fmt: skip
         """See `TrackingEngine`."""
-        return align(source, target, T_world_camera_guess, settings, noise, self.context, photometric)
+        return align(source.read(), target, T_world_camera_guess, settings, noise, self.context, photometric)

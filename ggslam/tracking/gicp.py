@@ -7,6 +7,7 @@ import ctypes
 import enum
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -163,6 +164,30 @@ class AlignmentStatus(enum.Enum):
 
 
 @dataclass(frozen=True)
+class PointMatches:
+    """What each point of a frame was matched to.
+
+    Attributes:
+        voxels: int32 [n], index of the fine voxel, -1 without.
+        squared_distances: float32 [n], squared point-to-plane distances, infinite without match.
+    """
+
+    voxels: np.ndarray
+    squared_distances: np.ndarray
+
+    def read(self) -> PointMatches:
+        """See `MatchSource`."""
+        return self
+
+
+class MatchSource(Protocol):
+    """Matches, which may still have to be fetched."""
+
+    def read(self) -> PointMatches:
+        """The matches on the host."""
+
+
+@dataclass(frozen=True)
 class AlignmentResult:
     """Where the frame is and how well that is known.
 
@@ -182,8 +207,7 @@ class AlignmentResult:
         visibility: float64 [6] ascending, the share of points that see each direction of motion (`observability`).
         weak_directions: float64 [k, 6], the directions seen by less than the limit: unit vectors (v, w radius) in world
             axes about the points' centroid, radius their root mean square distance from it.
-        matches: int32 [n], index of the fine voxel each point is matched to, -1 without.
-        squared_distances: float32 [n], squared point-to-plane distances, infinite without match.
+        matches: of the frame's points; `read` them.
         cost: mean robust cost of the geometry per unit of weight, square metres (plus the photometric part's).
         photometric_residual: mean absolute grey difference to the reference, [0, 1]; 0 without a reference.
         photometric_share: share of the photometric points seen by the reference.
@@ -199,8 +223,7 @@ class AlignmentResult:
     camera_information: np.ndarray
     visibility: np.ndarray
     weak_directions: np.ndarray
-    matches: np.ndarray
-    squared_distances: np.ndarray
+    matches: MatchSource
     cost: float
     photometric_residual: float = 0.0
     photometric_share: float = 0.0
@@ -291,7 +314,8 @@ def _result(
     status, visibility, weak = judge(information, T[:3, :3], spread, bool(found.usable), settings.degenerate_below)
     return AlignmentResult(
         T, status, bool(found.converged), found.coarse_iterations + found.fine_iterations, found.overlap, found.rmse,
-        about_point(information, T[:3, 3]), information, visibility, weak, matches, squared, found.cost,
+        about_point(information, T[:3, 3]), information, visibility, weak, PointMatches(matches, squared),
+        found.cost,
         found.photometric_residual, found.photometric_share,
     )  # fmt: skip
 

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -13,6 +15,23 @@ from ggslam.interface.core import tracking as structures
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.tracking.settings import DepthNoise, PointSettings
+
+
+class PointSource(Protocol):
+    """Points of a frame, which may still have to be computed or fetched."""
+
+    def __len__(self) -> int:
+        """Number of points."""
+
+    @property
+    def median_depth(self) -> float:
+        """Median depth in metres; 0 without points."""
+
+    def median_depth_if_known(self) -> float | None:
+        """Median depth in metres; None if that would have to be waited for."""
+
+    def read(self) -> FramePoints:
+        """The points on the host."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +61,40 @@ class FramePoints:
         return float(np.median(self.points[:, 2])) if len(self.points) else 0.0
 
     def median_depth_if_known(self) -> float | None:
-        """Median depth in metres, unless someone would have to be waited for."""
+        """See `PointSource`."""
         return self.median_depth
+
+    def read(self) -> FramePoints:
+        """See `PointSource`."""
+        return self
+
+
+class DeferredPoints:
+    """Points of a frame that are extracted when they are read: keyframes need them, not every tracker does.
+
+    Args:
+        extract: gives them.
+        median_depth: estimate of their median depth, metres, that needs no extraction.
+    """
+
+    def __init__(self, extract: Callable[[], FramePoints], median_depth: float) -> None:
+        self._extract = extract
+        self._points: FramePoints | None = None
+        self.median_depth = median_depth
+        """Metres, an estimate."""
+
+    def __len__(self) -> int:
+        return len(self.read())
+
+    def median_depth_if_known(self) -> float | None:
+        """See `PointSource`."""
+        return self.median_depth
+
+    def read(self) -> FramePoints:
+        """The points, extracted by the first call."""
+        if self._points is None:
+            self._points = self._extract()
+        return self._points
 
 
 def grid_stride(pixels: int, count: int) -> int:

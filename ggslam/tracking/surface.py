@@ -18,7 +18,7 @@ from ggslam.formats.array_archive import ArrayArchive, Arrays
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transformed
 from ggslam.tracking.gicp import GicpTarget
-from ggslam.tracking.points import FramePoints
+from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import TargetSettings
 
 SPACING = 3.0 / 200.0
@@ -79,11 +79,12 @@ class MeasuredSurface:
     def __len__(self) -> int:
         return len(self._parts)
 
-    def add(self, points: FramePoints, T_world_camera: np.ndarray) -> GicpTarget:
+    def add(self, points: PointSource, T_world_camera: np.ndarray) -> GicpTarget:
         """Adds the points of a keyframe seen from `T_world_camera` [4, 4]; returns the new target."""
-        part = self._append(points.points.copy(), points.normals.copy(), np.array(T_world_camera, float))
+        read = points.read()
+        part = self._append(read.points.copy(), read.normals.copy(), np.array(T_world_camera, float))
         self.active.add(len(self._parts) - 1)
-        self.target = self._gathered([part], self.target)
+        self.target = self._gather([part], self.target)
         return self.target
 
     def _append(self, points: np.ndarray, normals: np.ndarray, T_world_camera: np.ndarray) -> _Part:
@@ -98,7 +99,7 @@ class MeasuredSurface:
 
     def of(self, numbers: Iterable[int]) -> GicpTarget:
         """A target of these keyframes alone."""
-        return self._gathered([self._parts[number] for number in numbers], None)
+        return self._gather([self._parts[number] for number in numbers], None)
 
     def points(self, numbers: Iterable[int]) -> np.ndarray:
         """World points float32 [n, 3] of these keyframes."""
@@ -151,7 +152,7 @@ class MeasuredSurface:
             self._append(q.astype(np.float32) * (r / np.float32(32767)), normals, T.astype(float))
         self.arrange(set(range(len(self._parts))))
 
-    def _gathered(self, parts: list[_Part], base: GicpTarget | None) -> GicpTarget:
+    def _gather(self, parts: list[_Part], base: GicpTarget | None) -> GicpTarget:
         count = sum(part.count for part in parts)
         points, quaternions, log_scales = (np.empty((count, width), np.float32) for width in (3, 4, 3))
         begin = 0

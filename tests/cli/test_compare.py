@@ -28,7 +28,7 @@ def ggslam(*arguments: object) -> Result:
 
 
 def compared(*arguments: object, out: Path) -> tuple[dict[str, Any], str]:
-    result = ggslam("compare", *arguments, "--json", out / "found.json")
+    result = ggslam("compare", *arguments, "--out", out / "found.json")
     assert result.exit_code == 0 and result.exception is None, (result.output, result.exception)
     return json.loads((out / "found.json").read_text()), result.output
 

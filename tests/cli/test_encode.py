@@ -45,7 +45,8 @@ def ggslam(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) 
 def voxel_cloud(side: int = 40) -> VoxelCloud:
     """A wavy sheet of four objects, sorted as voxel clouds are."""
     x, y = (v.reshape(-1) for v in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
-    z = np.rint(6 + 5 * np.sin(x / 5) * np.cos(y / 6)).astype(int)
+    z = np.rint(5 + 5 * np.sin(x / 5) * np.cos(y / 6)).astype(int)
+    z -= z.min()  # grids of runs begin at their lowest points
     colors = np.stack([100 + 90 * np.sin(x / 6), 120 + 80 * np.cos(y / 9), 10 * z], 1).clip(0, 255).astype(np.uint8)
     ids = (7 * (x > side // 2) + 300 * (y > side // 2)).astype(np.int32)
     return VoxelCloud(np.stack([x, y, z], 1).astype(np.int32), colors, ids, 0.02, np.array([-0.4, 1.2, 0.06]))

@@ -83,20 +83,20 @@ def test_a_recording_is_located_in_a_run(run: Path, room: Path, tmp_path: Path) 
     gaussians = sum(c.parts[GAUSSIANS].count for c in cells if GAUSSIANS in c.parts)
     assert gaussians == len(RunFolder.open(run).gaussians())
     assert "cut into cells" not in done("localize", run, room, "--stop", 2, "--out", tmp_path / "again")
-    full = ["--full-map", "--start", ORIGIN, "--stop", 6]
+    full = ["--full-map", "--start-pose", ORIGIN, "--stop", 6]
     done("localize", run, room, *full, "--out", tmp_path / "full")
     assert summary(tmp_path / "full")["full_map"] and summary(tmp_path / "full")["located_share"] == 1
 
 
 def test_scans_are_located_in_a_cloud(scans: Path, tmp_path: Path) -> None:
     cloud = scans.parent / "cloud.npy"
-    done("localize", cloud, scans, "--start", "given", "--out", tmp_path / "out")
+    done("localize", cloud, scans, "--start-pose", "given", "--out", tmp_path / "out")
     found = summary(tmp_path / "out")
     assert found["located_share"] == 1 and found["rmse_m"] < 0.03 and found["map_points_mean"] > 0
     done("submaps", cloud, "--out", tmp_path / "map.grid", "--axes", "xy", "--voxel", "0", "--visit", "survey")
     output = done("submaps", tmp_path / "map.grid", "--since", "survey")
     assert "along xy" in output and "points.pcd" in output and "cells since survey" in output
-    done("localize", tmp_path / "map.grid", scans, "--start", "given", "--radius", 6, "--out", tmp_path / "small")
+    done("localize", tmp_path / "map.grid", scans, "--start-pose", "given", "--radius", 6, "--out", tmp_path / "small")
     small = summary(tmp_path / "small")
     assert small["located_share"] == 1 and small["map_points_mean"] < found["map_points_mean"]
     assert small["damaged_cells"] == []
@@ -104,7 +104,7 @@ def test_scans_are_located_in_a_cloud(scans: Path, tmp_path: Path) -> None:
         version = store.cell(store.cells()[len(store.cells()) // 2]).version
     damaged = next((tmp_path / "map.grid" / "cells").glob(f"*/{version}/points.pcd"))
     damaged.write_bytes(damaged.read_bytes()[:-1])
-    output = done("localize", tmp_path / "map.grid", scans, "--start", "given", "--out", tmp_path / "torn")
+    output = done("localize", tmp_path / "map.grid", scans, "--start-pose", "given", "--out", tmp_path / "torn")
     assert summary(tmp_path / "torn")["located_share"] == 1 and "left out" in output and "points.pcd" in output
 
 
@@ -125,24 +125,24 @@ def test_what_cannot_be_done_is_one_error(run: Path, room: Path, scans: Path, tm
     cloud = scans.parent / "cloud.npy"
     one_error(ggslam("localize", tmp_path / "none", room), "none", "no such folder")
     one_error(ggslam("localize", room, room), str(room), "neither a grid store")
-    one_error(ggslam("localize", tmp_path / "no.pcd", room, "--start", ORIGIN), "no.pcd")
-    one_error(ggslam("localize", cloud, scans), "laser scans", "--start given")
+    one_error(ggslam("localize", tmp_path / "no.pcd", room, "--start-pose", ORIGIN), "no.pcd")
+    one_error(ggslam("localize", cloud, scans), "laser scans", "--start-pose given")
     one_error(ggslam("localize", cloud, room), "no places")
     one_error(ggslam("localize", run, room, "--scale", 0.5), "camera", "--scale")
-    one_error(ggslam("localize", run, room, "--start", "1 2 3"), "--start", "'1 2 3'")
-    one_error(ggslam("localize", run, room, "--start", "100"), "--first")
-    one_error(ggslam("localize", run, room, "--start", "1e300 0 0 0 0 0 1"), "--start")
-    one_error(ggslam("localize", run, room, "--start", ORIGIN, "--no-start"), "one of them")
+    one_error(ggslam("localize", run, room, "--start-pose", "1 2 3"), "--start-pose", "'1 2 3'")
+    one_error(ggslam("localize", run, room, "--start-pose", "100"), "--start")
+    one_error(ggslam("localize", run, room, "--start-pose", "1e300 0 0 0 0 0 1"), "--start-pose")
+    one_error(ggslam("localize", run, room, "--start-pose", ORIGIN, "--no-start-pose"), "one of them")
     one_error(ggslam("submaps", room), "no grid store")
     one_error(ggslam("submaps", tmp_path / "none"), "none")
     bare = shutil.copytree(scans, tmp_path / "bare")
     (bare / "trajectory.txt").write_text("0 0 0 0 0 0 0 1\n")
-    one_error(ggslam("localize", cloud, bare, "--start", ORIGIN), "trajectory.txt", "1 poses", "12 scans")
+    one_error(ggslam("localize", cloud, bare, "--start-pose", ORIGIN), "trajectory.txt", "1 poses", "12 scans")
     (bare / "trajectory.txt").unlink()
     one_error(ggslam("submaps", bare, "--out", tmp_path / "bare.grid"), "no poses")
-    one_error(ggslam("localize", cloud, bare, "--start", "given"), "no pose")
+    one_error(ggslam("localize", cloud, bare, "--start-pose", "given"), "no pose")
     (bare / "scans" / "000001.npy").write_bytes(b"?")
-    torn = ggslam("localize", cloud, bare, "--start", ORIGIN, "--out", tmp_path / "torn")
+    torn = ggslam("localize", cloud, bare, "--start-pose", ORIGIN, "--out", tmp_path / "torn")
     one_error(torn, "000001.npy", "cannot be read")
     (scans.parent / "damaged.grid").mkdir()
     (scans.parent / "damaged.grid" / "index.sqlite").write_bytes(b"nothing of the kind" * 100)
@@ -154,22 +154,22 @@ def test_damaged_places_are_left_out(run: Path, room: Path, tmp_path: Path) -> N
     done("submaps", run, "--out", store)
     parts = sorted((store / "cells").rglob("places.npz"))
     parts[0].write_bytes(parts[0].read_bytes()[:-1])
-    output = done("localize", store, room, "--stop", 3, "--start", ORIGIN, "--out", tmp_path / "torn")
+    output = done("localize", store, room, "--stop", 3, "--start-pose", ORIGIN, "--out", tmp_path / "torn")
     assert summary(tmp_path / "torn")["located_share"] == 1 and "left out" in output and "places.npz" in output
     assert "places.npz" in done("submaps", store)
     for part in parts[1:]:
         part.unlink()
-    one_error(ggslam("localize", store, room), "--start is needed", "places.npz")
+    one_error(ggslam("localize", store, room), "--start-pose is needed", "places.npz")
 
 
 def test_another_camera_is_located_from_a_start_pose(run: Path, room: Path, tmp_path: Path) -> None:
-    output = done("localize", run, room, "--scale", 0.5, "--stop", 3, "--start", ORIGIN, "--out", tmp_path / "out")
+    output = done("localize", run, room, "--scale", 0.5, "--stop", 3, "--start-pose", ORIGIN, "--out", tmp_path / "out")
     assert summary(tmp_path / "out")["located_share"] == 1 and "lost frames are not looked up" in output
 
 
 @pytest.mark.parametrize(
     ("command", "option", "value"),
-    [("localize", "--radius", -1), ("localize", "--voxel", 0), ("localize", "--first", -1), ("submaps", "--radius", -1)]
+    [("localize", "--radius", -1), ("localize", "--voxel", 0), ("localize", "--start", -1), ("submaps", "--radius", -1)]
 )
 def test_numbers_out_of_range_are_named_as_they_were_given(
     run: Path, room: Path, tmp_path: Path, command: str, option: str, value: int
@@ -181,7 +181,7 @@ def test_numbers_out_of_range_are_named_as_they_were_given(
 def test_a_damaged_scan_in_the_middle_loses_nothing(scans: Path, tmp_path: Path) -> None:
     torn = shutil.copytree(scans, tmp_path / "torn")
     (torn / "scans" / "000007.npy").write_bytes(b"?")
-    result = ggslam("localize", scans.parent / "cloud.npy", torn, "--start", "given", "--out", tmp_path / "out")
+    result = ggslam("localize", scans.parent / "cloud.npy", torn, "--start-pose", "given", "--out", tmp_path / "out")
     one_error(result, "000007.npy")
     assert summary(tmp_path / "out")["frames"] == 7 and len(read_tum(tmp_path / "out" / "trajectory.txt")) == 7
 

@@ -46,7 +46,7 @@ def one_error(result: Result, *words: str) -> None:
 @pytest.fixture(scope="module")
 def of_recording(room: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     out = tmp_path_factory.mktemp("volumes") / "room"
-    wanted = ["--esdf", "--occupancy", 0.1, "--object-meshes", "--report", "--speeds", "1,3"]
+    wanted = ["--esdf", "--occupancy", 0.1, "--object-meshes", "--driving", "--speeds", "1,3"]
     return out, made(room, "--out", out, *QUICK, *wanted)
 
 
@@ -199,7 +199,7 @@ def test_what_was_there_stays_if_anything_goes_wrong(
 
     with monkeypatch.context() as patched:
         patched.setattr(DistanceField, "update", second_is_interrupted)
-        assert ggslam("volumes", room, "--out", out, *few, "--esdf", "--report").exit_code == 130
+        assert ggslam("volumes", room, "--out", out, *few, "--esdf", "--driving").exit_code == 130
     found = record(out)
     assert found["frames"] == 1 and "KeyboardInterrupt" in found["stopped_by"]
     assert (out / "notes.txt").is_file() and not (out / "occupancy.bt").exists()

@@ -111,7 +111,7 @@ def test_made_up_payloads(fill: int | None) -> None:
         coder.build(rng.integers(0, 1 << depth, (50, 3)), depth)
         for components in (1, 3):
             try:
-                values = coder.decode_attribute(RahtSettings(components, 8, 51, 51, 1, 2, 6, 0.0), payload)
+                values = coder.decode_attribute(RahtSettings(components, 8, 51, 51, 1, 2, 6, 0, 0.0), payload)
                 assert values.min() >= 0 and values.max() <= 255
             except FormatError:
                 pass

@@ -11,11 +11,11 @@ import pytest
 from ggslam.coding.metrics import (
     CloudPair,
     color_quality,
-    estimate_normals,
     matching_rows,
     psnr,
     rgb_to_yuv,
 )
+from ggslam.geometry.normals import estimate_normals
 
 PLANE = np.stack([*np.meshgrid(np.arange(20) * 10, np.arange(20) * 10), np.zeros((20, 20))], -1).reshape(-1, 3)
 UP = np.tile([0.0, 0.0, 1.0], (len(PLANE), 1))

@@ -12,11 +12,12 @@ import pytest
 import torch
 from device_watch import DEVICE, DeviceMixing, DeviceTensor, DeviceWatch
 
-from ggslam.mapping.cpu.losses import LossSettings
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
-from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages
+from ggslam.mapping.cuda.losses import CudaImageLoss
+from ggslam.mapping.losses import LossTarget
+from ggslam.mapping.settings import LossSettings
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.cuda import CudaRasterizer
 from ggslam.scene.camera import Camera
@@ -285,7 +286,7 @@ def make_map(count: int = 60) -> GaussianMap:
 
 def test_a_training_step_mixes_nothing_and_waits_for_its_projection_only(watch: DeviceWatch) -> None:
     gaussians, settings = make_map(), AdamSettings(dict.fromkeys(ADAM_GROUPS, 1e-3))
-    target = DeviceKeyframeImages(
+    target = LossTarget(
         torch.full((24, 40, 3), 128, dtype=torch.uint8, device="cuda"),
         torch.full((24, 40), 2000, dtype=torch.int16, device="cuda").view(torch.uint16),
         1e-3,

@@ -310,4 +310,5 @@ def test_real_clouds(shared_data: Path) -> None:
     statue = read_point_cloud(folder / "angel.ply")
     assert len(statue) == 71_359 and statue.colors is not None and statue.colors.std() > 5
     scan = read_point_cloud(folder / "scan_pair" / "source.ply")
-    assert scan.colors is None and scan.left_out == ("scalar_intensity",)
+    assert scan.colors is None and scan.left_out == ()
+    assert scan.reflectance_name == "scalar_intensity" and scan.reflectance is not None and scan.reflectance.std() > 5

@@ -86,7 +86,7 @@ def test_both_files_hold_the_same_points_and_are_read_back(tmp_path: Path) -> No
     assert len(np.unique(cloud.grid, axis=0)) == len(cloud) > 1000 and cloud.grid.min(0).tolist() == [0, 0, 0]
     write_points(tmp_path, cloud)
     metric, grid = read_ply(tmp_path / "points.ply"), read_ply(tmp_path / "points_grid.ply")
-    assert metric.elements["vertex"]["x"].dtype == np.float32 and grid.elements["vertex"]["x"].dtype == np.int32
+    assert metric.elements["vertex"]["x"].dtype == grid.elements["vertex"]["x"].dtype == np.float32
     np.testing.assert_allclose(metric.elements["vertex"]["y"], cloud.points[:, 1], atol=1e-6)
     for name in ("points.ply", "points_grid.ply"):
         found = read_points(tmp_path / name)

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from ggslam.cli.main import app
-from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.jobs.export.splats import export_packed, export_pcd
 from ggslam.jobs.export.views import export_colmap, export_nerfstudio
@@ -184,8 +184,8 @@ def refused(*arguments: str) -> GgslamError:
 
 def test_what_does_not_go_together(run: RunFolder, tmp_path: Path) -> None:
     out = ["--out", str(tmp_path / "map.ply")]
-    assert isinstance(refused(str(run.path), "--format", "spz", *out), FormatError)
-    assert isinstance(refused(str(run.path), "--format", "pcd", *out), FormatError)
+    assert "says ply, but --format says spz" in str(refused(str(run.path), "--format", "spz", *out))
+    assert "says ply, but --format says pcd" in str(refused(str(run.path), "--format", "pcd", *out))
     assert isinstance(refused(str(run.path), "--format", "splat", "--keyframes", *out), ConfigError)
     assert isinstance(refused(str(run.path), "--format", "colmap", "--voxel", "0", *out), ConfigError)
     with pytest.raises(RunFolderError, match="nothing to export"):

@@ -92,7 +92,7 @@ def test_without_the_recording_depth_is_rendered_and_one_is_told(
             "mesh",
             "--voxel",
             VOXEL,
-            "--recording",
+            "--sequence",
             away,
             "--out",
             tmp_path / "room.ply",

@@ -19,9 +19,9 @@ from ggslam.localization.surface import (
     NORMAL,
     FullSurface,
     PartialSurface,
-    estimated_normals,
     load_surface,
     packed_normals,
+    surface_normals,
 )
 from ggslam.localization.visits import FrameSights, ScanSights, record_visit
 from ggslam.native.loader import NativeContext
@@ -80,7 +80,7 @@ def test_a_partial_map_locates_as_well_as_the_full_one(world, store: GridStore, 
     poses, scans, points, _ = world
     partial = located(PartialSurface(store, TARGET, context), context, poses, scans)
     full = located(FullSurface(store, TARGET, context), context, poses, scans)
-    assert all(r.status.located for r in partial + full)
+    assert all(r.status.is_located for r in partial + full)
     assert rmse(partial, poses) < 0.02 and rmse(full, poses) < 0.02
     assert all(r.map_points == len(points) for r in full)
     assert all(0 < r.map_points < 0.5 * len(points) for r in partial)
@@ -107,7 +107,7 @@ def test_frames_are_located_with_and_without_a_start_pose(
     with PartialSurface(room_store, TargetSettings(), context) as surface:
         localizer = Localizer(surface, front_end, start)
         results = [localizer.locate(frame) for frame in frames.stream()]
-    assert all(r.status.located for r in results)
+    assert all(r.status.is_located for r in results)
     assert (results[0].status is LocalizationStatus.FOUND) != with_start
     assert rmse(results, frames.ground_truth) < 0.01
 
@@ -119,7 +119,7 @@ def test_where_the_map_has_nothing_is_a_status_not_an_error(world, store: GridSt
     with PartialSurface(store, TARGET, context) as surface:
         localizer = Localizer(surface, ScanTracker(ScanTrackerSettings(), context, away), away)
         found = localizer.locate(scans[0])
-        assert found.status is LocalizationStatus.OUTSIDE and not found.status.located and found.map_points == 0
+        assert found.status is LocalizationStatus.OUTSIDE and not found.status.is_located and found.map_points == 0
         assert np.array_equal(found.T_world_sensor, away) and "nothing around (5" in found.reason
 
 
@@ -143,9 +143,9 @@ def test_normals_are_made_up_where_the_map_has_none(world, tmp_path: Path, conte
         assert not load_surface(bare, key)[2]
         for surface in (PartialSurface(bare, TARGET, context), FullSurface(bare, TARGET, context)):
             results = located(surface, context, poses[:12], scans[:12])
-            assert all(r.status.located for r in results) and rmse(results, poses[:12]) < 0.03
+            assert all(r.status.is_located for r in results) and rmse(results, poses[:12]) < 0.03
     flat = points[near & (points[:, 2] == 0)][:2000]
-    assert (np.abs(estimated_normals(flat)[:, 2]) > 0.999).mean() > 0.95
+    assert (np.abs(surface_normals(flat)[:, 2]) > 0.999).mean() > 0.95
 
 
 def test_a_target_on_the_way_is_what_it_is_when_made_there(world, store: GridStore, context: NativeContext) -> None:
@@ -202,7 +202,7 @@ def test_scans_are_recorded_and_located_again(world, tmp_path: Path, context: Na
         written = record_visit(made, items, poses, ScanSights(), "first")
         assert len(written) == len(set(written)) >= 3
         results = located(PartialSurface(made, TARGET, context), context, poses, scans)
-    assert all(r.status.located for r in results) and rmse(results, poses) < 0.03
+    assert all(r.status.is_located for r in results) and rmse(results, poses) < 0.03
 
 
 def test_frames_outside_of_the_map_are_looked_up(room: Path, room_store: GridStore, context: NativeContext) -> None:

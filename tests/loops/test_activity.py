@@ -23,7 +23,7 @@ def walked(turns: float, count: int = 120, settings: ActivitySettings | None = N
     keyframes = ActiveKeyframes(settings)
     for k in range(round(turns * count)):
         keyframes.add(looking_out(2 * np.pi * k / count), DEPTH)
-        keyframes.changed()
+        keyframes.update()
     return keyframes
 
 
@@ -41,7 +41,7 @@ def test_a_closure_brings_back_what_is_seen_and_motion_the_rest() -> None:
     assert {0, 1, 2} <= keyframes.active and 40 not in keyframes.active
     for k in range(1, 50):
         keyframes.add(looking_out(2 * np.pi * k / 120), DEPTH)
-        keyframes.changed()
+        keyframes.update()
     assert 45 in keyframes.active
 
 
@@ -51,7 +51,7 @@ def test_turning_back_needs_no_closure() -> None:
     assert 20 not in keyframes.active
     for k in range(newest, 15, -1):
         keyframes.add(looking_out(2 * np.pi * k / 120), DEPTH)
-        keyframes.changed()
+        keyframes.update()
     assert 20 in keyframes.active
 
 
@@ -61,7 +61,7 @@ def test_a_room_stays_active_for_ever() -> None:
         T = np.eye(4)
         T[:3, 3] = [0.5 * np.sin(k / 10), 0.3 * np.cos(k / 7), 0]
         keyframes.add(T, DEPTH)
-        assert not keyframes.changed()
+        assert not keyframes.update()
     assert len(keyframes.active) == 300
 
 

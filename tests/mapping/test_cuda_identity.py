@@ -14,11 +14,11 @@ from identity_picture import COUNT, HEIGHT, WIDTH, MaskedKeyframe, make_map, pic
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.mapping.cpu.class_table import FIRST_CLASSES
-from ggslam.mapping.cpu.identity import IdentityLearner
+from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.pixel_pool import draw_pool
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
-from ggslam.mapping.cuda.pixel_pool import DevicePixelPool
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
+from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.pixel_terms import PixelTerms
@@ -68,7 +68,7 @@ class Both:
     def __init__(self, library: CudaLibrary, mask: np.ndarray | None = None, **changes: object) -> None:
         self.settings = dataclasses.replace(IdentitySettings(every=1, pixels=64, neighbours=ALONE), **changes)  # type: ignore[arg-type]
         self.device = library.whole_device(None)
-        self.cpu = IdentityLearner(self.settings, 3)
+        self.cpu = CpuIdentityLearner(self.settings, 3)
         self.cuda = CudaIdentityLearner(self.settings, 3, self.device, library)
         self.map, self.device_map = make_map("cpu"), make_map(self.device)
         self.view = View(library, self.device)
@@ -89,7 +89,7 @@ class Both:
         """Both will use the same pixels in their next steps."""
         pool = draw_pool(self.mask, steps * self.settings.pixels, self.settings, np.random.default_rng(seed))
         tensors = torch.from_numpy(pool.pixels).to(self.device), torch.from_numpy(pool.vote_weights).to(self.device)
-        self.cpu._pools[0], self.cuda._pools[0] = pool, DevicePixelPool(*tensors)
+        self.cpu._pools[0], self.cuda._pools[0] = pool, PixelPool(*tensors)
 
     def step(self, steps: int, seed: int = 0) -> None:
         self.give_pool(steps, seed)
@@ -129,7 +129,7 @@ def test_many_classes_compete_all_at_once(cuda_library: CudaLibrary) -> None:
     mask = (np.arange(HEIGHT * WIDTH) % 200 + 1).reshape(HEIGHT, WIDTH).astype(np.uint16)
     both = Both(cuda_library, mask)
     both.begin()
-    both.cpu._competing = lambda classes: np.arange(200)  # type: ignore[method-assign]
+    both.cpu._choose_competitors = lambda classes: np.arange(200)  # type: ignore[method-assign]
     both.step(3)
     both.check()
     assert both.cuda.table.count == 200 > FIRST_CLASSES
@@ -328,17 +328,16 @@ def test_a_map_made_before_is_resumed(cuda_library: CudaLibrary) -> None:
 
 
 def test_consecutive_parts_of_a_pool_are_used(cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ggslam.mapping.cuda.identity.KEPT_POOLS", 2)
+    monkeypatch.setattr(CudaIdentityLearner, "kept_pools", 2)
     both = Both(cuda_library)
-    mask = both.keyframe.device_mask
-    assert mask is not None
-    parts = [both.cuda._draw(0, mask)[0] for _ in range(8)]
+    others = [MaskedKeyframe(number, both.keyframe.mask, both.device) for number in (1, 2)]
+    parts = [both.cuda._draw(both.keyframe)[0] for _ in range(8)]
     assert torch.equal(torch.cat(parts), both.cuda._pools[0].pixels)
     first = both.cuda._pools[0]
-    both.cuda._draw(0, mask)
+    both.cuda._draw(both.keyframe)
     assert both.cuda._pools[0] is not first
-    both.cuda._draw(1, mask)
-    both.cuda._draw(2, mask)
+    both.cuda._draw(others[0])
+    both.cuda._draw(others[1])
     assert list(both.cuda._pools) == [1, 2]
     both.cuda.keep_pools([0, 2])
     assert list(both.cuda._pools) == [2]

@@ -11,16 +11,18 @@ import torch
 from identity_picture import HEIGHT, WIDTH, picture
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.mapping.cpu.class_table import FIRST_CLASSES, ClassTable
+from ggslam.mapping.class_numbers import FIRST_CLASSES
+from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.identity import by_parts, cross_entropy
 from ggslam.mapping.cpu.neighbours import kl_gradient
-from ggslam.mapping.cpu.pixel_pool import PixelPool, draw_pool
+from ggslam.mapping.cpu.pixel_pool import draw_pool
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.pixel_pool import PixelDrawer
-from ggslam.mapping.cuda.votes import merge_votes, vote_labels
-from ggslam.mapping.identity_objects import IDS
+from ggslam.mapping.identity import IDS
 from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.mapping.pixel_pool import PixelPool
+from ggslam.mapping.votes import merge_votes, vote_labels
 from ggslam.scene.gaussian_map import GaussianMap
 
 
@@ -43,7 +45,7 @@ def test_votes_that_name_one_object_after_a_merge_are_added(cuda_library: CudaLi
 
 def test_classes_grow_and_go_as_on_the_cpu(cuda_library: CudaLibrary) -> None:
     device = cuda_library.whole_device(None)
-    cpu = ClassTable(np.random.default_rng(0))
+    cpu = CpuClassTable(np.random.default_rng(0))
     cuda = CudaClassTable(np.random.default_rng(0), ClassKernels(device, cuda_library))
     ids = np.arange(1, 2 * FIRST_CLASSES, dtype=np.uint16)
     for table in (cpu, cuda):

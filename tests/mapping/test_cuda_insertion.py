@@ -13,9 +13,10 @@ from scipy.ndimage import distance_transform_edt
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.mapping.cpu.insertion import NewGaussians, fill_gaussians, new_gaussians, unexplained
-from ggslam.mapping.cuda.insertion import DeviceGaussians, DeviceInsertion
+from ggslam.mapping.cpu.insertion import fill_gaussians, new_gaussians, unexplained
+from ggslam.mapping.cuda.insertion import CudaInsertion
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE
+from ggslam.mapping.new_gaussians import NewGaussians
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import se3_exp
@@ -56,12 +57,12 @@ def make_images(height: int, width: int, seed: int = 0, holes: float = 0.02) -> 
     return Images(camera, color, (depth * DEPTH_UNITS_PER_METRE + 0.5).astype(np.uint16), alpha, rendered)
 
 
-def on_device(library: CudaLibrary, images: Images, s: InsertionSettings, empty: bool = False) -> DeviceGaussians:
+def on_device(library: CudaLibrary, images: Images, s: InsertionSettings, empty: bool = False) -> NewGaussians:
     device = library.whole_device(None)
     color, depth, alpha, rendered = (
         torch.from_numpy(a).to(device) for a in (images.color, images.depth, images.alpha, images.rendered)
     )
-    insertion = DeviceInsertion(device, library)
+    insertion = CudaInsertion(device, library)
     known = (None, None) if empty else (alpha, rendered)
     return insertion.new_gaussians(color, depth, 1 / DEPTH_UNITS_PER_METRE, *known, images.camera, POSE, s)
 
@@ -75,7 +76,7 @@ def on_host(images: Images, s: InsertionSettings, empty: bool = False) -> list[N
     return parts
 
 
-def check_same(found: DeviceGaussians, expected: list[NewGaussians], images: Images, levels: int = 0) -> None:
+def check_same(found: NewGaussians, expected: list[NewGaussians], images: Images, levels: int = 0) -> None:
     """The discs agree; of the fillings all but the depth does, which must be that of a nearest pixel, and the colour
     to so many `levels` of 255."""
     pixels = found.pixels.cpu().numpy()
@@ -168,7 +169,7 @@ def test_depth_of_another_scale(cuda_library: CudaLibrary) -> None:
     expected = on_host(images, s, empty=True)
     device = cuda_library.whole_device(None)
     halved = torch.from_numpy(images.depth // 2 * 2).to(device), torch.from_numpy(images.depth // 2).to(device)
-    insertion, color = DeviceInsertion(device, cuda_library), torch.from_numpy(images.color).to(device)
+    insertion, color = CudaInsertion(device, cuda_library), torch.from_numpy(images.color).to(device)
     both = [
         insertion.new_gaussians(color, depth, scale, None, None, images.camera, POSE, s)
         for depth, scale in zip(halved, (1 / 5000, 1 / 2500), strict=True)
@@ -179,7 +180,7 @@ def test_depth_of_another_scale(cuda_library: CudaLibrary) -> None:
 
 def test_an_instance_serves_images_of_any_size_and_repeats_itself(cuda_library: CudaLibrary) -> None:
     device = cuda_library.whole_device(None)
-    insertion, s = DeviceInsertion(device, cuda_library), InsertionSettings()
+    insertion, s = CudaInsertion(device, cuda_library), InsertionSettings()
     results = []
     for size in ((37, 53), (48, 64), (20, 1), (37, 53)):
         images = make_images(*size)
@@ -199,7 +200,7 @@ def test_the_order_of_threads_does_not_matter(cuda_library: CudaLibrary) -> None
 def test_wrong_arrays_are_refused(cuda_library: CudaLibrary) -> None:
     images = make_images(37, 53)
     device = cuda_library.whole_device(None)
-    insertion, s = DeviceInsertion(device, cuda_library), InsertionSettings()
+    insertion, s = CudaInsertion(device, cuda_library), InsertionSettings()
     color, depth, alpha = (torch.from_numpy(a).to(device) for a in (images.color, images.depth, images.alpha))
     camera = images.camera
     with pytest.raises(RenderError, match="color: expected torch.uint8"):

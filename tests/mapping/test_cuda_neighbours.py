@@ -10,12 +10,12 @@ from scipy.spatial import cKDTree
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.mapping.cuda.neighbours import device_neighbours
+from ggslam.mapping.cuda.neighbours import cuda_neighbours
 
 
 def search(library: CudaLibrary, points: np.ndarray, rows: np.ndarray, k: int) -> np.ndarray:
     device = library.whole_device(None)
-    found = device_neighbours(torch.from_numpy(points).to(device), torch.from_numpy(rows).to(device), k, library)
+    found = cuda_neighbours(torch.from_numpy(points).to(device), torch.from_numpy(rows).to(device), k, library)
     assert found.dtype == torch.int64 and found.device == device
     return found.cpu().numpy()
 
@@ -118,8 +118,8 @@ def test_wrong_arrays_are_refused(cuda_library: CudaLibrary) -> None:
     device = cuda_library.whole_device(None)
     points, rows = torch.zeros(9, 3, device=device), torch.zeros(2, dtype=torch.int64, device=device)
     with pytest.raises(RenderError, match="points: expected torch.float32"):
-        device_neighbours(points.double(), rows, 2, cuda_library)
+        cuda_neighbours(points.double(), rows, 2, cuda_library)
     with pytest.raises(RenderError, match="contiguous"):
-        device_neighbours(torch.zeros(3, 9, device=device).T, rows, 2, cuda_library)
+        cuda_neighbours(torch.zeros(3, 9, device=device).T, rows, 2, cuda_library)
     with pytest.raises(RenderError, match="rows: expected integers"):
-        device_neighbours(points, rows.float(), 2, cuda_library)
+        cuda_neighbours(points, rows.float(), 2, cuda_library)

@@ -9,8 +9,9 @@ import torch
 
 from ggslam.errors import RenderError
 from ggslam.mapping.cpu.exposure import ExposureAdam, identity_exposure
-from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
-from ggslam.mapping.settings import ExposureSettings
+from ggslam.mapping.cpu.losses import CpuImageLoss
+from ggslam.mapping.losses import LossTarget
+from ggslam.mapping.settings import ExposureSettings, LossSettings
 from ggslam.native.loader import NativeContext
 
 TRUE = np.array([[0.85, 0.03], [1.1, -0.02], [0.95, 0.05]])
@@ -29,8 +30,8 @@ def fit(settings: ExposureSettings, steps: int = 500) -> np.ndarray:
     image = random.random((3, 40, 50)).astype(np.float32)
     color = np.clip(255 * (TRUE[:, 0, None, None] * image + TRUE[:, 1, None, None]) + 0.5, 0, 255)
     ones = torch.ones(40, 50)
-    target = KeyframeImages(color.transpose(1, 2, 0).astype(np.uint8), np.full((40, 50), 1000, np.uint16), 1e-3)
-    loss, adam, exposure = ImageLoss(NativeContext(1)), ExposureAdam(settings), identity_exposure()
+    target = LossTarget(color.transpose(1, 2, 0).astype(np.uint8), np.full((40, 50), 1000, np.uint16), 1e-3)
+    loss, adam, exposure = CpuImageLoss(NativeContext(1)), ExposureAdam(settings), identity_exposure()
     for step in range(steps):
         seen = replace(target, exposure=exposure)
         result = loss.evaluate(View(torch.from_numpy(image), ones, ones), seen, LossSettings())

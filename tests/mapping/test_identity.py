@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.mapping.cpu.class_table import CODE_LENGTH, FIRST_CLASSES, ClassTable
-from ggslam.mapping.cpu.identity import IdentityLearner, cross_entropy
+from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES
+from ggslam.mapping.cpu.class_table import CpuClassTable
+from ggslam.mapping.cpu.identity import CpuIdentityLearner, cross_entropy
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
 from ggslam.mapping.cpu.pixel_pool import at_boundary, draw_pool
-from ggslam.mapping.cpu.votes import merge_votes, vote_labels
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
 from ggslam.mapping.labelling import KeyframeLabels
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.settings import MapperSettings
+from ggslam.mapping.votes import merge_votes, vote_labels
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import render_labels
@@ -46,7 +47,7 @@ def pictures(small: int = 300, big: int = 2) -> np.ndarray:
 
 def make_mapper(**changes: object) -> Mapper:
     settings = dataclasses.replace(IdentitySettings(every=1, pixels=512), **changes)  # type: ignore[arg-type]
-    return CpuMapper(GaussianMap(0, 16), MapperSettings(), NativeContext(2), 0, IdentityLearner(settings))
+    return CpuMapper(GaussianMap(0, 16), MapperSettings(), NativeContext(2), 0, CpuIdentityLearner(settings))
 
 
 def trained(mask: np.ndarray | None, iterations: int = 40, **changes: object) -> Mapper:
@@ -193,7 +194,7 @@ def with_nothing(logits: torch.Tensor) -> torch.Tensor:
 
 def test_cross_entropy_has_the_gradients_of_torch() -> None:
     random = np.random.default_rng(0)
-    table = ClassTable(random)
+    table = CpuClassTable(random)
     table.add(np.arange(1, 8, dtype=np.uint16))
     features = random.normal(size=(30, 16)).astype(np.float32)
     classes = random.integers(0, 7, 30)
@@ -210,7 +211,7 @@ def test_cross_entropy_has_the_gradients_of_torch() -> None:
 
 def test_cross_entropy_over_some_classes() -> None:
     random = np.random.default_rng(0)
-    table = ClassTable(random)
+    table = CpuClassTable(random)
     table.add(np.arange(1, 300, dtype=np.uint16))
     features = random.normal(size=(5, 16)).astype(np.float32)
     chosen = np.array([3, 50, 200])
@@ -273,7 +274,7 @@ def test_neighbours_pull_an_unseen_gaussian_along() -> None:
 
 
 def test_classes_grow_and_go() -> None:
-    table = ClassTable(np.random.default_rng(0))
+    table = CpuClassTable(np.random.default_rng(0))
     ids = np.arange(1, 2 * FIRST_CLASSES, dtype=np.uint16)
     table.add(ids)
     table.add(np.array([0, 5, 60000], np.uint16))
@@ -312,7 +313,7 @@ def test_votes_that_name_one_object_after_a_merge_are_added() -> None:
     gaussians.vote_ids[:] = torch.tensor([[1, 2, 3, 0], [4, 3, 0, 0]])
     gaussians.vote_weights[:] = torch.tensor([[3.0, 2.0, 2.0, 0.0], [1.0, 0.5, 0.0, 0.0]])
     assert vote_labels(gaussians).tolist() == [1, 4]
-    alias = np.arange(65536, dtype=np.uint16)
+    alias = torch.arange(65536, dtype=torch.int32)
     alias[3] = 2
     alias[4] = 0
     merge_votes(gaussians, alias)

@@ -10,8 +10,10 @@ import pytest
 import torch
 
 from ggslam.errors import ConfigError, RenderError
-from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossResult, LossSettings
+from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
+from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.losses_reference import reference_loss
+from ggslam.mapping.settings import LossSettings
 from ggslam.native.loader import NativeContext, available_instruction_sets
 
 EXPOSURE = np.array([[1.1, 0.02], [0.9, -0.03], [1.05, 0.01]])
@@ -39,7 +41,7 @@ class View:
 
 def make_case(
     height: int, width: int, seed: int = 0, exposure: np.ndarray | None = EXPOSURE, float_depth: bool = False
-) -> tuple[View, KeyframeImages]:
+) -> tuple[View, LossTarget]:
     """A noisy target and a view that is near it, with missing depth and colours beyond [0, 1]."""
     random = np.random.default_rng(seed)
     ramp = np.linspace(0, 1, width)[None, :, None] * np.linspace(1, 0.3, height)[:, None, None]
@@ -57,10 +59,10 @@ def make_case(
         torch.from_numpy(metres + 0.1 * random.normal(size=metres.shape)).float(),
         torch.from_numpy(random.uniform(0, 1, metres.shape)).float(),
     )
-    return view, KeyframeImages((255 * texture).astype(np.uint8), depth, scale, exposure)
+    return view, LossTarget((255 * texture).astype(np.uint8), depth, scale, exposure)
 
 
-def assert_agrees(result: LossResult, view: View, target: KeyframeImages, settings: LossSettings) -> None:
+def assert_agrees(result: CpuLossResult, view: View, target: LossTarget, settings: LossSettings) -> None:
     exposure = np.tile([1.0, 0.0], (3, 1)) if target.exposure is None else target.exposure
     # The core holds exposure and scale as float32: the reference starts from the same numbers.
     arguments = [view.image, view.depth, view.alpha, torch.from_numpy(exposure.astype(np.float32))]
@@ -85,13 +87,13 @@ def assert_agrees(result: LossResult, view: View, target: KeyframeImages, settin
 @pytest.mark.parametrize("name", SETTINGS)
 def test_values_and_gradients_for_every_setting(name: str, instruction_set: str) -> None:
     view, target = make_case(37, 53)
-    loss = ImageLoss(NativeContext(2, instruction_set))
+    loss = CpuImageLoss(NativeContext(2, instruction_set))
     assert_agrees(loss.evaluate(view, target, SETTINGS[name]), view, target, SETTINGS[name])
 
 
 @pytest.mark.parametrize("instruction_set", available_instruction_sets())
 def test_values_and_gradients_for_every_size(instruction_set: str) -> None:
-    loss = ImageLoss(NativeContext(3, instruction_set))  # one instance: its scratch memory must follow the sizes
+    loss = CpuImageLoss(NativeContext(3, instruction_set))  # one instance: its scratch memory must follow the sizes
     for seed, (height, width) in enumerate(SIZES + SIZES[::-1]):
         view, target = make_case(height, width, seed)
         for name in ("default", "all"):
@@ -102,7 +104,7 @@ def test_values_and_gradients_for_every_size(instruction_set: str) -> None:
 @pytest.mark.parametrize("exposure", [None, EXPOSURE, EXPOSURE.astype(np.float32)])
 def test_kinds_of_input(float_depth: bool, exposure: np.ndarray | None) -> None:
     view, target = make_case(37, 53, exposure=exposure, float_depth=float_depth)
-    loss = ImageLoss(NativeContext(2))
+    loss = CpuImageLoss(NativeContext(2))
     assert_agrees(loss.evaluate(view, target, SETTINGS["all"]), view, target, SETTINGS["all"])
 
 
@@ -110,7 +112,7 @@ def test_kinds_of_input(float_depth: bool, exposure: np.ndarray | None) -> None:
 def test_no_depth_anywhere(name: str) -> None:
     view, target = make_case(37, 53)
     target = replace(target, depth=np.zeros_like(target.depth))
-    result = ImageLoss(NativeContext(2)).evaluate(view, target, SETTINGS[name])
+    result = CpuImageLoss(NativeContext(2)).evaluate(view, target, SETTINGS[name])
     assert_agrees(result, view, target, SETTINGS[name])
     assert result.values.valid_pixels == 0 and np.isnan(result.psnr) and np.isnan(result.values.depth_l1_m)
     assert np.isfinite(result.values.total) and not result.d_depth.any() and not result.d_alpha.any()
@@ -120,7 +122,7 @@ def test_perfect_view_has_no_loss() -> None:
     _, target = make_case(37, 53, exposure=None)
     depth = torch.from_numpy(target.depth.astype(np.float32) * np.float32(target.depth_scale))
     image = torch.from_numpy(target.color.transpose(2, 0, 1).astype(np.float32, order="C") * np.float32(1 / 255))
-    result = ImageLoss(NativeContext(2)).evaluate(View(image, depth, torch.ones_like(depth)), target, LossSettings())
+    result = CpuImageLoss(NativeContext(2)).evaluate(View(image, depth, torch.ones_like(depth)), target, LossSettings())
     assert result.values.total == pytest.approx(0, abs=1e-6) and result.values.ssim == pytest.approx(1, abs=1e-6)
     assert result.d_image.abs().max() < 1e-8 and not result.d_depth.any()
 
@@ -130,11 +132,11 @@ def test_constant_image_keeps_its_gradient_precise() -> None:
     color = np.full((60, 70, 3), 230, np.uint8)
     image = torch.full((3, 60, 70), 0.85) + 0.01 * torch.rand(3, 60, 70, generator=torch.Generator().manual_seed(1))
     view = View(image, torch.ones(60, 70), torch.ones(60, 70))
-    target, settings = KeyframeImages(color, np.full((60, 70), 5000, np.uint16), 1 / 5000), LossSettings()
+    target, settings = LossTarget(color, np.full((60, 70), 5000, np.uint16), 1 / 5000), LossSettings()
     leaf = image.double().requires_grad_()
     exposure = torch.tensor([[1.0, 0.0]] * 3, dtype=torch.float64)
     reference_loss(leaf, view.depth.double(), view.alpha.double(), exposure, target, settings)["total"].backward()
-    result = ImageLoss(NativeContext(2)).evaluate(view, target, settings)
+    result = CpuImageLoss(NativeContext(2)).evaluate(view, target, settings)
     assert leaf.grad is not None
     assert (result.d_image.double() - leaf.grad).norm() < 1e-3 * leaf.grad.norm()
 
@@ -144,7 +146,7 @@ def test_same_bits_for_any_number_of_threads_and_any_call(instruction_set: str) 
     view, target = make_case(190, 77)
     results = []
     for threads in (1, 2, 3):
-        loss = ImageLoss(NativeContext(threads, instruction_set))
+        loss = CpuImageLoss(NativeContext(threads, instruction_set))
         for _ in range(2):
             result = loss.evaluate(view, target, SETTINGS["all"])
             results.append((result.values, result.d_image.clone(), result.d_depth.clone(), result.d_alpha.clone(),
@@ -158,7 +160,7 @@ def test_same_bits_for_any_number_of_threads_and_any_call(instruction_set: str) 
 def test_buffers_are_reused_and_nothing_lingers() -> None:
     """A view full of NaN must not spoil the next evaluation."""
     view, target = make_case(37, 53)
-    loss = ImageLoss(NativeContext(2))
+    loss = CpuImageLoss(NativeContext(2))
     first = loss.evaluate(view, target, LossSettings())
     values, pointer = first.values, first.d_image.data_ptr()
     broken = View(*(torch.full_like(value, torch.nan) for value in (view.image, view.depth, view.alpha)))
@@ -194,14 +196,14 @@ def test_wrong_view_is_refused(name: str) -> None:
     field, value = BAD_VIEWS[name]
     setattr(view, field, value)
     with pytest.raises(RenderError, match=f"rendered {field}: expected"):
-        ImageLoss(NativeContext(1)).evaluate(view, target, LossSettings())
+        CpuImageLoss(NativeContext(1)).evaluate(view, target, LossSettings())
 
 
 @pytest.mark.parametrize("name", BAD_TARGETS)
 def test_wrong_target_is_refused(name: str) -> None:
     view, target = make_case(8, 9)
     with pytest.raises(RenderError, match="expected"):
-        ImageLoss(NativeContext(1)).evaluate(view, replace(target, **BAD_TARGETS[name]), LossSettings())
+        CpuImageLoss(NativeContext(1)).evaluate(view, replace(target, **BAD_TARGETS[name]), LossSettings())
 
 
 @pytest.mark.parametrize(

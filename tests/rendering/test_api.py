@@ -29,7 +29,7 @@ def gradients_of(backend: str, scene: GaussianTensors, dtype: torch.dtype, devic
     inputs = leaves(scene, dtype, device)
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     pose = torch.as_tensor(POSE_WORLD_CAMERA) @ twist_matrix(twist)
-    rendered = render(inputs, CAMERA, pose.to(device), backend=backend)
+    rendered = render(inputs, CAMERA, T_world_camera=pose.to(device), backend=backend)
     gradients = make_image_gradients(CAMERA, scene.features.shape[1])
     moved = dataclasses.replace(gradients, **{k: v.to(device) for k, v in vars(gradients).items() if v is not None})
     moved.loss(rendered).backward()
@@ -50,32 +50,33 @@ def test_cpu_agrees_with_the_reference(features: int, coefficients: int) -> None
 
 def test_two_renderings_before_one_backward() -> None:
     scene = leaves(make_scene(100))
-    first = render(scene, CAMERA, POSE_WORLD_CAMERA)
-    second = render(scene, CAMERA, np.linalg.inv(POSE) @ np.diag([1.0, 1, 1, 1]), median_depth=True)
+    first = render(scene, CAMERA, T_world_camera=POSE_WORLD_CAMERA)
+    second = render(scene, CAMERA, T_world_camera=np.linalg.inv(POSE) @ np.diag([1.0, 1, 1, 1]), median_depth=True)
     assert second.median_depth is not None and not second.median_depth.requires_grad
     (first.image.sum() + 2 * second.image.sum()).backward()
     once = leaves(make_scene(100))
-    (3 * render(once, CAMERA, POSE_WORLD_CAMERA).image.sum()).backward()
+    (3 * render(once, CAMERA, T_world_camera=POSE_WORLD_CAMERA).image.sum()).backward()
     assert scene.means.grad is not None and once.means.grad is not None
     assert relative_error(scene.means.grad, once.means.grad) < 1e-5
 
 
 def test_images_are_the_callers_own() -> None:
-    first = render(make_scene(50), CAMERA, POSE_WORLD_CAMERA)
+    first = render(make_scene(50), CAMERA, T_world_camera=POSE_WORLD_CAMERA)
     kept = first.image.clone()
-    render(make_scene(60, seed=3), CAMERA, POSE_WORLD_CAMERA)
+    render(make_scene(60, seed=3), CAMERA, T_world_camera=POSE_WORLD_CAMERA)
     assert torch.equal(first.image, kept)
 
 
 def test_backends_by_name() -> None:
     assert {"cpu", "cuda", "reference", "gsplat"} <= set(backends())
     with pytest.raises(RenderError, match="unknown rendering backend 'opengl'; available: cpu"):
-        render(make_scene(1), CAMERA, np.eye(4), backend="opengl")
+        render(make_scene(1), CAMERA, T_world_camera=np.eye(4), backend="opengl")
     with pytest.raises(RenderError, match="4x4"):
-        render(make_scene(1), CAMERA, np.eye(3))
-    register_backend("twice", lambda *a, **k: render(a[0], a[1], a[2], **k))
+        render(make_scene(1), CAMERA, T_world_camera=np.eye(3))
+    register_backend("twice", lambda *a, **k: render(a[0], a[1], T_world_camera=a[2], **k))
     assert "twice" in backends()
-    assert render(make_scene(1), CAMERA, np.eye(4), backend="twice").image.shape == (3, CAMERA.height, CAMERA.width)
+    view = render(make_scene(1), CAMERA, T_world_camera=np.eye(4), backend="twice")
+    assert view.image.shape == (3, CAMERA.height, CAMERA.width)
 
 
 def test_gsplat_absent_is_said_plainly() -> None:
@@ -83,10 +84,10 @@ def test_gsplat_absent_is_said_plainly() -> None:
         import gsplat  # noqa: F401
     except ImportError:
         with pytest.raises(MissingDependency, match="gsplat"):
-            render(make_scene(1), CAMERA, np.eye(4), backend="gsplat")
+            render(make_scene(1), CAMERA, T_world_camera=np.eye(4), backend="gsplat")
     else:
         with pytest.raises(RenderError, match="CUDA"):
-            render(make_scene(1), CAMERA, np.eye(4), backend="gsplat")
+            render(make_scene(1), CAMERA, T_world_camera=np.eye(4), backend="gsplat")
 
 
 @pytest.mark.parametrize(("features", "coefficients"), [(0, 1), (5, 9)])

@@ -136,10 +136,11 @@ def test_a_file_that_is_no_library(tmp_path: Path) -> None:
 def test_gaussians_on_the_cpu_are_not_for_the_cuda_backend() -> None:
     scene = make_scene(5)
     with pytest.raises(RenderError, match="on a CUDA device, found torch.float32 on cpu"):
-        render(scene, CAMERA, torch.eye(4), backend="cuda")
+        render(scene, CAMERA, T_world_camera=torch.eye(4), backend="cuda")
     assert choose_backend(torch.device("cpu")) == "cpu"
     assert torch.equal(
-        render(scene, CAMERA, torch.eye(4), backend="auto").image, render(scene, CAMERA, torch.eye(4)).image
+        render(scene, CAMERA, T_world_camera=torch.eye(4), backend="auto").image,
+        render(scene, CAMERA, T_world_camera=torch.eye(4)).image,
     )
 
 

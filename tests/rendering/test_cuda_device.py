@@ -100,8 +100,8 @@ def test_backend_by_name(rasterizer: CudaRasterizer) -> None:
     on_gpu = moved(scene, rasterizer.device)
     for name in PARAMETERS:
         getattr(on_gpu, name).requires_grad_()
-    found = render(on_gpu, CAMERA, pose, backend="auto")
-    expected = render(scene, CAMERA, pose, backend="auto")
+    found = render(on_gpu, CAMERA, T_world_camera=pose, backend="auto")
+    expected = render(scene, CAMERA, T_world_camera=pose, backend="auto")
     assert choose_backend() == "cuda" and expected.image.device.type == "cpu"
     assert relative_error(found.image.detach().cpu(), expected.image) < 1e-5
     found.image.sum().backward()

@@ -19,11 +19,12 @@ from test_fused_adam import make_map
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.mapping.cpu.exposure import ExposureAdam, identity_exposure
-from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
+from ggslam.mapping.cpu.losses import CpuImageLoss
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss
 from ggslam.mapping.keyframe import PoseAdam
-from ggslam.mapping.settings import ExposureSettings
+from ggslam.mapping.losses import LossTarget
+from ggslam.mapping.settings import ExposureSettings, LossSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
@@ -55,7 +56,7 @@ def no_waiting(device: torch.device) -> Iterator[None]:
 class DeviceTraining:
     """Trains a map, and the poses and exposures of two keyframes, on the device."""
 
-    def __init__(self, gaussians: GaussianMap, rasterizer: CudaRasterizer, target: KeyframeImages) -> None:
+    def __init__(self, gaussians: GaussianMap, rasterizer: CudaRasterizer, target: LossTarget) -> None:
         library, self.rasterizer, self.map = rasterizer.library, rasterizer, gaussians
         self.loss, self.states = CudaImageLoss(library=library), KeyframeStates(library=library)
         self.target = moved_target(target, rasterizer.device)
@@ -79,7 +80,7 @@ def test_iterations_go_the_way_of_the_cpu(cuda_library: CudaLibrary) -> None:
     with no_waiting(rasterizer.device):
         for step in range(1, 8):
             training.iterate(step % 2)
-    cpu, loss, total = CpuRasterizer(1), ImageLoss(NativeContext(1)), 0.0
+    cpu, loss, total = CpuRasterizer(1), CpuImageLoss(NativeContext(1)), 0.0
     poses, exposures = list(VIEWS), [identity_exposure(), identity_exposure()]
     pose_adams, exposure_adams = [PoseAdam(), PoseAdam()], [ExposureAdam(EXPOSURE), ExposureAdam(EXPOSURE)]
     for step in range(8):

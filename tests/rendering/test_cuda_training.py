@@ -18,8 +18,10 @@ from test_fused_adam import make_map
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages, LossSettings
-from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages, DeviceLossResult
+from ggslam.mapping.cpu.losses import CpuImageLoss
+from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
+from ggslam.mapping.losses import LossTarget
+from ggslam.mapping.settings import LossSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.cpu import CpuRasterizer
@@ -44,7 +46,7 @@ LOSSES = {
 # --- image loss -----------------------------------------------------------------------------------------------------
 
 
-def make_case(height: int, width: int, float_depth: bool = False) -> tuple[RenderBuffers, KeyframeImages]:
+def make_case(height: int, width: int, float_depth: bool = False) -> tuple[RenderBuffers, LossTarget]:
     """A noisy target and a view that is near it, with missing depth and colours beyond [0, 1]."""
     random = np.random.default_rng(height + width)
     ramp = np.linspace(0, 1, width)[None, :, None] * np.linspace(1, 0.3, height)[:, None, None]
@@ -59,18 +61,18 @@ def make_case(height: int, width: int, float_depth: bool = False) -> tuple[Rende
         torch.from_numpy(metres + 0.1 * random.normal(size=metres.shape)).float(),
         torch.from_numpy(random.uniform(0, 1, metres.shape)).float(),
     )
-    return view, KeyframeImages((255 * texture).astype(np.uint8), depth, scale, EXPOSURE)
+    return view, LossTarget((255 * texture).astype(np.uint8), depth, scale, EXPOSURE)
 
 
-def moved_target(target: KeyframeImages, device: torch.device) -> DeviceKeyframeImages:
+def moved_target(target: LossTarget, device: torch.device) -> LossTarget:
     exposure = None if target.exposure is None else torch.from_numpy(target.exposure).float().to(device)
     color, depth = torch.from_numpy(target.color).to(device), torch.from_numpy(target.depth).to(device)
-    return DeviceKeyframeImages(color, depth, target.depth_scale, exposure)
+    return LossTarget(color, depth, target.depth_scale, exposure)
 
 
-def check_loss(loss: CudaImageLoss, view: RenderBuffers, target: KeyframeImages, settings: LossSettings) -> None:
+def check_loss(loss: CudaImageLoss, view: RenderBuffers, target: LossTarget, settings: LossSettings) -> None:
     result = loss.evaluate(moved(view, loss.device), moved_target(target, loss.device), settings)
-    expected = ImageLoss(NativeContext(1)).evaluate(view, target, settings)
+    expected = CpuImageLoss(NativeContext(1)).evaluate(view, target, settings)
     found = result.read_values()
     for name, value in vars(expected.values).items():
         assert getattr(found, name) == pytest.approx(value, rel=1e-5, abs=1e-7, nan_ok=True), name
@@ -113,7 +115,7 @@ def test_loss_of_a_whole_image_on_a_gpu() -> None:
     check_loss(CudaImageLoss(), *make_case(480, 640), LOSSES["default"])
 
 
-def copies(result: DeviceLossResult) -> list[torch.Tensor]:
+def copies(result: CudaLossResult) -> list[torch.Tensor]:
     return [value.cpu().clone() for value in vars(result).values()]
 
 
@@ -262,7 +264,7 @@ def test_training_on_a_keyframe_goes_the_same_way(cuda_library: CudaLibrary) -> 
     """Forward, loss and step, some times over: the loss falls as on the CPU."""
     _, target = make_case(CAMERA.height, CAMERA.width)
     rasterizer, loss = CudaRasterizer(library=cuda_library), CudaImageLoss(library=cuda_library)
-    cpu, cpu_loss = CpuRasterizer(1), ImageLoss(NativeContext(1))
+    cpu, cpu_loss = CpuRasterizer(1), CpuImageLoss(NativeContext(1))
     expected = make_map(0, 0)
     found, device_target = on_device(expected, rasterizer.device), moved_target(target, rasterizer.device)
     totals = []

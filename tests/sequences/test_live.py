@@ -17,7 +17,7 @@ from ggslam.errors import MissingDependency, SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence, recognise_format
-from ggslam.sequences.formats.realsense import _inverted
+from ggslam.sequences.formats.realsense import _invert_distortion
 from ggslam.sequences.live import LiveSequence, LiveSource, is_live, open_live
 
 
@@ -73,7 +73,7 @@ def test_inverse_lens_model() -> None:
     """Fitted coefficients undo the other direction's polynomial."""
     camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
     k1, k2, p1, p2, k3 = coefficients = np.array([-0.05, 0.06, 0.0005, -0.0004, -0.02])
-    k = _inverted(coefficients, camera)
+    k = _invert_distortion(coefficients, camera)
     x, y = 0.4, -0.3  # distorted
     r = x * x + y * y
     f = 1 + k1 * r + k2 * r**2 + k3 * r**3

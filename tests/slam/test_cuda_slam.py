@@ -30,7 +30,7 @@ from ggslam.slam.realtime import RealtimeSlam
 from ggslam.slam.result import SlamResult
 from ggslam.slam.slam import Slam
 
-FRAMES = 5
+FRAMES = 3
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_objects_are_learned(frames: list[Frame], cuda_library: CudaLibrary) -> 
 def test_refinement_and_real_time(frames: list[Frame], cuda_library: CudaLibrary) -> None:
     settings = config("refine_iterations=4", "identity.enabled=false")
     slam = Slam(frames[0].camera, settings, has_masks=True, library=cuda_library)
-    RealtimeSlam(slam, 1.0).run(frames[:3], lambda frame, report: None)
+    RealtimeSlam(slam, 1.0).run(frames, lambda frame, report: None)
     done = slam.mapper.times.iterations
     result = slam.finish()
     assert slam.mapper.times.iterations == done + 4 and result.refine_iterations == 4

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from kept import generated_recording
 
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
@@ -29,7 +30,6 @@ from ggslam.slam.config import load_config
 from ggslam.slam.result import SlamResult
 from ggslam.slam.slam import Slam
 from ggslam.submaps.grid import GridStore
-from ggslam.synthetic import write_synthetic_sequence
 
 PLENTY = "memory_limit_mb=100000"
 SMALL = [PLENTY, "paging.budget_mb=3.0", "paging.cell=0.5", "paging.keep_radius=0.5", "paging.view_margin=1"]
@@ -39,8 +39,8 @@ PLAIN = ["mapping.iterations_per_frame=1", "identity.enabled=false", "refine_ite
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A camera that turns in the generated room: what it saw first goes out of view. 44 frames of 80x60."""
-    folder = tmp_path_factory.mktemp("recordings") / "turning"
-    return write_synthetic_sequence(folder, frames=44, width=80, height=60, seed=0, trajectory="pan")
+    few = {"frames": 44, "width": 80, "height": 60, "seed": 0, "trajectory": "pan"}
+    return generated_recording(tmp_path_factory, "turning", **few)
 
 
 def slam_over(recording: Path, *overrides: str) -> SlamResult:

@@ -164,7 +164,7 @@ def test_what_a_camera_sees_is_needed(cells_for) -> None:
     rows = cells.cells_of(gaussians)
     means = gaussians.means.numpy().astype(float).copy()
     cells.move_out(gaussians, rows)
-    needed = cells.needed(Frustums.of(camera, np.stack(poses), [6.0] * 5))
+    needed = cells.visible_cells(Frustums.of(camera, np.stack(poses), [6.0] * 5))
     for T_camera_world, keys in zip(poses, needed, strict=True):
         x, y, z = (means @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]).T
         u, v = 50 * x / z + 31.5, 50 * y / z + 23.5

@@ -10,7 +10,7 @@ import pytest
 
 from ggslam.errors import ConfigError, FormatError
 from ggslam.formats.point_cloud import read_point_cloud
-from ggslam.submaps.cell_points import POINTS, changed_share, decode_points, encode_points, thinned
+from ggslam.submaps.cell_points import POINTS, changed_share, decode_points, encode_points, thin
 from ggslam.submaps.cell_records import CellChange
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import SubmapRecorder, load_points, store_cloud
@@ -84,14 +84,14 @@ def test_points_are_thinned_like_in_a_dictionary() -> None:
     cubes: dict[tuple, list[int]] = {}
     for number, point in enumerate(points):
         cubes.setdefault(tuple(np.floor(point / 0.2)), []).append(number)
-    found = thinned({"points": points, "label": label, "weight": weight}, 0.2, 1.0)
+    found = thin({"points": points, "label": label, "weight": weight}, 0.2, 1.0)
     expected = [cubes[key] for key in sorted(cubes)]
     np.testing.assert_allclose(found["points"], [points[rows].mean(0) for rows in expected])
     np.testing.assert_allclose(found["weight"], [weight[rows].mean(0) for rows in expected])
     assert found["label"].tolist() == [rows[0] for rows in expected]
-    quarter = thinned({"points": points, "label": label}, 0.0, 0.25)
+    quarter = thin({"points": points, "label": label}, 0.0, 0.25)
     assert quarter["label"].tolist() == list(range(0, 4000, 4))
-    assert len(thinned({"points": points[:0]}, 0.2, 0.5)["points"]) == 0
+    assert len(thin({"points": points[:0]}, 0.2, 0.5)["points"]) == 0
 
 
 @pytest.mark.parametrize(("far", "dtype"), [(0.0, np.float32), (5e5, np.float64)])

@@ -12,7 +12,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.sequences.factory import open_sequence
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
-from ggslam.tracking.engine import NativeEngine
+from ggslam.tracking.engine import CpuTrackingEngine
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.settings import DepthNoise, PointSettings, TrackerSettings
 from ggslam.tracking.surface import MeasuredSurface
@@ -28,12 +28,12 @@ def frames(room: Path) -> list[Frame]:
 
 
 @pytest.fixture(scope="module")
-def native(frames: list[Frame]) -> NativeEngine:
-    return NativeEngine(frames[0].camera, NativeContext(2))
+def native(frames: list[Frame]) -> CpuTrackingEngine:
+    return CpuTrackingEngine(frames[0].camera, NativeContext(2))
 
 
 @pytest.fixture(scope="module")
-def target(frames: list[Frame], native: NativeEngine) -> GicpTarget:
+def target(frames: list[Frame], native: CpuTrackingEngine) -> GicpTarget:
     """The surface of two frames."""
     surface = MeasuredSurface(TrackerSettings().target, native.context)
     for frame in (frames[0], frames[4]):

@@ -17,9 +17,9 @@ from ggslam.sequences.factory import open_sequence
 from ggslam.tracking.edges_planes.local_map import FeatureOdometry
 from ggslam.tracking.edges_planes.scans import LidarFeatures, split_features
 from ggslam.tracking.edges_planes.settings import LIDAR, FeatureAlignSettings, FeatureTrackerSettings
-from ggslam.tracking.edges_planes.tracker import DeferredPoints, FeatureTracker
+from ggslam.tracking.edges_planes.tracker import FeatureTracker
 from ggslam.tracking.gicp import align
-from ggslam.tracking.points import extract_points
+from ggslam.tracking.points import DeferredPoints, extract_points
 from ggslam.tracking.settings import DepthNoise, PointSettings, TrackerSettings
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
@@ -58,12 +58,13 @@ def test_a_motion_is_followed_without_any_target() -> None:
 def test_the_result_has_what_a_pose_graph_and_a_keyframe_need() -> None:
     tracker = make_tracker()
     result = run(tracker, [np.eye(4), se3_exp(np.array([0.1, 0, 0, 0, 0, 0]) * 0.2)])[-1]
-    assert isinstance(result.points, DeferredPoints) and "points" not in vars(result.points)
-    assert result.median_depth_m == pytest.approx(1.5, abs=0.5) and "points" not in vars(result.points)
+    assert isinstance(result.points, DeferredPoints)
+    assert result.median_depth_m == pytest.approx(1.5, abs=0.5)
+    assert result.points._points is None  # nobody has read them, so nothing was extracted
     frame = room_view(se3_exp(np.array([0.1, 0, 0, 0, 0, 0]) * 0.2), sigma=0.002, seed=1)
     expected = extract_points(frame.depth, CAMERA, PointSettings(), tracker.noise or DepthNoise(), tracker.context)
     assert len(result.points) == len(expected)
-    assert np.array_equal(result.points.normals, expected.normals)
+    assert np.array_equal(result.points.read().normals, expected.normals)
     assert result.alignment is not None
     information, c = result.alignment.information, result.T_world_camera[:3, 3]
     assert np.linalg.eigvalsh(information)[0] > 0

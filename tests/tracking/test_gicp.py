@@ -136,7 +136,7 @@ def test_align_finds_the_pose_from_ten_centimetres_and_five_degrees(context: Nat
     assert np.linalg.norm(error[3:]) < 1e-3
     assert found.overlap > 0.9
     assert found.rmse < 2e-3
-    assert (found.matches >= 0).mean() > 0.9
+    assert (found.matches.read().voxels >= 0).mean() > 0.9
 
 
 def test_the_result_is_the_same_for_any_number_of_threads() -> None:
@@ -145,7 +145,8 @@ def test_the_result_is_the_same_for_any_number_of_threads() -> None:
     for threads in (1, 2, 3):
         context = NativeContext(threads)
         found = align(room_points(truth, context), room_target(context), np.eye(4), SETTINGS, NOISE, context)
-        results.append((found.T_world_camera, found.information, found.matches, found.squared_distances))
+        matches = found.matches.read()
+        results.append((found.T_world_camera, found.information, matches.voxels, matches.squared_distances))
     for other in results[1:]:
         assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
 

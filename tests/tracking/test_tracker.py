@@ -13,11 +13,12 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
-from ggslam.tracking.engine import NativeEngine
+from ggslam.tracking.engine import CpuTrackingEngine
+from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.noise import estimate_noise
-from ggslam.tracking.settings import DepthNoise, PhotometricSettings, RecoverySettings
+from ggslam.tracking.settings import DepthNoise, PhotometricSettings, RecoverySettings, TrackerSettings
 from ggslam.tracking.surface import MeasuredSurface
-from ggslam.tracking.tracker import Tracker, TrackerSettings, TrackingStatus
+from ggslam.tracking.tracker import TrackingStatus
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 STILL = se3_exp(np.zeros(6))
@@ -54,7 +55,7 @@ def wall_view(T: np.ndarray, corner: bool, gain: float = 1.0) -> Frame:
 def run(poses: list[np.ndarray], corner: bool, settings: TrackerSettings, gain: float = 1.0) -> list:
     """Tracks the views; the first is the only keyframe."""
     context = NativeContext(2)
-    tracker, surface = Tracker(CAMERA, settings, context, poses[0]), MeasuredSurface(settings.target, context)
+    tracker, surface = GicpTracker(CAMERA, settings, context, poses[0]), MeasuredSurface(settings.target, context)
     results = []
     for T in poses:
         results.append(tracker.track(wall_view(T, corner, gain if results else 1.0)))
@@ -80,14 +81,14 @@ def test_a_frame_is_looked_for_where_the_motion_leads(monkeypatch: pytest.Monkey
     """The camera's motion is taken in its own axes, which are turned against the world's here."""
     T_world_wall = se3_exp(np.array([0.3, -0.2, 0.1, 0.5, 1.2, -0.4]))
     poses = [T_world_wall @ se3_exp(i * np.array([0.03, -0.01, 0.02, 0.01, 0.02, 0.0])) for i in range(3)]
-    starts, align = [], NativeEngine.align
+    starts, align = [], CpuTrackingEngine.align
 
-    def watched(engine: NativeEngine, points: Any, target: Any, guess: np.ndarray, *more: Any) -> Any:
+    def watched(engine: CpuTrackingEngine, points: Any, target: Any, guess: np.ndarray, *more: Any) -> Any:
         starts.append(guess)
         return align(engine, points, target, guess, *more)
 
-    monkeypatch.setattr(NativeEngine, "align", watched)
-    tracker = Tracker(CAMERA, TrackerSettings(), NativeContext(2), poses[0])
+    monkeypatch.setattr(CpuTrackingEngine, "align", watched)
+    tracker = GicpTracker(CAMERA, TrackerSettings(), NativeContext(2), poses[0])
     surface = MeasuredSurface(TrackerSettings().target, tracker.context)
     for T in poses:
         starts.clear()
@@ -140,7 +141,7 @@ def test_nothing_to_match_gives_no_start() -> None:
 
 def test_an_empty_depth_image_is_lost_and_tracking_goes_on_after_it() -> None:
     context = NativeContext(2)
-    tracker = Tracker(CAMERA, TrackerSettings(), context)
+    tracker = GicpTracker(CAMERA, TrackerSettings(), context)
     surface = MeasuredSurface(TrackerSettings().target, context)
     first = wall_view(STILL, True)
     tracker.set_target(surface.add(tracker.track(first).points, STILL))
@@ -167,6 +168,6 @@ def test_noise_is_measured() -> None:
 
 
 def test_noise_given_is_not_measured() -> None:
-    tracker = Tracker(CAMERA, TrackerSettings(noise=DepthNoise(0.01, 0.0)), NativeContext(1))
+    tracker = GicpTracker(CAMERA, TrackerSettings(noise=DepthNoise(0.01, 0.0)), NativeContext(1))
     tracker.track(wall_view(STILL, True))
     assert tracker.noise == DepthNoise(0.01, 0.0)

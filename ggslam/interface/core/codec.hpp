@@ -25,6 +25,20 @@ struct OctreeSettings {
   std::int32_t unique_points;       // 0: the number of points is coded for every leaf
 };
 
+// What geometry coding in general depends on: trees whose nodes are not split along every axis (QTBT), planes, points
+// that are coded directly, scaled positions, several codewords.
+struct TreeSettings {
+  std::int32_t levels, neighbour_boundary, adjacent_child, intra_prediction, unique_points;
+  std::int32_t direct_mode;   // 0 to 3
+  std::int32_t direct_pairs;  // two points share what their positions begin with
+  std::int32_t direct_rate;   // of 32 nodes that could be coded directly, with planes in mode 1
+  std::int32_t planes, plane_thresholds[3];
+  std::int32_t scaling, slice_qp, direct_qp, qp_shift;
+  std::int32_t codewords;
+  std::int32_t separate_bits;  // bins of equal probability are a stream of their own
+  std::uint8_t axes[64];       // by level: 4 x, 2 y, 1 z
+};
+
 // What an attribute's coding by the region-adaptive hierarchical transform depends on.
 struct RahtSettings {
   std::int32_t components;   // 1 or 3
@@ -32,7 +46,8 @@ struct RahtSettings {
   std::int32_t qp, qp_secondary;  // of component 0 and of the others
   std::int32_t prediction;
   std::int32_t min_parent_neighbours, min_neighbours;  // prediction thresholds 0 and 1
-  float rdoq;                // encoder: weight of the rate in dropping coefficients; 0: none is dropped
+  std::int32_t first_version;  // the stream was written by this codec when its roots of large weights were its own
+  float rdoq;                // encoder: weight of a bit in dropping coefficients, 1 as the reference's; 0: none is dropped
 };
 
 // clip(floor(scale p + rounding), first, last) - first.
@@ -86,6 +101,19 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slic
                                                        const std::uint8_t* data, std::size_t size,
                                                        std::uint32_t points);
 
+// The same where the tree does not split every node along all axes, or has other tools than an octree. Its root lies in
+// [0, 2^depth)^3.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_tree(void* context, void* slice,
+                                                   const ggslam::gpcc::TreeSettings* settings, std::int32_t depth,
+                                                   const std::uint8_t* data, std::size_t size, std::uint32_t points);
+
+// Codes the slice's points by such a tree. Returns the number of bytes.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_tree(void* context, void* slice,
+                                                   const ggslam::gpcc::TreeSettings* settings);
+
+// Hands on the contexts of the slice before, for slices that go on with them.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_go_on(void* slice, const void* before);
+
 // Positions [points, 3] in coding order.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_positions(void* context, void* slice, std::int32_t* out);
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_attribute(void* context, void* slice,
@@ -116,6 +144,11 @@ GGSLAM_EXPORT void ggslam_gpcc_plane_counts(const ggslam::gpcc::Points* points, 
 GGSLAM_EXPORT void ggslam_gpcc_number_planes(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
                                              std::int32_t axis, const std::uint16_t* number_of_plane,
                                              const std::uint8_t* cut, std::uint16_t* numbers, std::int64_t* inside);
+
+// Appends to `codes`, which has room for count of them, the points in cubes of 4 x 4 x 4 voxels that a hash chooses: one
+// cube in mask + 1 (a power of two). A code has 21 bits a coordinate. Returns how many there are.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_sample_cubes(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
+                                                    std::uint32_t mask, std::uint64_t* codes);
 
 // Bytes written to `out`, which must hold size + size / 32 + 1, or kNoRoom.
 GGSLAM_EXPORT int64_t ggslam_lzf_compress(const uint8_t* data, int64_t size, uint8_t* out, int64_t capacity);

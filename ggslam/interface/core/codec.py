@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_int64, c_size_t, c_uint32, c_void_p
+from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_int64, c_size_t, c_uint8, c_uint32, c_void_p
 from enum import IntEnum
 from typing import Any
 
 HEADER = "core/codec.hpp"
-HEADER_SHA256 = "915ab317f94e9452a5d3d806c6758607f78600a7d12a7d5c984907656177135d"
+HEADER_SHA256 = "e36cd88304434530b0298987aa16941b69a5b56bafdf15fb21c772a1f72d6c53"
 
 
 class Status(IntEnum):
@@ -31,12 +31,26 @@ class OctreeSettings(Structure):
     ]
 
 
+class TreeSettings(Structure):
+    """What geometry coding in general depends on: trees whose nodes are not split along every axis (QTBT), planes,
+    points that are coded directly, scaled positions, several codewords."""
+
+    _fields_ = [
+        ("levels", c_int32), ("neighbour_boundary", c_int32), ("adjacent_child", c_int32),
+        ("intra_prediction", c_int32), ("unique_points", c_int32), ("direct_mode", c_int32), ("direct_pairs", c_int32),
+        ("direct_rate", c_int32), ("planes", c_int32), ("plane_thresholds", c_int32 * 3), ("scaling", c_int32),
+        ("slice_qp", c_int32), ("direct_qp", c_int32), ("qp_shift", c_int32), ("codewords", c_int32),
+        ("separate_bits", c_int32), ("axes", c_uint8 * 64),
+    ]
+
+
 class RahtSettings(Structure):
     """What an attribute's coding by the region-adaptive hierarchical transform depends on."""
 
     _fields_ = [
         ("components", c_int32), ("bit_depth", c_int32), ("qp", c_int32), ("qp_secondary", c_int32),
-        ("prediction", c_int32), ("min_parent_neighbours", c_int32), ("min_neighbours", c_int32), ("rdoq", c_float),
+        ("prediction", c_int32), ("min_parent_neighbours", c_int32), ("min_neighbours", c_int32),
+        ("first_version", c_int32), ("rdoq", c_float),
     ]
 
 
@@ -54,7 +68,7 @@ class Points(Structure):
     _fields_ = [("data", c_void_p), ("rows", c_void_p), ("count", c_size_t), ("kind", c_int32)]
 
 
-STRUCTURES: tuple[type[Structure], ...] = (OctreeSettings, RahtSettings, Grid, Points)
+STRUCTURES: tuple[type[Structure], ...] = (OctreeSettings, TreeSettings, RahtSettings, Grid, Points)
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_gpcc_slice_create": (c_void_p, []),
     "ggslam_gpcc_slice_destroy": (None, [c_void_p]),
@@ -69,6 +83,11 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_gpcc_decode_geometry": (c_int64, [
         c_void_p, c_void_p, POINTER(OctreeSettings), c_void_p, c_size_t, c_uint32,
     ]),
+    "ggslam_gpcc_decode_tree": (c_int64, [
+        c_void_p, c_void_p, POINTER(TreeSettings), c_int32, c_void_p, c_size_t, c_uint32,
+    ]),
+    "ggslam_gpcc_encode_tree": (c_int64, [c_void_p, c_void_p, POINTER(TreeSettings)]),
+    "ggslam_gpcc_go_on": (c_int64, [c_void_p, c_void_p]),
     "ggslam_gpcc_positions": (c_int64, [c_void_p, c_void_p, c_void_p]),
     "ggslam_gpcc_decode_attribute": (c_int64, [
         c_void_p, c_void_p, POINTER(RahtSettings), c_void_p, c_size_t, c_void_p,
@@ -81,6 +100,7 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_gpcc_number_planes": (None, [
         POINTER(Points), POINTER(Grid), c_int32, c_void_p, c_void_p, c_void_p, c_void_p,
     ]),
+    "ggslam_gpcc_sample_cubes": (c_int64, [POINTER(Points), POINTER(Grid), c_uint32, c_void_p]),
     "ggslam_lzf_compress": (c_int64, [c_void_p, c_int64, c_void_p, c_int64]),
     "ggslam_lzf_decompress": (c_int64, [c_void_p, c_int64, c_void_p, c_int64]),
 }

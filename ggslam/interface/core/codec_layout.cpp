@@ -10,15 +10,24 @@ using ggslam::gpcc::Grid;
 using ggslam::gpcc::OctreeSettings;
 using ggslam::gpcc::Points;
 using ggslam::gpcc::RahtSettings;
+using ggslam::gpcc::TreeSettings;
 
 namespace {
 constexpr std::size_t kLayout[] = {
     sizeof(OctreeSettings), offsetof(OctreeSettings, depth), offsetof(OctreeSettings, neighbour_boundary),
     offsetof(OctreeSettings, adjacent_child), offsetof(OctreeSettings, intra_prediction),
     offsetof(OctreeSettings, unique_points),
+    sizeof(TreeSettings), offsetof(TreeSettings, levels), offsetof(TreeSettings, neighbour_boundary),
+    offsetof(TreeSettings, adjacent_child), offsetof(TreeSettings, intra_prediction),
+    offsetof(TreeSettings, unique_points), offsetof(TreeSettings, direct_mode), offsetof(TreeSettings, direct_pairs),
+    offsetof(TreeSettings, direct_rate), offsetof(TreeSettings, planes), offsetof(TreeSettings, plane_thresholds),
+    offsetof(TreeSettings, scaling), offsetof(TreeSettings, slice_qp), offsetof(TreeSettings, direct_qp),
+    offsetof(TreeSettings, qp_shift), offsetof(TreeSettings, codewords), offsetof(TreeSettings, separate_bits),
+    offsetof(TreeSettings, axes),
     sizeof(RahtSettings), offsetof(RahtSettings, components), offsetof(RahtSettings, bit_depth),
     offsetof(RahtSettings, qp), offsetof(RahtSettings, qp_secondary), offsetof(RahtSettings, prediction),
-    offsetof(RahtSettings, min_parent_neighbours), offsetof(RahtSettings, min_neighbours), offsetof(RahtSettings, rdoq),
+    offsetof(RahtSettings, min_parent_neighbours), offsetof(RahtSettings, min_neighbours),
+    offsetof(RahtSettings, first_version), offsetof(RahtSettings, rdoq),
     sizeof(Grid), offsetof(Grid, scale), offsetof(Grid, rounding), offsetof(Grid, first), offsetof(Grid, last),
     offsetof(Grid, exact),
     sizeof(Points), offsetof(Points, data), offsetof(Points, rows), offsetof(Points, count), offsetof(Points, kind),

@@ -6,12 +6,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ggslam.coding import (
-    AttributeSettings,
     CodecSettings,
     CodingReport,
     PointCloud,
@@ -29,13 +27,13 @@ from ggslam.errors import ConfigError, FormatError
 from ggslam.formats.gaussian_ply import write_gaussian_parts
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_point_cloud
+from ggslam.jobs.code.attributes import attributes_to_code, restored_attributes
 from ggslam.runs.folder import RunFolder
 from ggslam.system.atomic import make_folder, write_bytes
 
 PRESETS = ("pointcloud", "splat")
 Box = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner, metres."""
-_MOST_IDS = 1 << 16
 _SAMPLED = 1 << 18
 """Gaussians that tell where most of them lie."""
 
@@ -59,7 +57,12 @@ class Decoded:
 
 
 def encode_file(
-    source: Path, out: Path, settings: CodecSettings, preset: str = "pointcloud", rate: str = "r03"
+    source: Path,
+    out: Path,
+    settings: CodecSettings,
+    preset: str = "pointcloud",
+    rate: str = "r03",
+    ids: bool = True,
 ) -> Encoded:
     """Codes a cloud or a Gaussian map.
 
@@ -67,8 +70,9 @@ def encode_file(
         source: a PLY or PCD file, or a run folder: its points.ply (pointcloud) or map.ply (splat).
         out: the stream to write.
         settings: every choice of the codec; the preset adds what is coded and how.
-        preset: "pointcloud": positions and colours, labels lossless; "splat": whole Gaussians of a 3DGS PLY.
+        preset: "pointcloud": positions, colours, reflectance, and ids lossless; "splat": whole Gaussians of a 3DGS PLY.
         rate: of the splat preset, r01 to r04.
+        ids: whether ids (whole numbers beside position, colour and reflectance) are coded at all.
 
     Raises:
         FormatError: the input is damaged or has nothing to code.
@@ -80,28 +84,30 @@ def encode_file(
     _refuse_itself(path, out)
     try:
         if preset == "splat":
-            report = _encode_splats(path, out, settings, rate, notes)
+            report = _encode_splats(path, out, settings, rate, ids, notes)
         else:
-            report = _encode_points(path, out, settings, notes)
+            report = _encode_points(path, out, settings, ids, notes)
     except (ConfigError, FormatError) as error:
         raise (error if str(path) in str(error) else type(error)(f"{path}: {error}")) from None
     return Encoded(out, report, notes)
 
 
-def _encode_points(path: Path, out: Path, settings: CodecSettings, notes: list[str]) -> CodingReport:
+def _encode_points(path: Path, out: Path, settings: CodecSettings, ids: bool, notes: list[str]) -> CodingReport:
     cloud = read_point_cloud(path)
-    points, settings, metadata = coded_points(cloud, settings)
-    attributes, labels = _coded_attributes(cloud, notes)
-    own = {name: AttributeSettings(lossless=True) for name in labels}
-    metadata |= {"preset": "pointcloud"} | ({"label_offsets": labels} if any(labels.values()) else {})
-    settings = replace(settings, attributes={**settings.attributes, **own}, metadata=metadata)
+    points, settings = coded_points(cloud, settings)
+    coded = attributes_to_code(cloud, ids)
+    notes += coded.notes
+    settings = replace(settings, attributes={**settings.attributes, **coded.settings}, metadata=coded.metadata)
+    attributes = coded.values
     encoded = encode_cloud(points, attributes, settings)
     make_folder(out.parent)
     write_bytes(out, encoded.data)
     return encoded.report
 
 
-def _encode_splats(path: Path, out: Path, settings: CodecSettings, rate: str, notes: list[str]) -> CodingReport:
+def _encode_splats(
+    path: Path, out: Path, settings: CodecSettings, rate: str, ids: bool, notes: list[str]
+) -> CodingReport:
     """Codes a 3DGS PLY that need not fit into memory."""
     rows = GaussianRows(path)
     if not len(rows):
@@ -109,7 +115,7 @@ def _encode_splats(path: Path, out: Path, settings: CodecSettings, rate: str, no
     step, with_ids, sample = max(1, len(rows) // _SAMPLED), False, []
     for block in rows.blocks():
         sample.append(block.means.numpy()[::step].astype(np.float64))
-        with_ids = with_ids or bool(block.object_id.any())
+        with_ids = with_ids or (ids and bool(block.object_id.any()))
     settings = splat_settings(settings, rate, splat_attributes(rows.like, with_ids))
     outliers = _Outliers(np.concatenate(sample))
 
@@ -138,7 +144,7 @@ def study_cloud(source: Path, settings: CodecSettings) -> GridCloud:
     if cloud.voxel_size is not None:  # in metres, as the pictures and tables are
         settings = replace(settings, voxel_size=settings.voxel_size or cloud.voxel_size)
         return on_grid(cloud.points, cloud.colors, settings)
-    points, settings, _ = coded_points(cloud, settings)
+    points, settings = coded_points(cloud, settings)
     return on_grid(points, cloud.colors, settings)
 
 
@@ -169,12 +175,12 @@ def decode_file(
             return _write_splats(CloudInParts(len(cloud), cloud, iter([cloud])), out)
         if not len(cloud):
             raise FormatError("no points in the box")
-        labels = _labels_restored(cloud)
+        attributes = restored_attributes(cloud)
     except FormatError as error:
         raise FormatError(f"{source}: {error}") from None
     make_folder(out.parent)
     points, comments = _placed(cloud)
-    write_point_cloud(out, points, labels, comments if out.suffix.lower() != ".pcd" else ())
+    write_point_cloud(out, points, attributes, comments if out.suffix.lower() != ".pcd" else ())
     return Decoded(out, len(cloud), "points")
 
 
@@ -223,48 +229,31 @@ def _input_file(source: Path, preset: str) -> Path:
     return RunFolder.open(source).path / ("map.ply" if preset == "splat" else "points.ply")
 
 
-def coded_points(cloud: ColoredCloud, settings: CodecSettings) -> tuple[np.ndarray, CodecSettings, dict[str, Any]]:
-    """Positions as the encoder shall see them, the settings that fit them, and what the decoder needs to know to place
-    them.
+def coded_points(cloud: ColoredCloud, settings: CodecSettings) -> tuple[np.ndarray, CodecSettings]:
+    """Positions as the encoder shall see them, and the settings that fit them.
 
     Clouds on a grid are coded as whole voxels, so that lossless geometry gives back exactly their points: those that
-    ggslam voxelised (the grid's place goes into the metadata), and those whose coordinates are whole numbers, as of
-    the usual test clouds. Others are metres; the settings choose their voxels. So do they where they name a voxel size.
+    ggslam voxelised (the stream tells where the grid lies), and those whose coordinates are whole numbers, as of the
+    usual test clouds. Others are metres; the settings choose their voxels. So do they where they name a voxel size.
     """
     if settings.box is None and settings.voxel_size in (None, cloud.voxel_size):
         if cloud.grid is not None and cloud.voxel_size is not None and cloud.origin is not None:
-            place = {"grid": {"voxel_size": cloud.voxel_size, "origin": cloud.origin.tolist()}}
-            return cloud.grid, replace(settings, voxel_size=None), place
+            corner, shift = _corner(cloud.origin, cloud.voxel_size)
+            return cloud.grid + corner, replace(settings, voxel_size=None, unit=cloud.voxel_size, shift=shift)
         small = settings.voxel_size is None and np.abs(cloud.points).max() < 1 << 30
         if small and (cloud.points == np.rint(cloud.points)).all():
-            return cloud.points.astype(np.int32), settings, {}
-    return cloud.points, settings, {}
+            return cloud.points.astype(np.int32), settings
+    return cloud.points, settings
 
 
-def _coded_attributes(cloud: ColoredCloud, notes: list[str]) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Attributes by name, and of each label the number to add to what is coded."""
-    attributes: dict[str, np.ndarray] = {}
-    offsets: dict[str, int] = {}
-    if cloud.colors is None:
-        notes.append("the cloud has no colours")
-    else:
-        attributes["color"] = cloud.colors
-    for name, values in cloud.labels.items():
-        low, high = int(values.min()), int(values.max())
-        offset = 0 if low >= 0 and high < _MOST_IDS else low
-        if high - offset >= _MOST_IDS:
-            notes.append(f"left out '{name}': it reaches from {low} to {high}, more than 16 bits")
-            continue
-        offsets[name] = offset
-        attributes[name] = (values.astype(np.int64) - offset).astype(np.uint16)
-    if cloud.left_out:
-        names = cloud.left_out if len(cloud.left_out) < 6 else (*cloud.left_out[:4], "...", cloud.left_out[-1])
-        notes.append(f"left out {', '.join(names)}: neither position nor colour nor whole numbers")
-        if {"opacity", "scale_0", "rot_0"} <= set(cloud.left_out):
-            notes.append("these are Gaussians: `preset` splat codes them whole")
-    if cloud.nowhere:
-        notes.append(f"left out {cloud.nowhere} points that have no position (not a number)")
-    return attributes, offsets
+def _corner(origin: np.ndarray, voxel_size: float) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """A grid's origin in whole voxels, int32 [3], and what is left of it in metres."""
+    corner = np.rint(origin / voxel_size)
+    if np.abs(corner).max() >= 1 << 30:
+        corner = np.zeros(3)
+    left = origin - corner * voxel_size
+    left[np.abs(left) < 1e-6 * voxel_size] = 0
+    return corner.astype(np.int32), (float(left[0]), float(left[1]), float(left[2]))
 
 
 def _decoded(data: bytes, slice_id: int | None, box: Box | None, workers: int | None) -> PointCloud:
@@ -277,16 +266,12 @@ def _decoded(data: bytes, slice_id: int | None, box: Box | None, workers: int | 
 
 def _placed(cloud: PointCloud) -> tuple[np.ndarray, list[str]]:
     """Positions to write, and the header comments of a cloud that is on its grid still."""
-    quantization, grid = cloud.quantization, cloud.world_grid
-    if grid is None:
-        if not quantization.metres and quantization.scale == 1 and quantization.centre == 0:
-            return np.rint(cloud.points).astype(np.int32), []
-        return _narrowed(cloud.points, 1 / quantization.scale), []
-    voxel_size, origin, comments = grid.voxel_size, grid.origin, []
-    if quantization.scale == 1:
-        place = " ".join(repr(float(value)) for value in origin)
-        comments = ["x y z are metres", f"voxel_size {voxel_size!r}", f"origin {place}"]
-    return _narrowed(cloud.points, voxel_size / quantization.scale), comments
+    quantization = cloud.quantization
+    points, voxel_size = cloud.points, quantization.voxel_size
+    if not quantization.metres or quantization.centre != 0:
+        return _narrowed(points, voxel_size), []
+    place = " ".join(repr(float(value)) for value in quantization.first)
+    return _narrowed(points, voxel_size), ["x y z are metres", f"voxel_size {voxel_size!r}", f"origin {place}"]
 
 
 def _narrowed(points: np.ndarray, voxel_size: float) -> np.ndarray:
@@ -322,18 +307,3 @@ class _Outliers:
         if not self._far or self._bulk == 0:
             return []
         return [f"{self._far} Gaussians lie far outside the others; the grid spans them too and is coarser for it"]
-
-
-def _labels_restored(cloud: PointCloud) -> dict[str, np.ndarray]:
-    """The attributes to write: labels as int32 with their offsets."""
-    offsets = cloud.metadata.get("label_offsets")
-    out: dict[str, np.ndarray] = {}
-    for name, values in cloud.attributes.items():
-        offset = offsets.get(name) if isinstance(offsets, dict) else None
-        if name == "color" and values.ndim == 2 and values.dtype == np.uint8:
-            out[name] = values
-        else:
-            if offset is not None and (not isinstance(offset, int) or abs(offset) >= 1 << 40):
-                raise FormatError(f"the metadata's offset of '{name}' is damaged")
-            out[name] = values.astype(np.int64) + (offset or 0)
-    return out

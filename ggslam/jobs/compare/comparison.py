@@ -11,21 +11,14 @@ from typing import Any, Literal
 import numpy as np
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
-from ggslam.evaluation.geometry import (
-    THRESHOLDS_M,
-    Cloud,
-    CloudScores,
-    Overlap,
-    Registration,
-    overlap,
-    register,
-    score_cloud,
-)
+from ggslam.evaluation.geometry import THRESHOLDS_M, CloudScores, score_cloud
 from ggslam.evaluation.trajectory import FEWEST_POSES, TrajectoryScores, align_points, associate, score_trajectory
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.trajectory import Trajectory
 from ggslam.formats.triangle_mesh import read_mesh
+from ggslam.geometry.clouds import Cloud, Overlap, overlap
+from ggslam.geometry.icp import CloudRegistration, register
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.scene.poses import inverse
@@ -79,7 +72,7 @@ class Comparison:
     common_poses: int
     a_on_b: Overlap
     b_on_a: Overlap
-    icp: Registration | None
+    icp: CloudRegistration | None
     b_on_a_after_icp: Overlap | None
     scores: CloudScores
 

@@ -48,8 +48,8 @@ class LocalizeRequest:
     Attributes:
         map: folder of a grid store or a run, or a cloud.
         sequence: the recording.
-        start: pose of the first frame or scan: 7 numbers (position, quaternion xyzw), or `GIVEN`, or None.
-        no_start: it is looked up among the map's places.
+        start_pose: pose of the first frame or scan: 7 numbers (position, quaternion xyzw), or `GIVEN`, or None.
+        no_start_pose: the first frame is looked up among the map's places.
         full: against the whole map.
         out: folder for the results; None: localized/NAME.
         radius: R' in metres; None: the store's.
@@ -61,8 +61,8 @@ class LocalizeRequest:
 
     map: Path
     sequence: SequenceRequest
-    start: str | None = None
-    no_start: bool = False
+    start_pose: str | None = None
+    no_start_pose: bool = False
     full: bool = False
     out: Path | None = None
     radius: float | None = None
@@ -80,16 +80,16 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         GgslamError: map or recording cannot be read, or nothing says where to begin. If that happens in the middle, or
             on Ctrl-C, what was located is written all the same.
     """
-    if request.start is not None and request.no_start:
-        raise ConfigError("`start` and `no_start`: one of them")
+    if request.start_pose is not None and request.no_start_pose:
+        raise ConfigError("`start_pose` and `no_start_pose`: one of them")
     out = request.out or Path("localized") / request.sequence.path.resolve().name
     with ExitStack() as opened:
         recording = _open_recording(request)
         start = _start(request, recording.ground_truth)
         if start is None and isinstance(recording, ScanSequence):
             raise ConfigError(
-                f"{recording.path}: laser scans have no images to look the place of the first one up by: give its pose "
-                f'with `start` "x y z qx qy qz qw", or `start` {GIVEN} where the recording has poses of its own'
+                f"{recording.path}: laser scans have no images to look the place of the first one up by: give its "
+                f'pose with `start_pose` "x y z qx qy qz qw", or `start_pose` {GIVEN} where the recording has poses'
             )
         store = open_map(request.map, opened, observer)
         context = NativeContext(request.threads)
@@ -105,7 +105,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         results, error = _run(localizer, recording, observer)
         if error is not None and not results:
             raise error
-        damaged = sorted([*surface.damaged, *(places.damaged if places is not None else [])])
+        damaged = sorted([*surface.damage, *(places.damaged if places is not None else [])])
         report = LocalizationReport(
             str(request.map), str(request.sequence.path), request.full, recording.timestamps[: len(results)], results,
             None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
@@ -166,8 +166,8 @@ def parsed_pose(text: str) -> np.ndarray:
     norm = float(np.linalg.norm(numbers[3:]))
     if len(numbers) != 7 or not (np.abs(numbers) <= _FARTHEST).all() or not 0.9 < norm < 1.1:
         expected = f'"x y z qx qy qz qw", metres and a unit quaternion, or "{GIVEN}"'
-        frame = " (the first frame to use is `first`)" if text.strip().isdecimal() else ""
-        raise ConfigError(f"`start`: expected {expected}, found {text!r}{frame}")
+        frame = " (the first frame to use is `start`)" if text.strip().isdecimal() else ""
+        raise ConfigError(f"`start_pose`: expected {expected}, found {text!r}{frame}")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = quaternion_to_matrix(numbers[[6, 3, 4, 5]] / norm), numbers[:3]
     return T
@@ -182,12 +182,12 @@ def _open_recording(request: LocalizeRequest) -> Sequence | ScanSequence:
 
 
 def _start(request: LocalizeRequest, truth: np.ndarray | None) -> np.ndarray | None:
-    if request.start is None:
+    if request.start_pose is None:
         return None
-    if request.start != GIVEN:
-        return parsed_pose(request.start)
+    if request.start_pose != GIVEN:
+        return parsed_pose(request.start_pose)
     if truth is None or not np.isfinite(truth[0]).all():
-        raise SequenceError(f"{request.sequence.path}: `start` {GIVEN}: the first frame has no pose")
+        raise SequenceError(f"{request.sequence.path}: `start_pose` {GIVEN}: the first frame has no pose")
     return truth[0]
 
 
@@ -210,7 +210,7 @@ def _places(
         return None
     if start is None and not len(places):
         reason = f"; left out: {places.damaged[0]}" if places.damaged else ""
-        raise ConfigError(f"{request.map}: has no places to look up: `start` is needed{reason}")
+        raise ConfigError(f"{request.map}: has no places to look up: `start_pose` is needed{reason}")
     return places
 
 

@@ -47,7 +47,7 @@ class LocalizationReport:
     def poses(self) -> np.ndarray:
         """T_world_sensor [n, 4, 4], NaN where it was not located."""
         unknown = np.full((4, 4), np.nan)
-        return np.array([r.T_world_sensor if r.status.located else unknown for r in self.results])
+        return np.array([r.T_world_sensor if r.status.is_located else unknown for r in self.results])
 
     def errors_m(self) -> np.ndarray | None:
         """Distances [n] to the given poses as they are, NaN where either is unknown."""
@@ -62,7 +62,7 @@ class LocalizationReport:
         points = [r.map_points for r in self.results if r.map_points]
         return {
             "map": self.map, "sequence": self.sequence, "full_map": self.full, "frames": len(self.results),
-            "located_share": sum(r.status.located for r in self.results) / n,
+            "located_share": sum(r.status.is_located for r in self.results) / n,
             "statuses": dict(Counter(r.status.value for r in self.results)),
             "localization_ms": {"mean": ms.mean(), "median": np.median(ms), "p95": np.percentile(ms, 95),
                                 "max": ms.max()},

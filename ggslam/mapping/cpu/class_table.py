@@ -5,68 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
 from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
 
-FIRST_CLASSES = 100
-"""Rows allocated to begin with."""
-ROW_LENGTH = 4.0
-"""Length of a new class's row: with codes of length 2 a Gaussian of one object has a logit of 8 for it."""
-CODE_LENGTH = 2.0
 
-
-class ClassNumbers:
-    """Which class each object id has: numbers from 0 on, without gaps."""
-
-    def __init__(self) -> None:
-        self._ids = np.zeros(FIRST_CLASSES, np.uint16)
-        self._class_of = np.full(65536, -1, np.int32)
-        self.count = 0
-
-    @property
-    def ids(self) -> np.ndarray:
-        """Object id of each class, uint16 [count]; a view."""
-        return self._ids[: self.count]
-
-    @property
-    def table(self) -> np.ndarray:
-        """Class number of every object id, int32 [65536], -1 where there is none; a view."""
-        return self._class_of
-
-    def of(self, object_ids: np.ndarray) -> np.ndarray:
-        """Class number of each object id, int32 of the same shape; -1 where there is none."""
-        return self._class_of[object_ids]
-
-    def add(self, object_ids: np.ndarray) -> slice:
-        """Gives the next numbers to those ids (uint16, distinct) that are not 0 and have none yet; returns them."""
-        new = object_ids[(object_ids != 0) & (self._class_of[object_ids] < 0)]
-        numbers = slice(self.count, self.count + len(new))
-        if numbers.stop > len(self._ids):
-            self._ids = np.pad(self._ids, (0, max(numbers.stop, 2 * len(self._ids)) - len(self._ids)))
-        self._ids[numbers], self._class_of[new] = new, np.arange(numbers.start, numbers.stop)
-        self.count = numbers.stop
-        return numbers
-
-    def remove(self, object_id: int) -> int | None:
-        """Takes an id's number away, which the class with the last number gets; returns the number, None if the id has
-        none."""
-        number, last = int(self._class_of[object_id]), self.count - 1
-        if number < 0:
-            return None
-        self._class_of[self._ids[last]] = number
-        self._class_of[object_id] = -1
-        self._ids[number], self._ids[last] = self._ids[last], 0
-        self.count = last
-        return number
-
-
-def new_rows(rng: np.random.Generator, count: int, channels: int) -> np.ndarray:
-    """Weights of new classes, float32 [count, channels]: directions drawn evenly."""
-    directions = rng.normal(size=(count, channels)).astype(np.float32)
-    directions *= ROW_LENGTH / np.linalg.norm(directions, axis=1, keepdims=True)
-    return directions
-
-
-class ClassTable:
+class CpuClassTable:
     """A growing linear classifier with its optimizer.
 
     Args:

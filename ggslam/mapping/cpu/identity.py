@@ -1,44 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identity learning: every Gaussian learns which object it belongs to, from instance masks of the keyframes.
-
-As in Ye et al., "Gaussian Grouping", 2024 and GG-SLAM, a Gaussian carries a 16-D identity vector o, rendered like
-colour; a 1x1 convolution classifies what is rendered. Loss: l_obj CE(logits, mask) + l_obj3d (l_val / C) mean KL over
-nearest neighbours. Otherwise than there
-
-- the cross-entropy is taken at sampled pixels, balanced among objects, through the terms of the view that is rendered
-  for its colours anyway (`rendering.pixel_terms`): no identity image is ever composited;
-- classes are added as ids appear;
-- the same terms count votes: how much rendering weight a Gaussian had under each mask id. They label the map from the
-  first keyframe on, give new Gaussians their first vector, and check what was learned.
-"""
+"""Identity learning on the CPU, see `ggslam.mapping.identity`."""
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from ggslam.mapping.cpu.class_table import ClassTable
+from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
-from ggslam.mapping.cpu.pixel_pool import PixelPool, draw_pool
-from ggslam.mapping.cpu.votes import merge_votes, vote_labels, vote_shares
-from ggslam.mapping.identity_objects import BIRTH_VOTE, MIN_WEIGHT, POOL_STEPS, TERMS, IdentityObjects
-from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.cpu.pixel_pool import draw_pool
+from ggslam.mapping.identity import BIRTH_VOTE, MIN_WEIGHT, TERMS, IdentityLearner, MaskedKeyframe
+from ggslam.mapping.pixel_pool import PixelPool
+from ggslam.mapping.votes import merge_votes, vote_labels
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.pixel_terms import FeatureAdamSettings, PixelTerms
 from ggslam.rendering.types import RenderBuffers
-from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
 
-SH_C0 = 0.28209479177387814
 MANY_CLASSES = 128
 """Beyond so many classes a step's softmax runs over those in its sample and this many others, drawn at random."""
 
 
 @dataclass
-class IdentityLearner(IdentityObjects):
+class CpuIdentityLearner(IdentityLearner):
     """Trains identity vectors and classifier, counts votes.
 
     Args:
@@ -51,22 +38,16 @@ class IdentityLearner(IdentityObjects):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.table: ClassTable = ClassTable(self._rng)
-        self._pools: dict[int, PixelPool] = {}
-        self._shown: np.ndarray | None = None  # labels by votes, of the last keyframe's time
-        self._shown_order = -1
+        self.table: CpuClassTable = CpuClassTable(self._rng)
         self._index = NeighbourIndex(self.settings.neighbours.growth)
 
     # --- objects ------------------------------------------------------------------------------------------------------
 
-    def _labels_changed(self) -> None:
-        self._shown = None
-
     def _merge_votes(self, gaussians: GaussianMap) -> None:
-        merge_votes(gaussians, self._alias)
+        merge_votes(gaussians, torch.from_numpy(self._alias.astype(np.int32)))
 
     def _dissolve(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
-        labels = vote_labels(gaussians)
+        labels = vote_labels(gaussians).numpy()
         wrong = self.table.classifier.labels(gaussians.features.numpy())[0] == dropped
         self.table.remove(dropped)
         gaussians.features.numpy()[wrong] = self.table.codes(np.where(labels[wrong] > 0, labels[wrong], kept))
@@ -74,9 +55,6 @@ class IdentityLearner(IdentityObjects):
     def split(
         self, gaussians: GaussianMap, rasterizer: CpuRasterizer, mask: np.ndarray, whole: int, part: int
     ) -> None:
-        """An object turned out to be two: what the last rendering shows where `mask` [H, W] has the part, and more of
-        it there than elsewhere, now votes for the part as it did for the whole. In older keyframes the map decides
-        from now on which pixels of the whole are the part's (`_as_mapped`)."""
         whole, part = int(self._alias[whole]), int(self._alias[part])
         if not self._split_off(whole, part):
             return
@@ -90,26 +68,18 @@ class IdentityLearner(IdentityObjects):
         rows = np.flatnonzero(here > 0.5 * np.maximum(everywhere, 1e-9))
         ids = gaussians.vote_ids.numpy()
         ids[rows] = np.where(ids[rows] == whole, part, ids[rows])
-        merge_votes(gaussians, self._alias)
+        self._merge_votes(gaussians)
         if self.settings.initialisation == "votes" and len(rows):
-            gaussians.features.numpy()[rows] = self.table.codes(vote_labels(gaussians)[rows])
+            gaussians.features.numpy()[rows] = self.table.codes(vote_labels(gaussians).numpy()[rows])
 
     def _as_mapped(self, gaussians: GaussianMap, terms: PixelTerms, labels: np.ndarray) -> np.ndarray:
         """Labels of pixels, those of a whole replaced by its part's where the map shows the part."""
         if not self._whole_of.any():
             return labels
-        if self._shown is None or self._shown_order != gaussians.order or len(self._shown) != len(gaussians):
-            self._shown, self._shown_order = vote_labels(gaussians), gaussians.order
-        shown, _ = terms.labels(self._shown)
+        shown, _ = terms.labels(self._shown_labels(gaussians).numpy().astype(np.uint16))
         return np.where((self._whole_of[shown] == labels) & (shown > 0), shown, labels)
 
     def begin(self, gaussians: GaussianMap, rows: slice, labels: np.ndarray) -> None:
-        """New Gaussians get their first identity vectors and votes.
-
-        Args:
-            rows: where they are in the map.
-            labels: uint16 [M], object under the pixel each was born from, 0 = unknown.
-        """
         ids = self.current(labels)
         gaussians.vote_ids.numpy()[rows, 0] = ids
         gaussians.vote_weights.numpy()[rows, 0] = np.where(ids > 0, BIRTH_VOTE, 0)
@@ -121,44 +91,25 @@ class IdentityLearner(IdentityObjects):
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
-    def due(self, keyframe: Keyframe) -> bool:
-        """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
-        return self._count_iteration(keyframe.mask is not None)
+    def _sampled(
+        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: MaskedKeyframe, pixels: np.ndarray,
+        vote_weights: np.ndarray, rate_factor: float,
+    ) -> None:  # fmt: skip
+        assert keyframe.mask is not None
+        labels = self.current(keyframe.mask.reshape(-1)[pixels])
+        terms = rasterizer.pixel_terms(pixels, TERMS, MIN_WEIGHT)
+        labels = self._as_mapped(gaussians, terms, labels)
+        terms.vote(gaussians, labels, vote_weights)
+        if self.settings.schedule == "sampled":
+            self._train(gaussians, terms, self.table.classes(labels), rate_factor)
 
-    def step(
-        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: Keyframe, view: RenderBuffers,
-        rate_factor: float = 1.0,
-    ) -> torch.Tensor | None:  # fmt: skip
-        """One step on the view that `rasterizer` rendered last, which must be that of `keyframe`.
-
-        Args:
-            rate_factor: multiplies the learning rates (of the sampled schedule).
-
-        Returns:
-            With the dense schedule the gradient of the rendered features [F, H, W], for the caller's backward pass;
-            else None, and the step is made.
-        """
-        start = time.perf_counter()
-        gradient = None
-        if self.settings.schedule == "dense":
-            gradient = self._dense(gaussians, rasterizer, keyframe, view)
-        pixels, vote_weights = self._draw(keyframe)
-        if len(pixels):
-            assert keyframe.mask is not None
-            labels = self.current(keyframe.mask.reshape(-1)[pixels])
-            terms = rasterizer.pixel_terms(pixels, TERMS, MIN_WEIGHT)
-            labels = self._as_mapped(gaussians, terms, labels)
-            terms.vote(gaussians, labels, vote_weights)
-            if self.settings.schedule == "sampled":
-                self._train(gaussians, terms, self.table.classes(labels), rate_factor)
-        self.times.steps += time.perf_counter() - start
-        self.times.count += 1
-        return gradient
+    def _new_pool(self, keyframe: MaskedKeyframe, wanted: int) -> PixelPool[np.ndarray]:
+        assert keyframe.mask is not None
+        return draw_pool(self.current(keyframe.mask), wanted, self.settings, self._rng)
 
     def _dense(
-        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: Keyframe, view: RenderBuffers
+        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: MaskedKeyframe, view: RenderBuffers
     ) -> torch.Tensor:
-        """Cross-entropy of a whole rendered identity image, as published; updates the classifier."""
         s = self.settings
         assert keyframe.mask is not None and view.features is not None
         pixels = np.flatnonzero(keyframe.mask)
@@ -170,7 +121,7 @@ class IdentityLearner(IdentityObjects):
         self.table.step(chosen, s.weight * rows, s.classifier_rate)
         out = np.zeros_like(features)
         out[:, pixels] = s.weight * gradient.T
-        if s.neighbours.weight > 0 and self.times.count % s.neighbours.every == 0 and len(gaussians) > 1:
+        if self._pulls(gaussians):
             rows_pulled, pull = self._pull_together(gaussians)
             terms = PixelTerms.of_gaussians(rows_pulled, 1, rasterizer.context)
             terms.step(gaussians, pull, FeatureAdamSettings(rate=s.rate))
@@ -180,19 +131,19 @@ class IdentityLearner(IdentityObjects):
         s, known = self.settings, classes >= 0  # an object may have been taken back since its pixels were drawn
         if not known.any():
             return
-        chosen = self._competing(classes[known])
+        chosen = self._choose_competitors(classes[known])
         features = terms.features(gaussians)
         gradient = np.zeros_like(features)
         self.last_loss, of_known, rows = cross_entropy(features[known], self.classifier, classes[known], chosen)
         gradient[known] = s.weight * of_known
-        if s.neighbours.weight > 0 and self.times.count % s.neighbours.every == 0 and len(gaussians) > 1:
+        if self._pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
             terms = terms.joined(PixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
             gradient = np.concatenate([gradient, pull])
         terms.step(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate))
         self.table.step(chosen, s.weight * rows, rate_factor * s.classifier_rate)
 
-    def _competing(self, classes: np.ndarray) -> np.ndarray:
+    def _choose_competitors(self, classes: np.ndarray) -> np.ndarray:
         """Classes that a step's softmax runs over: all, or with very many those that appear and some others."""
         if self.table.count <= MANY_CLASSES:
             return np.arange(self.table.count)
@@ -210,33 +161,9 @@ class IdentityLearner(IdentityObjects):
         gradient = np.concatenate([own, others.reshape(-1, len(classifier))]) @ classifier.weight
         return np.concatenate([rows, near.reshape(-1)]), (factor * gradient).astype(np.float32)
 
-    def _draw(self, keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray]:
-        """The next pixels of a keyframe, int32 [P], and the weight each has as a vote."""
-        pool = self._pools.get(keyframe.index)
-        if pool is None or pool.used + self.settings.pixels > len(pool.pixels):
-            assert keyframe.mask is not None
-            wanted = POOL_STEPS * self.settings.pixels
-            pool = draw_pool(self.current(keyframe.mask), wanted, self.settings, self._rng)
-            self._pools[keyframe.index] = pool
-        part = slice(pool.used, pool.used + self.settings.pixels)
-        pool.used = part.stop
-        return pool.pixels[part], pool.vote_weights[part]
-
-    # --- results ------------------------------------------------------------------------------------------------------
-
-    def label(self, gaussians: GaussianMap) -> None:
-        """Writes each Gaussian's object into `object_id`: the one with a share of `min_confidence` of its votes, else
-        the learned one if it is as probable, else 0. Votes first: what is rendered is learned as a whole, and single
-        Gaussians in it may be wrong (in a rendered room 95 % of Gaussians were right by votes, 91 % as learned)."""
-        start = time.perf_counter()
-        ids, share = vote_shares(gaussians)
-        sure = share >= self.settings.min_confidence
-        if self.settings.schedule != "votes":
-            seen = share > 0
-            learned = by_parts(self.classifier, gaussians.features.numpy(), self.settings.min_confidence)
-            ids = np.where(sure, ids, np.where(seen, learned, 0))
-        gaussians.object_id.numpy()[:] = ids
-        self.times.labelling += time.perf_counter() - start
+    def _learned_labels(self, gaussians: GaussianMap) -> torch.Tensor:
+        ids = by_parts(self.classifier, gaussians.features.numpy(), self.settings.min_confidence)
+        return torch.from_numpy(ids.astype(np.int32))
 
 
 def cross_entropy(

@@ -3,26 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
+from ggslam.mapping.new_gaussians import NewGaussians
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
-
-
-@dataclass(frozen=True)
-class NewGaussians:
-    """Gaussians to insert, world frame: means [M, 3], quaternions wxyz [M, 4], log_scales [M, 3], rgb [M, 3]."""
-
-    means: np.ndarray
-    quaternions: np.ndarray
-    log_scales: np.ndarray
-    rgb: np.ndarray
-    pixels: np.ndarray
-    """Flat pixel index of each, int64 [M]."""
 
 
 def unexplained(depth: np.ndarray, alpha: np.ndarray, rendered_depth: np.ndarray, s: InsertionSettings) -> np.ndarray:
@@ -92,7 +79,7 @@ def _is_smooth(depth: np.ndarray) -> np.ndarray:
 def new_gaussians(
     color: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, where: np.ndarray,
     s: InsertionSettings,
-) -> NewGaussians:  # fmt: skip
+) -> NewGaussians[np.ndarray]:  # fmt: skip
     """Discs on the measured surface, one per selected pixel (bool [H, W]) with usable depth.
 
     Each disc covers its pixel's footprint: sigma = scale_pixels * stride * z / f across the viewing direction, longer
@@ -118,7 +105,7 @@ def new_gaussians(
 def fill_gaussians(
     color: np.ndarray, depth: np.ndarray, alpha: np.ndarray, camera: Camera, T_world_camera: np.ndarray,
     s: InsertionSettings,
-) -> NewGaussians:  # fmt: skip
+) -> NewGaussians[np.ndarray]:  # fmt: skip
     """Small spheres where neither the sensor nor the map knows a surface, at the depth of the nearest known pixel.
 
     Args:

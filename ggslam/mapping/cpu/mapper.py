@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 
@@ -11,16 +10,17 @@ import numpy as np
 import torch
 
 from ggslam.mapping.cpu.exposure import ExposureAdam
-from ggslam.mapping.cpu.identity import IdentityLearner
+from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, new_gaussians, unexplained
-from ggslam.mapping.cpu.losses import ImageLoss, KeyframeImages
-from ggslam.mapping.cpu.votes import vote_labels
+from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
+from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -34,7 +34,8 @@ class CpuMapper(Mapper):
         Others: as in `Mapper`.
     """
 
-    identity: IdentityLearner | None
+    identity: CpuIdentityLearner | None
+    _rasterizer: CpuRasterizer
 
     def __init__(
         self,
@@ -42,13 +43,13 @@ class CpuMapper(Mapper):
         settings: MapperSettings,
         context: NativeContext,
         seed: int = 0,
-        identity: IdentityLearner | None = None,
+        identity: CpuIdentityLearner | None = None,
     ) -> None:
         super().__init__(gaussians, settings, seed, identity)
         self._losses = LossSums()
         self._last_psnr = float("nan")
         self._rasterizer = CpuRasterizer(context=context)
-        self._loss = ImageLoss(context)
+        self._loss = CpuImageLoss(context)
         self._pose_optimizers: list[PoseAdam] = []
         self._exposure_optimizers: list[ExposureAdam] = []
 
@@ -59,9 +60,6 @@ class CpuMapper(Mapper):
     @property
     def last_psnr(self) -> float:
         return self._last_psnr
-
-    def vote_labels(self) -> np.ndarray:
-        return vote_labels(self.map)
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         super().adopt(gaussians, keyframes)
@@ -78,7 +76,7 @@ class CpuMapper(Mapper):
         where, alpha = np.ones(depth.shape, bool), np.zeros(depth.shape, np.float32)
         show: Callable[[], MapLabels] | None = None
         if self.map.count:
-            view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
+            view = self._render(keyframe, features=False)
             alpha, rendered = view.alpha.numpy(), view.expected_depth.numpy()
             where = unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
@@ -98,10 +96,6 @@ class CpuMapper(Mapper):
                 labels = np.zeros(len(new.pixels), np.uint16) if mask is None else mask.reshape(-1)[new.pixels]
                 self.identity.begin(self.map, rows, labels)
 
-    def _split(self, mask: np.ndarray, whole: int, part: int) -> None:
-        assert self.identity is not None
-        self.identity.split(self.map, self._rasterizer, mask, whole, part)
-
     def _show_labels(self, alpha: np.ndarray, depth: np.ndarray, stride: int = 2) -> MapLabels:
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""
         height, width = alpha.shape
@@ -111,56 +105,23 @@ class CpuMapper(Mapper):
         ids, share = ids.reshape(grid.shape), share.reshape(grid.shape) * (alpha[::stride, ::stride] > 0.5)
         return MapLabels.from_grid(ids, share, depth, stride)
 
-    def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
-        s, t0 = self.settings, time.perf_counter()
-        learn = self.identity is not None and self.identity.due(keyframe)
-        dense = learn and self.identity is not None and self.identity.settings.schedule == "dense"
-        view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=dense)
-        t1 = time.perf_counter()
-        exposure = keyframe.exposure if s.exposure.enabled else None
-        target = KeyframeImages(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
-        loss = self._loss.evaluate(view, target, s.loss)
-        t2 = time.perf_counter()
-        grad_features = None
-        if learn and self.identity is not None:
-            grad_features = self.identity.step(self.map, self._rasterizer, keyframe, view)
-        t3 = time.perf_counter()
-        optimizer = self._standard_adam if rate_factor == 1 else self._adam(rate_factor)
-        step = self._rasterizer.backward_step(
-            self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features, optimizer=optimizer,
-            detach_features=self.identity is None or self.identity.settings.detach,
-        )  # fmt: skip
-        self._refine_keyframe(keyframe, step.twist, loss.exposure_gradient, rate_factor)
-        t4 = time.perf_counter()
-        self.times.forward += t1 - t0
-        self.times.loss += t2 - t1
-        self.times.identity += t3 - t2
-        self.times.backward += t4 - t3
-        self.times.iterations += 1
-        keyframe.iterations += 1
+    def _render(self, keyframe: Keyframe, features: bool) -> RenderBuffers:
+        return self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=features)
+
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> CpuLossResult:
+        exposure = keyframe.exposure if self.settings.exposure.enabled else None
+        target = LossTarget(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
+        return self._loss.evaluate(view, target, self.settings.loss)
+
+    def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:
+        if pose_rate:
+            optimizer = self._pose_optimizers[keyframe.index]
+            keyframe.T_camera_world = optimizer.step(keyframe.T_camera_world, twist, pose_rate)
+        if self.settings.exposure.enabled and keyframe.index > 0:
+            optimizer_of_exposure = self._exposure_optimizers[keyframe.index]
+            keyframe.exposure = optimizer_of_exposure.step(keyframe.exposure, loss.exposure_gradient)
         self._last_psnr = loss.psnr
         self._losses.total += loss.values.total
         self._losses.color += loss.values.color
         self._losses.ssim += loss.values.ssim
         self._losses.depth += loss.values.depth
-
-    def _train_identity(self, keyframe: Keyframe, steps: int, rate_factor: float) -> None:
-        if self.identity is None:
-            return
-        view = self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=False)
-        for _ in range(steps):
-            self.identity.step(self.map, self._rasterizer, keyframe, view, rate_factor)
-
-    def _refine_keyframe(
-        self, keyframe: Keyframe, twist: np.ndarray, exposure_gradient: np.ndarray, rate_factor: float
-    ) -> None:
-        """Pose and exposure of a keyframe follow their gradients. The first keyframe stays: it is the world."""
-        s = self.settings
-        if keyframe.index == 0:
-            return
-        if s.pose_refinement.enabled:
-            rate = min(s.pose_refinement.rate_sigmas * self.depth_sigma, s.pose_refinement.max_rate)
-            optimizer = self._pose_optimizers[keyframe.index]
-            keyframe.T_camera_world = optimizer.step(keyframe.T_camera_world, twist, rate_factor * rate)
-        if s.exposure.enabled:
-            keyframe.exposure = self._exposure_optimizers[keyframe.index].step(keyframe.exposure, exposure_gradient)

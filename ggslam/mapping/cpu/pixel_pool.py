@@ -3,31 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ggslam.mapping.identity_settings import IdentitySettings
-
-
-@dataclass
-class PixelPool:
-    """Pixels of one keyframe drawn for steps to come.
-
-    Attributes:
-        pixels: int32, flat indices.
-        vote_weights: float32, inverse of the density with which each was drawn, mean 1.
-        used: how many of them are used up.
-    """
-
-    pixels: np.ndarray
-    vote_weights: np.ndarray
-    used: int = 0
+from ggslam.mapping.pixel_pool import PixelPool
 
 
 def draw_pool(
     ids: np.ndarray, wanted: int, settings: IdentitySettings, rng: np.random.Generator
-) -> PixelPool:
+) -> PixelPool[np.ndarray]:
     """Draws labelled pixels: a share `settings.boundary` of them at the boundaries of objects, where nearly all errors
     are, the others anywhere; in both parts an object of n pixels comes with a share that goes with n^(1 - balance).
 

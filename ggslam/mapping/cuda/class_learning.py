@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The losses of identity learning and the classifier's optimizer on an NVIDIA GPU, by kernels that are only started
-here: `cross_entropy` of `identity.py`, `kl_gradient` of `neighbours.py` and `ClassTable.step`."""
+here: `cross_entropy` of `identity.py`, `kl_gradient` of `neighbours.py` and `CpuClassTable.step`."""
 
 from __future__ import annotations
 

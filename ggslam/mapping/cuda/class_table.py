@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from ggslam.cuda.streams import let_go
-from ggslam.mapping.cpu.class_table import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
+from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
 from ggslam.mapping.cuda.class_learning import ClassKernels
-from ggslam.mapping.identity_objects import IDS
+from ggslam.mapping.identity import IDS
 from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
 
 _LOGITS_AT_ONCE = 2**24
@@ -23,7 +23,7 @@ class CudaClassTable:
     """A growing linear classifier with its optimizer.
 
     Args:
-        rng: draws the rows of new classes, as for `ClassTable`.
+        rng: draws the rows of new classes, as for `CpuClassTable`.
         kernels: of the device.
         channels: length of an identity vector.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identity learning on an NVIDIA GPU: `ggslam.mapping.cpu.identity` with map, masks, samples, classifier and votes on
+"""Identity learning on an NVIDIA GPU: `ggslam.mapping.identity` with map, masks, samples, classifier and votes on
 a device.
 
 A step is only started, on torch's current stream: nothing in it waits for the device. What comes with keyframes (new
@@ -9,7 +9,6 @@ classes, and neighbours are those of the map as it is.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Protocol
 
@@ -19,11 +18,19 @@ import torch
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
-from ggslam.mapping.cuda.neighbours import device_neighbours
-from ggslam.mapping.cuda.pixel_pool import DevicePixelPool, PixelDrawer
-from ggslam.mapping.cuda.votes import merge_votes, vote_labels, vote_shares
-from ggslam.mapping.identity_objects import BIRTH_VOTE, IDS, MIN_WEIGHT, POOL_STEPS, TERMS, IdentityObjects
+from ggslam.mapping.cuda.neighbours import cuda_neighbours
+from ggslam.mapping.cuda.pixel_pool import PixelDrawer
+from ggslam.mapping.identity import (
+    BIRTH_VOTE,
+    IDS,
+    MIN_WEIGHT,
+    TERMS,
+    IdentityLearner,
+    MaskedKeyframe,
+)
 from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.mapping.pixel_pool import PixelPool
+from ggslam.mapping.votes import merge_votes, vote_labels
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.pixel_terms import FeatureAdamSettings
@@ -41,17 +48,14 @@ SPLIT_PIXELS, SPLIT_TERMS, SPLIT_MIN_WEIGHT = 32768, 48, 1e-3
 """A split looks at so many pixels at a time, with so many contributions to each, none lighter."""
 
 
-class MaskedKeyframe(Protocol):
-    """What is asked of a keyframe: its number, and its mask, uint16 [H, W] on the device, or None."""
-
-    @property
-    def index(self) -> int: ...
+class CudaMaskedKeyframe(MaskedKeyframe, Protocol):
+    """A keyframe whose mask is on the device, too."""
 
     @property
     def device_mask(self) -> torch.Tensor | None: ...
 
 
-class CudaIdentityLearner(IdentityObjects):
+class CudaIdentityLearner(IdentityLearner):
     """Trains identity vectors and classifier, counts votes.
 
     Args:
@@ -59,12 +63,14 @@ class CudaIdentityLearner(IdentityObjects):
         seed: of sampling. On one device all draws repeat with the same seed.
         device: CUDA device of the map; None: the current one.
         library: the compiled kernels; None: those of the device, compiled if need be.
-        neighbours: finds nearest Gaussians without a wait; None: `device_neighbours`.
+        neighbours: finds nearest Gaussians without a wait; None: `cuda_neighbours`.
 
     Raises:
         MissingDependency: no CUDA device, or the kernels cannot be compiled.
         NativeCoreError: the compiled kernels do not fit this code.
     """
+
+    kept_pools = KEPT_POOLS
 
     def __init__(
         self,
@@ -80,10 +86,7 @@ class CudaIdentityLearner(IdentityObjects):
         self.table: CudaClassTable = CudaClassTable(self._rng, self._kernels)
         drawn_from = int(np.random.default_rng([seed, 17]).integers(2**62))
         self._drawer = PixelDrawer(self.device, self.library, drawn_from)
-        self._neighbours = neighbours or device_neighbours
-        self._pools: dict[int, DevicePixelPool] = {}
-        self._shown: torch.Tensor | None = None  # labels by votes, of the last keyframe's time
-        self._shown_order = -1
+        self._neighbours = neighbours or cuda_neighbours
         self._has_parts = False
         self._device_alias = torch.arange(IDS, dtype=torch.int32, device=self.device)
         self._device_whole_of = torch.zeros(IDS, dtype=torch.int32, device=self.device)
@@ -98,9 +101,6 @@ class CudaIdentityLearner(IdentityObjects):
         return float(losses.double().sum() / known)
 
     # --- objects ------------------------------------------------------------------------------------------------------
-
-    def _labels_changed(self) -> None:
-        self._shown = None
 
     def _ids_changed(self) -> None:
         super()._ids_changed()
@@ -121,7 +121,6 @@ class CudaIdentityLearner(IdentityObjects):
     def split(
         self, gaussians: GaussianMap, rasterizer: CudaRasterizer, mask: np.ndarray, whole: int, part: int
     ) -> None:
-        """An object turned out to be two, see `IdentityLearner.split`; `mask` (uint16 [H, W]) is on the host."""
         whole, part = int(self._alias[whole]), int(self._alias[part])
         if not self._split_off(whole, part):
             return
@@ -143,24 +142,16 @@ class CudaIdentityLearner(IdentityObjects):
         """Labels of pixels, those of a whole replaced by its part's where the map shows the part."""
         if not self._has_parts:
             return labels
-        if self._shown is None or self._shown_order != gaussians.order or len(self._shown) != len(gaussians):
-            self._shown, self._shown_order = vote_labels(gaussians), gaussians.order
-        shown, _ = terms.labels(self._shown)
+        shown, _ = terms.labels(self._shown_labels(gaussians))
         return torch.where((self._device_whole_of[shown.long()] == labels) & (shown > 0), shown, labels)
 
-    def labels_at(self, keyframe: MaskedKeyframe, pixels: torch.Tensor) -> torch.Tensor:
+    def labels_at(self, keyframe: CudaMaskedKeyframe, pixels: torch.Tensor) -> torch.Tensor:
         """Objects at pixels (integers [M], flat indices) of a keyframe, int32 [M], for `begin`; 0 = unknown."""
         if keyframe.device_mask is None:
             return torch.zeros(len(pixels), dtype=torch.int32, device=self.device)
         return self._kernels.labels(keyframe.device_mask, pixels.to(torch.int32), self._device_alias)
 
     def begin(self, gaussians: GaussianMap, rows: slice, labels: torch.Tensor) -> None:
-        """New Gaussians get their first identity vectors and votes.
-
-        Args:
-            rows: where they are in the map.
-            labels: int32 [M] on the device, object under the pixel each was born from, 0 = unknown.
-        """
         ids = self._device_alias[labels.long()]
         gaussians.vote_ids[rows, 0] = ids
         gaussians.vote_weights[rows, 0] = BIRTH_VOTE * (ids > 0)
@@ -173,31 +164,20 @@ class CudaIdentityLearner(IdentityObjects):
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
-    def due(self, keyframe: MaskedKeyframe) -> bool:
-        """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
-        return self._count_iteration(keyframe.device_mask is not None)
-
-    def step(
-        self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: MaskedKeyframe, view: RenderBuffers,
-        rate_factor: float = 1.0,
-    ) -> torch.Tensor | None:  # fmt: skip
-        """Starts one step on the view that `rasterizer` rendered last, which must be that of `keyframe`; arguments and
-        result as `IdentityLearner.step`, on the device. `times.steps` counts the seconds it takes to start."""
-        start = time.perf_counter()
-        mask = keyframe.device_mask
-        assert mask is not None
-        gradient = self._dense(gaussians, mask, view) if self.settings.schedule == "dense" else None
-        pixels, vote_weights = self._draw(keyframe.index, mask)
-        labels = self._kernels.labels(mask, pixels, self._device_alias)
+    def _sampled(
+        self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: CudaMaskedKeyframe, pixels: torch.Tensor,
+        vote_weights: torch.Tensor, rate_factor: float,
+    ) -> None:  # fmt: skip
+        labels = self._kernels.labels(_mask_of(keyframe), pixels, self._device_alias)
         terms = rasterizer.pixel_terms(pixels, TERMS, MIN_WEIGHT)
         labels = self._as_mapped(gaussians, terms, labels)
         if self.settings.schedule == "sampled" and self.table.count:
             self._train(gaussians, terms, labels, vote_weights, rate_factor)
         else:
             terms.vote(gaussians, labels, vote_weights)
-        self.times.steps += time.perf_counter() - start
-        self.times.count += 1
-        return gradient
+
+    def _new_pool(self, keyframe: CudaMaskedKeyframe, wanted: int) -> PixelPool[torch.Tensor]:
+        return self._drawer.draw(_mask_of(keyframe), self._device_alias, wanted, self.settings)
 
     def _train(
         self, gaussians: GaussianMap, terms: CudaPixelTerms, labels: torch.Tensor, vote_weights: torch.Tensor,
@@ -218,9 +198,11 @@ class CudaIdentityLearner(IdentityObjects):
         terms.step(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate))
         self.table.step(rows, known, rate_factor * s.classifier_rate)
 
-    def _dense(self, gaussians: GaussianMap, mask: torch.Tensor, view: RenderBuffers) -> torch.Tensor:
-        """Cross-entropy of a whole rendered identity image, as published; updates the classifier."""
-        s, size = self.settings, mask.numel()
+    def _dense(
+        self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: CudaMaskedKeyframe, view: RenderBuffers
+    ) -> torch.Tensor:
+        s, mask = self.settings, _mask_of(keyframe)
+        size = mask.numel()
         assert view.features is not None
         pixels = torch.arange(size, dtype=torch.int32, device=self.device)
         classes, known = self._kernels.classes(
@@ -244,10 +226,6 @@ class CudaIdentityLearner(IdentityObjects):
             terms.step(gaussians, pull, FeatureAdamSettings(rate=s.rate))
         return out
 
-    def _pulls(self, gaussians: GaussianMap) -> bool:
-        s = self.settings.neighbours
-        return s.weight > 0 and self.times.count % s.every == 0 and len(gaussians) > 1
-
     def _pull_together(self, gaussians: GaussianMap) -> tuple[torch.Tensor, torch.Tensor]:
         """Rows int64 [R] of the 3-D loss and their gradients float32 [R, F]; a row may appear more than once."""
         s, classes, size = self.settings.neighbours, self.table.count, len(gaussians)
@@ -260,28 +238,11 @@ class CudaIdentityLearner(IdentityObjects):
         gradients = self._kernels.neighbour_loss(logits, samples, s.weight * s.value / classes)
         return pulled, torch.mm(gradients, self.table.weight)
 
-    def _draw(self, number: int, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The next pixels of keyframe `number`, int32 [P], and the weight each has as a vote."""
-        pool, wanted = self._pools.get(number), self.settings.pixels
-        if pool is None or pool.used + wanted > len(pool.pixels):
-            pool = self._drawer.draw(mask, self._device_alias, POOL_STEPS * wanted, self.settings)
-            self._pools.pop(number, None)
-            self._pools[number] = pool
-            if len(self._pools) > KEPT_POOLS:
-                del self._pools[next(iter(self._pools))]
-        part = slice(pool.used, pool.used + wanted)
-        pool.used = part.stop
-        return pool.pixels[part], pool.vote_weights[part]
+    def _learned_labels(self, gaussians: GaussianMap) -> torch.Tensor:
+        return self.table.labels(gaussians.features, self.settings.min_confidence)
 
-    # --- results ------------------------------------------------------------------------------------------------------
 
-    def label(self, gaussians: GaussianMap) -> None:
-        """Writes each Gaussian's object into `object_id`, see `IdentityLearner.label`."""
-        start = time.perf_counter()
-        ids, share = vote_shares(gaussians)
-        sure = share >= self.settings.min_confidence
-        if self.settings.schedule != "votes":
-            learned = self.table.labels(gaussians.features, self.settings.min_confidence)
-            ids = torch.where(sure, ids, torch.where(share > 0, learned, 0))
-        gaussians.object_id.copy_(ids)
-        self.times.labelling += time.perf_counter() - start
+def _mask_of(keyframe: CudaMaskedKeyframe) -> torch.Tensor:
+    mask = keyframe.device_mask
+    assert mask is not None
+    return mask

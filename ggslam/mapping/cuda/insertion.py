@@ -22,6 +22,7 @@ from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
 from ggslam.interface.arrays import address
 from ggslam.interface.cuda.mapping import InsertionJob
+from ggslam.mapping.new_gaussians import NewGaussians
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.rendering.types import check_pose
 from ggslam.scene.camera import Camera
@@ -32,26 +33,6 @@ _MOST_PIXELS = 1 << 29
 """Pixels and points for filling are numbered together in 31 bits."""
 
 
-@dataclass(frozen=True)
-class DeviceGaussians:
-    """Gaussians to insert, world frame, float32 on the device; see `NewGaussians`.
-
-    Attributes:
-        means: [M, 3], metres.
-        quaternions: [M, 4] wxyz, of unit length.
-        log_scales: [M, 3], natural logarithm of the standard deviations in metres.
-        rgb: [M, 3] in [0, 1].
-        pixels: int64 [M], flat index of the pixel that each comes from.
-    """
-
-    means: torch.Tensor
-    quaternions: torch.Tensor
-    log_scales: torch.Tensor
-    rgb: torch.Tensor
-    pixels: torch.Tensor
-
-    def __len__(self) -> int:
-        return self.means.shape[0]
 
 
 @dataclass(frozen=True)
@@ -59,7 +40,7 @@ class Selection:
     """Pixels that get a Gaussian.
 
     Attributes:
-        job: for `DeviceInsertion.build`.
+        job: for `CudaInsertion.build`.
         total: their number, int32 [1] on the device.
     """
 
@@ -67,7 +48,7 @@ class Selection:
     total: torch.Tensor
 
 
-class DeviceInsertion:
+class CudaInsertion:
     """Finds new Gaussians on torch's current stream; keeps scratch memory between keyframes. One instance serves one
     caller and one stream at a time.
 
@@ -85,7 +66,7 @@ class DeviceInsertion:
         self._memory = GrowingMemory(self.device)
         self._total = torch.empty(1, dtype=torch.int32, device=self.device)
 
-    def new_gaussians(self, *arguments: Any, **named: Any) -> DeviceGaussians:
+    def new_gaussians(self, *arguments: Any, **named: Any) -> NewGaussians[torch.Tensor]:
         """`select` and `build`. Waits for the device once, for the number of Gaussians."""
         selection = self.select(*arguments, **named)
         return self.build(selection, int(selection.total.item()))
@@ -129,7 +110,7 @@ class DeviceInsertion:
         self.library.call("insertion_select", ctypes.byref(job))
         return Selection(job, self._total)
 
-    def build(self, selection: Selection, count: int) -> DeviceGaussians:
+    def build(self, selection: Selection, count: int) -> NewGaussians[torch.Tensor]:
         """The Gaussians of a selection, `count` being the number in its `total`."""
         job = selection.job
         job.count = count
@@ -151,10 +132,10 @@ class DeviceInsertion:
         job.stream = self.library.stream(self.device)
         return job
 
-    def _empty(self, count: int) -> DeviceGaussians:
+    def _empty(self, count: int) -> NewGaussians[torch.Tensor]:
         means, quaternions, log_scales, rgb = (torch.empty(count, n, device=self.device) for n in (3, 4, 3, 3))
         pixels = torch.empty(count, dtype=torch.int64, device=self.device)
-        return DeviceGaussians(means, quaternions, log_scales, rgb, pixels)
+        return NewGaussians(means, quaternions, log_scales, rgb, pixels)
 
     def _check_images(
         self, color: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor | None,

@@ -19,7 +19,7 @@ are needed (2 MB for 640x480, a tenth of a millisecond)."""
 
 
 @dataclass
-class DeviceImages:
+class CudaKeyframeImages:
     """Images of a keyframe.
 
     Attributes:
@@ -81,7 +81,7 @@ class CudaKeyframe(Keyframe):
         """Only the beginning sets it, and that goes with the row."""
 
     @property
-    def device_images(self) -> DeviceImages:
+    def device_images(self) -> CudaKeyframeImages:
         """On the device."""
         return self._images.of(self)
 
@@ -101,15 +101,15 @@ class ImageStore:
 
     def __init__(self, device: torch.device, limit: int = IMAGE_BYTES) -> None:
         self._device, self._limit = device, limit
-        self._images: OrderedDict[int, DeviceImages] = OrderedDict()
+        self._images: OrderedDict[int, CudaKeyframeImages] = OrderedDict()
         self.nbytes = 0
         """Memory that they take at present."""
 
-    def of(self, keyframe: Keyframe) -> DeviceImages:
+    def of(self, keyframe: Keyframe) -> CudaKeyframeImages:
         """Those of a keyframe, uploaded if need be."""
         images = self._images.pop(keyframe.index, None)
         if images is None:
-            images = DeviceImages(upload(keyframe.color, self._device), upload(keyframe.depth, self._device))
+            images = CudaKeyframeImages(upload(keyframe.color, self._device), upload(keyframe.depth, self._device))
             self.nbytes += images.nbytes
         self._images[keyframe.index] = images  # the one used last stands last
         self._make_room()

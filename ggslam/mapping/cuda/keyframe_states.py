@@ -18,7 +18,7 @@ from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.streams import let_go
 from ggslam.errors import RenderError
 from ggslam.interface.cuda.mapping import KeyframeState, KeyframeStepJob, KeyframeWriteJob
-from ggslam.mapping.cpu.losses import LossValues
+from ggslam.mapping.losses import LossValues
 from ggslam.mapping.settings import ExposureSettings
 
 _RESULTS = torch.Size([len(LossValues.__dataclass_fields__) + 6])
@@ -121,7 +121,7 @@ class KeyframeStates:
 
         Args:
             twist: d loss / d xi, float64 [6], see `CudaGradients`.
-            loss_results: `DeviceLossResult.results`, float64 [15].
+            loss_results: `CudaLossResult.results`, float64 [15].
             skipped: int32 [1], such as the rasterizer's `last_overflowed`: where it is not 0, nothing changes, the
                 sums neither. None: it is 0.
             pose_rate: size of the pose's step in metres and radians; 0: the pose stays.

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss of `losses.py` on an NVIDIA GPU: the same values and gradients, by kernels that are only started here.
+"""The loss of `ggslam.mapping.losses` on an NVIDIA GPU: the same values and gradients, by kernels that are only
+started here.
 
 Nothing waits for the device: the values stay there as a tensor until somebody asks for them, and the exposure is read
 from the device, so that it can be optimised there. Sums have a fixed order: the result repeats bit for bit.
@@ -17,46 +18,22 @@ from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
 from ggslam.interface.cuda.mapping import ImageLossJob
-from ggslam.mapping.cpu.losses import LossSettings, LossValues, RenderedImages
+from ggslam.mapping.losses import LOSS_WEIGHTS, LossGradients, LossTarget, LossValues, RenderedImages
+from ggslam.mapping.settings import LossSettings
 
 _VALUES = len(fields(LossValues))
-_WEIGHTS = ("dssim_weight", "depth_weight", "opacity_weight", "no_depth_weight", "minimum_alpha", "charbonnier_epsilon")
 
 
 @dataclass(frozen=True)
-class DeviceKeyframeImages:
-    """The target, on the device of the loss; see `KeyframeImages`.
-
-    Attributes:
-        color: uint8 [H, W, 3].
-        depth: uint16 or float32 [H, W]; 0, negative, infinite or NaN: none.
-        depth_scale: metres per unit of `depth`.
-        exposure: float32 [3, 2], gain and offset applied to the rendered R, G, B; None: (1, 0). Its numbers are not
-            checked, for that would mean to wait for them.
-    """
-
-    color: torch.Tensor
-    depth: torch.Tensor
-    depth_scale: float
-    exposure: torch.Tensor | None = None
-
-
-@dataclass(frozen=True)
-class DeviceLossResult:
+class CudaLossResult(LossGradients):
     """Loss and gradients on the device. The tensors belong to the `CudaImageLoss` and are overwritten by its next
     evaluation.
 
     Attributes:
         results: float64 [15], the numbers of `LossValues` in their order, then `exposure_gradient`.
-        d_image: d loss / d rendered image (before exposure), float32 [3, H, W].
-        d_depth: d loss / d accumulated depth, float32 [H, W].
-        d_alpha: d loss / d alpha, float32 [H, W].
     """
 
     results: torch.Tensor
-    d_image: torch.Tensor
-    d_depth: torch.Tensor
-    d_alpha: torch.Tensor
 
     @property
     def exposure_gradient(self) -> torch.Tensor:
@@ -89,13 +66,12 @@ class CudaImageLoss:
         self._gradients = self._new_gradients(0, 0)
 
     def evaluate(
-        self, rendered: RenderedImages, target: DeviceKeyframeImages, settings: LossSettings
-    ) -> DeviceLossResult:
+        self, rendered: RenderedImages, target: LossTarget[torch.Tensor], settings: LossSettings
+    ) -> CudaLossResult:
         """Starts the evaluation of loss and gradients of one view.
 
         Raises:
-            RenderError: an array has another shape, type or device than `RenderedImages` and `DeviceKeyframeImages`
-                say.
+            RenderError: an array has another shape, type or device than `RenderedImages` and `LossTarget` say.
         """
         height, width = self._target_size(target)
         job = ImageLossJob(height=height, width=width, device=self.device.index or 0, depth_scale=target.depth_scale)
@@ -108,7 +84,7 @@ class CudaImageLoss:
         job.exposure = None if target.exposure is None else target.exposure.data_ptr()
         job.normalised_depth = settings.depth_kind == "normalised"
         job.charbonnier = settings.color_kind == "charbonnier"
-        for name in _WEIGHTS:
+        for name in LOSS_WEIGHTS:
             setattr(job, name, getattr(settings, name))
         if self._gradients[1].shape != (height, width):
             self._gradients = self._new_gradients(height, width)
@@ -117,13 +93,13 @@ class CudaImageLoss:
         size = self.library.functions.ggslam_cuda_image_loss_bytes(ctypes.byref(job))
         job.workspace = self._memory.block("loss", size).data_ptr()
         self.library.call("image_loss", ctypes.byref(job))
-        return DeviceLossResult(self._results, *self._gradients)
+        return CudaLossResult(*self._gradients, self._results)
 
     def _new_gradients(self, height: int, width: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         image = torch.empty(3, height, width, device=self.device)
         return image, torch.empty(height, width, device=self.device), torch.empty(height, width, device=self.device)
 
-    def _target_size(self, target: DeviceKeyframeImages) -> tuple[int, int]:
+    def _target_size(self, target: LossTarget[torch.Tensor]) -> tuple[int, int]:
         height, width = target.color.shape[:2] if target.color.ndim == 3 and target.color.numel() else (0, 0)
         self._check("target color", target.color, (torch.uint8,), (height, width, 3))
         self._check("target depth", target.depth, (torch.uint16, torch.float32), (height, width))

@@ -8,7 +8,6 @@ somebody asks for poses. What it tells of losses is what has arrived of them wit
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
@@ -19,17 +18,18 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.streams import Pace, SideStream
 from ggslam.cuda.transfers import HostMirror, download
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
-from ggslam.mapping.cuda.insertion import DeviceInsertion, Selection
-from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceImages, ImageStore
+from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
+from ggslam.mapping.cuda.keyframe import CudaKeyframe, CudaKeyframeImages, ImageStore
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
-from ggslam.mapping.cuda.losses import CudaImageLoss, DeviceKeyframeImages, DeviceLossResult
-from ggslam.mapping.cuda.votes import vote_labels
+from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
+from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.mapping.settings import MapperSettings
-from ggslam.rendering.cuda.rasterizer import CudaRasterizer, CudaStepResult
+from ggslam.mapping.votes import vote_labels
+from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
@@ -46,6 +46,7 @@ class CudaMapper(Mapper):
     """
 
     identity: CudaIdentityLearner | None
+    _rasterizer: CudaRasterizer
 
     def __init__(
         self, gaussians: GaussianMap, settings: MapperSettings, library: CudaLibrary, seed: int = 0,
@@ -55,7 +56,7 @@ class CudaMapper(Mapper):
         self.device = library.whole_device(None)
         self._rasterizer = CudaRasterizer(self.device, library=library, waits=False)
         self._loss = CudaImageLoss(self.device, library)
-        self._insertion = DeviceInsertion(self.device, library)
+        self._insertion = CudaInsertion(self.device, library)
         self._states = KeyframeStates(self.device, library)
         self._images = ImageStore(self.device)
         self._totals = HostMirror(self._states.totals)
@@ -75,9 +76,6 @@ class CudaMapper(Mapper):
     def image_bytes(self) -> int:
         """Memory on the device that images of keyframes take at present; part of it for good, see `ImageStore`."""
         return self._images.nbytes
-
-    def vote_labels(self) -> np.ndarray:
-        return vote_labels(self.map).cpu().numpy().astype(np.uint16)
 
     def beside_others(self) -> AbstractContextManager[object]:
         return SideStream(self.device)
@@ -106,7 +104,7 @@ class CudaMapper(Mapper):
         super().refine(iterations, progress)
         numbers = self._trainable()
         for _ in range(self._missed(int(download(self._rasterizer.overflows)[0][0]))):
-            self.iterate(self._drawn(numbers), self.settings.refine_decay)
+            self.iterate(self._draw(numbers), self.settings.refine_decay)
         self._totals.send()
 
     def _missed(self, overflows: int | None = None) -> int:
@@ -140,9 +138,7 @@ class CudaMapper(Mapper):
         """The map as a keyframe sees it, without identities; `with_room`: waits for room for all that is in view."""
         self._rasterizer.waits = with_room
         try:
-            return self._rasterizer.forward(
-                self.map, keyframe.camera, self._states.pose(keyframe.index), features=False
-            )
+            return self._render(keyframe, features=False)
         finally:
             self._rasterizer.waits = False
 
@@ -152,8 +148,8 @@ class CudaMapper(Mapper):
         return self._rasterizer.last_overflowed
 
     def selection(
-        self, images: DeviceImages, keyframe: CudaKeyframe, alpha: torch.Tensor | None, depth: torch.Tensor | None,
-        T_world_camera: np.ndarray,
+        self, images: CudaKeyframeImages, keyframe: CudaKeyframe, alpha: torch.Tensor | None,
+        depth: torch.Tensor | None, T_world_camera: np.ndarray,
     ) -> Selection:  # fmt: skip
         """Starts to choose the pixels of a keyframe that the map, rendered as `alpha` and `depth`, does not explain."""
         return self._insertion.select(
@@ -169,60 +165,26 @@ class CudaMapper(Mapper):
         ids, share = self._rasterizer.pixel_terms(grid.reshape(-1)).labels(vote_labels(self.map))
         return ids.view(grid.shape), share.view(grid.shape) * (alpha[::stride, ::stride] > 0.5)
 
-    def _split(self, mask: np.ndarray, whole: int, part: int) -> None:
-        assert self.identity is not None
-        self.identity.split(self.map, self._rasterizer, mask, whole, part)
-
     # --- optimisation ------------------------------------------------------------------------------------------------
 
-    def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
-        assert isinstance(keyframe, CudaKeyframe)
-        s, row, t0 = self.settings, keyframe.index, time.perf_counter()
-        learn = self.identity is not None and self.identity.due(keyframe)
-        dense = learn and self.identity is not None and self.identity.settings.schedule == "dense"
-        view = self._rasterizer.forward(self.map, keyframe.camera, self._states.pose(row), features=dense)
-        t1 = time.perf_counter()
-        images = keyframe.device_images
-        exposure = self._states.exposure(row) if s.exposure.enabled else None
-        target = DeviceKeyframeImages(images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
-        loss = self._loss.evaluate(view, target, s.loss)
-        t2 = time.perf_counter()
-        grad_features = None
-        if learn and self.identity is not None:
-            grad_features = self.identity.step(self.map, self._rasterizer, keyframe, view)
-        t3 = time.perf_counter()
-        step = self._rasterizer.backward_step(
-            self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features,
-            optimizer=self._standard_adam if rate_factor == 1 else self._adam(rate_factor),
-            detach_features=self.identity is None or self.identity.settings.detach,
-        )  # fmt: skip
-        self._finish_step(row, step, loss, rate_factor)
-        t4 = time.perf_counter()
-        self.times.forward += t1 - t0
-        self.times.loss += t2 - t1
-        self.times.identity += t3 - t2
-        self.times.backward += t4 - t3
-        self.times.iterations += 1
-        keyframe.iterations += 1
+    def _render(self, keyframe: Keyframe, features: bool) -> RenderBuffers:
+        return self._rasterizer.forward(
+            self.map, keyframe.camera, self._states.pose(keyframe.index), features=features
+        )
 
-    def _finish_step(self, row: int, step: CudaStepResult, loss: DeviceLossResult, rate_factor: float) -> None:
-        """Pose and exposure of a keyframe follow their gradients, and the sums go on. The first keyframe stays: it is
-        the world."""
-        s, moves = self.settings, row > 0
-        rate = min(s.pose_refinement.rate_sigmas * self.depth_sigma, s.pose_refinement.max_rate)
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> CudaLossResult:
+        assert isinstance(keyframe, CudaKeyframe)
+        images, s = keyframe.device_images, self.settings
+        exposure = self._states.exposure(keyframe.index) if s.exposure.enabled else None
+        target = LossTarget(images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
+        return self._loss.evaluate(view, target, s.loss)
+
+    def _finish_step(self, keyframe: Keyframe, twist: torch.Tensor, loss: CudaLossResult, pose_rate: float) -> None:
+        exposure = self.settings.exposure
         self._states.step(
-            row, step.twist, loss.results, self._rasterizer.last_overflowed,
-            rate_factor * rate if moves and s.pose_refinement.enabled else 0.0,
-            s.exposure if moves and s.exposure.enabled else None,
+            keyframe.index, twist, loss.results, self._rasterizer.last_overflowed, pose_rate,
+            exposure if exposure.enabled and keyframe.index > 0 else None,
         )  # fmt: skip
-
-    def _train_identity(self, keyframe: Keyframe, steps: int, rate_factor: float) -> None:
-        assert isinstance(keyframe, CudaKeyframe)
-        if self.identity is None:
-            return
-        view = self._rasterizer.forward(self.map, keyframe.camera, self._states.pose(keyframe.index), features=False)
-        for _ in range(steps):
-            self.identity.step(self.map, self._rasterizer, keyframe, view, rate_factor)
 
 
 class _Look:

@@ -16,7 +16,7 @@ _DISTANCES_AT_ONCE = 1 << 24
 """Distances that the search for many neighbours keeps at a time."""
 
 
-def device_neighbours(points: torch.Tensor, rows: torch.Tensor, k: int, library: CudaLibrary) -> torch.Tensor:
+def cuda_neighbours(points: torch.Tensor, rows: torch.Tensor, k: int, library: CudaLibrary) -> torch.Tensor:
     """The k nearest other points of some, in order of their distance. Started on torch's current stream; nothing waits.
 
     Another point is one of another number, be it at the same place. Of equally near ones the lowest numbers are taken

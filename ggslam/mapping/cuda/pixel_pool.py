@@ -5,30 +5,15 @@ kernels that are only started here."""
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
 
 import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
 from ggslam.interface.cuda.mapping import PixelPoolJob
-from ggslam.mapping.identity_objects import IDS
+from ggslam.mapping.identity import IDS
 from ggslam.mapping.identity_settings import IdentitySettings
-
-
-@dataclass
-class DevicePixelPool:
-    """Pixels of one keyframe drawn for steps to come, on the device.
-
-    Attributes:
-        pixels: int32 [M], flat indices. Where nothing is labelled they are unlabelled pixels.
-        vote_weights: float32 [M], inverse of the density with which each was drawn, mean 1.
-        used: how many of them are used up.
-    """
-
-    pixels: torch.Tensor
-    vote_weights: torch.Tensor
-    used: int = 0
+from ggslam.mapping.pixel_pool import PixelPool
 
 
 class PixelDrawer:
@@ -50,8 +35,8 @@ class PixelDrawer:
 
     def draw(
         self, mask: torch.Tensor, alias: torch.Tensor, wanted: int, settings: IdentitySettings
-    ) -> DevicePixelPool:
-        """Draws labelled pixels, as `draw_pool`.
+    ) -> PixelPool[torch.Tensor]:
+        """Draws labelled pixels, as `draw_pool`; unlabelled ones where nothing is labelled.
 
         Args:
             mask: uint16 [H, W] on the device; 0 is never drawn while there is anything else.
@@ -82,4 +67,4 @@ class PixelDrawer:
         sums = odds.cumsum(0)
         job.sums = sums.data_ptr()
         self._library.call("draw_pixels", ctypes.byref(job))
-        return DevicePixelPool(pixels, weights / weights.mean().clamp_min(1e-30))
+        return PixelPool(pixels, weights / weights.mean().clamp_min(1e-30))

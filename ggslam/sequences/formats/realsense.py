@@ -92,7 +92,7 @@ class Device:
         if lens.model == models.kannala_brandt4:
             return values[:4], True
         if lens.model == models.inverse_brown_conrady:
-            return _inverted(values, _camera(lens)), False
+            return _invert_distortion(values, _camera(lens)), False
         if lens.model in (models.brown_conrady, models.modified_brown_conrady):
             return values, False
         raise SequenceError(f"{self._place}: lens model {lens.model} is not supported")
@@ -127,7 +127,7 @@ def _camera(lens: Any) -> Camera:
     return Camera(int(lens.width), int(lens.height), float(lens.fx), float(lens.fy), float(lens.ppx), float(lens.ppy))
 
 
-def _inverted(coefficients: np.ndarray, camera: Camera) -> np.ndarray:
+def _invert_distortion(coefficients: np.ndarray, camera: Camera) -> np.ndarray:
     """OpenCV's coefficients of a lens whose polynomial turns distorted coordinates into straight ones instead.
 
     The model is linear in its coefficients: they are fitted on a grid of the image, within hundredths of a pixel for

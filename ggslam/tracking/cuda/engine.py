@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tracker's work on an NVIDIA GPU: what `NativeEngine` does, by kernels, with one wait per alignment.
+"""The tracker's work on an NVIDIA GPU: what `CpuTrackingEngine` does, by kernels, with one wait per alignment.
 
 A frame's depth is sent once. Points, their number, the whole optimisation from the coarse voxels to the fine ones and
 its result stay on the device; the host gets the result in one copy, and waits for that alone. Sums have a fixed order:
@@ -24,12 +24,12 @@ from ggslam.cuda.transfers import Download, Upload
 from ggslam.interface.core import tracking as structures
 from ggslam.interface.cuda.tracking import AlignJob, AlignResult, DepthPointsJob
 from ggslam.scene.camera import Camera
-from ggslam.tracking.cuda.points import DevicePoints
-from ggslam.tracking.cuda.results import DeviceAlignment, device_alignment
-from ggslam.tracking.cuda.target import DeviceTarget
-from ggslam.tracking.gicp import GicpTarget, PhotometricPart, native_align_settings
+from ggslam.tracking.cuda.points import CudaPoints
+from ggslam.tracking.cuda.results import cuda_alignment
+from ggslam.tracking.cuda.target import CudaTarget
+from ggslam.tracking.gicp import AlignmentResult, GicpTarget, PhotometricPart, native_align_settings
 from ggslam.tracking.photometric import PhotometricReference
-from ggslam.tracking.points import FramePoints, check_depth, grid_stride, native_points_settings
+from ggslam.tracking.points import PointSource, check_depth, grid_stride, native_points_settings
 from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings
 
 
@@ -52,14 +52,14 @@ class CudaTrackingEngine:
         self.library, self.device = library_and_device(device, library)
         self.camera = camera
         self._memory = GrowingMemory(self.device)
-        self._target = DeviceTarget(self.library, self.device)
+        self._target = CudaTarget(self.library, self.device)
         self._depth = torch.empty(4 * camera.width * camera.height, dtype=torch.uint8, device=self.device)
         self._depth_upload, self._grey_upload, self._reference_upload = (Upload(self.device) for _ in range(3))
         self._results = Download(AlignResult.ALIGN_RESULTS, self.device)
         self._workspace = torch.zeros(0, dtype=torch.uint8, device=self.device)
         self._reference: weakref.ref[PhotometricReference] | None = None
 
-    def points(self, depth: np.ndarray, settings: PointSettings, noise: DepthNoise) -> DevicePoints:
+    def points(self, depth: np.ndarray, settings: PointSettings, noise: DepthNoise) -> CudaPoints:
         """Starts `points.extract_points`.
 
         Args:
@@ -78,7 +78,7 @@ class CudaTrackingEngine:
         columns, rows = (
             max(0, math.ceil((size - 2 * border - stride // 2) / stride)) for size in (depth.shape[1], depth.shape[0])
         )
-        found = DevicePoints(columns * rows, self.device)
+        found = CudaPoints(columns * rows, self.device)
         job = DepthPointsJob(
             self._depth.data_ptr(), found.arrays(), None, self.library.stream(self.device), arguments,
             self.device.index or 0, columns, rows,
@@ -89,15 +89,15 @@ class CudaTrackingEngine:
         return found
 
     def align(
-        self, source: FramePoints, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
+        self, source: PointSource, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
         noise: DepthNoise, photometric: PhotometricPart | None = None,
-    ) -> DeviceAlignment:  # fmt: skip
+    ) -> AlignmentResult:  # fmt: skip
         """As `gicp.align`, of points that `points` gave; waits for the result.
 
         Raises:
             TypeError: other points.
         """
-        if not isinstance(source, DevicePoints):
+        if not isinstance(source, CudaPoints):
             raise TypeError("expected points that are on the device")
         matched = torch.empty((2, max(1, source.room)), dtype=torch.float32, device=self.device)
         fine, coarse = self._target.levels(target)
@@ -116,7 +116,7 @@ class CudaTrackingEngine:
         source.send()  # some hundred kilobytes, so that a keyframe has them without another wait
         found = self._results.wait()
         source.settle(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
-        return device_alignment(found, matched, settings)
+        return cuda_alignment(found, matched, settings)
 
     def _aligning_memory(self, job: AlignJob) -> torch.Tensor:
         """What an alignment works in, all zero when new."""

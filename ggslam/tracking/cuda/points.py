@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points of a frame that stay on the device until someone on the host looks at them."""
+"""Points of a frame that stay on the device until the host reads them."""
 
 from __future__ import annotations
 
 from ctypes import sizeof
 from itertools import accumulate
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,30 +17,23 @@ _BEGIN = 64
 """Words before the arrays, of which the header takes the first two."""
 
 
-class DevicePoints(FramePoints):
-    """`FramePoints` on a device. The arrays, which keyframes and loops need, come to the host with the frame's
-    alignment; before it they are fetched, all at once, when any of them is first asked for. So are their number and
-    median depth.
+class CudaPoints:
+    """`FramePoints` on a device. They come to the host with the frame's alignment; before it their number and median
+    depth, or all of them, are fetched when they are first asked for.
 
     Args:
         room: points at most; their number is known to the device alone.
         device: where they are.
     """
 
-    room: int
-    _block: torch.Tensor
-    _begins: dict[str, int]
-    _header: tuple[int, float] | None
-    _copy: torch.Tensor | None
-    """On the host; filled when the device has come to it."""
-
     def __init__(self, room: int, device: torch.device) -> None:
-        words = torch.empty(_BEGIN + room * sum(_ROWS.values()), dtype=torch.float32, device=device)
-        begins = dict(zip(_ROWS, accumulate((room * width for width in _ROWS.values()), initial=_BEGIN), strict=False))
-        for name, value in (
-            ("room", room), ("_block", words), ("_begins", begins), ("_header", None), ("_copy", None)
-        ):  # fmt: skip
-            object.__setattr__(self, name, value)
+        self.room = room
+        self._block = torch.empty(_BEGIN + room * sum(_ROWS.values()), dtype=torch.float32, device=device)
+        sizes = (room * width for width in _ROWS.values())
+        self._begins = dict(zip(_ROWS, accumulate(sizes, initial=_BEGIN), strict=False))
+        self._header: tuple[int, float] | None = None
+        self._copy: torch.Tensor | None = None  # on the host; filled when the device has come to it
+        self._points: FramePoints | None = None
 
     def arrays(self) -> PointArrays:
         """Addresses on the device; this object must stay alive."""
@@ -52,11 +44,11 @@ class DevicePoints(FramePoints):
         """Starts to copy the arrays to the host."""
         if self._copy is None and self._block.device.type == "cuda":
             copy = torch.empty(self._block.shape, dtype=self._block.dtype, pin_memory=True)
-            object.__setattr__(self, "_copy", copy.copy_(self._block, non_blocking=True))
+            self._copy = copy.copy_(self._block, non_blocking=True)
 
     def settle(self, count: int, median_depth: float) -> None:
         """Takes what the device says of the points, once it is known; what was sent has arrived then."""
-        object.__setattr__(self, "_header", (count, median_depth))
+        self._header = count, median_depth
 
     def __len__(self) -> int:
         """Waits for the device if the points were not aligned yet."""
@@ -71,19 +63,18 @@ class DevicePoints(FramePoints):
         """Median depth in metres; None before the points were aligned."""
         return None if self._header is None else self._header[1]
 
-    def __getattr__(self, name: str) -> Any:
-        """The arrays, at the first look at any of them."""
-        if name not in _ROWS:
-            raise AttributeError(name)
-        arrived = self._copy is not None and self._header is not None
-        words = (self._copy if self._copy is not None and arrived else self._block.cpu()).numpy()
-        count, _ = self._header_of(words)
-        for field, offset in self._begins.items():
-            width = _ROWS[field]
-            rows = words[offset : offset + width * count]
-            rows = rows.view(np.int32) if field == "pixels" else rows
-            object.__setattr__(self, field, rows.reshape(count, width) if width > 1 else rows)
-        return object.__getattribute__(self, name)
+    def read(self) -> FramePoints:
+        """The points on the host. Waits for the device unless what was sent has arrived."""
+        if self._points is None:
+            arrived = self._copy is not None and self._header is not None
+            words = (self._copy if self._copy is not None and arrived else self._block.cpu()).numpy()
+            count, _ = self._header_of(words)
+            rows = {name: words[begin : begin + _ROWS[name] * count] for name, begin in self._begins.items()}
+            self._points = FramePoints(
+                rows["points"].reshape(-1, 3), rows["normals"].reshape(-1, 3), rows["covariances"].reshape(-1, 6),
+                rows["pixels"].view(np.int32).reshape(-1, 2), rows["weights"],
+            )  # fmt: skip
+        return self._points
 
     def _known_header(self) -> tuple[int, float]:
         if self._header is None:

@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 
 from ggslam.interface.cuda.tracking import AlignResult
-from ggslam.tracking.gicp import AlignmentResult, judge
+from ggslam.tracking.gicp import AlignmentResult, PointMatches, judge
 from ggslam.tracking.observability import PointSpread, about_point
 from ggslam.tracking.settings import AlignSettings
 
@@ -19,23 +17,27 @@ _PLACES[np.triu_indices(6)] = range(21)
 _PLACES += np.triu(_PLACES, 1).T
 
 
-class DeviceAlignment(AlignmentResult):
-    """`AlignmentResult` whose matches and distances stay on the device until someone asks for them."""
+class CudaMatches:
+    """Matches of points that stay on the device until they are read.
 
-    _matched: torch.Tensor
-    _count: int
+    Args:
+        matched: float32 [2, room] on the device, bits of the matches and squared distances.
+        count: points there are.
+    """
 
-    def __getattr__(self, name: str) -> Any:
-        """Matches and distances, at the first look at either."""
-        if name not in ("matches", "squared_distances"):
-            raise AttributeError(name)
-        matches, squared = self._matched.cpu().numpy()[:, : self._count]
-        object.__setattr__(self, "matches", matches.view(np.int32))
-        object.__setattr__(self, "squared_distances", squared)
-        return object.__getattribute__(self, name)
+    def __init__(self, matched: torch.Tensor, count: int) -> None:
+        self._matched, self._count = matched, count
+        self._matches: PointMatches | None = None
+
+    def read(self) -> PointMatches:
+        """The matches on the host; the first call waits for the device."""
+        if self._matches is None:
+            voxels, squared = self._matched.cpu().numpy()[:, : self._count]
+            self._matches = PointMatches(voxels.view(np.int32), squared)
+        return self._matches
 
 
-def device_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSettings) -> DeviceAlignment:
+def cuda_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSettings) -> AlignmentResult:
     """An alignment from what the kernels say.
 
     Args:
@@ -50,17 +52,11 @@ def device_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSe
     spread = PointSpread(float(found[AlignResult.SPREAD_TOTAL]), centroid, float(found[AlignResult.RADIUS]))
     usable = bool(found[AlignResult.USABLE])
     status, visibility, weak = judge(information, T[:3, :3], spread, usable, settings.degenerate_below)
-    values = {
-        "T_world_camera": T, "status": status, "converged": bool(found[AlignResult.CONVERGED]),
-        "iterations": int(found[AlignResult.COARSE_ITERATIONS] + found[AlignResult.FINE_ITERATIONS]),
-        "overlap": float(found[AlignResult.OVERLAP]), "rmse": float(found[AlignResult.RMSE]),
-        "information": about_point(information, T[:3, 3]), "camera_information": information,
-        "visibility": visibility, "weak_directions": weak, "cost": float(found[AlignResult.COST]),
-        "photometric_residual": float(found[AlignResult.PHOTOMETRIC_RESIDUAL]),
-        "photometric_share": float(found[AlignResult.PHOTOMETRIC_SHARE]),
-        "_matched": matched, "_count": int(found[AlignResult.POINT_COUNT]),
-    }  # fmt: skip
-    result = object.__new__(DeviceAlignment)  # the dataclass's own constructor asks for the matches
-    for name, value in values.items():
-        object.__setattr__(result, name, value)
-    return result
+    return AlignmentResult(
+        T, status, bool(found[AlignResult.CONVERGED]),
+        int(found[AlignResult.COARSE_ITERATIONS] + found[AlignResult.FINE_ITERATIONS]),
+        float(found[AlignResult.OVERLAP]), float(found[AlignResult.RMSE]), about_point(information, T[:3, 3]),
+        information, visibility, weak, CudaMatches(matched, int(found[AlignResult.POINT_COUNT])),
+        float(found[AlignResult.COST]), float(found[AlignResult.PHOTOMETRIC_RESIDUAL]),
+        float(found[AlignResult.PHOTOMETRIC_SHARE]),
+    )  # fmt: skip

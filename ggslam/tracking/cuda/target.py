@@ -22,7 +22,7 @@ _PLACES_PER_BLOCK = 4
 """Of the hash table, at least: most look-ups end at the first place."""
 
 
-class DeviceTarget:
+class CudaTarget:
     """The newest target on the device. It is sent when it is first used, in one copy; the next one takes its memory.
 
     Args:

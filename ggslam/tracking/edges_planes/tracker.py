@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The edge/plane front-end for depth cameras: takes the place of `tracker.Tracker` and keeps its promises."""
+"""The tracker that aligns edges and planes of depth images, with G-ICP to fall back on."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -13,45 +12,18 @@ from ggslam.features.orb import View, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse
 from ggslam.tracking.edges_planes.alignment import FeatureAlignment
 from ggslam.tracking.edges_planes.extraction import ScanFeatures
 from ggslam.tracking.edges_planes.local_map import LocalFeatureMap
 from ggslam.tracking.edges_planes.scans import DepthImageFeatures
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
-from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, PointMatches
+from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.observability import about_point
-from ggslam.tracking.points import FramePoints, extract_points
+from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource, extract_points
 from ggslam.tracking.settings import DepthNoise, TrackerSettings
-from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
-
-
-class DeferredPoints(FramePoints):
-    """Points of a frame that are extracted when someone asks for them: keyframes need them, this front-end does not.
-
-    Args:
-        extract: gives them.
-        median_depth: estimate of their median depth, metres, that needs no extraction.
-    """
-
-    def __init__(self, extract: Callable[[], FramePoints], median_depth: float) -> None:
-        object.__setattr__(self, "_extract", extract)
-        object.__setattr__(self, "_median_depth", median_depth)
-
-    def __getattr__(self, name: str) -> Any:
-        """The arrays, at the first look at any of them."""
-        if name not in FramePoints.__dataclass_fields__:
-            raise AttributeError(name)
-        found = object.__getattribute__(self, "_extract")()
-        for field in FramePoints.__dataclass_fields__:
-            object.__setattr__(self, field, getattr(found, field))
-        return getattr(found, name)
-
-    @property
-    def median_depth(self) -> float:
-        """Of the frame's plane features, metres."""
-        return self._median_depth
+from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, TrackingStatus
 
 
 @dataclass(frozen=True)
@@ -92,7 +64,8 @@ class FeatureTracker(Tracker):
         context: NativeContext | None = None,
         T_world_camera: np.ndarray | None = None,
     ) -> None:
-        super().__init__(camera, settings, context, T_world_camera)
+        super().__init__(TrackerState.begin(camera, settings, context, T_world_camera))
+        self._gicp = GicpTracker.sharing(self.state)
         self.features = features or FeatureTrackerSettings()
         self.local_map = LocalFeatureMap(self.features)
         self.counts = FeatureCounts()
@@ -100,31 +73,28 @@ class FeatureTracker(Tracker):
         self._extractor = DepthImageFeatures(camera, self.features.extraction, self.features.device)
 
     def track(self, frame: Frame) -> TrackingResult:
-        """Locates a frame; the first one gets the current pose.
-
-        Raises:
-            ValueError: the depth image does not fit the camera.
-        """
+        """See `Tracker.track`."""
+        motion = self.state.motion
         self.local_map.clock.start()
         if self.noise is None:
             self.noise = estimate_noise(frame.depth, self.camera)
         scan = self._extractor.extract(frame.depth, self.noise or DepthNoise())
         points = DeferredPoints(lambda: self._points(frame), scan.median_depth)
-        view = View(frame.color, frame.depth, self._pose)
+        view = View(frame.color, frame.depth, motion.T_world_camera)
         self.counts = FeatureCounts(len(scan.planes), len(scan.edges))
         if self.local_map.is_empty:
-            return self._start_in_target(frame, scan) if self._was_lost else self._begin(view, points, scan)
+            return self._start_in_target(frame, scan) if motion.lost else self._begin_map(view, points, scan)
         self.noise = self.noise or DepthNoise()
-        found = self.local_map.align(scan, self._pose @ self._velocity)
+        found = self.local_map.align(scan, motion.predict())
         self.counts = replace(
             self.counts, outer_iterations=found.outer_iterations, inner_iterations=found.inner_iterations
         )
         convincing = self.local_map.is_convincing(found)
-        if not convincing and found.usable and not self._was_lost:
+        if not convincing and found.usable and not motion.lost:
             self.local_map.clock.lift()  # to be late is better than to be lost
             found = self.local_map.align(scan, found.T_map_sensor)
             convincing = self.local_map.is_convincing(found)
-        if self._may_ask_gicp() and (not convincing or self._was_lost or len(found.weak_directions)):
+        if self._may_ask_gicp() and (not convincing or motion.lost or len(found.weak_directions)):
             return self._ask_gicp(frame, scan, found, convincing)
         reason = ""
         if not convincing:
@@ -138,7 +108,7 @@ class FeatureTracker(Tracker):
         super().move(T_new_old)
         self.local_map.move(T_new_old)
 
-    def relocate(self, view: View, points: FramePoints, found: AlignmentResult, source: str) -> TrackingResult:
+    def relocate(self, view: View, points: PointSource, found: AlignmentResult, source: str) -> TrackingResult:
         """As `Tracker.relocate`; the local map begins anew there."""
         result = super().relocate(view, points, found, source)
         self.local_map.clear()
@@ -153,13 +123,13 @@ class FeatureTracker(Tracker):
 
     def _start_in_target(self, frame: Frame, scan: ScanFeatures) -> TrackingResult:
         """Nothing of its own to hold on to, but a map that someone else made: see `start_lost`."""
-        result = super().track(frame)
+        result = self._gicp.track(frame)
         if result.status is not TrackingStatus.LOST:
             self.local_map.add(scan, result.T_world_camera)
         return result
 
-    def _begin(self, view: View, points: FramePoints, scan: ScanFeatures) -> TrackingResult:
-        result = self._first(view, points)
+    def _begin_map(self, view: View, points: PointSource, scan: ScanFeatures) -> TrackingResult:
+        result = self._begin(view, points)
         if result.status is not TrackingStatus.LOST:
             self.local_map.add(scan, result.T_world_camera)
         return result
@@ -175,28 +145,25 @@ class FeatureTracker(Tracker):
         return found, ""
 
     def _starts(self, view: View) -> Iterator[tuple[str, np.ndarray]]:
-        yield "last pose", self._pose
-        for number, earlier in enumerate(self._views):
+        yield "last pose", self.state.motion.T_world_camera
+        for number, earlier in enumerate(self.state.motion.views):
             pose = pose_from_matches(view, earlier, self.camera, self.settings.recovery.features)
             if pose is not None:
                 yield f"features of view {number}", pose.T_world_camera
 
     def _accept(
-        self, view: View, points: FramePoints, scan: ScanFeatures, found: FeatureAlignment, reason: str
+        self, view: View, points: PointSource, scan: ScanFeatures, found: FeatureAlignment, reason: str
     ) -> TrackingResult:
         T = found.T_map_sensor
-        self._velocity = np.eye(4) if self._was_lost else inverse(self._pose) @ T
-        self._was_lost = False
-        self._pose = view.T_world_camera = T
-        self._remember(view, points)
+        self.state.motion.follow(view, T)
+        self.state.motion.remember(view, points, self.settings)
         self.local_map.update(scan, T, found.overlap)
         status = TrackingStatus.DEGENERATE if len(found.weak_directions) else TrackingStatus.OK
         status = TrackingStatus.RECOVERED if reason else status
         return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, _as_gicp(found))
 
-    def _give_up(self, points: FramePoints, found: FeatureAlignment) -> TrackingResult:
-        self._velocity = np.eye(4)
-        self._was_lost = True
+    def _give_up(self, points: PointSource, found: FeatureAlignment) -> TrackingResult:
+        self.state.motion.lose()
         limit = self.features.align.convincing_overlap
         reason = f"{found.overlap:.0%} of {self.counts.planes} planes lie on the local map, {limit:.0%} needed"
         if not found.usable:
@@ -205,8 +172,9 @@ class FeatureTracker(Tracker):
                 f"too few of {self.counts.planes} planes and {self.counts.edges} edges match the local map, "
                 f"{needed} needed"
             )
+        pose = self.state.motion.T_world_camera.copy()
         return TrackingResult(
-            self._pose.copy(), TrackingStatus.LOST, found.overlap, found.rmse, reason, points, _as_gicp(found)
+            pose, TrackingStatus.LOST, found.overlap, found.rmse, reason, points, _as_gicp(found)
         )
 
     def _may_ask_gicp(self) -> bool:
@@ -214,8 +182,8 @@ class FeatureTracker(Tracker):
 
     def _ask_gicp(self, frame: Frame, scan: ScanFeatures, found: FeatureAlignment, convincing: bool) -> TrackingResult:
         """The frame as G-ICP sees it. After being lost the local map begins anew: the camera may be elsewhere."""
-        was_lost = self._was_lost
-        result = super().track(frame)
+        was_lost = self.state.motion.lost
+        result = self._gicp.track(frame)
         if result.status is TrackingStatus.LOST:
             return result
         if was_lost:
@@ -236,5 +204,5 @@ def _as_gicp(found: FeatureAlignment) -> AlignmentResult:
     return AlignmentResult(
         T, status if found.usable else AlignmentStatus.LOST, found.converged, found.inner_iterations, found.overlap,
         found.rmse, about_point(found.information, T[:3, 3]), found.information, found.visibility,
-        found.weak_directions, found.matches, found.squared_distances, found.cost,
+        found.weak_directions, PointMatches(found.matches, found.squared_distances), found.cost,
     )  # fmt: skip

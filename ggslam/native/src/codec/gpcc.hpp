@@ -3,6 +3,7 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "common/dispatch.hpp"
@@ -32,6 +33,21 @@ struct Octree {
 
   int depth() const { return static_cast<int>(levels.size()); }
   std::uint32_t weight_of_leaf(std::uint32_t leaf) const { return leaf_points.empty() ? 1 : leaf_points[leaf]; }
+};
+
+// Adaptive contexts that a slice leaves to the next one, as bytes; empty: none.
+struct Memory {
+  std::vector<std::uint8_t> bytes;
+
+  template <class Contexts>
+  void load(Contexts& contexts) const {
+    if (bytes.size() == sizeof(Contexts)) std::memcpy(static_cast<void*>(&contexts), bytes.data(), sizeof(Contexts));
+  }
+  template <class Contexts>
+  void save(const Contexts& contexts) {
+    const auto* begin = reinterpret_cast<const std::uint8_t*>(&contexts);
+    bytes.assign(begin, begin + sizeof(Contexts));
+  }
 };
 
 // Counts the points below every node; needed by the attribute coder.

@@ -4,6 +4,7 @@
 #include "codec/gpcc.hpp"
 
 #include <algorithm>
+#include <map>
 #include <new>
 
 #include "common/context.hpp"
@@ -16,6 +17,13 @@ GGSLAM_DECLARE_KERNEL(void octree_encode(const gpcc::OctreeSettings& settings, g
                                          std::vector<std::uint8_t>& out))
 GGSLAM_DECLARE_KERNEL(gpcc::Status octree_decode(const gpcc::OctreeSettings& settings, const std::uint8_t* data,
                                                  std::size_t size, std::uint64_t points, gpcc::Octree& tree))
+GGSLAM_DECLARE_KERNEL(void tree_keys(const std::int32_t* points, std::size_t count, const gpcc::TreeSettings& settings,
+                                     std::vector<std::uint64_t>& keys))
+GGSLAM_DECLARE_KERNEL(void tree_encode(const gpcc::TreeSettings& settings, const std::uint64_t* keys,
+                                       std::uint32_t count, std::vector<std::uint8_t>& out))
+GGSLAM_DECLARE_KERNEL(gpcc::Status tree_decode(const gpcc::TreeSettings& settings, const std::uint8_t* data,
+                                               std::size_t size, std::uint64_t points, gpcc::Memory& memory,
+                                               std::vector<std::int32_t>& out))
 GGSLAM_DECLARE_KERNEL(gpcc::Status raht_encode(const gpcc::RahtSettings& settings, const gpcc::Octree& tree,
                                                std::int32_t* attributes, std::vector<std::uint8_t>& out))
 GGSLAM_DECLARE_KERNEL(gpcc::Status raht_decode(const gpcc::RahtSettings& settings, const gpcc::Octree& tree,
@@ -47,7 +55,18 @@ namespace {
 struct Slice {
   Octree tree;
   std::vector<std::uint8_t> bytes;
+  Memory geometry_contexts;
+  std::map<std::int32_t, Memory> attribute_contexts;
 };
+
+// Makes the octree of positions [*, 3] in [0, 2^depth).
+void build_octree(Isa isa, const std::vector<std::int32_t>& positions, int depth, Octree& tree) {
+  const auto count = static_cast<std::uint32_t>(positions.size() / 3);
+  std::vector<std::uint64_t> codes(count);
+  std::vector<std::uint32_t> order(count);
+  GGSLAM_DISPATCH(isa, morton_order)(positions.data(), count, depth, order.data(), codes.data());
+  GGSLAM_DISPATCH(isa, octree_build)(codes.data(), count, depth, tree);
+}
 
 template <class Function>
 std::int64_t guarded(const Function& function) {
@@ -137,6 +156,42 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slic
         GGSLAM_DISPATCH(gpcc::isa_of(context), octree_decode)(*settings, data, size, points, s.tree);
     if (status == gpcc::kOk) gpcc::sum_weights(s.tree);
     return -static_cast<std::int64_t>(status);
+  });
+}
+
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_tree(void* context, void* slice, const gpcc::TreeSettings* settings,
+                                                   std::int32_t depth, const std::uint8_t* data, std::size_t size,
+                                                   std::uint32_t points) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    Slice& s = *static_cast<Slice*>(slice);
+    std::vector<std::int32_t> positions;
+    const gpcc::Status status = GGSLAM_DISPATCH(gpcc::isa_of(context), tree_decode)(
+        *settings, data, size, points, s.geometry_contexts, positions);
+    if (status == gpcc::kOk) gpcc::build_octree(gpcc::isa_of(context), positions, depth, s.tree);
+    return -static_cast<std::int64_t>(status);
+  });
+}
+
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_tree(void* context, void* slice, const gpcc::TreeSettings* settings) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    Slice& s = *static_cast<Slice*>(slice);
+    std::vector<std::int32_t> positions(3 * s.tree.points);
+    std::vector<std::uint64_t> keys;
+    GGSLAM_DISPATCH(gpcc::isa_of(context), octree_positions)(s.tree, positions.data());
+    GGSLAM_DISPATCH(gpcc::isa_of(context), tree_keys)(positions.data(), s.tree.points, *settings, keys);
+    s.bytes.clear();
+    GGSLAM_DISPATCH(gpcc::isa_of(context), tree_encode)(
+        *settings, keys.data(), static_cast<std::uint32_t>(keys.size()), s.bytes);
+    return static_cast<std::int64_t>(s.bytes.size());
+  });
+}
+
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_go_on(void* slice, const void* before) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    const Slice& b = *static_cast<const Slice*>(before);
+    static_cast<Slice*>(slice)->geometry_contexts = b.geometry_contexts;
+    static_cast<Slice*>(slice)->attribute_contexts = b.attribute_contexts;
+    return gpcc::kOk;
   });
 }
 

@@ -72,3 +72,18 @@ GGSLAM_EXPORT void ggslam_gpcc_number_planes(const Points* points, const Grid* g
     if (cut[plane]) *inside++ = static_cast<std::int64_t>(i);
   });
 }
+
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_sample_cubes(const Points* points, const Grid* grid, std::uint32_t mask,
+                                                    std::uint64_t* codes) {
+  std::uint64_t* end = codes;
+  for_each_point(*points, [&](std::size_t, const auto* p) {
+    std::uint64_t cube = 0, code = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+      const auto v = static_cast<std::uint64_t>(coordinate(*grid, axis, p[axis]));
+      cube = cube << 21 | v >> 2;
+      code = code << 21 | v;
+    }
+    if ((cube * 0x9e3779b97f4a7c15ull >> 40 & mask) == 0) *end++ = code;
+  });
+  return end - codes;
+}

@@ -3,7 +3,6 @@
 // 16-bit probabilities of a zero. BinaryEncoder and BinaryDecoder have the same interface, so that every model above
 // them is written once, as a template: code() is given the bit by the encoder and ignores it in the decoder.
 #pragma once
-#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
@@ -105,37 +104,6 @@ class BinaryEncoder {
   std::uint64_t low_ = 0;      // 16 + pending_ bits, and a carry above them
   std::uint32_t range_ = 0xffff;
   int pending_ = 0;
-};
-
-// Costs of a bit in 1/256 bit, by the high byte of the probability of the bit.
-struct BitCosts {
-  std::uint16_t of[256];
-  BitCosts() {
-    for (int i = 0; i < 256; ++i) of[i] = static_cast<std::uint16_t>(std::lround(256 * std::log2(256 / (i + 0.5))));
-  }
-};
-
-inline const BitCosts& bit_costs() {
-  static const BitCosts costs;
-  return costs;
-}
-
-// Takes the encoder's place where only the number of bits is asked for. Probabilities stay as they are.
-class BitCounter {
- public:
-  static constexpr bool kEncoder = true;
-  int code(int bit, const Probability& p) {
-    bits_ += bit_costs().of[(bit ? 0xffff - p.zero : p.zero) >> 8];
-    return bit;
-  }
-  int bypass(int bit) {
-    bits_ += 256;
-    return bit;
-  }
-  std::int64_t bits() const { return bits_; }  // times 256
-
- private:
-  std::int64_t bits_ = 0;
 };
 
 class BinaryDecoder {

@@ -73,6 +73,12 @@ class CoefficientModel {
   Probability run_[5], above_zero_[7], above_one_[7], prefix_[2][3], suffix_[2][3];
 };
 
+// Bits of a run of zeros, about.
+inline int run_bits(std::uint32_t run) {
+  static constexpr std::uint8_t kBits[11] = {1, 2, 3, 5, 5, 7, 7, 9, 9, 11, 11};
+  return run < 11 ? kBits[run] : 12 + 2 * (32 - __builtin_clz(run - 10));
+}
+
 template <int Components>
 class CoefficientWriter {
  public:
@@ -88,13 +94,7 @@ class CoefficientWriter {
     model_.code(coder_, q);
     run_ = 0;
   }
-  // What coding q, not zero, would take now, in 1/256 bit.
-  std::int64_t cost(Coefficients<Components> q) {
-    BitCounter counter;
-    model_.code_run(counter, run_);
-    model_.code(counter, q);
-    return counter.bits();
-  }
+  std::uint32_t run() const { return run_; }  // zeros since the last coefficient
   void finish() {
     if (run_ > 0) model_.code_run(coder_, run_);
   }

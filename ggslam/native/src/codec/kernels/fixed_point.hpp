@@ -56,10 +56,13 @@ inline std::uint64_t inverse_square_root(std::uint64_t a) {
   return shift > 0 ? r << shift : r >> -shift;
 }
 
-// About sqrt(a), above it by one at times. The second form keeps the product within 64 bits.
-inline std::uint64_t square_root(std::uint64_t a) {
+// About sqrt(a), above it by one at times. Above 2^46 (weights of more than 65,536) the argument loses its low bits
+// first. The first version of this codec kept them there; its streams are read with `kept`.
+inline std::uint64_t square_root(std::uint64_t a, bool kept = false) {
   if (a <= std::uint64_t{1} << 46) return 1 + (a * inverse_square_root(a) >> 40);
-  return 1 + (((a + 65536) >> 16) * inverse_square_root(a) >> 24);
+  const std::uint64_t high = (a + 65536) >> 16;
+  if (kept) return 1 + (high * inverse_square_root(a) >> 24);
+  return 1 + (high * inverse_square_root(high) >> 32);
 }
 
 // What the transform needs of a weight, by table for the small ones.
@@ -69,9 +72,9 @@ struct WeightRoots {
   int shift;              // large numbers are shifted down by this before they are multiplied by `inverse`
 };
 
-inline WeightRoots compute_weight_roots(std::uint32_t weight) {
+inline WeightRoots compute_weight_roots(std::uint32_t weight, bool kept) {
   const int shift = weight > 1024 ? (31 - __builtin_clz(weight - 1)) >> 1 : 0;
-  return {static_cast<std::int64_t>(square_root(static_cast<std::uint64_t>(weight) << 30)),
+  return {static_cast<std::int64_t>(square_root(static_cast<std::uint64_t>(weight) << 30, kept)),
           static_cast<std::int64_t>(inverse_square_root(weight) >> (40 - shift - kFractionBits)), shift};
 }
 
@@ -80,35 +83,37 @@ struct Butterfly {
   std::int32_t a, b;
 };
 
-inline Butterfly compute_butterfly(std::uint32_t left, std::uint32_t right) {
+inline Butterfly compute_butterfly(std::uint32_t left, std::uint32_t right, bool kept) {
   const std::uint64_t inverse = inverse_square_root(static_cast<std::uint64_t>(left) + right);
-  return {static_cast<std::int32_t>(square_root(static_cast<std::uint64_t>(left) << 30) * inverse >> 40),
-          static_cast<std::int32_t>(square_root(static_cast<std::uint64_t>(right) << 30) * inverse >> 40)};
+  return {static_cast<std::int32_t>(square_root(static_cast<std::uint64_t>(left) << 30, kept) * inverse >> 40),
+          static_cast<std::int32_t>(square_root(static_cast<std::uint64_t>(right) << 30, kept) * inverse >> 40)};
 }
 
 class WeightTables {
  public:
-  WeightTables() {
-    for (std::uint32_t w = 1; w < kRoots; ++w) roots_[w] = compute_weight_roots(w);
+  explicit WeightTables(bool kept) : kept_(kept) {
+    for (std::uint32_t w = 1; w < kRoots; ++w) roots_[w] = compute_weight_roots(w, kept);
     for (std::uint32_t l = 1; l < kPairs; ++l)
-      for (std::uint32_t r = 1; r < kPairs; ++r) butterflies_[l][r] = compute_butterfly(l, r);
+      for (std::uint32_t r = 1; r < kPairs; ++r) butterflies_[l][r] = compute_butterfly(l, r, kept);
   }
   WeightRoots roots(std::uint32_t weight) const {
-    return weight < kRoots ? roots_[weight] : compute_weight_roots(weight);
+    return weight < kRoots ? roots_[weight] : compute_weight_roots(weight, kept_);
   }
   Butterfly butterfly(std::uint32_t left, std::uint32_t right) const {
-    return left < kPairs && right < kPairs ? butterflies_[left][right] : compute_butterfly(left, right);
+    return left < kPairs && right < kPairs ? butterflies_[left][right] : compute_butterfly(left, right, kept_);
   }
 
  private:
   static constexpr std::uint32_t kRoots = 512, kPairs = 40;
   WeightRoots roots_[kRoots] = {};
   Butterfly butterflies_[kPairs][kPairs] = {};
+  bool kept_;
 };
 
-inline const WeightTables& weight_tables() {
-  static const WeightTables tables;
-  return tables;
+// `kept`: as in square_root.
+inline const WeightTables& weight_tables(bool kept) {
+  static const WeightTables standard(false), first_version(true);
+  return kept ? first_version : standard;
 }
 
 }  // namespace ggslam::GGSLAM_ISA::codec

@@ -41,19 +41,34 @@ struct NodeContext {
   unsigned predicted_full = 0;   // ...to be occupied
 };
 
+// The state that coding adapts.
+struct OccupancyContexts {
+  Probability single_child, occupancy[32], several_points, more_points;
+  std::uint8_t maps[18][604];
+
+  OccupancyContexts() { std::memset(maps, 127, sizeof maps); }
+};
+
+// What planes say of a node's children: along axis k they lie in one half (`known`: the children that are not in it, 0 if
+// that is not known), or they may (`possible`).
+struct PlaneKnowledge {
+  unsigned known[3] = {0, 0, 0};
+  bool possible[3] = {true, true, true};
+};
+
 class OccupancyModel {
  public:
   explicit OccupancyModel(bool siblings_only)
-      : class_of_pattern_(siblings_only ? kSiblingPatternClass : kPatternClass), tables_(occupancy_tables()) {
-    std::memset(maps_, 127, sizeof maps_);
-  }
+      : class_of_pattern_(siblings_only ? kSiblingPatternClass : kPatternClass), tables_(occupancy_tables()) {}
+
+  OccupancyContexts& contexts() { return own_; }
 
   // Codes an occupancy byte (ignored by the decoder) and returns it. It is never 0.
   template <class Coder>
   unsigned code(Coder& coder, unsigned occupancy, const NodeContext& node) {
     if (node.pattern == 0) {
       const bool single = Coder::kEncoder && (occupancy & (occupancy - 1)) == 0;
-      if (coder.code(single, single_child_)) return code_single(coder, occupancy);
+      if (coder.code(single, own_.single_child)) return code_single(coder, occupancy);
     }
     const int r = class_of_pattern_[node.pattern];
     const std::uint64_t adjacency =
@@ -68,8 +83,8 @@ class OccupancyModel {
       if (zeros_left > 0) {
         const int adjacent = adjacency >> (8 * child) & 0xff, predicted = prediction >> (8 * child) & 0xff;
         const int map = 3 * (bin > 4 ? kFewerAdjacent[adjacent] : adjacent) + predicted;
-        std::uint8_t& entry = maps_[map][kMapStart[bin] + map_index(bin, r, node.pattern, before)];
-        bit = coder.code(occupancy >> child & 1, contexts_[entry >> 3]);
+        std::uint8_t& entry = own_.maps[map][kMapStart[bin] + map_index(bin, r, node.pattern, before)];
+        bit = coder.code(occupancy >> child & 1, own_.occupancy[entry >> 3]);
         entry = static_cast<std::uint8_t>(bit ? entry + kMapStep[(255 - entry) >> 4] : entry - kMapStep[entry >> 4]);
         zeros_left -= 1 - bit;
       }
@@ -79,15 +94,38 @@ class OccupancyModel {
     return decoded;
   }
 
+  // The same where planes are known of, or a node is not split along every axis (its children lie in the lower half).
+  template <class Coder>
+  unsigned code_with_planes(Coder& coder, unsigned occupancy, const NodeContext& node, const PlaneKnowledge& planes) {
+    const unsigned* known = planes.known;
+    const unsigned excluded = known[0] | known[1] | known[2];
+    const bool all_possible = planes.possible[0] && planes.possible[1] && planes.possible[2];
+    if (excluded == 0 && all_possible) return code(coder, occupancy, node);
+    if (known[0] && known[1] && known[2]) return 1u << corner(known);
+    if (node.pattern == 0) {
+      const bool single = Coder::kEncoder && (occupancy & (occupancy - 1)) == 0;
+      if (all_possible && coder.code(single, own_.single_child)) return code_single(coder, occupancy, known);
+      for (int axis = 0; axis < 3; ++axis)  // two children, along the axis whose plane is not known
+        if (known[(axis + 1) % 3] && known[(axis + 2) % 3] && !known[axis])
+          return (1u << corner(known)) | (1u << (corner(known) | 4u >> axis));
+    }
+    return code_bins(coder, occupancy, node, planes, excluded);
+  }
+
   // Codes the number of points in a leaf, at least 1.
   template <class Coder>
   std::uint32_t code_leaf_points(Coder& coder, std::uint32_t points) {
-    if (!coder.code(Coder::kEncoder && points > 1, several_points_)) return 1;
-    return 2 + code_exp_golomb(coder, Coder::kEncoder ? points - 2 : 0, 0, more_points_);
+    if (!coder.code(Coder::kEncoder && points > 1, own_.several_points)) return 1;
+    return 2 + code_exp_golomb(coder, Coder::kEncoder ? points - 2 : 0, 0, own_.more_points);
   }
 
  private:
   static constexpr std::uint8_t kFewerAdjacent[6] = {0, 0, 1, 2, 3, 3};
+
+  // The child in all known halves, the lower one where none is known.
+  static unsigned corner(const unsigned* known) {
+    return (known[0] & 1) << 2 | (known[1] & 1) << 1 | (known[2] & 1);
+  }
 
   template <class Coder>
   static unsigned code_single(Coder& coder, unsigned occupancy) {
@@ -95,6 +133,70 @@ class OccupancyModel {
     const int x = coder.bypass(child >> 2), y = coder.bypass(child >> 1 & 1), z = coder.bypass(child & 1);
     return 1u << (x << 2 | y << 1 | z);
   }
+  template <class Coder>
+  static unsigned code_single(Coder& coder, unsigned occupancy, const unsigned* known) {
+    const unsigned child = Coder::kEncoder ? __builtin_ctz(occupancy) : 0;
+    unsigned decoded = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+      const int shift = 2 - axis;
+      const unsigned bit = known[axis] ? known[axis] & 1 : coder.bypass(static_cast<int>(child >> shift & 1));
+      decoded |= bit << shift;
+    }
+    return 1u << decoded;
+  }
+
+  template <class Coder>
+  unsigned code_bins(Coder& coder, unsigned occupancy, const NodeContext& node, const PlaneKnowledge& planes,
+                     unsigned excluded) {
+    const int r = class_of_pattern_[node.pattern];
+    const std::uint8_t* order = tables_.child_order[node.pattern];
+    ZeroCounts zeros(node.pattern == 0, planes);
+    for (unsigned rest = excluded; rest != 0; rest &= rest - 1) zeros.add(__builtin_ctz(rest));
+    unsigned decoded = 0, before = 0;
+    for (int bin = 0; bin < 8; ++bin) {
+      const int child = order[bin];
+      if (excluded >> child & 1) continue;
+      int bit = 1;
+      if (!zeros.imply_one(child)) {
+        const int adjacent = static_cast<int>((node.open >> child & 1) +
+                                              2 * ((node.touched >> child & 1) + (node.touched_again >> child & 1)));
+        int map = 3 * (bin > 4 ? kFewerAdjacent[adjacent] : adjacent);
+        if (excluded == 0) map += (node.predicted_any >> child & 1) + (node.predicted_full >> child & 1);
+        std::uint8_t& entry = own_.maps[map][kMapStart[bin] + map_index(bin, r, node.pattern, before)];
+        bit = coder.code(occupancy >> child & 1, own_.occupancy[entry >> 3]);
+        entry = static_cast<std::uint8_t>(bit ? entry + kMapStep[(255 - entry) >> 4] : entry - kMapStep[entry >> 4]);
+        if (bit == 0) zeros.add(child);
+      }
+      decoded |= static_cast<unsigned>(bit) << child;
+      before |= static_cast<unsigned>(bit) << bin;
+    }
+    return decoded;
+  }
+
+  // Empty children by axis and half. A child is there for certain when a half that cannot be empty has no other left.
+  class ZeroCounts {
+   public:
+    ZeroCounts(bool alone, const PlaneKnowledge& planes) : most_(alone ? 6 : 7) {
+      for (int axis = 0; axis < 3; ++axis) {
+        sure_[axis] = planes.known[axis] || !planes.possible[axis];
+        most_of_half_[axis] = alone && planes.known[axis] ? 2 : 3;
+      }
+    }
+    void add(int child) {
+      ++total_;
+      for (int axis = 0; axis < 3; ++axis) ++of_half_[axis][child >> (2 - axis) & 1];
+    }
+    bool imply_one(int child) const {
+      if (total_ >= most_) return true;
+      for (int axis = 0; axis < 3; ++axis)
+        if (sure_[axis] && of_half_[axis][child >> (2 - axis) & 1] >= most_of_half_[axis]) return true;
+      return false;
+    }
+
+   private:
+    int most_, total_ = 0, most_of_half_[3], of_half_[3][2] = {};
+    bool sure_[3];
+  };
 
   static int map_index(int bin, int r, unsigned pattern, unsigned before) {
     if (pattern == 0) return __builtin_popcount(before);
@@ -107,8 +209,7 @@ class OccupancyModel {
 
   const std::uint8_t* class_of_pattern_;
   const OccupancyTables& tables_;
-  Probability single_child_, contexts_[32], several_points_, more_points_;
-  std::uint8_t maps_[18][604];
+  OccupancyContexts own_;
 };
 
 }  // namespace ggslam::GGSLAM_ISA::codec

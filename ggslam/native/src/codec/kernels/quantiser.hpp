@@ -14,26 +14,36 @@ inline std::int64_t quantiser_step(int qp) {
 
 class Quantiser {
  public:
-  explicit Quantiser(const gpcc::RahtSettings& settings)
-      : step_{quantiser_step(settings.qp), quantiser_step(settings.qp_secondary), quantiser_step(settings.qp_secondary)} {
-    const auto step = static_cast<double>(step_[0]);
-    bit_weight_ = static_cast<std::int64_t>(settings.rdoq * step * step);
+  explicit Quantiser(const gpcc::RahtSettings& settings) {
+    for (int k = 0; k < 3; ++k) {
+      const int qp = k == 0 ? settings.qp : settings.qp_secondary;
+      step_[k] = quantiser_step(qp);
+      const std::int64_t unshifted = quantiser_step(qp % 6);
+      inverse_[k] = qp <= kFineInverse ? ((std::int64_t{1} << kInverseBits) + unshifted / 2) / unshifted >> (qp / 6) : 0;
+    }
+    bit_weight_ = static_cast<std::int64_t>(settings.rdoq * static_cast<double>(step_[0] * step_[0]));
   }
 
-  // An encoder's choice: values are rounded up from two thirds of a step.
+  // An encoder's choice: values are rounded up from two thirds of a step. Up to the coarsest step of 8 bits the inverse
+  // is the reference encoder's; above, where it has few bits left, sizes are divided.
   std::int32_t quantise(std::int64_t value, int component) const {
-    const std::int64_t step = step_[component], size = (value < 0 ? -value : value) * 256 + step / 3;
-    if (size < step) return 0;
-    const auto q = static_cast<std::int32_t>(size / step);
-    return value < 0 ? -q : q;
+    const std::int64_t size = (value < 0 ? -value : value) * 256, step = step_[component];
+    std::int64_t q;
+    if (inverse_[component] != 0)
+      q = (size * inverse_[component] + (std::int64_t{1} << kInverseBits) / 3) >> kInverseBits;
+    else
+      q = (size + step / 3) / step;
+    return static_cast<std::int32_t>(value < 0 ? -q : q);
   }
   std::int64_t restored(std::int32_t q, int component) const { return (q * step_[component] + 128) >> 8; }
-  // The squared error, times 256, that is worth as much as these 1/256 bits.
-  std::int64_t weighted_bits(std::int64_t bits) const { return bits * bit_weight_ >> 16; }
+  // The squared error, times 2^26, that is worth as much as these bits.
+  std::int64_t weighted_bits(int bits, int components) const { return bits * (components == 1 ? 25 : 35) * bit_weight_; }
 
  private:
-  std::int64_t step_[3];
-  std::int64_t bit_weight_;  // of a bit: the setting times the squared step of component 0, in 1/65536
+  static constexpr int kInverseBits = 26, kFineInverse = 51;
+
+  std::int64_t step_[3], inverse_[3];
+  std::int64_t bit_weight_;  // the setting times the squared step of component 0
 };
 
 }  // namespace ggslam::GGSLAM_ISA::codec

@@ -3,6 +3,7 @@
 // Trans. Image Processing 2016; prediction: Lasserre and Flynn, 2019), from the root down: the encoder reconstructs as
 // it goes, so both directions are the same walk.
 #include <algorithm>
+#include <cstdlib>
 #include <utility>
 
 #include "codec/gpcc.hpp"
@@ -40,8 +41,8 @@ class Transform {
   // `attributes` [points, Components] in the order of the points: read by the encoder, written with what a decoder
   // reconstructs by both.
   Transform(const RahtSettings& settings, const Octree& tree, Coder& coder, std::int32_t* attributes)
-      : settings_(settings), tree_(tree), coder_(coder), attributes_(attributes), weights_(weight_tables()),
-        quantiser_(settings), max_value_((std::int64_t{1} << settings.bit_depth) - 1),
+      : settings_(settings), tree_(tree), coder_(coder), attributes_(attributes),
+        weights_(weight_tables(settings.first_version != 0)), quantiser_(settings), max_value_((std::int64_t{1} << settings.bit_depth) - 1),
         leaf_depth_(tree.depth()), leaves_are_points_(tree.leaf_points.empty()) {}
 
   Status run() {
@@ -117,7 +118,7 @@ class Transform {
     Values source{}, result{};
     for (int k = 0; k < Components; ++k)
       if (Coder::kEncoder) source.v[0][k] = normalised_sum(child_sum(leaf_depth_, 1, k), weight);
-    code_coefficient(source.v[0], result.v[0]);
+    code_coefficient(source.v[0], result.v[0], false);
     keep(leaf_depth_, 1, weight, result.v[0]);
   }
 
@@ -260,7 +261,7 @@ class Transform {
   }
 
   // Codes the difference of a coefficient from its prediction and adds it to the latter.
-  void code_coefficient(const std::int64_t* source, std::int64_t* result) {
+  void code_coefficient(const std::int64_t* source, std::int64_t* result, bool droppable = true) {
     Coefficients<Components> q;
     if constexpr (Coder::kEncoder) {
       std::int64_t difference[Components];
@@ -268,21 +269,25 @@ class Transform {
         difference[k] = rounded(source[k] - result[k]);
         q.c[k] = quantiser_.quantise(difference[k], k);
       }
-      if (settings_.rdoq > 0 && !q.zero() && is_cheap(difference, q)) q = {};
+      if (droppable && settings_.rdoq > 0 && !q.zero() && is_cheap(difference, q)) q = {};
     }
     coder_.code(q);
     for (int k = 0; k < Components; ++k) result[k] += quantiser_.restored(q.c[k], k) << kFractionBits;
   }
 
-  // Whether small coefficients cost more bits than the error they save is worth.
-  bool is_cheap(const std::int64_t* difference, const Coefficients<Components>& q) {
-    std::int64_t saved = 0;
+  // Whether small coefficients cost more bits than the error they save is worth. The rule, with the settings' weight of
+  // 1, is the reference encoder's: its streams are the same to the byte.
+  bool is_cheap(const std::int64_t* difference, const Coefficients<Components>& q) const {
+    static constexpr int kBits[3] = {0, 256, 405};  // of a size, in 1/256
+    std::int64_t sum = 0, error = 0;
+    int bits = 128;
     for (int k = 0; k < Components; ++k) {
-      if (q.c[k] < -1 || q.c[k] > 1) return false;
-      const std::int64_t rest = difference[k] - quantiser_.restored(q.c[k], k);
-      saved += difference[k] * difference[k] - rest * rest;
+      const std::int64_t size = std::abs(static_cast<std::int64_t>(q.c[k]));
+      if ((sum += size) > 2) return false;
+      bits += kBits[size];
+      error += difference[k] * difference[k];
     }
-    return saved * 256 < quantiser_.weighted_bits(coder_.cost(q));
+    return (error << 26) < quantiser_.weighted_bits(run_bits(coder_.run()) + (bits >> 8), Components);
   }
 
   std::int32_t clipped(std::int64_t value) const {
@@ -323,7 +328,7 @@ class Transform {
           source.v[0][k] = multiply(static_cast<std::int64_t>(taken[k]) << kFractionBits, f.a) -
                            multiply(normalised_sum(sum[k], w), f.b);
         }
-      code_coefficient(source.v[0], detail);
+      code_coefficient(source.v[0], detail, false);
       for (int k = 0; k < Components; ++k) {
         const std::int64_t low = rest.v[0][k], high = detail[k];
         taken[k] = clipped(rounded(multiply(low, f.b) + multiply(high, f.a)));

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ggslam.mapping.cpu.votes` on the map's device. Nothing waits for it."""
+"""What the votes that Gaussians carry say: the rendering weight each had under the mask ids it was seen with most. All
+of it happens on the map's device, and nothing waits for it."""
 
 from __future__ import annotations
 
@@ -19,11 +20,12 @@ def vote_shares(gaussians: GaussianMap) -> tuple[torch.Tensor, torch.Tensor]:
     ids, weights = gaussians.vote_ids, gaussians.vote_weights
     most, best = weights.max(1)
     labels = torch.where(most > 0, ids.gather(1, best[:, None])[:, 0], 0)
-    return labels, most / weights.sum(1).clamp_min(1e-12)
+    total = sum(weights.unbind(1), torch.zeros_like(most))  # in this order on every device
+    return labels, most / total.clamp_min(1e-12)
 
 
 def merge_votes(gaussians: GaussianMap, alias: torch.Tensor) -> None:
-    """Replaces ids in the votes by `alias` (int32 [65536] on the device); slots that then name one object become
+    """Replaces ids in the votes by `alias` (int32 [65536] on the map's device); slots that then name one object become
     one."""
     ids, weights = gaussians.vote_ids, gaussians.vote_weights
     ids.copy_(alias[ids.long()])

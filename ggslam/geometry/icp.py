@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Point-to-plane ICP: brings one cloud upon another (Y. Chen and G. Medioni, "Object Modelling by Registration of
+Multiple Range Images", 1992).
+
+For clouds that are compared once. The tracker aligns a frame to voxels of Gaussians instead, by compiled G-ICP, see
+`tracking.gicp`; `scripts/kdtree_gicp.py` is what that is measured against and shares nothing with either on purpose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.geometry.clouds import Cloud, Overlap, Points, as_cloud, check_distance, overlap
+from ggslam.geometry.normals import estimate_normals
+from ggslam.scene.poses import orthonormalized, se3_exp, transformed, turning_angle
+
+FEWEST_MATCHES = 10
+"""Fewer pairs of points than this leave a pose open."""
+SMALL_STEP = 3e-5
+"""Metres and radians: ICP ends at a smaller step."""
+
+
+@dataclass(frozen=True)
+class CloudRegistration:
+    """Result of ICP.
+
+    Attributes:
+        T_target_source: float64 [4, 4].
+        overlap: of the moved source upon the target, over all points.
+        moved_m, turned_deg: size of the motion from the start to the result, `moved_m` at the middle of the source.
+        iterations: made at all distances together.
+        converged: whether the last distance ended by a small step.
+    """
+
+    T_target_source: np.ndarray
+    overlap: Overlap
+    moved_m: float
+    turned_deg: float
+    iterations: int
+    converged: bool
+
+
+def register(
+    source: Points, target: Points, target_normals: np.ndarray | None = None,
+    max_distances: Sequence[float] = (0.25, 0.10, 0.05), T_start: np.ndarray | None = None, iterations: int = 30,
+    sample: int = 50_000, seed: int = 0,
+) -> CloudRegistration:  # fmt: skip
+    """Finds the motion that brings a source upon a target.
+
+    Args:
+        source, target: [N, 3] and [M, 3] metres.
+        target_normals: [M, 3]; None: estimated where they are needed.
+        max_distances: pairs farther apart are no pairs; from the first to the last. The last counts for the overlap.
+        T_start: T_target_source to begin with; None: the identity.
+        iterations: at most, at each distance.
+        sample: the source's points that steer the motion, drawn at random.
+        seed: of the draw.
+
+    Raises:
+        ValueError: a cloud is empty or not finite, a distance is not positive, or fewer than 10 points have a partner
+            at some iteration.
+    """
+    source, target = as_cloud(source), as_cloud(target)
+    distances = [check_distance(d) for d in max_distances]
+    normals = _LazyNormals(target, target_normals)
+    chosen = source.points[source.sample(sample, seed)]
+    start = np.eye(4) if T_start is None else np.asarray(T_start, np.float64)
+    T, made, converged = start, 0, False
+    for distance in distances:
+        converged = False
+        for _ in range(iterations):
+            step = _step(transformed(chosen, T), target, normals, distance)
+            T = orthonormalized(se3_exp(step) @ T)
+            made += 1
+            if np.abs(step).max() < SMALL_STEP:
+                converged = True
+                break
+    middle = source.points.mean(0, keepdims=True)
+    return CloudRegistration(
+        T_target_source=T,
+        overlap=overlap(source, target, distances[-1], T, seed),
+        moved_m=float(np.linalg.norm(transformed(middle, T) - transformed(middle, start))),
+        turned_deg=float(np.degrees(turning_angle(start, T))),
+        iterations=made,
+        converged=converged,
+    )
+
+
+class _LazyNormals:
+    """Normals of a cloud, given, or estimated for those points that are asked for."""
+
+    def __init__(self, cloud: Cloud, normals: np.ndarray | None) -> None:
+        self._cloud = cloud
+        self._normals = np.zeros_like(cloud.points) if normals is None else np.asarray(normals, np.float64)
+        self._known = np.full(len(cloud), normals is not None)
+
+    def of(self, rows: np.ndarray) -> np.ndarray:
+        unknown = np.unique(rows[~self._known[rows]])
+        self._normals[unknown] = estimate_normals(self._cloud.points, unknown, tree=self._cloud.tree)
+        self._known[unknown] = True
+        return self._normals[rows]
+
+
+def _step(moved: np.ndarray, target: Cloud, normals: _LazyNormals, distance: float) -> np.ndarray:
+    """Gauss-Newton step (translation, rotation) [6], applied from the left, of the point-to-plane distances."""
+    apart, nearest = target.tree.query(moved, distance_upper_bound=distance, workers=-1)
+    pairs = np.isfinite(apart)
+    if pairs.sum() < FEWEST_MATCHES:
+        raise ValueError(f"expected at least {FEWEST_MATCHES} points within {distance} m of the target, found "
+                         f"{int(pairs.sum())} of {len(moved)}")  # fmt: skip
+    p, q, n = moved[pairs], target.points[nearest[pairs]], normals.of(nearest[pairs])
+    J = np.concatenate([n, np.cross(p, n)], 1)
+    residual = ((p - q) * n).sum(1)
+    return np.linalg.lstsq(J.T @ J, -J.T @ residual, rcond=1e-9)[0]  # directions that nothing holds stay as they are

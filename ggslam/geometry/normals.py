@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Normals of a point cloud.
+
+Depth images have neighbours in their grid instead, and three parts take normals from there, each what it needs: the
+compiled core the shape of a point, noise taken off, for G-ICP (`tracking.points`), new Gaussians none beside a jump
+(`mapping.cpu.insertion`), the segmenter one at every pixel, from inverse depth (`objects.depth_surfaces`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+NEIGHBOURS = 16
+"""Points from which a normal is estimated, the point itself included."""
+_CHUNK = 1 << 17
+
+
+def estimate_normals(
+    points: np.ndarray, rows: np.ndarray | None = None, neighbours: int = NEIGHBOURS, tree: cKDTree | None = None
+) -> np.ndarray:
+    """Unit normals float64 [n, 3] of points [N, 3], the direction of least variance among each point's nearest
+    neighbours; their sign is arbitrary.
+
+    Args:
+        points: the cloud, N > 0.
+        rows: int [n], the points whose normals are wanted; None: all.
+        neighbours: points in a plane, the point itself included.
+        tree: of the points; None: one is built.
+    """
+    points = np.asarray(points, np.float64)
+    tree = cKDTree(points) if tree is None else tree
+    rows, count = np.arange(len(points)) if rows is None else rows, min(neighbours, len(points))
+    normals = np.empty((len(rows), 3))
+    for start in range(0, len(rows), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        near = points[tree.query(points[rows[part]], count, workers=-1)[1].reshape(-1, count)]
+        offsets = near - near.mean(1, keepdims=True)
+        normals[part] = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
+    return normals

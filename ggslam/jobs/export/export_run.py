@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run in the form that other programs take, in one call."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ggslam.errors import ConfigError
+from ggslam.jobs.export.formats import ExportFormat, choose_format
+from ggslam.jobs.export.map_files import (
+    export_objects,
+    export_points,
+    export_segmented,
+    export_splats,
+    export_trajectory,
+)
+from ggslam.jobs.export.meshes import MeshRequest, export_mesh
+from ggslam.jobs.export.splats import export_packed, export_pcd
+from ggslam.jobs.export.views import export_colmap, export_nerfstudio
+from ggslam.jobs.progress import Observer
+from ggslam.runs.folder import RunFolder
+
+_WITH_OBJECTS = (ExportFormat.ply, ExportFormat.segmented, ExportFormat.mesh)
+_WITH_VIEWS = (ExportFormat.colmap, ExportFormat.nerfstudio)
+
+
+def export_run(
+    run: str | Path | RunFolder,
+    out: str | Path,
+    format: str | None = None,
+    *,
+    voxel: float | None = None,
+    objects: str | None = None,
+    min_opacity: float = 0.0,
+    plain: bool = False,
+    keyframes: bool = False,
+    recording: str | Path | None = None,
+    rendered: bool = False,
+    observer: Observer | None = None,
+) -> str:
+    """Writes a run in a form that other programs take, as `ggslam export` does; returns a line that says what was
+    written.
+
+    Args:
+        run: the run, or its folder.
+        out: file or, for points, colmap, nerfstudio and for objects one by one, folder to write.
+        format: ply: 3DGS Gaussians; segmented: the same in the colours of their objects; compressed-ply, spz, splat:
+            the same in fewer bytes; points, pcd: coloured clouds; mesh: .glb, .obj or .ply; trajectory: TUM; colmap,
+            nerfstudio: images with poses and points. None: what the name of `out` says.
+        voxel: metres: distance of points (default 0.01), or the edge of a mesh's voxels (default: as the run's
+            settings say).
+        objects: names or ids, "mug,7", or "all", for ply, segmented and mesh: only these.
+        min_opacity: leave out fainter Gaussians (not of trajectory, mesh, colmap, nerfstudio).
+        plain: ply, segmented: only the fields of 3DGS.
+        keyframes: colmap, nerfstudio: only keyframes and held-out frames.
+        recording: where the recording is now, if it was moved (colmap, nerfstudio, mesh).
+        rendered: mesh: from depth rendered from the map, even if the recording is there.
+        observer: receives progress updates of meshes.
+
+    Raises:
+        ConfigError: an unknown format or object, or arguments that do not go together.
+        MissingDependency: a package is needed for this format.
+        RunFolderError: no run, a damaged one, or nothing to write.
+        SequenceError: the recording cannot be read.
+    """
+    folder, place = run if isinstance(run, RunFolder) else RunFolder.open(Path(run)), Path(out)
+    kind = choose_format(None if format is None else _format_named(format), place, objects)
+    _refuse_ignored(kind, objects, keyframes, recording, rendered)
+    images, points = None if recording is None else Path(recording), 0.01 if voxel is None else voxel
+    if kind is ExportFormat.mesh:
+        return export_mesh(folder, place, MeshRequest(voxel, objects, rendered, images), observer)
+    if kind in _WITH_VIEWS:
+        write = export_colmap if kind is ExportFormat.colmap else export_nerfstudio
+        return write(folder, place, points, keyframes, images)
+    if kind is ExportFormat.segmented:
+        return export_segmented(folder, place, objects, min_opacity, plain)
+    if kind is ExportFormat.ply and objects is not None:
+        return export_objects(folder, place, objects, min_opacity, plain)
+    if kind is ExportFormat.ply:
+        return export_splats(folder, place, min_opacity, plain)
+    if kind is ExportFormat.points:
+        return export_points(folder, place, points, min_opacity)
+    if kind is ExportFormat.pcd:
+        return export_pcd(folder, place, points, min_opacity)
+    if kind is ExportFormat.trajectory:
+        return export_trajectory(folder, place)
+    return export_packed(folder, place, kind.value, min_opacity)
+
+
+def _format_named(name: str) -> ExportFormat:
+    try:
+        return ExportFormat(name)
+    except ValueError:
+        known = ", ".join(kind.value for kind in ExportFormat)
+        raise ConfigError(f"`format`: expected one of {known}, found {name!r}") from None
+
+
+def _refuse_ignored(
+    kind: ExportFormat, objects: str | None, keyframes: bool, recording: str | Path | None, rendered: bool
+) -> None:
+    """Raises ConfigError for an argument that this format leaves without effect."""
+    if objects is not None and kind not in _WITH_OBJECTS:
+        raise ConfigError(f"`objects` goes with `format` ply, segmented or mesh, not {kind.value}")
+    if keyframes and kind not in _WITH_VIEWS:
+        raise ConfigError(f"`keyframes` goes with `format` colmap or nerfstudio, not {kind.value}")
+    if recording is not None and kind not in (*_WITH_VIEWS, ExportFormat.mesh):
+        raise ConfigError(f"`recording` goes with `format` colmap, nerfstudio or mesh, not {kind.value}")
+    if rendered and kind is not ExportFormat.mesh:
+        raise ConfigError(f"`rendered` goes with `format` mesh, not {kind.value}")

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scores of a run in one call."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ggslam.jobs.progress import Observer, SilentObserver
+from ggslam.jobs.score.scoring import score_run
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.metrics import MetricsRecord
+
+
+def evaluate_run(
+    run: str | Path | RunFolder,
+    *,
+    recording: str | Path | None = None,
+    masks: str | Path | None = None,
+    lpips: bool = True,
+    every: int = 1,
+    observer: Observer | None = None,
+) -> MetricsRecord:
+    """Scores a run against its recording, as `ggslam eval` does: trajectory, images, objects.
+
+    Args:
+        run: the run, or its folder.
+        recording: where the recording is now, if it was moved.
+        masks: folder of true instance masks, if not the recording's own.
+        lpips: also LPIPS, if its weights are there.
+        every: score the images of every n-th frame only.
+        observer: receives progress updates.
+
+    Returns:
+        What was written to the run's metrics.json, see `docs/formats.md`.
+
+    Raises:
+        RunFolderError: no run, or a damaged one, or its frames were not kept.
+        SequenceError: the recording is not there any more.
+    """
+    folder = run if isinstance(run, RunFolder) else RunFolder.open(Path(run))
+    truth = None if masks is None else Path(masks)
+    sequence = open_recording_of(folder, None if recording is None else Path(recording), truth)
+    return score_run(folder, sequence, observer or SilentObserver(), lpips=lpips, every=every, masks=truth)

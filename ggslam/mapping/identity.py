@@ -1,0 +1,294 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identity learning: every Gaussian learns which object it belongs to, from instance masks of the keyframes.
+
+As in Ye et al., "Gaussian Grouping", 2024 and GG-SLAM, a Gaussian carries a 16-D identity vector o, rendered like
+colour; a 1x1 convolution classifies what is rendered. Loss: l_obj CE(logits, mask) + l_obj3d (l_val / C) mean KL over
+nearest neighbours. Otherwise than there
+
+- the cross-entropy is taken at sampled pixels, balanced among objects, through the terms of the view that is rendered
+  for its colours anyway (`rendering.pixel_terms`): no identity image is ever composited;
+- classes are added as ids appear;
+- the same terms count votes: how much rendering weight a Gaussian had under each mask id. They label the map from the
+  first keyframe on, give new Gaussians their first vector, and check what was learned.
+
+What is the same on every device is here: which ids were merged, split off or taken back, and the order of a step.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+import torch
+
+from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.mapping.pixel_pool import PixelPool
+from ggslam.mapping.votes import vote_labels, vote_shares
+from ggslam.rendering.types import RenderBuffers
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IdentityClassifier
+
+POOL_STEPS = 8
+"""Steps' worth of pixels that are drawn from a keyframe at once."""
+TERMS, MIN_WEIGHT = 32, 5e-3
+"""Contributions to a pixel that training looks at: at most so many, none lighter."""
+BIRTH_VOTE = 0.1
+"""Weight of the vote that a Gaussian gets for the pixel it is born from."""
+IDS = 65536
+"""Object ids there can be, 0 (none) among them."""
+
+
+@dataclass
+class IdentityTimes:
+    """Seconds spent so far."""
+
+    steps: float = 0.0
+    labelling: float = 0.0
+    count: int = 0
+
+
+class Classes(Protocol):
+    """A table of classes, see `CpuClassTable`."""
+
+    @property
+    def count(self) -> int: ...
+
+    @property
+    def classifier(self) -> IdentityClassifier: ...
+
+    def classes(self, object_ids: np.ndarray) -> np.ndarray: ...
+
+    def add(self, object_ids: np.ndarray) -> None: ...
+
+    def resume(self, classifier: IdentityClassifier) -> None: ...
+
+    def remove(self, object_id: int) -> None: ...
+
+
+class MaskedKeyframe(Protocol):
+    """What is asked of a keyframe: its number, and its mask, uint16 [H, W], or None."""
+
+    @property
+    def index(self) -> int: ...
+
+    @property
+    def mask(self) -> np.ndarray | None: ...
+
+
+@dataclass
+class IdentityLearner(ABC):
+    """Objects and their ids.
+
+    Args:
+        settings: of identity learning.
+        seed: of sampling.
+    """
+
+    settings: IdentitySettings
+    seed: int = 0
+    times: IdentityTimes = field(default_factory=IdentityTimes)
+
+    kept_pools: ClassVar[int | None] = None
+    """Keyframes whose pixels drawn ahead are kept; beyond, those drawn first go. None: all."""
+
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng([self.seed, 16])
+        self._alias = np.arange(IDS, dtype=np.uint16)
+        self._whole_of = np.zeros(IDS, np.uint16)
+        self._pools: dict[int, PixelPool[Any]] = {}
+        self._iterations = 0
+        self._shown: torch.Tensor | None = None  # labels by votes, of the last keyframe's time
+        self._shown_order = -1
+        self.table: Classes
+
+    @property
+    def classifier(self) -> IdentityClassifier:
+        """As trained so far."""
+        return self.table.classifier
+
+    def resume(self, classifier: IdentityClassifier) -> None:
+        """Goes on with the classes of a map made before, whose Gaussians bring their vectors and votes."""
+        self.table.resume(classifier)
+
+    def due(self, keyframe: MaskedKeyframe) -> bool:
+        """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
+        self._iterations += 1
+        return keyframe.mask is not None and self.table.count > 0 and self._iterations % self.settings.every == 0
+
+    # --- a map that is partly on disk ---------------------------------------------------------------------------------
+
+    def catch_up(self, gaussians: GaussianMap) -> None:
+        """The votes of Gaussians that were on disk follow the merges and removals of objects since; their identity
+        vectors are left to further steps."""
+        if (self._alias != np.arange(IDS)).any():
+            self._merge_votes(gaussians)
+
+    def catch_up_and_label(self, gaussians: GaussianMap) -> None:
+        """The end for a part of the map that was on disk, see `label`."""
+        self.catch_up(gaussians)
+        self.label(gaussians)
+
+    def keep_pools(self, keyframes: Iterable[int]) -> None:
+        """Forgets the pixels that were drawn ahead from any but these keyframes."""
+        self._pools = {number: self._pools[number] for number in keyframes if number in self._pools}
+
+    # --- objects ------------------------------------------------------------------------------------------------------
+
+    def current(self, ids: np.ndarray) -> np.ndarray:
+        """Object ids with those replaced that were merged into others."""
+        return self._alias[ids]
+
+    def observe(self, mask: np.ndarray) -> None:
+        """A keyframe with this mask (uint16 [H, W]) arrives: its objects get classes."""
+        self._forget_shown()
+        self.table.add(np.flatnonzero(np.bincount(self.current(mask).reshape(-1), minlength=1)).astype(np.uint16))
+
+    def merge(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
+        """Two objects turned out to be one: masks, votes and classes of `dropped` become those of `kept`."""
+        kept = int(self._alias[kept])
+        if kept == dropped:
+            return
+        self._alias[self._alias == dropped] = kept
+        self._whole_of[dropped] = 0
+        self._ids_changed()
+        self._merge_votes(gaussians)
+        self.table.add(np.array([kept], np.uint16))
+        if self.table.classes(np.array([dropped]))[0] >= 0:
+            self._dissolve(gaussians, kept, dropped)
+
+    def forget(self, gaussians: GaussianMap, object_ids: Sequence[int]) -> None:
+        """Objects that were none: their class goes, their Gaussians become what else they look like."""
+        for object_id in object_ids:
+            self.table.remove(object_id)
+            self._alias[self._alias == object_id] = 0
+        self._whole_of[list(object_ids)] = 0
+        self._ids_changed()
+        self._merge_votes(gaussians)
+
+    def _shown_labels(self, gaussians: GaussianMap) -> torch.Tensor:
+        """The map's labels by votes as of the newest keyframe, int32 [N]."""
+        if self._shown is None or self._shown_order != gaussians.order or len(self._shown) != len(gaussians):
+            self._shown, self._shown_order = vote_labels(gaussians), gaussians.order
+        return self._shown
+
+    def _forget_shown(self) -> None:
+        self._shown = None
+
+    def _split_off(self, whole: int, part: int) -> bool:
+        """Remembers a part of an object; False if both were merged into one."""
+        if whole == part:
+            return False
+        self._whole_of[part] = whole
+        self._ids_changed()
+        return True
+
+    # --- steps --------------------------------------------------------------------------------------------------------
+
+    def step(
+        self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, view: RenderBuffers, rate_factor: float = 1.0
+    ) -> torch.Tensor | None:
+        """One step on the view that `rasterizer` rendered last, which must be that of `keyframe`. On a GPU it is only
+        started, and `times.steps` counts the seconds that takes.
+
+        Args:
+            rate_factor: multiplies the learning rates (of the sampled schedule).
+
+        Returns:
+            With the dense schedule the gradient of the rendered features [F, H, W], for the caller's backward pass;
+            else None, and the step is made.
+        """
+        start = time.perf_counter()
+        gradient = None
+        if self.settings.schedule == "dense":
+            gradient = self._dense(gaussians, rasterizer, keyframe, view)
+        pixels, vote_weights = self._draw(keyframe)
+        if len(pixels):
+            self._sampled(gaussians, rasterizer, keyframe, pixels, vote_weights, rate_factor)
+        self.times.steps += time.perf_counter() - start
+        self.times.count += 1
+        return gradient
+
+    def _draw(self, keyframe: Any) -> tuple[Any, Any]:
+        """The next pixels of a keyframe, int32 [P], and the weight each has as a vote."""
+        pool = self._pools.get(keyframe.index)
+        if pool is None or not pool.has(self.settings.pixels):
+            pool = self._new_pool(keyframe, POOL_STEPS * self.settings.pixels)
+            self._pools.pop(keyframe.index, None)
+            self._pools[keyframe.index] = pool
+            if self.kept_pools is not None and len(self._pools) > self.kept_pools:
+                del self._pools[next(iter(self._pools))]
+        return pool.take(self.settings.pixels)
+
+    def _pulls(self, gaussians: GaussianMap) -> bool:
+        """Whether this step has the 3-D loss."""
+        s = self.settings.neighbours
+        return s.weight > 0 and self.times.count % s.every == 0 and len(gaussians) > 1
+
+    # --- results ------------------------------------------------------------------------------------------------------
+
+    def label(self, gaussians: GaussianMap) -> None:
+        """Writes each Gaussian's object into `object_id`: the one with a share of `min_confidence` of its votes, else
+        the learned one if it is as probable, else 0. Votes first: what is rendered is learned as a whole, and single
+        Gaussians in it may be wrong (in a rendered room 95 % of Gaussians were right by votes, 91 % as learned)."""
+        start = time.perf_counter()
+        ids, share = vote_shares(gaussians)
+        if self.settings.schedule != "votes":
+            learned = self._learned_labels(gaussians)
+            sure = share >= self.settings.min_confidence
+            ids = torch.where(sure, ids, torch.where(share > 0, learned, 0))
+        gaussians.object_id.copy_(ids)
+        self.times.labelling += time.perf_counter() - start
+
+    # --- what depends on where the map is -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def begin(self, gaussians: GaussianMap, rows: slice, labels: Any) -> None:
+        """New Gaussians get their first identity vectors and votes.
+
+        Args:
+            rows: where they are in the map.
+            labels: [M], object under the pixel each was born from, 0 = unknown; uint16 on the host, int32 on a device.
+        """
+
+    @abstractmethod
+    def _new_pool(self, keyframe: Any, wanted: int) -> PixelPool[Any]:
+        """So many labelled pixels of a keyframe that has a mask."""
+
+    @abstractmethod
+    def _sampled(
+        self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, pixels: Any, vote_weights: Any,
+        rate_factor: float,
+    ) -> None:  # fmt: skip
+        """Votes, and with the sampled schedule a step, at pixels of a keyframe's mask."""
+
+    @abstractmethod
+    def _dense(self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, view: RenderBuffers) -> torch.Tensor:
+        """Cross-entropy of a whole rendered identity image, as published; updates the classifier. Returns the gradient
+        of the rendered features [F, H, W]."""
+
+    @abstractmethod
+    def split(self, gaussians: GaussianMap, rasterizer: Any, mask: np.ndarray, whole: int, part: int) -> None:
+        """An object turned out to be two: what the last rendering shows where `mask` (uint16 [H, W]) has the part, and
+        more of it there than elsewhere, now votes for the part as it did for the whole. In older keyframes the map
+        decides from now on which pixels of the whole are the part's."""
+
+    @abstractmethod
+    def _learned_labels(self, gaussians: GaussianMap) -> torch.Tensor:
+        """Most probable object of each Gaussian's identity vector, int32 [N], 0 below `min_confidence`."""
+
+    def _ids_changed(self) -> None:
+        """`_alias` or `_whole_of` changed."""
+        self._forget_shown()
+
+    @abstractmethod
+    def _merge_votes(self, gaussians: GaussianMap) -> None:
+        """The votes follow `_alias`."""
+
+    @abstractmethod
+    def _dissolve(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
+        """Removes the class of `dropped`; Gaussians that have it get the code of what they are by votes, else of
+        `kept`."""

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tracker that aligns frames by G-ICP, with the way back after it was lost."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from ggslam.features.orb import View, pose_from_matches
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import orthonormalized
+from ggslam.tracking.engine import CpuTrackingEngine, TrackingEngine
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
+from ggslam.tracking.noise import estimate_noise
+from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
+from ggslam.tracking.points import PointSource
+from ggslam.tracking.settings import DepthNoise, PhotometricMode, TrackerSettings
+from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, TrackingStatus
+
+MIN_TEXTURED = 200
+"""Textured points from which grey values are trusted."""
+
+
+class GicpTracker(Tracker):
+    """Constant velocity, then G-ICP, with grey values where geometry leaves a direction open; if that fails, other
+    starts. Grey values are compared with an earlier frame, which the tracker chooses by itself.
+
+    Args:
+        camera: of all frames.
+        settings: see `TrackerSettings`.
+        context: threads to work on; the tracker's own, so that it does not wait for other users.
+        T_world_camera: pose of the first frame.
+        engine: where points are extracted and aligned; None: on the threads of `context`.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        settings: TrackerSettings | None = None,
+        context: NativeContext | None = None,
+        T_world_camera: np.ndarray | None = None,
+        engine: TrackingEngine | None = None,
+    ) -> None:
+        super().__init__(TrackerState.begin(camera, settings, context, T_world_camera))
+        self._given_engine = engine
+        self._median_depth: float | None = None
+
+    @classmethod
+    def sharing(cls, state: TrackerState) -> GicpTracker:
+        """A tracker that works with the state of another."""
+        tracker = cls(state.camera, state.settings, state.context)
+        tracker.state = state
+        return tracker
+
+    @property
+    def engine(self) -> TrackingEngine:
+        """Where points are extracted and aligned."""
+        return self._given_engine or CpuTrackingEngine(self.camera, self.context)
+
+    def track(self, frame: Frame) -> TrackingResult:
+        """See `Tracker.track`."""
+        target, motion = self.target, self.state.motion
+        if self.noise is None:
+            self.noise = estimate_noise(frame.depth, self.camera)
+        noise = self.noise or DepthNoise()
+        points = self.engine.points(frame.depth, self.settings.points, noise)
+        view = View(frame.color, frame.depth, motion.T_world_camera)
+        if target is None:
+            return self._begin(view, points)
+        self.noise = noise  # what could not be measured before the first keyframe is taken as usual
+        found, reason = self._locate(view, points, target)
+        if not self._is_acceptable(found):
+            return self._give_up(points, found)
+        T = orthonormalized(found.T_world_camera)
+        motion.follow(view, T)
+        motion.remember(view, points, self.settings)
+        status = TrackingStatus.DEGENERATE if found.degenerate else TrackingStatus.OK
+        status = TrackingStatus.RECOVERED if reason else status
+        return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, found)
+
+    # --- parts -------------------------------------------------------------------------------------------------------
+
+    def _locate(self, view: View, points: PointSource, target: GicpTarget) -> tuple[AlignmentResult, str]:
+        """The best alignment, and which start it came from (empty: constant velocity)."""
+        depth = points.median_depth_if_known()
+        expected = self._median_depth if depth is None else depth
+        mode = self._mode(points.median_depth if expected is None else expected)
+        found = self._locate_by(mode, view, points, target)
+        if depth is None:  # it is known now, and seldom so far from the frame's before that the mode is another one
+            self._median_depth = points.median_depth
+            actual = self._mode(self._median_depth)
+            return found if actual == mode else self._locate_by(actual, view, points, target)
+        return found
+
+    def _locate_by(
+        self, mode: PhotometricMode, view: View, points: PointSource, target: GicpTarget
+    ) -> tuple[AlignmentResult, str]:
+        """As `_locate`, in a photometric mode."""
+        guess = self.state.motion.predict()
+        photometric = self._photometric_part(view) if mode == "always" or self.state.motion.lost else None
+        found = self._align(points, target, guess, photometric)
+        if photometric is not None and not self._explains_greys(found) and not found.degenerate:
+            # Images that do not agree (too far apart, shutters out of step) must not pull at good geometry.
+            found = self._align(points, target, guess, None)
+        if self._is_convincing(found) and not (found.degenerate and mode != "never"):
+            return found, ""
+        if photometric is None and found.degenerate and mode != "never":
+            photometric = self._photometric_part(view)
+            found = self._align(points, target, guess, photometric) if photometric else found
+        if self._is_convincing(found) and self._explains_greys(found):
+            return found, ""
+        return self._retry(view, points, target, found, photometric)
+
+    def _mode(self, median_depth: float) -> PhotometricMode:
+        """The photometric mode with "auto" decided."""
+        settings = self.settings.photometric
+        if settings.mode != "auto":
+            return settings.mode
+        assert self.noise is not None
+        return "always" if self.noise.sigma(median_depth) > settings.noisy_m else "degenerate"
+
+    def _align(
+        self, points: PointSource, target: GicpTarget, guess: np.ndarray, photometric: PhotometricPart | None,
+        coarse: bool = True,
+    ) -> AlignmentResult:  # fmt: skip
+        assert self.noise is not None
+        settings = self.settings.align if coarse else dataclasses.replace(self.settings.align, coarse_iterations=0)
+        return self.engine.align(points, target, guess, settings, self.noise, photometric)
+
+    def _photometric_part(self, view: View) -> PhotometricPart | None:
+        """Textured points of the view and the reference; None without either."""
+        settings = self.settings.photometric
+        reference = self._current_reference()
+        if reference is None:
+            return None
+        points = textured_points(self._shrink(view), settings)
+        return PhotometricPart(points, reference, settings) if len(points) >= MIN_TEXTURED else None
+
+    def _current_reference(self) -> PhotometricReference | None:
+        motion = self.state.motion
+        if motion.reference is None and motion.reference_view is not None:
+            view = motion.reference_view
+            motion.reference = PhotometricReference.from_view(self._shrink(view), view.T_world_camera)
+        return motion.reference
+
+    def _shrink(self, view: View) -> GreyDepth:
+        shrink = self.settings.photometric.shrink * max(1, round(self.camera.width / 320))
+        return GreyDepth.from_images(view.color, view.depth, self.camera, shrink)
+
+    def _is_convincing(self, found: AlignmentResult) -> bool:
+        return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.recovery.convincing_overlap
+
+    def _explains_greys(self, found: AlignmentResult) -> bool:
+        """Whether the images agree at the pose found; true if none were compared."""
+        limit = self.settings.recovery.convincing_residual
+        return found.photometric_share == 0 or found.photometric_residual <= limit
+
+    def _is_acceptable(self, found: AlignmentResult) -> bool:
+        """Whether to believe a pose at all. Some overlap can be had anywhere (a floor is a floor), so that a pose short
+        of the convincing overlap, or after being lost, must be witnessed by grey values."""
+        if found.status is AlignmentStatus.LOST or found.overlap < self.settings.recovery.min_overlap:
+            return False
+        if self.state.motion.lost:
+            return self._is_witnessed(found)
+        return self._is_convincing(found) or self._is_witnessed(found, tolerance=2)
+
+    def _is_witnessed(self, found: AlignmentResult, tolerance: float = 1) -> bool:
+        """Whether there is some overlap and the images agree over enough of the frame."""
+        recovery = self.settings.recovery
+        if found.status is AlignmentStatus.LOST or found.overlap < recovery.min_overlap:
+            return False
+        seen = found.photometric_share >= recovery.min_share
+        return seen and found.photometric_residual <= tolerance * recovery.convincing_residual
+
+    def _retry(
+        self, view: View, points: PointSource, target: GicpTarget, found: AlignmentResult,
+        photometric: PhotometricPart | None,
+    ) -> tuple[AlignmentResult, str]:  # fmt: skip
+        """The best alignment over all starts."""
+        photometric = photometric or self._photometric_part(view)
+        best, reason = found, ""
+        if photometric is not None and found.photometric_share == 0:  # all starts are compared by the same measure
+            best = self._align(points, target, self.state.motion.predict(), photometric)
+        # Feature matches are good to a centimetre or two; the coarse level would slide off along a bare wall.
+        starts = [("last pose", self.state.motion.T_world_camera, True)]
+        for number, earlier in enumerate(self.state.motion.views):
+            pose = pose_from_matches(view, earlier, self.camera, self.settings.recovery.features)
+            if pose is not None:
+                starts.append((f"features of view {number}", pose.T_world_camera, False))
+        for name, guess, coarse in starts:
+            candidate = self._align(points, target, guess, photometric, coarse)
+            if self._is_better(candidate, best):
+                best, reason = candidate, name
+        return best, reason
+
+    @staticmethod
+    def _is_better(candidate: AlignmentResult, best: AlignmentResult) -> bool:
+        """Whether an alignment of the same points beats another.
+
+        With grey values the joint cost decides: sliding along a bare wall keeps all the overlap. Without them more
+        overlap is better, and a loose fit costs a little.
+        """
+        if candidate.status is AlignmentStatus.LOST or best.status is AlignmentStatus.LOST:
+            return candidate.status is not AlignmentStatus.LOST
+        if candidate.photometric_share > 0 and best.photometric_share > 0:
+            return candidate.cost < best.cost
+        return candidate.overlap - 2.0 * candidate.rmse > best.overlap - 2.0 * best.rmse
+
+    def _give_up(self, points: PointSource, found: AlignmentResult) -> TrackingResult:
+        """Stays where it was last known, standing still."""
+        self.state.motion.lose()
+        limit = self.settings.recovery.min_overlap
+        reason = f"{found.overlap:.0%} of {len(points)} points match the map, {limit:.0%} needed, from every start"
+        if found.overlap >= limit:
+            reason = (
+                f"only {found.overlap:.0%} of {len(points)} points match the map, and the image does not agree "
+                f"(mean grey difference {found.photometric_residual:.3f} over {found.photometric_share:.0%} of it)"
+            )
+        if len(points) < self.settings.align.min_matches:
+            reason = f"only {len(points)} points have depth, {self.settings.align.min_matches} needed"
+        pose = self.state.motion.T_world_camera.copy()
+        return TrackingResult(pose, TrackingStatus.LOST, found.overlap, found.rmse, reason, points, found)

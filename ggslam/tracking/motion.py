@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a tracker knows of the camera's motion, and the located frames that it remembers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ggslam.features.orb import View
+from ggslam.scene.poses import inverse, orthonormalized, separation
+from ggslam.tracking.photometric import PhotometricReference
+from ggslam.tracking.points import PointSource
+from ggslam.tracking.settings import PhotometricSettings, TrackerSettings
+
+
+@dataclass
+class CameraMotion:
+    """Where the camera is and how it moves.
+
+    Attributes:
+        T_world_camera: float64 [4, 4], the last known pose.
+        velocity: float64 [4, 4], the last motion from one frame to the next.
+        lost: whether the last frame was not located.
+        views: the last located frames, the newest first.
+        reference_view: an earlier one, not too far away, whose grey values frames are compared with.
+        reference: the same, prepared; None: not yet.
+    """
+
+    T_world_camera: np.ndarray
+    velocity: np.ndarray = field(default_factory=lambda: np.eye(4))
+    lost: bool = False
+    views: list[View] = field(default_factory=list)
+    reference_view: View | None = None
+    reference: PhotometricReference | None = None
+
+    def predict(self) -> np.ndarray:
+        """The next pose [4, 4] at constant velocity."""
+        return self.T_world_camera @ self.velocity
+
+    def follow(self, view: View, T_world_camera: np.ndarray) -> None:
+        """A frame was located at `T_world_camera` [4, 4], which becomes its view's pose."""
+        self.velocity = np.eye(4) if self.lost else inverse(self.T_world_camera) @ T_world_camera
+        self.lost = False
+        self.T_world_camera = view.T_world_camera = T_world_camera
+
+    def lose(self) -> None:
+        """A frame was not located: the camera stays where it was last known, standing still."""
+        self.velocity, self.lost = np.eye(4), True
+
+    def restart(self, view: View, T_world_camera: np.ndarray) -> None:
+        """The camera was found at `T_world_camera` [4, 4] by other means; the frames remembered are of elsewhere."""
+        self.velocity, self.lost = np.eye(4), False
+        self.T_world_camera = view.T_world_camera = T_world_camera
+        self.views, self.reference_view, self.reference = [], None, None
+
+    def move(self, T_new_old: np.ndarray) -> None:
+        """The world about the camera was moved by a correction [4, 4]."""
+        self.T_world_camera = orthonormalized(T_new_old @ self.T_world_camera)
+        for view in {id(v): v for v in (*self.views, self.reference_view) if v is not None}.values():
+            view.T_world_camera = T_new_old @ view.T_world_camera
+        self.reference = None
+
+    def remember(self, view: View, points: PointSource, settings: TrackerSettings) -> None:
+        """Keeps the last located frames for feature matching, and a not too distant one for its grey values."""
+        self.views = [view, *self.views[: settings.recovery.views - 1]]
+        if self.reference_view is None or self._is_far(self.reference_view, view, points, settings.photometric):
+            self.reference_view, self.reference = view, None
+
+    @staticmethod
+    def _is_far(reference: View, view: View, points: PointSource, settings: PhotometricSettings) -> bool:
+        moved, turned = separation(reference.T_world_camera, view.T_world_camera)
+        return moved > settings.renew_translation * points.median_depth or turned > settings.renew_rotation_deg
