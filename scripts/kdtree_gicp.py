@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ggslam.localization.localizer import LocalizationStatus, Tracked
+from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
 from ggslam.localization.surface import load_surface
 from ggslam.scene.poses import inverse, orthonormalized, se3_exp
 from ggslam.submaps.cell_keys import CellKey
@@ -92,17 +92,17 @@ class TreeTracker:
     def __init__(self, T_world_sensor: np.ndarray) -> None:
         self._pose, self._velocity = np.array(T_world_sensor, float), np.eye(4)
 
-    def track(self, item: np.ndarray, surface: TreeSurface, target: TreeTarget) -> Tracked:
+    def track(self, item: np.ndarray, surface: TreeSurface, target: TreeTarget) -> FrontEndResult:
         """See `FrontEnd`."""
         points = scan_points(item, ScanSettings()).points.astype(np.float64)
         T, overlap, rmse = aligned(points, target, self._pose @ self._velocity)
         if overlap < _MIN_OVERLAP:
             self._velocity = np.eye(4)
-            return Tracked(self._pose.copy(), LocalizationStatus.LOST, overlap, rmse, "too few matches")
+            return FrontEndResult(self._pose.copy(), LocalizationStatus.LOST, overlap, rmse, "too few matches")
         self._velocity, self._pose = inverse(self._pose) @ T, T
-        return Tracked(T.copy(), LocalizationStatus.OK, overlap, rmse)
+        return FrontEndResult(T.copy(), LocalizationStatus.OK, overlap, rmse)
 
-    def look_up(self, item: np.ndarray, surface: TreeSurface) -> Tracked | None:
+    def look_up(self, item: np.ndarray, surface: TreeSurface) -> FrontEndResult | None:
         """See `FrontEnd`."""
         return None
 

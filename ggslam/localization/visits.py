@@ -14,8 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from ggslam.features.orb import View
-from ggslam.localization.places import PLACES, StoredView, places_to_bytes, stored_views
+from ggslam.features.orb import FeatureView
+from ggslam.localization.places import PLACES, StoredView, stored_places_to_bytes, stored_views
 from ggslam.localization.scans import LaserScan
 from ggslam.localization.surface import NORMAL, packed_normals, surface_normals
 from ggslam.loops.places import PlaceIndex
@@ -87,7 +87,7 @@ class FrameSights:
         """What a frame adds."""
         self._noise = self._noise or estimate_noise(item.depth, self.camera)
         found = extract_points(item.depth, self.camera, self._settings, self._noise or DepthNoise(), self._context)
-        place = self._places.describe(View(item.color, item.depth, T_world_sensor))
+        place = self._places.describe(FeatureView(item.color, item.depth, T_world_sensor))
         normals = found.normals @ T_world_sensor[:3, :3].T
         small = item.depth[::_STEP, ::_STEP].copy()
         looked_at = partial(_in_view, small, self.camera, inverse(T_world_sensor))
@@ -171,7 +171,7 @@ class VisitRecorder:
         camera, parts, counts = self._sights.camera, {}, {}
         if views and camera is not None:
             views = [*self._earlier_views(gathered.key, camera), *views][-_MOST_VIEWS:]
-            parts, counts = {PLACES: places_to_bytes(views, camera)}, {PLACES: len(views)}
+            parts, counts = {PLACES: stored_places_to_bytes(views, camera)}, {PLACES: len(views)}
         # The cell's time is that of the last sight: T counts from then on.
         key = self._recorder.record(
             gathered.T_world_sensor, np.concatenate([points, left]), gathered.timestamp,

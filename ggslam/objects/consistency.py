@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ggslam.objects.overlap import Overlap
+from ggslam.objects.overlap import SegmentOverlap
 
 _MIN_PIXELS = 20
 _MIN_CHANGE = 0.02
@@ -30,7 +30,7 @@ class ConsistencyJudge:
         self._agreement: list[float] = []
         self._previous: np.ndarray | None = None
 
-    def observe(self, segments: np.ndarray, overlap: Overlap) -> bool | None:
+    def observe(self, segments: np.ndarray, overlap: SegmentOverlap) -> bool | None:
         """Takes one keyframe into account; returns the verdict.
 
         Args:
@@ -62,7 +62,7 @@ class ConsistencyJudge:
             self.consistent = sum(recent) / len(recent) >= (_AGREE + _DISAGREE) / 2
 
 
-def agreement_of(overlap: Overlap) -> float | None:
+def agreement_of(overlap: SegmentOverlap) -> float | None:
     """How well ids agree with the map's, 0 to 1 = as well as their best renaming; None: nothing to compare."""
     shared = overlap.shared
     seen = shared.sum(1) >= _MIN_PIXELS

@@ -19,9 +19,9 @@ import torch
 from scipy.spatial import cKDTree
 
 from ggslam.objects.hole_refinement import Recorded, refine
-from ggslam.objects.hole_views import HoleView, View, look, looked_again
+from ggslam.objects.hole_views import HoleView, MapView, look, looked_again
 from ggslam.objects.plane_filling import as_seen, cover, find_hole, make_chart, overlapped, paint
-from ggslam.objects.rim_planes import RimPlane, find_planes, rim_points
+from ggslam.objects.rim_planes import RimPlane, find_rim_planes, rim_points
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.segmented_rows import copies_of
 from ggslam.objects.traces import drop_traces, places
@@ -70,7 +70,7 @@ class Filling:
 def inpaint(
     scene: SegmentedMap,
     removed: GaussianTensors,
-    views: Sequence[View],
+    views: Sequence[MapView],
     ignored: Sequence[int] = (),
     recorded: Callable[[int], Recorded] | None = None,
     settings: InpaintSettings | None = None,
@@ -95,7 +95,7 @@ class _Hole:
     """One hole while it is closed. New Gaussians are the last rows of the map."""
 
     def __init__(
-        self, scene: SegmentedMap, removed: GaussianTensors, views: Sequence[View], ignored: Sequence[int],
+        self, scene: SegmentedMap, removed: GaussianTensors, views: Sequence[MapView], ignored: Sequence[int],
         settings: InpaintSettings,
     ) -> None:  # fmt: skip
         self.scene, self.removed, self.views, self.settings = scene, removed, views, settings
@@ -129,7 +129,7 @@ class _Hole:
 
     def _continue_planes(self, views: Sequence[HoleView]) -> int:
         cameras = np.array([v.view.position for v in views])
-        planes = find_planes(*rim_points(views), cameras, self.settings.plane_tolerance_m)
+        planes = find_rim_planes(*rim_points(views), cameras, self.settings.plane_tolerance_m)
         kept = copies_of(self.scene.gaussians, self.surroundings())
         focal = float(np.median([v.view.camera.fx for v in views]))
         patches = []

@@ -26,7 +26,7 @@ class MapView:
 
 
 @dataclass(frozen=True)
-class Overlap:
+class SegmentOverlap:
     """Pixels that segments of a keyframe share with objects of the map.
 
     Attributes:
@@ -72,7 +72,7 @@ def same_surface(view: MapView, depth: np.ndarray, settings: AssociationSettings
     return (view.depth > 0) & ((depth <= 0) | (np.abs(view.depth - depth) < tolerance))
 
 
-def overlap_of(segments: np.ndarray, view: MapView, depth: np.ndarray, settings: AssociationSettings) -> Overlap:
+def overlap_of(segments: np.ndarray, view: MapView, depth: np.ndarray, settings: AssociationSettings) -> SegmentOverlap:
     """Counts the pixels that `segments` (uint16 [H, W]) and the objects of `view` share."""
     known = same_surface(view, depth, settings) & (view.confidence >= settings.min_confidence)
     segment_ids, row = numbered(segments)
@@ -82,4 +82,4 @@ def overlap_of(segments: np.ndarray, view: MapView, depth: np.ndarray, settings:
     pairs = row[both].astype(np.int64) * shape[1] + column[both]
     shared = np.bincount(pairs, minlength=shape[0] * shape[1]).reshape(shape)
     area = np.bincount(row[row >= 0], minlength=shape[0])
-    return Overlap(segment_ids, object_ids, shared, area, row, column)
+    return SegmentOverlap(segment_ids, object_ids, shared, area, row, column)

@@ -67,7 +67,7 @@ def rim_points(views: Sequence[HoleView]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(points)[pick], np.concatenate(normals)[pick]
 
 
-def find_planes(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, tolerance: float) -> list[RimPlane]:
+def find_rim_planes(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, tolerance: float) -> list[RimPlane]:
     """Planes that many points lie on, the largest first.
 
     Args:

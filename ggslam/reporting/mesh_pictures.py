@@ -9,7 +9,7 @@ import numpy as np
 
 from ggslam.interface.core.rendering import MeshPictureInput
 from ggslam.native.loader import NativeContext, load_library
-from ggslam.reporting.cloud_pictures import View
+from ggslam.reporting.cloud_pictures import CloudView
 from ggslam.scene.poses import inverse
 
 _BACKGROUND = 255
@@ -18,7 +18,7 @@ _AMBIENT = 0.35
 
 
 def draw_mesh(
-    vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray, colors: np.ndarray, view: View,
+    vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray, colors: np.ndarray, view: CloudView,
     cull: bool = True, near: float = 0.05, context: NativeContext | None = None,
 ) -> np.ndarray:  # fmt: skip
     """A picture, uint8 [H, W, 3], of a mesh lit from the camera; white where there is none.

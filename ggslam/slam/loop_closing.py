@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ggslam.features.orb import View
+from ggslam.features.orb import FeatureView
 from ggslam.loops.activity import ActiveKeyframes, ActivitySettings
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.loops.pose_graph import PoseGraph
@@ -149,14 +149,14 @@ class LoopCloser:
         than to compute on the CPU until then."""
         if self._helper is None:
             self._helper = ThreadPoolExecutor(1, thread_name_prefix="places")
-        view = View(frame.color, frame.depth, np.eye(4))
+        view = FeatureView(frame.color, frame.depth, np.eye(4))
         self._begun = frame.index, self._helper.submit(self.places.describe, view)
 
     def _described(self, frame: Frame, T_world_camera: np.ndarray) -> Place:
         begun, self._begun = self._begun, None
         if begun is not None and begun[0] == frame.index:
             return begun[1].result()
-        return self.places.describe(View(frame.color, frame.depth, T_world_camera))
+        return self.places.describe(FeatureView(frame.color, frame.depth, T_world_camera))
 
     def add(self, frame: Frame, tracking: TrackingResult) -> Correction | None:
         """A keyframe was made of a frame, and its points are in the surface. Puts aside and takes back keyframes.
@@ -289,7 +289,7 @@ class LoopCloser:
         return result
 
     def _found_among(self, frame: Frame, lost: TrackingResult) -> tuple[TrackingResult, int] | None:
-        view = View(frame.color, frame.depth, lost.T_world_camera)
+        view = FeatureView(frame.color, frame.depth, lost.T_world_camera)
         place = self.places.describe(view)
         for match in self.places.query(place, self.settings.candidates):
             found, alignment = self._verify(lost.points, place, match.number)

@@ -37,7 +37,7 @@ from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.paging_settings import PagingSettings
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.system.interrupts import uninterrupted
+from ggslam.system.interrupts import delay_interrupts
 
 MEASURED_AFTER = 3
 """Keyframes after which the program's own need is measured: by then every part of it has run."""
@@ -197,7 +197,7 @@ class MapPager:
         if self.cells is None:
             return
         moved = np.flatnonzero(np.abs(T_new_old - np.eye(4)).max((1, 2)) > 0).tolist()
-        with uninterrupted():
+        with delay_interrupts():
             self.cells.change(lambda gaussians: move_with_keyframes(gaussians, T_new_old), moved)
 
     def bring_ends(self, kept: Iterable[int]) -> None:
@@ -224,7 +224,7 @@ class MapPager:
         if self.cells is None:
             return None
         self.prune_nowhere()
-        with uninterrupted():
+        with delay_interrupts():
             self.cells.move_out(self.map, self.cells.cells_of(self.map))
         self.map.shrink(0)
         self.archive.limit = 0
@@ -295,7 +295,7 @@ class MapPager:
         if self.cells is None or not keys:
             return
         begin = len(self.map)
-        with uninterrupted():
+        with delay_interrupts():
             rows = self.cells.move_in(self.map, keys)
         self.moved_in += rows.stop - begin
         self.most_resident = max(self.most_resident, len(self.map))
@@ -333,7 +333,7 @@ class MapPager:
                 "view of one keyframe: the limit will be exceeded (a larger memory_limit_mb, a smaller `scale` or "
                 "paging.view_range helps)"
             )
-        with uninterrupted():
+        with delay_interrupts():
             self.moved_out += cells.move_out(self.map, chosen) if chosen else 0
         self._trainable = None
 

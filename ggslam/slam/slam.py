@@ -35,7 +35,7 @@ from ggslam.slam.loop_closing import Correction, LoopCloser
 from ggslam.slam.object_masks import ObjectMasks, observations
 from ggslam.slam.parts import device_name, make_mapper, make_pager, make_tracker, run_library
 from ggslam.slam.result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
-from ggslam.slam.saved_places import places_to_bytes
+from ggslam.slam.saved_places import saved_places_to_bytes
 from ggslam.slam.step_log import StepLog
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.tracking.keyframes import KeyframePolicy
@@ -213,7 +213,7 @@ class Slam:
         parts = [gaussians] if cells is None else (part for _, part in cells.parts())
         poses = np.stack([k.T_world_camera for k in self.mapper.keyframes])
         noise = self.tracker.noise or DepthNoise()
-        return places_to_bytes(self.camera, self.surface, self.loops, noise, self.scale, poses, parts)
+        return saved_places_to_bytes(self.camera, self.surface, self.loops, noise, self.scale, poses, parts)
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, for a run that has no result."""

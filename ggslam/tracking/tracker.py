@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.features.orb import View
+from ggslam.features.orb import FeatureView
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -164,7 +164,7 @@ class Tracker(ABC):
         """Moves the tracker's own pose, after the world about it was moved by a correction [4, 4]."""
         self.state.motion.move(T_new_old)
 
-    def relocate(self, view: View, points: PointSource, found: AlignmentResult, source: str) -> TrackingResult:
+    def relocate(self, view: FeatureView, points: PointSource, found: AlignmentResult, source: str) -> TrackingResult:
         """A frame that was lost was located by other means; tracking goes on from there.
 
         Args:
@@ -178,7 +178,7 @@ class Tracker(ABC):
         motion.remember(view, points, self.settings)
         return TrackingResult(T.copy(), TrackingStatus.RECOVERED, found.overlap, found.rmse, source, points, found)
 
-    def _begin(self, view: View, points: PointSource) -> TrackingResult:
+    def _begin(self, view: FeatureView, points: PointSource) -> TrackingResult:
         """Before the first keyframe: the pose is given, and all a frame needs is depth to begin with."""
         motion, needed = self.state.motion, self.settings.align.min_matches
         if len(points) < needed:

@@ -14,7 +14,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.volumes.fusion_view import FusionView
 from ggslam.volumes.settings import TsdfSettings
-from ggslam.volumes.torch_candidates import NEAR, Candidates, DepthView, find_candidates
+from ggslam.volumes.torch_candidates import NEAR, BlockCandidates, DeviceView, find_candidates
 from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, MOST_VOXELS, SIDE, VOXELS, TsdfMap
 
 _SURPRISE = 0.5
@@ -100,7 +100,7 @@ class TorchTsdf:
         T = torch.from_numpy(checked.T_camera_world).to(self.device)
         depth_image = torch.from_numpy(checked.depth).to(self.device)
         in_range = (depth_image >= s.min_depth) & (depth_image <= s.max_depth)
-        view = DepthView(torch.where(in_range, depth_image, 0), camera, T[:3, :3], T[:3, 3])
+        view = DeviceView(torch.where(in_range, depth_image, 0), camera, T[:3, :3], T[:3, 3])
         found = find_candidates(view, SIDE * s.voxel, s.truncation, s.free_share)
         keys = _keys(found.coordinates)
         dense_row, free_row = _rows(self._dense, keys), _rows(self._free, keys)
@@ -120,7 +120,7 @@ class TorchTsdf:
         told = torch.where(free_row[new] < 0, (voxels.weight > 0).any(1)[int(old.sum()) :], in_band[int(old.sum()) :])
         self._keep(voxels, dense_row[old], keys[new], told)
 
-    def _note_free(self, found: Candidates, keys: Tensor, dense_row: Tensor, free_row: Tensor) -> None:
+    def _note_free(self, found: BlockCandidates, keys: Tensor, dense_row: Tensor, free_row: Tensor) -> None:
         free = found.free & (dense_row < 0)
         scale = FULL_WEIGHT / self.settings.max_weight
         measured = (scale / found.z[free] ** 2 + 0.5).floor().long()
@@ -186,7 +186,7 @@ def _rows(table: Tensor, keys: Tensor) -> Tensor:
 
 
 def _fuse(
-    voxels: Voxels, at: Tensor, view: DepthView, s: TsdfSettings, color: Tensor | None, labels: Tensor | None
+    voxels: Voxels, at: Tensor, view: DeviceView, s: TsdfSettings, color: Tensor | None, labels: Tensor | None
 ) -> Tensor:
     """Updates the voxels of blocks at coordinates [n, 3]; returns whether any came within the truncation, [n]."""
     distance, z, pixel = _distances(at, view, s)
@@ -225,7 +225,7 @@ def _round(values: Tensor) -> Tensor:
     return (values + 0.5).floor()
 
 
-def _distances(at: Tensor, view: DepthView, s: TsdfSettings) -> tuple[Tensor, Tensor, Tensor]:
+def _distances(at: Tensor, view: DeviceView, s: TsdfSettings) -> tuple[Tensor, Tensor, Tensor]:
     """Distance of voxels along the optical axis (-inf: unknown), their z, and the nearest pixel (0: none); [n, 512]."""
     device, c = at.device, view.camera
     side = torch.arange(SIDE, device=device, dtype=torch.float64)
@@ -242,7 +242,7 @@ def _distances(at: Tensor, view: DepthView, s: TsdfSettings) -> tuple[Tensor, Te
     return torch.where(inside & (nearest > 0), depth - z, -torch.inf), safe, pixel
 
 
-def _interpolate(view: DepthView, inside: Tensor, u: Tensor, v: Tensor, nearest: Tensor, s: TsdfSettings) -> Tensor:
+def _interpolate(view: DeviceView, inside: Tensor, u: Tensor, v: Tensor, nearest: Tensor, s: TsdfSettings) -> Tensor:
     """Depth between the four pixels around (u, v), where they are all there and differ little; else the nearest."""
     height, width = view.depth.shape
     inside = inside & (u >= 0) & (u < width - 1) & (v >= 0) & (v < height - 1)

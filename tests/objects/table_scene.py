@@ -10,7 +10,7 @@ import torch
 
 from ggslam.mapping.cpu.insertion import new_gaussians, unexplained
 from ggslam.mapping.settings import InsertionSettings
-from ggslam.objects.hole_views import View
+from ggslam.objects.hole_views import MapView
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.rendering.cpu import CpuRasterizer
@@ -31,7 +31,7 @@ class TableScene:
     """The map, its views, and the images with and without the cylinder, in the order of the views."""
 
     scene: SegmentedMap
-    views: list[View]
+    views: list[MapView]
     images: list[RayImages]
     truth: list[RayImages]
 
@@ -94,5 +94,5 @@ def build_table_scene() -> TableScene:
     voted[:, 0] = gaussians.object_id.numpy()
     votes = ObjectVotes(voted, (voted > 0).astype(np.float32))
     table = ObjectTable.build(gaussians, classifier, "masks", names)
-    views = [View(CAMERA, inverse(pose), number) for number, pose in enumerate(poses)]
+    views = [MapView(CAMERA, inverse(pose), number) for number, pose in enumerate(poses)]
     return TableScene(SegmentedMap(gaussians, classifier, table, votes), views, images, truth)

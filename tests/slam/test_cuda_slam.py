@@ -51,6 +51,7 @@ def run(frames: list[Frame], settings: Config, library: CudaLibrary | None) -> t
     return slam, slam.finish()
 
 
+@pytest.mark.long("the whole loop under emulation")
 def test_same_run_as_on_the_cpu(frames: list[Frame], cuda_library: CudaLibrary) -> None:
     """Without identity nothing is drawn at random: map and trajectory are the CPU's up to rounding."""
     settings = config("identity.enabled=false", "keyframes.max_gap=2")
@@ -64,6 +65,7 @@ def test_same_run_as_on_the_cpu(frames: list[Frame], cuda_library: CudaLibrary) 
     assert found.gaussians.means.device.type == "cpu"
 
 
+@pytest.mark.long("the whole loop under emulation")
 def test_objects_are_learned(frames: list[Frame], cuda_library: CudaLibrary) -> None:
     _, found = run(frames, config(), cuda_library)
     _, expected = run(frames, config(), None)

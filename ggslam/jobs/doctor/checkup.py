@@ -276,10 +276,10 @@ def _self_test() -> Iterator[Finding]:
     from ggslam.jobs.doctor.self_test import checks
 
     for name, check in checks().items():
-        yield _tested(name, check)
+        yield _test(name, check)
 
 
-def _tested(name: str, check: Callable[[], str]) -> Finding:
+def _test(name: str, check: Callable[[], str]) -> Finding:
     start = time.perf_counter()
     try:
         detail = check()

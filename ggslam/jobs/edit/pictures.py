@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ggslam.objects.editing import Change
-from ggslam.objects.hole_views import COVERED, View, marked
+from ggslam.objects.hole_views import COVERED, MapView, marked
 from ggslam.objects.segmented_rows import joined
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import Gaussians
-from ggslam.reporting.pictures import color_to_uint8, compare
+from ggslam.reporting.pictures import color_to_uint8, compare_pictures
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -44,7 +44,7 @@ def before_and_after(
     poses = record.poses()
     numbers = np.array(sorted(poses))
     looked_at = numbers[np.unique(np.linspace(0, len(numbers) - 1, _LOOKED_AT).round().astype(int))]
-    views = [View(camera, inverse(poses[frame]), frame) for frame in looked_at.tolist()]
+    views = [MapView(camera, inverse(poses[frame]), frame) for frame in looked_at.tolist()]
     before, after = (joined([getattr(c, name) for c in visible]) for name in ("before", "after"))
     areas = _areas(original, before, views) + _areas(edited, after, views)
     pictures, rasterizer = {}, CpuRasterizer()
@@ -55,11 +55,11 @@ def before_and_after(
             depth = np.where(out.alpha.numpy() > 0.5, out.expected_depth.numpy(), 0)
             images.append((color_to_uint8(out.image.numpy()), depth))
         (color, depth), (new_color, new_depth) = images
-        pictures[f"edit{looked_at[number]:06d}.png"] = compare(color, new_color, depth, new_depth)
+        pictures[f"edit{looked_at[number]:06d}.png"] = compare_pictures(color, new_color, depth, new_depth)
     return pictures
 
 
-def _areas(gaussians: Gaussians, part: Gaussians, views: Sequence[View]) -> np.ndarray:
+def _areas(gaussians: Gaussians, part: Gaussians, views: Sequence[MapView]) -> np.ndarray:
     """Pixels of each view in which `part` of a map is seen."""
     if not len(part.means):
         return np.zeros(len(views), int)

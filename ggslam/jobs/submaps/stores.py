@@ -13,7 +13,7 @@ import numpy as np
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.raw_points import read_raw_points
-from ggslam.localization.places import PLACES, StoredView, places_to_bytes
+from ggslam.localization.places import PLACES, StoredView, stored_places_to_bytes
 from ggslam.localization.surface import NORMAL
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.runs.folder import RunFolder
@@ -185,7 +185,7 @@ def _views(arrays: Mapping[str, np.ndarray]) -> tuple[list[StoredView], Camera]:
 def _place_parts(store: GridStore, views: list[StoredView], camera: Camera) -> Iterator[CellWrite]:
     positions = np.array([view.T_world_camera[:3, 3] for view in views]).reshape(-1, 3)
     for key, indices in partition(positions, store.grid):
-        data = places_to_bytes([views[i] for i in indices.tolist()], camera)
+        data = stored_places_to_bytes([views[i] for i in indices.tolist()], camera)
         yield CellWrite(key, {PLACES: data}, counts={PLACES: len(indices)})
 
 

@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
 from ggslam.jobs.run.pipeline import Follower, RunOutcome
-from ggslam.jobs.view.viewing import LivePage, live_page
+from ggslam.jobs.view.serve import LivePage, live_page
 from ggslam.jobs.watch.rerun_follower import LiveLog
 from ggslam.reporting.rerun_log import RerunLog
 from ggslam.scene.frame import Frame
@@ -44,7 +44,7 @@ class Watching:
 
 
 @contextmanager
-def watching(log: str | None, page: tuple[str, int] | None, name: str) -> Iterator[Watching]:
+def watch_run(log: str | None, page: tuple[str, int] | None, name: str) -> Iterator[Watching]:
     """Opens what was asked for, and closes it at the end.
 
     Args:

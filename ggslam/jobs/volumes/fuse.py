@@ -21,7 +21,7 @@ from ggslam.runs.recordings import SequenceRequest
 from ggslam.scene.frame import Frame
 from ggslam.slam.config import Config, config_to_dict, load_config
 from ggslam.system.atomic import make_folder
-from ggslam.system.interrupts import uninterrupted
+from ggslam.system.interrupts import delay_interrupts
 from ggslam.volumes.maps import WINDOW, VolumeMaps
 from ggslam.volumes.tsdf_file import load_tsdf
 from ggslam.volumes.volume_settings import VolumeSettings
@@ -143,7 +143,7 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
     _check(request, is_run)
     config = _config(request)
     onto = None if request.onto is None else load_tsdf(request.onto)
-    maps = VolumeMaps(_paced(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
+    maps = VolumeMaps(_set_pace(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
     if request.live:
         fused = _live(request, maps, observer)
         out = Path(fused.name) / "volumes"
@@ -157,7 +157,7 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
         fused = _fuse(source, maps, observer)
     if not fused.poses:
         raise fused.error if fused.error is not None else SequenceError(f"{request.source}: no frame could be fused")
-    with uninterrupted():
+    with delay_interrupts():
         maps.finish()
         if not len(maps.tsdf):
             limits = config.volumes.tsdf
@@ -182,7 +182,7 @@ def _config(request: VolumesRequest) -> Config:
     return replace(config, volumes=replace(config.volumes, tsdf=tsdf))
 
 
-def _paced(settings: VolumeSettings, request: VolumesRequest) -> VolumeSettings:
+def _set_pace(settings: VolumeSettings, request: VolumesRequest) -> VolumeSettings:
     """The settings with the pace of the distance field."""
     with_each = (request.live or request.latency) and settings.esdf_every == 0
     return replace(settings, esdf_every=1) if with_each else settings

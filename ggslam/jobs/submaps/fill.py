@@ -98,12 +98,12 @@ def make_store(request: SubmapsRequest, observer: Observer) -> None:
         raise ConfigError(f"{source}: is a grid store already; `out` wants a run, a cloud or a recording")
     if is_cloud(source) and not source.is_file():
         raise FormatError(f"cannot read {source}: no such file")
-    recording = None if is_cloud(source) or (source / MARKER).is_file() else _opened(request)
+    recording = None if is_cloud(source) or (source / MARKER).is_file() else _open(request)
     with open_or_create(request.store, _settings(request)) as store:
         if recording is not None:
             items, poses, sights = recording
             observer.begin("record", len(poses))
-            watched = _watched(items, observer, len(poses))
+            watched = _with_progress(items, observer, len(poses))
             written = record_visit(store, watched, poses, sights, request.visit or source.resolve().name, request.at)
             observer.note(f"{len(written)} cells written")
         elif is_cloud(source):
@@ -156,7 +156,7 @@ def _settings(request: SubmapsRequest) -> SubmapSettings:
     return replace(base, **request.settings)
 
 
-def _opened(
+def _open(
     request: SubmapsRequest,
 ) -> tuple[Iterator[Frame | LaserScan], np.ndarray, FrameSights | ScanSights]:
     """Items, their poses and what takes sights from them."""
@@ -189,7 +189,7 @@ def _poses(request: SubmapsRequest, timestamps: np.ndarray, own: np.ndarray | No
     return poses
 
 
-def _watched(items: Iterator[Frame | LaserScan], observer: Observer, total: int) -> Iterator[Frame | LaserScan]:
+def _with_progress(items: Iterator[Frame | LaserScan], observer: Observer, total: int) -> Iterator[Frame | LaserScan]:
     for done, item in enumerate(items, 1):
         yield item
         observer.advance(done, total)

@@ -21,7 +21,7 @@ from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.score.objects import ObjectScorer
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.reporting.pictures import color_to_uint8, compare, write_picture
+from ggslam.reporting.pictures import color_to_uint8, compare_pictures, write_picture
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.runs.records.keyframes import KeyframesRecord
@@ -72,7 +72,7 @@ def score_run(
         notes.append("no frame was held out; every score is over frames that the map was or could be trained on")
     if len(poses) and max(poses) + 1 < len(sequence):
         notes.append(f"the run ends at frame {max(poses)} of {len(sequence)}; scores are of its part")
-    lost = [f.frame for f in record.frames if f.lost]
+    lost = [f.frame for f in record.frames if f.is_lost]
     if lost:
         notes.append(f"{len(lost)} frames were lost (the first: {lost[0]}); they have no pose and are in no score")
     if metrics.trajectory is None:
@@ -191,7 +191,7 @@ def _shower(
         if scorer is not None:
             row = scorer.add(frame, rasterizer, view, T_camera_world, frame.index in pictured)
         if frame.index in pictured:
-            picture = compare(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth, row)
+            picture = compare_pictures(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth, row)
             write_picture(folder.path / "renders" / f"compare{frame.index:06d}.png", picture)
         return color, depth
 

@@ -29,7 +29,7 @@ from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.sequences.sequence import Sequence
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.system.interrupts import uninterrupted
+from ggslam.system.interrupts import delay_interrupts
 from ggslam.tracking.settings import TargetSettings, TrackerSettings
 
 GIVEN = "given"
@@ -110,7 +110,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
             str(request.map), str(request.sequence.path), request.full, recording.timestamps[: len(results)], results,
             None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
         )  # fmt: skip
-    with uninterrupted():
+    with delay_interrupts():
         write_localization(report, out, observer)
     if error is not None:
         observer.note(f"stopped after {len(results)} of {len(recording)} frames, which are in {out}")
@@ -157,7 +157,7 @@ def _store_in_run(path: Path, observer: Observer) -> GridStore:
     return GridStore.open(cells)
 
 
-def parsed_pose(text: str) -> np.ndarray:
+def parse_pose(text: str) -> np.ndarray:
     """T_world_sensor of "x y z qx qy qz qw". Raises ConfigError for anything else."""
     try:
         numbers = np.array([float(word) for word in text.replace(",", " ").split()])
@@ -185,7 +185,7 @@ def _start(request: LocalizeRequest, truth: np.ndarray | None) -> np.ndarray | N
     if request.start_pose is None:
         return None
     if request.start_pose != GIVEN:
-        return parsed_pose(request.start_pose)
+        return parse_pose(request.start_pose)
     if truth is None or not np.isfinite(truth[0]).all():
         raise SequenceError(f"{request.sequence.path}: `start_pose` {GIVEN}: the first frame has no pose")
     return truth[0]

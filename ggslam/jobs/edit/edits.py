@@ -28,7 +28,7 @@ from ggslam.objects.editing import (
     rename_object,
 )
 from ggslam.objects.hole_refinement import Recorded
-from ggslam.objects.hole_views import View
+from ggslam.objects.hole_views import MapView
 from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
 from ggslam.objects.recoloring import parse_color
 from ggslam.objects.segmented_map import SegmentedMap
@@ -40,7 +40,7 @@ from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
-from ggslam.system.interrupts import uninterrupted
+from ggslam.system.interrupts import delay_interrupts
 
 KINDS = ("remove", "keep", "move", "duplicate", "recolor", "merge", "rename")
 
@@ -120,7 +120,7 @@ def edit_run(
     target = _target(folder, out, in_place)
     source = _Source.of(folder)
     notes: list[str] = []
-    recording = _recorded(folder, sequence, notes) if inpainting else None
+    recording = _open_recording(folder, sequence, notes) if inpainting else None
     scene, original = folder.segmented_map(), folder.gaussians()
     changes = _apply_all(scene, edits, source.displacement)
     if in_place:
@@ -131,7 +131,7 @@ def edit_run(
         outcome.filling = _mend(source, scene, recording, settings or InpaintSettings() if inpainting else None, notes)
         pictures = before_and_after(original, scene.gaussians, changes, source.camera, source.keyframes)
         named_only = all(edit.kind == "rename" for edit in edits)
-        with uninterrupted():
+        with delay_interrupts():
             outcome.pictures = save_edited(
                 folder, written, scene, outcome.changes, source.displacement, pictures, named_only, sequence
             )
@@ -168,7 +168,7 @@ class _Source:
 
     camera: Camera
     keyframes: KeyframesRecord
-    views: list[View]
+    views: list[MapView]
     displacement: Displacement
 
     @staticmethod
@@ -185,7 +185,7 @@ class _Source:
             raise RunFolderError(f"{folder.path / record.FILE}: it lists no keyframes or no tracked frames")
         # Keyframes of the map that the run began with have no images here.
         views = [
-            View(camera, inverse(k.T_world_camera), None if k.frame == ELSEWHERE else k.frame)
+            MapView(camera, inverse(k.T_world_camera), None if k.frame == ELSEWHERE else k.frame)
             for k in record.keyframes
         ]  # fmt: skip
         return _Source(camera, record, views, displacement)
@@ -198,14 +198,14 @@ def _apply_all(scene: SegmentedMap, edits: Sequence[Edit], displacement: Displac
         try:
             changes.append(apply_edit(scene, edit))
         except ConfigError as error:
-            if changes and set(_named(original, edit)) - set(scene.table.ids()):
+            if changes and set(_ids_of(original, edit)) - set(scene.table.ids()):
                 raise ConfigError(f"`{edit.kind}` {edit.objects}: an earlier edit left none of it: {error}") from None
             raise
         displacement.follow(changes[-1], scene)
     return changes
 
 
-def _named(table: ObjectTable, edit: Edit) -> list[int]:
+def _ids_of(table: ObjectTable, edit: Edit) -> list[int]:
     """Ids of an edit's objects by a table; none if it knows them not."""
     try:
         return table.select(edit.objects)
@@ -278,7 +278,7 @@ def _mend(
     return filling
 
 
-def _recorded(folder: RunFolder, sequence: Path | None, notes: list[str]) -> Callable[[int], Recorded] | None:
+def _open_recording(folder: RunFolder, sequence: Path | None, notes: list[str]) -> Callable[[int], Recorded] | None:
     """Gives the images of a frame; None if the recording is not where the run had it.
 
     Raises:

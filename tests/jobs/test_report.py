@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from test_run_page import checked
 from typer.testing import CliRunner
 
 from ggslam.cli.main import app
@@ -17,13 +17,10 @@ from ggslam.errors import FormatError, RunFolderError
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.report.gather import load_run
 from ggslam.jobs.report.pages import write_comparison, write_report
-from ggslam.jobs.score.scoring import score_run
+from ggslam.jobs.score.run import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.slam.step_log import COLUMNS, read_table
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "jobs"))
-from test_run_page import checked  # noqa: E402
 
 
 @pytest.fixture(scope="module")
