@@ -187,12 +187,14 @@ def _read_fields(header: Header, text: str) -> list[tuple[str, str]]:
         if base is None:
             raise HeaderError(f"{header.path}: there is no mirror of the field {statement!r}")
         for declarator in statement[base.end() :].split(","):
-            found = re.fullmatch(r"\s*(\**)\s*(?:const )?(\w+)(?:\[([^\]]+)\])?\s*", declarator)
+            found = re.fullmatch(r"\s*(\**)\s*(?:const )?(\w+)((?:\[[^\]]+\])*)\s*", declarator)
             if found is None:
                 raise HeaderError(f"{header.path}: there is no mirror of the field {statement!r}")
-            stars, name, length = found.groups()
+            stars, name, lengths = found.groups()
             kind = "c_void_p" if stars else _value_type(header, base[2])
-            fields.append((name, f"{kind} * {header.evaluate(length)}" if length else kind))
+            for length in reversed(re.findall(r"\[([^\]]+)\]", lengths)):
+                kind += f" * {header.evaluate(length)}"
+            fields.append((name, kind))
     return fields
 
 

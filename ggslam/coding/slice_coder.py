@@ -9,9 +9,21 @@ from functools import lru_cache
 
 import numpy as np
 
-from ggslam.coding.syntax import AttributeParameters, GeometryParameters
+from ggslam.coding.attribute_syntax import RAHT, RAW
+from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
+from ggslam.coding.native_settings import (
+    AttributePayload,
+    CodingContext,
+    detail_settings,
+    layer_qps,
+    octree_settings,
+    predictive_settings,
+    raht_settings,
+    tree_settings,
+)
+from ggslam.coding.sequence_parameters import AttributeDescription
 from ggslam.errors import FormatError
-from ggslam.interface.core.codec import OctreeSettings, RahtSettings, Status
+from ggslam.interface.core.codec import RahtSettings, Status
 from ggslam.native.loader import NativeContext, load_library
 
 _REASONS = {
@@ -93,9 +105,12 @@ class SliceCoder:
         _check(self._core.ggslam_gpcc_merge(self._handle))
         self.points = self.leaves
 
-    def encode_geometry(self, parameters: GeometryParameters) -> bytes:
-        """The arithmetic payload."""
-        settings = _octree_settings(parameters, self.depth)
+    def encode_geometry(self, parameters: GeometryParameters, axes: tuple[int, ...] = ()) -> bytes:
+        """The arithmetic payload; `axes` as in the header, if the parameters have planes or partial splits."""
+        if not parameters.plain_octree:
+            tree = tree_settings(parameters, GeometryHeader(0, (0, 0, 0), axes, self.points), False)
+            return self._take(_check(self._core.ggslam_gpcc_encode_tree(self._context.handle, self._handle, tree)))
+        settings = octree_settings(parameters, self.depth)
         return self._take(
             _check(self._core.ggslam_gpcc_encode_geometry(self._context.handle, self._handle, ctypes.byref(settings)))
         )
@@ -109,21 +124,33 @@ class SliceCoder:
         return self._take(_check(size))
 
     def decode_geometry(
-        self, parameters: GeometryParameters, depth: int, payload: bytes | memoryview, points: int
-    ) -> np.ndarray:
-        """Makes the octree of a payload of `points` points; returns their positions int32 [points, 3].
+        self, parameters: GeometryParameters, header: GeometryHeader, payload: bytes | memoryview,
+        context: CodingContext | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Makes the octree of a payload; returns the positions of its points, int32 [points, 3].
 
         Raises:
             FormatError: the payload is damaged.
         """
-        settings, data = _octree_settings(parameters, depth), _bytes_view(payload)
-        _check(
-            self._core.ggslam_gpcc_decode_geometry(
-                self._context.handle, self._handle, ctypes.byref(settings), data.ctypes.data, len(data), points
-            )
-        )
-        self.points, self.depth = points, depth
+        context = context or CodingContext()
+        data, points, separate_bits = _bytes_view(payload), header.points, context.separate_bits
+        arguments = (data.ctypes.data, len(data), points)
+        handles = (self._context.handle, self._handle)
+        if parameters.predictive:
+            predictive = predictive_settings(parameters, header, separate_bits)
+            _check(self._core.ggslam_gpcc_decode_predictive(*handles, predictive, header.depth, *arguments))
+        elif parameters.plain_octree and header.codewords == 1 and not (separate_bits or context.keeps_contexts):
+            octree = octree_settings(parameters, header.depth)
+            _check(self._core.ggslam_gpcc_decode_geometry(*handles, octree, *arguments))
+        else:
+            tree = tree_settings(parameters, header, separate_bits)
+            _check(self._core.ggslam_gpcc_decode_tree(*handles, tree, header.depth, *arguments))
+        self.points, self.depth = points, header.depth
         return self.positions()
+
+    def go_on(self, before: SliceCoder) -> None:
+        """Takes over the contexts that another slice ended with."""
+        _check(self._core.ggslam_gpcc_go_on(self._handle, before._handle))
 
     def positions(self) -> np.ndarray:
         """Positions int32 [points, 3] in coding order."""
@@ -146,32 +173,54 @@ class SliceCoder:
         )  # fmt: skip
         return values
 
+    def decode_unit(
+        self, coded: AttributePayload, description: AttributeDescription, context: CodingContext
+    ) -> np.ndarray:
+        """Values int32 [points, components] of an attribute unit, by whichever transform it has.
+
+        Raises:
+            FormatError: the payload is damaged.
+        """
+        encoding = coded.parameters.encoding
+        if encoding == RAW:
+            return self._raw(coded, description)
+        index = coded.header.attribute if context.keeps_contexts else -1
+        if encoding == RAHT:
+            settings = raht_settings(
+                coded.parameters, description.components, description.bit_depth, coded.header.qp_deltas,
+                first_version=context.first_version,
+            )  # fmt: skip
+            settings.layers, settings.layer_qps = layer_qps(coded, description.bit_depth)
+            settings.separate_bits, settings.index = int(context.separate_bits), index
+            return self.decode_attribute(settings, coded.payload)
+        details = detail_settings(coded, description, context, index)
+        values, data = np.empty((self.points, description.components), np.int32), _bytes_view(coded.payload)
+        _check(
+            self._core.ggslam_gpcc_decode_details(
+                self._context.handle, self._handle, details, data.ctypes.data, len(data), values.ctypes.data
+            )
+        )
+        return values
+
+    def _raw(self, coded: AttributePayload, description: AttributeDescription) -> np.ndarray:
+        """Raw values: fixed numbers of bits, or whole bytes with their number before each."""
+        count = self.points * description.components
+        if coded.parameters.variable_length:
+            values = _variable_values(bytes(coded.payload), count)
+        else:
+            bits = np.unpackbits(_bytes_view(coded.payload), count=count * description.bit_depth)
+            if len(coded.payload) * 8 < count * description.bit_depth:
+                raise FormatError(_REASONS[2])
+            weights = 1 << np.arange(description.bit_depth - 1, -1, -1)
+            values = bits.reshape(count, -1) @ weights
+        values = np.ascontiguousarray(values.reshape(self.points, -1), np.int32)
+        _check(self._core.ggslam_gpcc_sort_values(self._handle, description.components, values.ctypes.data))
+        return values
+
     def _take(self, size: int) -> bytes:
         out = np.empty(size, np.uint8)
         self._core.ggslam_gpcc_take(self._handle, out.ctypes.data)
         return out.tobytes()
-
-
-def raht_settings(
-    parameters: AttributeParameters,
-    components: int,
-    bit_depth: int,
-    deltas: tuple[int, int] = (0, 0),
-    rdoq: float = 0.0,
-    first_version: bool = False,
-) -> RahtSettings:
-    """What the attribute coder depends on, of an attribute with these components.
-
-    Args:
-        deltas: of a slice, added to the quantiser parameters.
-        rdoq: `CodecSettings.rdoq`.
-        first_version: the stream has the first version's square roots of large weights.
-    """
-    first, others = parameters.qps(bit_depth, deltas)
-    return RahtSettings(
-        components, bit_depth, first, others, int(parameters.prediction), *parameters.thresholds,
-        int(first_version), rdoq,
-    )  # fmt: skip
 
 
 def rgb_to_ycbcr(rgb: np.ndarray, order: np.ndarray) -> np.ndarray:
@@ -191,12 +240,17 @@ def ycbcr_to_rgb(components: np.ndarray) -> np.ndarray:
     return rgb
 
 
-def _octree_settings(parameters: GeometryParameters, depth: int) -> OctreeSettings:
-    near = parameters.neighbour_boundary > 0
-    return OctreeSettings(
-        depth, parameters.neighbour_boundary, int(near and parameters.adjacent_child),
-        min(parameters.intra_prediction, 32) if near else 0, int(parameters.unique_points),
-    )  # fmt: skip
+def _variable_values(data: bytes, count: int) -> np.ndarray:
+    """Numbers of 0 to 4 bytes, each behind its length."""
+    out = np.empty(count, np.int64)
+    at = 0
+    for i in range(count):
+        length = data[at] if at < len(data) else 255
+        if length > 2 or at + 1 + length > len(data):
+            raise FormatError(_REASONS[2])
+        out[i] = int.from_bytes(data[at + 1 : at + 1 + length], "big")
+        at += 1 + length
+    return out
 
 
 def _check_values(values: np.ndarray, points: int, components: int) -> None:

@@ -43,7 +43,7 @@ def test_geometry_is_coded_byte_for_byte(gpcc_data: Path, name: str) -> None:
     """From shuffled positions of each slice, on the golden stream's own partition."""
     for units in read_stream(stream(gpcc_data, name)).slices:
         header = units.header
-        decoded = SliceCoder().decode_geometry(units.geometry, header.depth, units.payload, header.points)
+        decoded = SliceCoder().decode_geometry(units.geometry, header, units.payload)
         coder = SliceCoder()
         coder.build(np.random.default_rng(0).permutation(decoded), header.depth)
         assert coder.encode_geometry(units.geometry) == bytes(units.payload)

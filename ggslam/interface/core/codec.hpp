@@ -39,6 +39,14 @@ struct TreeSettings {
   std::uint8_t axes[64];       // by level: 4 x, 2 y, 1 z
 };
 
+// What predictive geometry depends on.
+struct PredictiveSettings {
+  std::int32_t unique_points, scaling, slice_qp, qp_shift;
+  std::int32_t qp_interval;  // points that share a quantiser
+  std::int32_t residual_bits[3];
+  std::int32_t separate_bits;
+};
+
 // What an attribute's coding by the region-adaptive hierarchical transform depends on.
 struct RahtSettings {
   std::int32_t components;   // 1 or 3
@@ -46,8 +54,29 @@ struct RahtSettings {
   std::int32_t qp, qp_secondary;  // of component 0 and of the others
   std::int32_t prediction;
   std::int32_t min_parent_neighbours, min_neighbours;  // prediction thresholds 0 and 1
+  std::int32_t layers, layer_qps[32][2];  // quantisers by level from the root; 0: qp and qp_secondary for all
+  std::int32_t separate_bits;  // bins of equal probability are a stream of their own
+  std::int32_t index;          // the attribute whose contexts a slice goes on with; negative: none does
   std::int32_t first_version;  // the stream was written by this codec when its roots of large weights were its own
   float rdoq;                // encoder: weight of a bit in dropping coefficients, 1 as the reference's; 0: none is dropped
+};
+
+// What an attribute's coding by the predicting and the lifting transform depends on.
+struct DetailSettings {
+  std::int32_t components, bit_depth, lifting;
+  std::int32_t neighbours, search_between, bias[3];
+  std::int32_t levels, canonical_order;
+  std::int32_t decimation;      // 0 by distance, 1 every n-th point, 2 by octree cubes
+  std::int32_t periods[32];     // n of each level, from the finest
+  std::int32_t first_distance;  // logarithm of the distance at the finest level
+  std::int32_t direct_predictors, direct_threshold, no_average;
+  std::int32_t search_within;   // how many points of its own level a point may be predicted from...
+  std::int32_t skip_layers;     // ...but not at so many of the finest levels
+  std::int32_t blend;
+  std::int32_t weighted;        // components take over parts of others, in quarters, by level from the coarsest
+  std::int32_t component_weights[32][2];
+  std::int32_t layers, layer_qps[32][2];  // quantisers by level from the coarsest
+  std::int32_t separate_bits, index;      // as in RahtSettings
 };
 
 // clip(floor(scale p + rounding), first, last) - first.
@@ -107,6 +136,12 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_tree(void* context, void* slice,
                                                    const ggslam::gpcc::TreeSettings* settings, std::int32_t depth,
                                                    const std::uint8_t* data, std::size_t size, std::uint32_t points);
 
+// The same by predictive geometry.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_predictive(void* context, void* slice,
+                                                         const ggslam::gpcc::PredictiveSettings* settings,
+                                                         std::int32_t depth, const std::uint8_t* data, std::size_t size,
+                                                         std::uint32_t points);
+
 // Codes the slice's points by such a tree. Returns the number of bytes.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_tree(void* context, void* slice,
                                                    const ggslam::gpcc::TreeSettings* settings);
@@ -120,6 +155,15 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_attribute(void* context, void* sli
                                                         const ggslam::gpcc::RahtSettings* settings,
                                                         const std::uint8_t* data, std::size_t size,
                                                         std::int32_t* attributes);
+
+// The same by the predicting or the lifting transform.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_details(void* context, void* slice,
+                                                      const ggslam::gpcc::DetailSettings* settings,
+                                                      const std::uint8_t* data, std::size_t size,
+                                                      std::int32_t* attributes);
+
+// Brings values [points, components] from the order of the stream, in which raw attributes are, into coding order.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_sort_values(void* slice, std::int32_t components, std::int32_t* values);
 
 // Y, Cb, Cr [count, 3] of the colours rgb[order[i]].
 GGSLAM_EXPORT void ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, const std::uint32_t* order,

@@ -9,7 +9,7 @@ from enum import IntEnum
 from typing import Any
 
 HEADER = "core/codec.hpp"
-HEADER_SHA256 = "e36cd88304434530b0298987aa16941b69a5b56bafdf15fb21c772a1f72d6c53"
+HEADER_SHA256 = "d4fa058b2c8a7680cad801ddb33713842087747327b8b5f7f536184fb2c86c24"
 
 
 class Status(IntEnum):
@@ -44,13 +44,36 @@ class TreeSettings(Structure):
     ]
 
 
+class PredictiveSettings(Structure):
+    """What predictive geometry depends on."""
+
+    _fields_ = [
+        ("unique_points", c_int32), ("scaling", c_int32), ("slice_qp", c_int32), ("qp_shift", c_int32),
+        ("qp_interval", c_int32), ("residual_bits", c_int32 * 3), ("separate_bits", c_int32),
+    ]
+
+
 class RahtSettings(Structure):
     """What an attribute's coding by the region-adaptive hierarchical transform depends on."""
 
     _fields_ = [
         ("components", c_int32), ("bit_depth", c_int32), ("qp", c_int32), ("qp_secondary", c_int32),
-        ("prediction", c_int32), ("min_parent_neighbours", c_int32), ("min_neighbours", c_int32),
-        ("first_version", c_int32), ("rdoq", c_float),
+        ("prediction", c_int32), ("min_parent_neighbours", c_int32), ("min_neighbours", c_int32), ("layers", c_int32),
+        ("layer_qps", c_int32 * 2 * 32), ("separate_bits", c_int32), ("index", c_int32), ("first_version", c_int32),
+        ("rdoq", c_float),
+    ]
+
+
+class DetailSettings(Structure):
+    """What an attribute's coding by the predicting and the lifting transform depends on."""
+
+    _fields_ = [
+        ("components", c_int32), ("bit_depth", c_int32), ("lifting", c_int32), ("neighbours", c_int32),
+        ("search_between", c_int32), ("bias", c_int32 * 3), ("levels", c_int32), ("canonical_order", c_int32),
+        ("decimation", c_int32), ("periods", c_int32 * 32), ("first_distance", c_int32), ("direct_predictors", c_int32),
+        ("direct_threshold", c_int32), ("no_average", c_int32), ("search_within", c_int32), ("skip_layers", c_int32),
+        ("blend", c_int32), ("weighted", c_int32), ("component_weights", c_int32 * 2 * 32), ("layers", c_int32),
+        ("layer_qps", c_int32 * 2 * 32), ("separate_bits", c_int32), ("index", c_int32),
     ]
 
 
@@ -68,7 +91,9 @@ class Points(Structure):
     _fields_ = [("data", c_void_p), ("rows", c_void_p), ("count", c_size_t), ("kind", c_int32)]
 
 
-STRUCTURES: tuple[type[Structure], ...] = (OctreeSettings, TreeSettings, RahtSettings, Grid, Points)
+STRUCTURES: tuple[type[Structure], ...] = (
+    OctreeSettings, TreeSettings, PredictiveSettings, RahtSettings, DetailSettings, Grid, Points,
+)
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_gpcc_slice_create": (c_void_p, []),
     "ggslam_gpcc_slice_destroy": (None, [c_void_p]),
@@ -86,12 +111,19 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_gpcc_decode_tree": (c_int64, [
         c_void_p, c_void_p, POINTER(TreeSettings), c_int32, c_void_p, c_size_t, c_uint32,
     ]),
+    "ggslam_gpcc_decode_predictive": (c_int64, [
+        c_void_p, c_void_p, POINTER(PredictiveSettings), c_int32, c_void_p, c_size_t, c_uint32,
+    ]),
     "ggslam_gpcc_encode_tree": (c_int64, [c_void_p, c_void_p, POINTER(TreeSettings)]),
     "ggslam_gpcc_go_on": (c_int64, [c_void_p, c_void_p]),
     "ggslam_gpcc_positions": (c_int64, [c_void_p, c_void_p, c_void_p]),
     "ggslam_gpcc_decode_attribute": (c_int64, [
         c_void_p, c_void_p, POINTER(RahtSettings), c_void_p, c_size_t, c_void_p,
     ]),
+    "ggslam_gpcc_decode_details": (c_int64, [
+        c_void_p, c_void_p, POINTER(DetailSettings), c_void_p, c_size_t, c_void_p,
+    ]),
+    "ggslam_gpcc_sort_values": (c_int64, [c_void_p, c_int32, c_void_p]),
     "ggslam_gpcc_to_ycbcr": (None, [c_void_p, c_void_p, c_void_p, c_uint32, c_void_p]),
     "ggslam_gpcc_from_ycbcr": (None, [c_void_p, c_void_p, c_uint32, c_void_p]),
     "ggslam_gpcc_on_grid": (None, [POINTER(Points), POINTER(Grid), c_void_p]),

@@ -82,7 +82,7 @@ class CudaPixelTerms:
         terms._call("collect", rendering, address(pixels), min_weight)
         return terms
 
-    def joined(self, other: CudaPixelTerms) -> CudaPixelTerms:
+    def append(self, other: CudaPixelTerms) -> CudaPixelTerms:
         """These pixels followed by those of `other`, which must have the same capacity."""
         if self.capacity != other.capacity:
             raise RenderError(f"joined: terms with room for {self.capacity} and for {other.capacity}")

@@ -13,6 +13,7 @@ namespace ggslam::gpcc {
 
 // A decoder holds no more than this; slices within the level limit of 1.1 million points need less.
 inline constexpr std::uint64_t kMaxNodes = 24u << 20;  // of all levels together
+inline constexpr std::int64_t kMaxPosition = 1 << 21;  // in a slice
 inline constexpr std::uint32_t kMaxLinked = 2u << 20;  // nodes of one level that have neighbours
 
 // The nodes of one size in Morton order. Entry 0 of each array stands for "no node"; nodes count from 1.
