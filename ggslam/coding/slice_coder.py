@@ -210,7 +210,7 @@ class SliceCoder:
         else:
             bits = np.unpackbits(_bytes_view(coded.payload), count=count * description.bit_depth)
             if len(coded.payload) * 8 < count * description.bit_depth:
-                raise FormatError(_REASONS[2])
+                raise FormatError(_REASONS[Status.TRUNCATED])
             weights = 1 << np.arange(description.bit_depth - 1, -1, -1)
             values = bits.reshape(count, -1) @ weights
         values = np.ascontiguousarray(values.reshape(self.points, -1), np.int32)
@@ -247,7 +247,7 @@ def _variable_values(data: bytes, count: int) -> np.ndarray:
     for i in range(count):
         length = data[at] if at < len(data) else 255
         if length > 2 or at + 1 + length > len(data):
-            raise FormatError(_REASONS[2])
+            raise FormatError(_REASONS[Status.TRUNCATED])
         out[i] = int.from_bytes(data[at + 1 : at + 1 + length], "big")
         at += 1 + length
     return out

@@ -40,6 +40,7 @@ struct alignas(16) Row {
 
 struct Table {
   Row row;
+  std::uint8_t pairs[3][2];
   void* rest;
 };
 
@@ -87,6 +88,7 @@ def test_a_header_is_mirrored(generator: ModuleType, tmp_path: Path, monkeypatch
     assert [name for name, _ in row._fields_] == ["first", "second", "kind", "values"]
     assert [kind for _, kind in row._fields_[:3]] == [c_void_p, c_void_p, c_int32]
     assert row._fields_[3][1] is c_double * 4 and table._fields_[0][1] is row
+    assert table._fields_[1][1] is ctypes.c_uint8 * 2 * 3
     result, arguments = part["FUNCTIONS"]["ggslam_part_count"]
     assert result is ctypes.c_int64
     assert arguments == [c_void_p, ctypes.POINTER(table), ctypes.c_size_t, c_void_p]
