@@ -36,8 +36,8 @@ if _TYPE_CHECKING:
     from ggslam.formats.trajectory import Trajectory as Trajectory
     from ggslam.formats.trajectory import read_trajectory as read_trajectory
     from ggslam.formats.trajectory import write_tum as write_tum
-    from ggslam.jobs.edit.editing import Edit as Edit
-    from ggslam.jobs.edit.editing import edit_run as edit_run
+    from ggslam.jobs.edit.edits import Edit as Edit
+    from ggslam.jobs.edit.edits import edit_run as edit_run
     from ggslam.jobs.export.export_run import export_run as export_run
     from ggslam.jobs.render.render_run import render_run as render_run
     from ggslam.jobs.run.pipeline import RunOutcome as RunOutcome
@@ -99,7 +99,7 @@ _HOMES = {
     "ggslam.formats.point_cloud": ("read_point_cloud", "write_point_cloud"),
     "ggslam.formats.point_sampling": ("sample_points",),
     "ggslam.formats.trajectory": ("Trajectory", "read_trajectory", "write_tum"),
-    "ggslam.jobs.edit.editing": ("Edit", "edit_run"),
+    "ggslam.jobs.edit.edits": ("Edit", "edit_run"),
     "ggslam.jobs.export.export_run": ("export_run",),
     "ggslam.jobs.render.render_run": ("render_run",),
     "ggslam.jobs.run.pipeline": ("RunOutcome",),

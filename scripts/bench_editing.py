@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from held_out import held_out_poses
 
-from ggslam.jobs.edit.editing import Edit, edit_run
+from ggslam.jobs.edit.edits import Edit, edit_run
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import vote_label_image

@@ -31,6 +31,7 @@ from ggslam.objects.segmented_map import ObjectVotes
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX, write_map_index
+from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
@@ -108,8 +109,7 @@ def building(base: Path, folder: Path, storeys: int, cell: float) -> Path:
 def commands(run: Path, out: Path, arguments: argparse.Namespace, times: int) -> dict[str, list[str]]:
     """What is measured on a building, by name."""
     shutil.rmtree(out, ignore_errors=True)
-    record = json.loads((run / "keyframes.json").read_text())
-    views = ["--every", str(max(1, len(record["frames"]) // arguments.views))]
+    views = ["--every", str(max(1, len(KeyframesRecord.read(run).frames) // arguments.views))]
     slices = ["--slices", str(arguments.slices * times)]
     found = {
         "export ply": ["export", run, "--out", out / "map.ply"],

@@ -12,13 +12,15 @@ ratio is to the run without identity that was measured right before, because the
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.timing import TimingRecord
 
 NONE = ["identity.enabled=false"]
 PUBLISHED = [
@@ -58,27 +60,26 @@ def run(settings: list[str], arguments: argparse.Namespace) -> dict[str, Any]:
         if done.returncode:
             raise SystemExit(f"{' '.join(command)}\n{done.stdout}\n{done.stderr}")
         folder = Path(temporary) / "run"
-        return {name: json.loads((folder / f"{name}.json").read_text()) for name in ("metrics", "timing")}
+        return {"metrics": MetricsRecord.read(folder), "timing": TimingRecord.read(folder)}
 
 
 def wall(outcome: dict[str, Any]) -> float:
     """Seconds from the first frame to the last identity step."""
-    return outcome["timing"]["wall_s"] + outcome["timing"]["mapping"]["identity_finish"]
+    return outcome["timing"].wall_s + outcome["timing"].mapping.identity_finish
 
 
 def cells(outcome: dict[str, Any], reference: float) -> list[float | None]:
     """The numbers of one line."""
-    metrics = outcome["metrics"]
-    scores = metrics.get("segmentation") or {}
-    held = scores.get("held_out") or {}
+    metrics: MetricsRecord = outcome["metrics"]
 
-    def percent(value: float | None) -> float | None:
+    def percent(*keys: str) -> float | None:
+        value = metrics.number("segmentation", *keys)
         return None if value is None else 100 * value
 
     return [
-        metrics["images"]["held_out"]["psnr"], percent(held.get("miou")), percent(held.get("boundary_miou")),
-        percent(held.get("votes_miou")), percent((scores.get("gaussians") or {}).get("accuracy")),
-        outcome["timing"]["mapping_ms_per_iteration"], wall(outcome), wall(outcome) / reference,
+        metrics.number("images", "held_out", "psnr"), percent("held_out", "miou"), percent("held_out", "boundary_miou"),
+        percent("held_out", "votes_miou"), percent("gaussians", "accuracy"),
+        outcome["timing"].mapping_ms_per_iteration, wall(outcome), wall(outcome) / reference,
     ]  # fmt: skip
 
 

@@ -37,7 +37,7 @@ import numpy as np
 from loop_runs import closing, cut, localization
 
 from ggslam.evaluation.trajectory import score_trajectory
-from ggslam.features.orb import View
+from ggslam.features.orb import FeatureView
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.loops.pose_graph import GraphResult, PoseGraph
 from ggslam.loops.settings import VerificationSettings
@@ -138,7 +138,7 @@ def retrieval(recordings: Sequence[Keyframes]) -> None:
 
 
 def _describe(recording: Keyframes, frame: Frame) -> Place:
-    view = View(frame.color, frame.depth, np.eye(4))
+    view = FeatureView(frame.color, frame.depth, np.eye(4))
     return PlaceIndex(recording.camera).describe(view)
 
 
@@ -173,7 +173,7 @@ def _seconds_of_query(index: PlaceIndex, query: Place) -> float:
     return time.perf_counter() - start
 
 
-def _variant(frame: Frame, kind: int) -> View:
+def _variant(frame: Frame, kind: int) -> FeatureView:
     """The frame turned to look like another place: mirrored, inverted, its colours mixed, one way per bit."""
     color, depth = frame.color, frame.depth
     if kind & 1:
@@ -186,7 +186,7 @@ def _variant(frame: Frame, kind: int) -> View:
         shift = 7 * (kind >> 3)
         color, depth = np.roll(color, (shift, 3 * shift), (0, 1)), np.roll(depth, (shift, 3 * shift), (0, 1))
         color = np.bitwise_xor(color, np.uint8(37 * (kind >> 3)))
-    return View(np.ascontiguousarray(color), np.ascontiguousarray(depth), np.eye(4))
+    return FeatureView(np.ascontiguousarray(color), np.ascontiguousarray(depth), np.eye(4))
 
 
 # --- verification ----------------------------------------------------------------------------------------------------

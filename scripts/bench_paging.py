@@ -22,6 +22,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.timing import TimingRecord
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from commands import usage
@@ -68,7 +71,7 @@ def generated(folder: Path, frames: int, width: int) -> Path:
 def needed(recording: Path, folder: Path, settings: list[str]) -> float:
     """Resident memory of a short run without its map, MB."""
     found = run(recording, folder / "short", [*settings, "memory_limit_mb=100000"], ["--stop", "24"], scored=False)
-    paging = found["timing"]["paging"]
+    paging = found["timing"].paging
     return float(paging["program_mb"])
 
 
@@ -76,10 +79,10 @@ def run(recording: Path, out: Path, settings: list[str], more: list[str], scored
     """One run in a process of its own, and scoring in another; what they left in the folder."""
     overrides = [word for setting in settings for word in ("--set", setting)]
     peak = command("run", str(recording), "--out", str(out), "--overwrite", "--no-eval", *overrides, *more)
-    found: dict[str, Any] = {"timing": json.loads((out / "timing.json").read_text()), "peak_mb": peak}
+    found: dict[str, Any] = {"timing": TimingRecord.read(out), "peak_mb": peak}
     if scored:
         found["scoring_mb"] = command("eval", str(out), "--no-lpips")
-        found["metrics"] = json.loads((out / "metrics.json").read_text())
+        found["metrics"] = MetricsRecord.read(out)
     found["disk_mb"] = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
     return found
 
@@ -97,26 +100,26 @@ def report(runs: dict[str, dict[str, Any]], limit: float) -> None:
     """Prints the figures of the runs and their ratios."""
     for name, found in runs.items():
         timing, metrics = found["timing"], found["metrics"]
-        held_out, trajectory = metrics["images"]["held_out"], metrics["trajectory"]
+        held_out, trajectory = metrics.images.held_out, metrics.trajectory
         print(
             f"{name}: peak RSS {found['peak_mb']:.0f} MB (scoring {found['scoring_mb']:.0f} MB), "
-            f"held-out PSNR {held_out['psnr']:.2f} dB, "
-            f"ATE {100 * trajectory['ate_rmse_m']:.2f} cm, {timing['frames_per_s']:.2f} frames/s, "
-            f"{timing['gaussians']} Gaussians, {timing['mapping']['keyframes']} keyframes, "
+            f"held-out PSNR {held_out.psnr:.2f} dB, "
+            f"ATE {100 * trajectory.ate_rmse_m:.2f} cm, {timing.frames_per_s:.2f} frames/s, "
+            f"{timing.gaussians} Gaussians, {timing.mapping.keyframes} keyframes, "
             f"run folder {found['disk_mb']:.0f} MB"
         )
     free, bound = runs.values()
-    paging = bound["timing"]["paging"]
+    paging = bound["timing"].paging
     state, room = paging["map_mb"] + paging["images_on_disk_mb"], limit - paging["program_mb"]
     print(f"paging: {json.dumps({key: round(value, 1) for key, value in paging.items()})}")
     print(
         f"limited / no limit: frames/s {ratio('frames_per_s', bound, free):.2f}, Gaussians "
         f"{ratio('gaussians', bound, free):.3f}, peak RSS {bound['peak_mb'] / free['peak_mb']:.2f}; PSNR "
-        f"{bound['metrics']['images']['held_out']['psnr'] - free['metrics']['images']['held_out']['psnr']:+.2f} dB"
+        f"{bound['metrics'].images.held_out.psnr - free['metrics'].images.held_out.psnr:+.2f} dB"
     )
     print(
         f"peak RSS / limit: {bound['peak_mb'] / limit:.3f}, scoring {bound['scoring_mb'] / limit:.3f}; Gaussians / the "
-        f"most in memory: {bound['timing']['gaussians'] / max(1, paging['most_resident']):.1f}"
+        f"most in memory: {bound['timing'].gaussians / max(1, paging['most_resident']):.1f}"
     )
     if room <= 0:
         print(f"the limit is below the program's own {paging['program_mb']:.0f} MB: choose a larger --budget")
@@ -130,7 +133,7 @@ def report(runs: dict[str, dict[str, Any]], limit: float) -> None:
 
 
 def ratio(name: str, bound: dict[str, Any], free: dict[str, Any]) -> float:
-    return float(bound["timing"][name] / free["timing"][name])
+    return float(getattr(bound["timing"], name) / getattr(free["timing"], name))
 
 
 if __name__ == "__main__":

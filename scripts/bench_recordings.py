@@ -15,12 +15,16 @@ import argparse
 import json
 import os
 import tempfile
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from commands import usage
 
+from ggslam.runs.records.keyframes import KeyframesRecord
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.scene.camera import Camera
 from ggslam.sequences import open_sequence, recognise_format
 from ggslam.synthetic import write_synthetic_sequence
 from ggslam.tracking.noise import estimate_noise
@@ -62,25 +66,29 @@ def run(item: Item, config: str, arguments: argparse.Namespace, out: Path) -> di
     overrides = [part for setting in arguments.set for part in ("--set", setting)]
     usage(["run", str(item.path), "--scale", str(item.scale), "--stop", str(arguments.stop), "--config", config,
            "--out", str(out), "--overwrite", *overrides])  # fmt: skip
-    frames = json.loads((out / "keyframes.json").read_text())["frames"]
-    lost = sum(frame["status"] == "lost" for frame in frames)
+    frames = KeyframesRecord.read(out).frames
     return {
-        "recording": item.name, "config": config, "metrics": json.loads((out / "metrics.json").read_text()),
-        "camera": json.loads((out / "sequence.json").read_text())["camera"], "frames": len(frames), "lost": lost,
+        "recording": item.name, "config": config, "metrics": MetricsRecord.read(out),
+        "camera": SequenceRecord.read(out).camera, "frames": len(frames), "lost": sum(f.is_lost for f in frames),
     }  # fmt: skip
+
+
+def values_of(item: MetricsRecord | Camera) -> dict[str, Any]:
+    """For JSON."""
+    return asdict(item) if isinstance(item, Camera) else item.values()
 
 
 def line(outcome: dict[str, Any], first: dict[str, Any], noise: float) -> str:
     """A line of a Markdown table; `first` is what speed is compared to, `noise` in metres."""
     metrics, camera = outcome["metrics"], outcome["camera"]
-    speed, reference = (o["metrics"]["speed"]["frames_per_s"] for o in (outcome, first))
+    speed, reference = (o["metrics"].speed.frames_per_s for o in (outcome, first))
     lost = f", {outcome['lost']} lost" if outcome["lost"] else ""
-    held_out = metrics["images"].get("held_out") or {}
+    psnr = metrics.number("images", "held_out", "psnr")
     cells = [
-        outcome["recording"], f"`{outcome['config']}`", f"{camera['width']}x{camera['height']}",
+        outcome["recording"], f"`{outcome['config']}`", f"{camera.width}x{camera.height}",
         f"{outcome['frames']}{lost}", f"{1e3 * noise:.1f} mm", f"{speed:.1f}", f"{speed / reference:.2f}",
-        f"{100 * metrics['trajectory']['ate_rmse_m']:.2f} cm",
-        f"{held_out['psnr']:.2f} dB" if "psnr" in held_out else "-",
+        f"{100 * metrics.trajectory.ate_rmse_m:.2f} cm",
+        "-" if psnr is None else f"{psnr:.2f} dB",
     ]  # fmt: skip
     return f"| {' | '.join(cells)} |"
 
@@ -113,7 +121,7 @@ def main() -> None:
                 first = first or outcome
                 print(line(outcome, first, noise.sigma(2.0)), flush=True)
     if arguments.json:
-        arguments.json.write_text(json.dumps(outcomes, indent=1))
+        arguments.json.write_text(json.dumps(outcomes, indent=1, default=values_of))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from ggslam.runs.records.keyframes import KeyframesRecord
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.timing import TimingRecord
+
 RECORDINGS = ("livingroom", "redkitchen", "rgbd_dataset_freiburg3_cabinet", "shelf")
 BIG_STEPS = {"rgbd_dataset_freiburg3_cabinet", "shelf"}
 COLUMNS = (
@@ -41,27 +45,22 @@ def run(recording: Path, k: int, arguments: argparse.Namespace, refine: int, rea
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
             raise SystemExit(f"{' '.join(command)}\n{done.stdout}\n{done.stderr}")
-        metrics = json.loads((out / "metrics.json").read_text())
-        timing = json.loads((out / "timing.json").read_text())
-        frames = json.loads((out / "keyframes.json").read_text())["frames"]
-    return {"metrics": metrics, "timing": timing, "lost": [f for f in frames if f["status"] == "lost"]}
+        lost = [frame for frame in KeyframesRecord.read(out).frames if frame.is_lost]
+        return {"metrics": MetricsRecord.read(out), "timing": TimingRecord.read(out), "lost": lost}
 
 
 def cells(outcome: dict[str, Any]) -> list[float | None]:
     """The numbers of one line of the table."""
-    metrics, timing = outcome["metrics"], outcome["timing"]
-    held, keyframes, everything = (metrics["images"].get(name) or {} for name in ("held_out", "keyframes", "all"))
-    trajectory = metrics.get("trajectory") or {}
-    mapping = timing["mapping"]
-    insertion = 1e3 * mapping["insertion"] / max(1, mapping["keyframes"])
-    depth, ate = everything.get("depth_l1_m"), trajectory.get("ate_rmse_m")
+    metrics, mapping = outcome["metrics"], outcome["timing"].mapping
+    speed, images = metrics.speed, metrics.images
+    insertion = 1e3 * mapping.insertion / max(1, mapping.keyframes)
+    depth, ate = images.number("all", "depth_l1_m"), metrics.number("trajectory", "ate_rmse_m")
     return [
-        metrics["speed"]["frames_per_s"], metrics["speed"]["iterations_per_frame"], metrics["speed"]["tracking_ms"],
-        metrics["speed"]["mapping_iteration_ms"], insertion, held.get("psnr"), keyframes.get("psnr"),
-        everything.get("psnr"), everything.get("psnr_unmasked"), held.get("ssim"), held.get("lpips"),
+        speed.frames_per_s, speed.iterations_per_frame, speed.tracking_ms, speed.mapping_iteration_ms, insertion,
+        images.number("held_out", "psnr"), images.number("keyframes", "psnr"), images.number("all", "psnr"),
+        images.number("all", "psnr_unmasked"), images.number("held_out", "ssim"), images.number("held_out", "lpips"),
         None if depth is None else 100 * depth, None if ate is None else 100 * ate,
-        metrics["map"]["gaussians"] / 1000, metrics["memory"]["peak_rss_mb"], len(outcome["lost"]),
-        metrics["speed"]["dropped_frames"],
+        metrics.map.gaussians / 1000, metrics.memory.peak_rss_mb, len(outcome["lost"]), speed.dropped_frames,
     ]  # fmt: skip
 
 
@@ -101,9 +100,9 @@ def main() -> None:
             label += f" realtime {arguments.realtime:g}" if arguments.realtime else ""
             print(line(name, label, cells(outcome)), flush=True)
             for frame in outcome["lost"]:
-                print(f"  lost at frame {frame['frame']}: {frame['reason']}")
+                print(f"  lost at frame {frame.frame}: {frame.reason}")
     if arguments.json:
-        arguments.json.write_text(json.dumps(outcomes, indent=1))
+        arguments.json.write_text(json.dumps(outcomes, indent=1, default=lambda record: record.values()))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ round, and how often and how much the client was sent while the run went on.
 from __future__ import annotations
 
 import argparse
-import json
 import signal
 import socket
 import statistics
@@ -31,6 +30,8 @@ from commands import ROOT
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
+
+from ggslam.runs.records.timing import TimingRecord
 
 KINDS = ("without --view", "nobody looks", "a page is open")
 _CAMERA = {
@@ -103,9 +104,9 @@ def measured(kind: str, words: list[str], out: Path) -> Result:
             process.send_signal(signal.SIGINT)
     if process.wait():
         sys.exit(f"{' '.join(command)}\n{''.join(said)}")
-    timing = json.loads((out / "timing.json").read_text())
+    timing = TimingRecord.read(out)
     sent = (looker.maps, looker.megabytes) if looker is not None else (0, 0.0)
-    return Result(timing["frames_per_s"], *sent)
+    return Result(timing.frames_per_s or 0.0, *sent)
 
 
 def main() -> None:

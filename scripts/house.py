@@ -49,6 +49,8 @@ def functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
 
 def is_bare_participle(name: str) -> bool:
     """Whether a function's name is a participle with nothing that it belongs to: `_named`, `kept_in`, `watching`."""
+    if name.startswith("__"):  # Python's own, such as __missing__
+        return False
     first, *rest = name.strip("_").split("_")
     participle = IRREGULAR.fullmatch(first) or (REGULAR.fullmatch(first) and not NO_PARTICIPLES.fullmatch(first))
     return bool(participle) and (not rest or bool(PREPOSITIONS.fullmatch(rest[0])))

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ggslam.localization.localizer import LocalizationStatus, Tracked
+from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
 from ggslam.localization.surface import load_surface
-from ggslam.scene.poses import inverse, orthonormalized, se3_exp
+from ggslam.scene.poses import inverse, orthonormalize, se3_exp
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import CellArrays
 from ggslam.submaps.cells_around import MapStatus
@@ -92,17 +92,17 @@ class TreeTracker:
     def __init__(self, T_world_sensor: np.ndarray) -> None:
         self._pose, self._velocity = np.array(T_world_sensor, float), np.eye(4)
 
-    def track(self, item: np.ndarray, surface: TreeSurface, target: TreeTarget) -> Tracked:
+    def track(self, item: np.ndarray, surface: TreeSurface, target: TreeTarget) -> FrontEndResult:
         """See `FrontEnd`."""
         points = scan_points(item, ScanSettings()).points.astype(np.float64)
         T, overlap, rmse = aligned(points, target, self._pose @ self._velocity)
         if overlap < _MIN_OVERLAP:
             self._velocity = np.eye(4)
-            return Tracked(self._pose.copy(), LocalizationStatus.LOST, overlap, rmse, "too few matches")
+            return FrontEndResult(self._pose.copy(), LocalizationStatus.LOST, overlap, rmse, "too few matches")
         self._velocity, self._pose = inverse(self._pose) @ T, T
-        return Tracked(T.copy(), LocalizationStatus.OK, overlap, rmse)
+        return FrontEndResult(T.copy(), LocalizationStatus.OK, overlap, rmse)
 
-    def look_up(self, item: np.ndarray, surface: TreeSurface) -> Tracked | None:
+    def look_up(self, item: np.ndarray, surface: TreeSurface) -> FrontEndResult | None:
         """See `FrontEnd`."""
         return None
 
@@ -137,7 +137,7 @@ def aligned(points: np.ndarray, target: TreeTarget, T: np.ndarray) -> tuple[np.n
         T[:3, :3], T[:3, 3] = turn @ T[:3, :3], T[:3, 3] + step[:3]
         if np.abs(step).max() < _SMALL:
             break
-    return orthonormalized(T), overlap, rmse
+    return orthonormalize(T), overlap, rmse
 
 
 def _cross(v: np.ndarray) -> np.ndarray:

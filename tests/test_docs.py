@@ -32,7 +32,8 @@ def run_python(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess
     return subprocess.run([sys.executable, *arguments], cwd=cwd, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize(("page", "least"), [("python.md", 12), ("pytorch.md", 6)])
+@pytest.mark.long("every example of a page, in order")
+@pytest.mark.parametrize(("page", "least"), [("python.md", 12), ("pytorch.md", 7)])
 def test_examples_run_in_order(tmp_path: Path, page: str, least: int) -> None:
     text = (DOCS / page).read_text()
     blocks = list(re.finditer(r"```python\n(.*?)```", text, re.S))
@@ -114,6 +115,7 @@ def test_pictures_are_used_and_small() -> None:
         assert path.name in text and path.stat().st_size < 3e6, path
 
 
+@pytest.mark.long("runs the programs of the README and the pages as they stand")
 def test_short_programs_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of the README and of the pages that have no test of their own; they share what a reader would have."""
     import numpy as np

@@ -14,7 +14,7 @@ import pytest
 
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run.pipeline import RunRequest, execute
-from ggslam.jobs.score.scoring import score_run
+from ggslam.jobs.score.run import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, open_recording_of
 from ggslam.runs.records.metrics import MetricsRecord

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from typing import Any
 
@@ -72,7 +73,8 @@ def progress_line(task: Task) -> str:
     if not task.finished and task.time_remaining is not None:
         parts.append(f"{duration(task.time_remaining)} left")
     info = Text.from_markup(str(task.fields.get("info", ""))).plain
-    return ", ".join([*parts, *([" ".join(info.split())] if info.strip() else [])])
+    parts += [" ".join(part.split()) for part in re.split(r"(?<!overlap) {2,}", info) if part.strip()]
+    return ", ".join(parts)
 
 
 def duration(seconds: float) -> str:

@@ -16,7 +16,7 @@ from ggslam.cli.console import console
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.jobs.edit.editing import Edit
+    from ggslam.jobs.edit.edits import Edit
 
 EPILOG = """
 Objects are named by id or name, several separated by commas. Edits are done in the order given: a later one sees
@@ -97,7 +97,7 @@ def edit(
     sequence: options.MovedSequence = None,
 ) -> None:
     """Edit a run's map: remove, keep, move, duplicate, recolour, merge and rename objects."""
-    from ggslam.jobs.edit.editing import edit_run
+    from ggslam.jobs.edit.edits import edit_run
     from ggslam.runs.folder import RunFolder
 
     edits = _edits(ctx.meta[_EDITS])
@@ -122,7 +122,7 @@ def _edits(words: list[tuple[str, list[str]]]) -> list[Edit]:
     Raises:
         ConfigError: `--rotate` follows no `--move`.
     """
-    from ggslam.jobs.edit.editing import Edit
+    from ggslam.jobs.edit.edits import Edit
 
     edits: list[Edit] = []
     for kind, values in words:

@@ -35,7 +35,7 @@ def evaluate(
 ) -> None:
     """Score a run against its recording: trajectory, images and objects of keyframes, held-out and all frames."""
     from ggslam.jobs.report.pages import write_report
-    from ggslam.jobs.score.scoring import score_run
+    from ggslam.jobs.score.run import score_run
     from ggslam.runs.folder import RunFolder
     from ggslam.runs.recordings import open_recording_of
 

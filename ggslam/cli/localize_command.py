@@ -81,8 +81,8 @@ def localize(
     threads: Threads = None,
 ) -> None:
     """Locate each frame or scan of a recording in a map, of which only the surroundings are in memory."""
-    from ggslam.jobs.localize.localizing import LocalizeRequest
-    from ggslam.jobs.localize.localizing import localize as locate_all
+    from ggslam.jobs.localize.locate import LocalizeRequest
+    from ggslam.jobs.localize.locate import localize as locate_all
     from ggslam.runs.recordings import SequenceRequest
 
     request = LocalizeRequest(

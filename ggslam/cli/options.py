@@ -28,9 +28,9 @@ LivePath = Annotated[
     ),
 ]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `ggslam run` wrote.")]
-Start = Annotated[int, typer.Option("--start", help="First frame to use.")]
-Stop = Annotated[int | None, typer.Option(help="Stop before this frame.")]
-Stride = Annotated[int, typer.Option(help="Use only every n-th frame.")]
+Start = Annotated[int, typer.Option("--start", help="First frame to use.", min=0)]
+Stop = Annotated[int | None, typer.Option(help="Stop before this frame.", min=1)]
+Stride = Annotated[int, typer.Option(help="Use only every n-th frame.", min=1)]
 Scale = Annotated[float, typer.Option(help="Resize the images by this factor, e.g. 0.5.")]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
 DepthScale = Annotated[

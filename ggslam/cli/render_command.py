@@ -33,7 +33,7 @@ def render(
     ] = None,
 ) -> None:
     """Render a run's map from the poses of its frames."""
-    from ggslam.jobs.render.rendering import render_frames, select_frames
+    from ggslam.jobs.render.frames import render_frames, select_frames
     from ggslam.runs.folder import RunFolder
 
     folder = RunFolder.open(run)

@@ -172,10 +172,10 @@ def _request(reading: SequenceRequest, record: Path | None) -> RunRequest:
 def _run_and_show(request: RunRequest, log: str | None, address: tuple[str, int] | None) -> None:
     """Runs, logged and shown on a page as asked; the page stays until Ctrl-C."""
     from ggslam.jobs.run.pipeline import execute
-    from ggslam.jobs.view.viewing import wait_for_interrupt
-    from ggslam.jobs.watch.watching import watching
+    from ggslam.jobs.view.serve import wait_for_interrupt
+    from ggslam.jobs.watch.watchers import watch_run
 
-    with watching(log, address, request.sequence.path.resolve().name) as watchers:
+    with watch_run(log, address, request.sequence.path.resolve().name) as watchers:
         page = watchers.page
         if page is not None:
             console.print(f"the map as it grows: {page.address}", highlight=False, markup=False)

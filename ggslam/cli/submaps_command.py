@@ -13,7 +13,7 @@ from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 
 if TYPE_CHECKING:
-    from ggslam.jobs.submaps.visiting import StoreListing
+    from ggslam.jobs.submaps.fill import StoreListing
 
 EPILOG = """
 [bold]Examples[/]
@@ -69,7 +69,7 @@ def submaps(
     columns: options.Columns = 4,
 ) -> None:  # fmt: skip
     """Make a grid store, add a visit to one, or list its cells, parts, visits and changes."""
-    from ggslam.jobs.submaps.visiting import SubmapsRequest, list_store, make_store
+    from ggslam.jobs.submaps.fill import SubmapsRequest, list_store, make_store
     from ggslam.runs.recordings import SequenceRequest
 
     if out is not None:

@@ -38,7 +38,7 @@ def view(
     sequence: options.MovedSequence = None,
 ) -> None:
     """Look at a run in the browser: map, camera, frames; select, name, move, delete and export objects."""
-    from ggslam.jobs.view.viewing import serve_run, wait_for_interrupt, write_page
+    from ggslam.jobs.view.serve import serve_run, wait_for_interrupt, write_page
     from ggslam.runs.folder import RunFolder
     from ggslam.viewer.server import address, close_server
 

@@ -14,7 +14,7 @@ from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.jobs.volumes.fusing import VolumesOutcome, VolumesRequest
+    from ggslam.jobs.volumes.fuse import VolumesOutcome, VolumesRequest
     from ggslam.volumes.safety import Braking
 
 EPILOG = """
@@ -115,7 +115,7 @@ def volumes(
     overwrite: Overwrite = False,
 ) -> None:
     """Make maps that planners read, each with a picture: TSDF with mesh, distance field, occupancy."""
-    from ggslam.jobs.volumes.fusing import VolumesRequest
+    from ggslam.jobs.volumes.fuse import VolumesRequest
     from ggslam.runs.recordings import SequenceRequest
     from ggslam.volumes.safety import Braking, Latencies
 
@@ -135,7 +135,7 @@ def volumes(
 
 def _make_and_show(request: VolumesRequest, speeds: list[float], braking: Braking) -> None:
     """Makes the maps and prints times, files and, where it was asked for, how fast a robot may drive."""
-    from ggslam.jobs.volumes.fusing import make_volumes
+    from ggslam.jobs.volumes.fuse import make_volumes
 
     with progress_bar() as bar:
         outcome = make_volumes(request, ProgressObserver(bar))

@@ -15,16 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.coding.native import rgb_to_ycbcr, ycbcr_to_rgb
+from ggslam.coding.attribute_syntax import MAX_PARAMETER_SETS, AttributeParameters
 from ggslam.coding.sequence_parameters import (
     KNOWN_LABELS,
     MATRIX_BT709,
     MATRIX_IDENTITY,
+    MATRIX_YCGCO,
     MAX_ATTRIBUTES,
     AttributeDescription,
 )
 from ggslam.coding.settings import AttributeSettings, CodecSettings
-from ggslam.coding.syntax import MAX_PARAMETER_SETS, AttributeParameters
+from ggslam.coding.slice_coder import rgb_to_ycbcr, ycbcr_to_rgb
 from ggslam.errors import ConfigError, FormatError
 
 _GBR = [1, 2, 0]  # where G, B, R are in R, G, B
@@ -100,6 +101,8 @@ class CodedAttribute:
             components += description.offset
         if description.matrix == MATRIX_BT709:
             return ycbcr_to_rgb(components.clip(0, 255).astype(np.int32) if description.scaled else components)
+        if description.matrix == MATRIX_YCGCO and description.components == 3:
+            return _rgb_of_ycgco(components, description.bit_depth - 1)
         values = components.astype(self.dtype)
         if description.components == 1:
             return values[:, 0]
@@ -109,6 +112,8 @@ class CodedAttribute:
     def dtype(self) -> np.dtype:
         """Of the values."""
         low, high = self.description.reach()
+        if self.description.matrix == MATRIX_YCGCO:
+            high >>= 1
         return np.dtype(np.int64 if low < 0 or high > 65535 else np.uint8 if high <= 255 else np.uint16)
 
     def corrections(self, components: np.ndarray, reconstructed: np.ndarray) -> dict[str, list[int]] | None:
@@ -134,6 +139,16 @@ class CodedAttribute:
             except (KeyError, ValueError, TypeError, IndexError, OverflowError):
                 raise FormatError(f"corrections of attribute {self.name} do not fit it") from None
         return self.table.ids[ranks]
+
+
+def _rgb_of_ycgco(components: np.ndarray, bits: int) -> np.ndarray:
+    """R, G, B of Y, Cg, Co [N, 3] by the reversible transform, of colours of so many bits."""
+    middle = 1 << bits
+    green_difference, orange = components[:, 1] - middle, components[:, 2] - middle
+    t = components[:, 0] - (green_difference >> 1)
+    green, blue = green_difference + t, t - (orange >> 1)
+    rgb = np.stack([orange + blue, green, blue], 1).clip(0, middle - 1)
+    return rgb.astype(np.uint8 if bits <= 8 else np.uint16)
 
 
 def _most_frequent(values: np.ndarray, starts: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ggslam.coding.cloud import PointCloud
-from ggslam.coding.native import SliceCoder, raht_settings
 from ggslam.coding.side_by_side import in_order
+from ggslam.coding.slice_coder import SliceCoder
 from ggslam.coding.stream import CodedSliceUnits, CodedStream, read_stream
 from ggslam.errors import FormatError
 
@@ -36,7 +36,7 @@ def decode_cloud(data: bytes | memoryview, workers: int | None = None) -> PointC
         FormatError: the stream is damaged, or uses a tool that this decoder lacks (the message names it).
     """
     stream = read_stream(data)
-    return _decode(stream, stream.slices, workers)
+    return _decode(stream, range(len(stream.slices)), workers)
 
 
 @dataclass(frozen=True)
@@ -58,21 +58,30 @@ def decode_in_parts(data: bytes | memoryview, workers: int | None = None) -> Clo
     """`decode_cloud` slice by slice: no more slices are decoded in memory than two for each worker."""
     stream = read_stream(data)
 
-    def decoded(number: int) -> PointCloud:
-        return _joined(stream, [_decode_slice(stream, stream.slices[number])])
+    chains = _chains(stream, range(len(stream.slices)))
+
+    def decode_part(number: int) -> PointCloud:
+        return _join(stream, list(_decode_chain(stream, chains[number]).values()))
 
     count = sum(units.header.points for units in stream.slices)
-    return CloudInParts(count, _joined(stream, []), in_order(decoded, len(stream.slices), workers))
+    return CloudInParts(count, _join(stream, []), in_order(decode_part, len(chains), workers))
 
 
 def list_slices(data: bytes | memoryview) -> list[SliceInfo]:
     """The slices of a stream; nothing is decoded but headers."""
     stream = read_stream(data)
-    boxes = [stream.quantization.restore(np.stack(units.grid_box)) for units in stream.slices]
+    boxes = [_corners(stream, units) for units in stream.slices]
     return [
         SliceInfo(units.header.slice_id, units.header.points, units.size, box[0], box[1])
         for units, box in zip(stream.slices, boxes, strict=True)
     ]
+
+
+def _corners(stream: CodedStream, units: CodedSliceUnits) -> np.ndarray:
+    """Lowest and highest position, float64 [2, 3], that a slice can hold."""
+    low = np.asarray(units.header.grid_origin, np.int64)
+    size = np.array([1 << units.header.size_log2[axis] for axis in stream.sequence.axes])
+    return stream.quantization.restore(np.stack([low, low + size - 1]))
 
 
 def decode_slice(data: bytes | memoryview, slice_id: int) -> PointCloud:
@@ -82,7 +91,7 @@ def decode_slice(data: bytes | memoryview, slice_id: int) -> PointCloud:
         FormatError: the stream is damaged or has no such slice.
     """
     stream = read_stream(data)
-    chosen = [units for units in stream.slices if units.header.slice_id == slice_id]
+    chosen = [number for number, units in enumerate(stream.slices) if units.header.slice_id == slice_id]
     if not chosen:
         ids = sorted({units.header.slice_id for units in stream.slices})
         raise FormatError(f"the stream has no slice {slice_id}; it has {ids[0]} to {ids[-1]}")
@@ -96,10 +105,10 @@ def decode_box(data: bytes | memoryview, low: Sequence[float], high: Sequence[fl
     reach = 1e-6 * stream.quantization.voxel_size
     first, last = np.asarray(low, np.float64) - reach, np.asarray(high, np.float64) + reach
     chosen = []
-    for units in stream.slices:
-        corners = stream.quantization.restore(np.stack(units.grid_box))
+    for number, units in enumerate(stream.slices):
+        corners = _corners(stream, units)
         if (corners[0] <= last).all() and (corners[1] >= first).all():
-            chosen.append(units)
+            chosen.append(number)
     cloud = _decode(stream, chosen, None)
     points = cloud.points
     inside = ((points >= first) & (points <= last)).all(1)
@@ -107,12 +116,20 @@ def decode_box(data: bytes | memoryview, low: Sequence[float], high: Sequence[fl
     return replace(cloud, grid_points=cloud.grid_points[inside], attributes=attributes)
 
 
-def _decode(stream: CodedStream, slices: list[CodedSliceUnits], workers: int | None) -> PointCloud:
-    parts = list(in_order(lambda number: _decode_slice(stream, slices[number]), len(slices), workers))
-    return _joined(stream, parts)
+SlicePart = tuple[np.ndarray, dict[str, np.ndarray]]
+"""Grid positions and attributes."""
 
 
-def _joined(stream: CodedStream, parts: Sequence[tuple[np.ndarray, dict[str, np.ndarray]]]) -> PointCloud:
+def _decode(stream: CodedStream, wanted: Sequence[int], workers: int | None) -> PointCloud:
+    """The slices of these numbers, rising."""
+    chains = _chains(stream, wanted)
+    parts: dict[int, SlicePart] = {}
+    for chain in in_order(lambda number: _decode_chain(stream, chains[number]), len(chains), workers):
+        parts |= chain
+    return _join(stream, [parts[number] for number in wanted])
+
+
+def _join(stream: CodedStream, parts: Sequence[SlicePart]) -> PointCloud:
     grid = _concatenate([part[0] for part in parts], (0, 3), np.int32)
     attributes = {}
     for attribute in stream.attributes:
@@ -129,21 +146,44 @@ def _concatenate(parts: list[np.ndarray], empty: tuple[int, ...], dtype: type | 
     return np.concatenate(parts) if parts else np.empty(empty, dtype)
 
 
-def _decode_slice(stream: CodedStream, units: CodedSliceUnits) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _decode_slice(
+    stream: CodedStream, units: CodedSliceUnits, before: SliceCoder | None = None
+) -> tuple[np.ndarray, dict[str, np.ndarray], SliceCoder]:
+    """Positions and attributes of a slice, and its coder, with whose contexts the next slice may go on."""
     header = units.header
     try:
         coder = SliceCoder()
-        grid = coder.decode_geometry(units.geometry, header.depth, units.payload, header.points)
-        grid += np.asarray(header.grid_origin, np.int32)
+        if before is not None:
+            coder.go_on(before)
+        grid = coder.decode_geometry(units.geometry, header, units.payload, stream.context)
+        grid = grid[:, stream.sequence.axes] + np.asarray(header.grid_origin, np.int32)
         attributes = {}
         for attribute in stream.attributes:
-            coded, description = units.attributes[attribute.index], attribute.description
-            settings = raht_settings(
-                coded.parameters, description.components, description.bit_depth, coded.header.qp_deltas,
-                first_version=stream.first_version,
-            )  # fmt: skip
-            components = coder.decode_attribute(settings, coded.payload)
+            components = coder.decode_unit(units.attributes[attribute.index], attribute.description, stream.context)
             attributes[attribute.name] = attribute.values(components, units.corrections.get(attribute.name))
     except FormatError as error:
         raise FormatError(f"slice {header.slice_id}: {error}") from None
-    return grid, attributes
+    return grid, attributes, coder
+
+
+def _decode_chain(stream: CodedStream, numbers: Sequence[int]) -> dict[int, SlicePart]:
+    """Slices that go on with one another's contexts, by number."""
+    parts, coder = {}, None
+    for number in numbers:
+        grid, attributes, coder = _decode_slice(stream, stream.slices[number], coder)
+        parts[number] = (grid, attributes)
+    return parts
+
+
+def _chains(stream: CodedStream, wanted: Sequence[int]) -> list[list[int]]:
+    """Numbers of slices that must be decoded for the wanted ones, in runs that go on with one another."""
+    chains: list[list[int]] = []
+    for number, units in enumerate(stream.slices):
+        if units.header.previous is None:
+            chains.append([])
+        elif not chains or units.header.previous != stream.slices[number - 1].header.slice_id:
+            raise FormatError(f"slice {units.header.slice_id} goes on with another than the one before it")
+        chains[-1].append(number)
+    wanted_set = set(wanted)
+    cut = [[n for n in chain if n <= max(wanted_set.intersection(chain), default=-1)] for chain in chains]
+    return [chain for chain in cut if chain]

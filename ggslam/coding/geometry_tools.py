@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ggslam.coding.geometry_syntax import GeometryParameters
 from ggslam.coding.grid_points import GridPoints
 from ggslam.coding.settings import CodecSettings
-from ggslam.coding.syntax import GeometryParameters
 
 DENSE_POINTS_PER_CUBE = 1.5
 """Occupied voxels per occupied cube of 4 x 4 x 4 above which neighbours give useful contexts."""

@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+from ggslam.coding.attribute_syntax import AttributeHeader, AttributeParameters
 from ggslam.coding.container import HEADER, Unit, UnitType, read_units
+from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
 from ggslam.coding.sequence_parameters import (
     MATRIX_BT709,
     MATRIX_IDENTITY,
     AttributeDescription,
     SequenceParameters,
 )
-from ggslam.coding.syntax import AttributeHeader, AttributeParameters, GeometryHeader, GeometryParameters
 from ggslam.coding.user_data import read_user_data
 from ggslam.errors import FormatError
 

@@ -13,7 +13,9 @@ KNOWN_LABELS = ("color", "reflectance", "opacity", "frame_index", "frame_number"
 MAX_ATTRIBUTES = 255
 """Attributes of a stream that are supported."""
 CICP_PARAMETER, SCALING_PARAMETER = 2, 3
-MATRIX_IDENTITY, MATRIX_BT709 = 0, 1
+MATRIX_IDENTITY, MATRIX_BT709, MATRIX_YCGCO = 0, 1, 8
+AXIS_ORDERS = ((2, 1, 0), (0, 1, 2), (0, 2, 1), (2, 0, 1), (2, 1, 0), (1, 2, 0), (1, 0, 2), (0, 1, 2))
+"""By the number in the stream: which of the coded axes are x, y and z."""
 _SECOND_EDITION = "a damaged stream, or one of a draft of the second edition, which is not supported"
 
 
@@ -21,7 +23,8 @@ _SECOND_EDITION = "a damaged stream, or one of a draft of the second edition, wh
 class AttributeDescription:
     """One attribute as the sequence parameter set lists it.
 
-    `matrix` is the colour matrix (ISO/IEC 23091-2): 0 components are G, B, R; 1 BT.709 Y, Cb, Cr; None: not said.
+    `matrix` is the colour matrix (ISO/IEC 23091-2): 0 components are G, B, R; 1 BT.709 Y, Cb, Cr; 8 Y, Cg, Co without
+    loss (the bit depth is one more than the colours'); None: not said.
     A value is offset + (coded scale >> fraction_bits).
     """
 
@@ -67,6 +70,12 @@ class SequenceParameters:
     slice_tag_bits: int = 0
     cabac_bypass_stream: bool = False
     entropy_continuation: bool = False
+    axis_order: int = 1
+
+    @property
+    def axes(self) -> tuple[int, int, int]:
+        """Which of the coded axes are x, y and z."""
+        return AXIS_ORDERS[self.axis_order]
 
     def write(self) -> bytes:
         """The payload of the unit. The axes are coded in the order x, y, z; the global scale is 1."""
@@ -135,17 +144,13 @@ class SequenceParameters:
             Fraction(numerator, denominator), metres, global_scale, identity, level, profiles, frame_bits, tag_bits,
         )  # fmt: skip
         axes = r.u(3)
-        parameters = replace(parameters, cabac_bypass_stream=r.flag(), entropy_continuation=r.flag())
+        parameters = replace(
+            parameters, axis_order=axes, cabac_bypass_stream=r.flag(), entropy_continuation=r.flag()
+        )
         extension = r.flag()
         if extension:
             raise FormatError("the sequence parameter set has an extension, which is not supported")
         r.finish()
-        if axes != 1:
-            raise FormatError(f"axis order {axes} is not supported (only 1: x, y, z)")
-        if parameters.cabac_bypass_stream:
-            raise FormatError("a separate stream of bypass bins is not supported")
-        if parameters.entropy_continuation:
-            raise FormatError("entropy continuation between slices is not supported")
         return parameters
 
 

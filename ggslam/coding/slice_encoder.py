@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.coding.attribute_syntax import AttributeHeader, AttributeParameters
 from ggslam.coding.attribute_values import CodedAttribute
 from ggslam.coding.cloud import SliceReport
 from ggslam.coding.container import UnitType, unit_bytes
-from ggslam.coding.native import MAX_SLICE_POINTS, SliceCoder, raht_settings
+from ggslam.coding.geometry_syntax import ALL_AXES, GeometryHeader, GeometryParameters
+from ggslam.coding.native_settings import raht_settings
 from ggslam.coding.quantization import Quantization
 from ggslam.coding.sequence_parameters import SequenceParameters
 from ggslam.coding.settings import CodecSettings
-from ggslam.coding.syntax import AttributeHeader, AttributeParameters, GeometryHeader, GeometryParameters
+from ggslam.coding.slice_coder import MAX_SLICE_POINTS, SliceCoder
 from ggslam.coding.user_data import write_user_data
 from ggslam.errors import ConfigError
 
@@ -66,7 +68,7 @@ def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
     if coder.points > MAX_SLICE_POINTS:
         raise ConfigError(f"{coder.points} points lie in one voxel: merge duplicates or choose smaller voxels")
     geometry = cloud.geometry
-    header = GeometryHeader(number, (int(origin[0]), int(origin[1]), int(origin[2])), depth, coder.points)
+    header = GeometryHeader(number, (int(origin[0]), int(origin[1]), int(origin[2])), (ALL_AXES,) * depth, coder.points)
     payload = header.write(cloud.sequence, geometry) + coder.encode_geometry(geometry) + header.footer()
     units = [unit_bytes(UnitType.GEOMETRY, payload)]
     if rows is not None:

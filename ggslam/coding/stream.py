@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.coding.attribute_syntax import AttributeHeader, AttributeParameters
 from ggslam.coding.attribute_values import CodedAttribute, IdTable
 from ggslam.coding.container import Unit, UnitType, read_units
-from ggslam.coding.native import MAX_SLICE_POINTS
+from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
+from ggslam.coding.native_settings import AttributePayload, CodingContext
 from ggslam.coding.quantization import Quantization
-from ggslam.coding.sequence_parameters import MATRIX_BT709, MATRIX_IDENTITY, SequenceParameters
-from ggslam.coding.syntax import AttributeHeader, AttributeParameters, GeometryHeader, GeometryParameters
+from ggslam.coding.sequence_parameters import MATRIX_BT709, MATRIX_IDENTITY, MATRIX_YCGCO, SequenceParameters
+from ggslam.coding.slice_coder import MAX_SLICE_POINTS
 from ggslam.coding.user_data import read_user_data, version_of
 from ggslam.errors import FormatError
 
@@ -21,15 +23,7 @@ from ggslam.errors import FormatError
 # say more than 1,431 points a byte. Counts of duplicates are not bounded so, which the first summand allows for.
 _FREE_POINTS = 1 << 20
 _POINTS_PER_BYTE = 1536
-
-
-@dataclass(frozen=True)
-class AttributePayload:
-    """One attribute of a slice, not yet decoded."""
-
-    header: AttributeHeader
-    parameters: AttributeParameters
-    payload: memoryview
+_UNSPECIFIED = 2  # of a colour matrix
 
 
 @dataclass
@@ -43,12 +37,6 @@ class CodedSliceUnits:
     corrections: dict[str, Any] = field(default_factory=dict)
     size: int = 0
 
-    @property
-    def grid_box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest grid position that the slice can hold: its octree's root."""
-        low = np.asarray(self.header.grid_origin, np.int64)
-        return low, low + (1 << self.header.depth) - 1
-
 
 @dataclass
 class CodedStream:
@@ -59,12 +47,12 @@ class CodedStream:
     side: dict[str, Any]
     attributes: list[CodedAttribute]
     quantization: Quantization
-    version: int | None
+    context: CodingContext
 
     @property
     def first_version(self) -> bool:
         """Whether the first version of this codec wrote it."""
-        return self.version == 1
+        return self.context.first_version
 
 
 class _Parser:
@@ -119,12 +107,15 @@ class _Parser:
         if identity not in self.attribute:
             raise FormatError(f"an attribute refers to parameter set {identity}, which the stream lacks")
         parameters = self.attribute[identity]
-        header, payload = AttributeHeader.read(unit.payload, parameters)
+        index = AttributeHeader.attribute_of(unit.payload)
+        if index >= len(self.sequence.attributes):
+            raise FormatError(f"an attribute {index} too many: the stream has {len(self.sequence.attributes)}")
+        header, payload = AttributeHeader.read(unit.payload, parameters, self.sequence.attributes[index].components)
         current = self.slices[-1]
         if header.slice_id != current.header.slice_id:
             raise FormatError(f"an attribute of slice {header.slice_id} follows slice {current.header.slice_id}")
-        if header.attribute >= len(self.sequence.attributes) or header.attribute in current.attributes:
-            raise FormatError(f"slice {header.slice_id} has an attribute {header.attribute} too many")
+        if header.attribute in current.attributes:
+            raise FormatError(f"slice {header.slice_id} has attribute {header.attribute} twice")
         current.attributes[header.attribute] = AttributePayload(header, parameters, payload)
         current.size += unit.size
 
@@ -164,9 +155,11 @@ def read_stream(data: bytes | memoryview) -> CodedStream:
     # The reference encoder counts frames in one bit, as this codec does since its second version.
     if version is None and parser.sequence.frame_counter_bits == parser.sequence.slice_tag_bits == 0:
         version = 1
-    return CodedStream(
-        parser.sequence, parser.slices, parser.side, attributes, _quantization(parser.sequence, parser.side), version
+    sequence, quantization = parser.sequence, _quantization(parser.sequence, parser.side)
+    context = CodingContext(
+        sequence.cabac_bypass_stream, sequence.entropy_continuation, version == 1, sequence.axes
     )
+    return CodedStream(sequence, parser.slices, parser.side, attributes, quantization, context)
 
 
 def _attributes(sequence: SequenceParameters, side: dict[str, Any]) -> list[CodedAttribute]:
@@ -176,7 +169,10 @@ def _attributes(sequence: SequenceParameters, side: dict[str, Any]) -> list[Code
     tables = side.get("tables")
     result = []
     for index, (name, description) in enumerate(zip(names, sequence.attributes, strict=True)):
-        if description.matrix not in (None, MATRIX_IDENTITY, MATRIX_BT709) and description.components == 3:
+        if description.matrix == _UNSPECIFIED:
+            description = replace(description, matrix=None)
+        known = (None, MATRIX_IDENTITY, MATRIX_BT709, MATRIX_YCGCO)
+        if description.matrix not in known and description.components == 3:
             raise FormatError(f"attribute {name} has the colour matrix {description.matrix}, which is not supported")
         if description.matrix == MATRIX_BT709 and (description.components != 3 or description.bit_depth != 8):
             description = replace(description, matrix=None)

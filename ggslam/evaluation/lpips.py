@@ -64,7 +64,7 @@ class Lpips:
             raise ValueError(f"LPIPS needs two images [H, W, 3] of one size, found {image.shape}, {reference.shape}")
         if min(image.shape[:2]) < SMALLEST_SIDE:
             raise ValueError(f"LPIPS needs images of at least {SMALLEST_SIDE} pixels, found {image.shape[:2]}")
-        both = torch.stack([_signed(image), _signed(reference)]).permute(0, 3, 1, 2).to(self.device)
+        both = torch.stack([_to_signed(image), _to_signed(reference)]).permute(0, 3, 1, 2).to(self.device)
         x = (both - self._shift) / self._scale
         total = 0.0
         for layer in range(5):
@@ -77,7 +77,7 @@ class Lpips:
         return total
 
 
-def _signed(image: np.ndarray) -> torch.Tensor:
+def _to_signed(image: np.ndarray) -> torch.Tensor:
     """Image as float32 in [-1, 1]."""
     x = torch.from_numpy(np.ascontiguousarray(image))
     return x.float() / 127.5 - 1.0 if x.dtype == torch.uint8 else x.float() * 2.0 - 1.0

@@ -86,7 +86,7 @@ def score_trajectory(
     Raises:
         ValueError: different lengths, or rpe_delta < 1.
     """
-    P, Q = _stacked(estimated), _stacked(truth)
+    P, Q = _stack(estimated), _stack(truth)
     if len(P) != len(Q) or rpe_delta < 1:
         raise ValueError(f"{len(P)} estimated and {len(Q)} true poses, rpe_delta {rpe_delta}")
     known = np.isfinite(P).all((1, 2)) & np.isfinite(Q).all((1, 2))
@@ -164,7 +164,7 @@ def associate(times: np.ndarray, other_times: np.ndarray, max_difference_s: floa
     return out[np.argsort(times[out[:, 0]], kind="stable")]
 
 
-def _stacked(poses: np.ndarray | Sequence[np.ndarray | None]) -> np.ndarray:
+def _stack(poses: np.ndarray | Sequence[np.ndarray | None]) -> np.ndarray:
     """[N, 4, 4] float64 with NaN for None."""
     unknown = np.full((4, 4), np.nan)
     return np.array([unknown if T is None else T for T in poses], np.float64).reshape(-1, 4, 4)

@@ -52,7 +52,7 @@ class Landmarks:
 
 
 @dataclass
-class View:
+class FeatureView:
     """A frame as the feature matcher needs it.
 
     Attributes:
@@ -107,7 +107,9 @@ class FeaturePose:
     inliers: int
 
 
-def pose_from_matches(view: View, known: View, camera: Camera, settings: FeatureSettings) -> FeaturePose | None:
+def pose_from_matches(
+    view: FeatureView, known: FeatureView, camera: Camera, settings: FeatureSettings
+) -> FeaturePose | None:
     """Pose of a view (whose own pose and depth are not used) from its matches with a located one and that one's depth.
 
     RANSAC with EPnP, then Levenberg-Marquardt. The same images give the same pose.

@@ -7,8 +7,8 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from ggslam.features.orb import View
-from ggslam.localization.localizer import ANY_NORMAL, LocalizationStatus, Tracked
+from ggslam.features.orb import FeatureView
+from ggslam.localization.localizer import ANY_NORMAL, FrontEndResult, LocalizationStatus
 from ggslam.localization.places import StoredPlaces, StoredView
 from ggslam.localization.surface import Surface
 from ggslam.loops.settings import VerificationSettings
@@ -17,7 +17,7 @@ from ggslam.loops.verification import LocalMap, verify
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, transformed
+from ggslam.scene.poses import inverse, transform_points
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
 from ggslam.tracking.gicp_tracker import GicpTracker
@@ -67,21 +67,21 @@ class FrameTracker:
         self._look_up = look_up or LookUpSettings()
         self._tracked: tuple[Frame, PointSource] | None = None
 
-    def track(self, item: Frame, surface: Surface, target: GicpTarget) -> Tracked:
+    def track(self, item: Frame, surface: Surface, target: GicpTarget) -> FrontEndResult:
         """See `FrontEnd`."""
         self._aim(surface, target)
         found = self.tracker.track(item)
         self._tracked = item, found.points
         return _as_tracked(found)
 
-    def look_up(self, item: Frame, surface: Surface) -> Tracked | None:
+    def look_up(self, item: Frame, surface: Surface) -> FrontEndResult | None:
         """See `FrontEnd`."""
         if not self._places:
             return None
         points = self._points_of(item)
         if len(points) < self.tracker.settings.align.min_matches:
             return None
-        view = View(item.color, item.depth, np.eye(4))
+        view = FeatureView(item.color, item.depth, np.eye(4))
         place = self._places.describe(view)
         for match, known in self._places.query(place, self._look_up.candidates):
             alignment = self._verify(surface, LocalMap(place.landmarks, points.points), points, known)
@@ -129,10 +129,10 @@ class FrameTracker:
 
         voxels = target.voxels()["means"]
         near = voxels[np.linalg.norm(voxels - T_world_view[:3, 3], axis=1) <= self._look_up.reach]
-        old = LocalMap(known.place.landmarks, transformed(near, T_view_world))
+        old = LocalMap(known.place.landmarks, transform_points(near, T_view_world))
         found = verify(old, new, self.tracker.camera, noise.sigma, align_at, self._look_up.verification)
         return last if found.accepted else None
 
 
-def _as_tracked(found: TrackingResult) -> Tracked:
-    return Tracked(found.T_world_camera, _OUTCOMES[found.status], found.overlap, found.rmse_m, found.reason)
+def _as_tracked(found: TrackingResult) -> FrontEndResult:
+    return FrontEndResult(found.T_world_camera, _OUTCOMES[found.status], found.overlap, found.rmse_m, found.reason)

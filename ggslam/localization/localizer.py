@@ -16,7 +16,7 @@ import numpy as np
 
 from ggslam.localization.surface import Surface
 from ggslam.native.loader import NativeContext
-from ggslam.scene.poses import inverse, orthonormalized
+from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
 from ggslam.tracking.scan_points import ScanSettings, scan_points
@@ -48,7 +48,7 @@ class LocalizationStatus(Enum):
 
 
 @dataclass(frozen=True)
-class Tracked:
+class FrontEndResult:
     """What a front-end says of one frame or scan.
 
     Attributes:
@@ -67,7 +67,7 @@ class Tracked:
 
 
 @dataclass(frozen=True)
-class Localization(Tracked):
+class Localization(FrontEndResult):
     """Where a frame or scan is, and what that took.
 
     Attributes:
@@ -91,10 +91,10 @@ class Localization(Tracked):
 class FrontEnd(Protocol[Item]):
     """Locates one frame or scan after another against the target of the moment."""
 
-    def track(self, item: Item, surface: Surface, target: GicpTarget) -> Tracked:
+    def track(self, item: Item, surface: Surface, target: GicpTarget) -> FrontEndResult:
         """Locates the next one."""
 
-    def look_up(self, item: Item, surface: Surface) -> Tracked | None:
+    def look_up(self, item: Item, surface: Surface) -> FrontEndResult | None:
         """Looks for a lost one in the whole map; None: it was not found, or there is nothing to look it up by. Moves
         the surface."""
 
@@ -143,15 +143,15 @@ class Localizer(Generic[Item]):
         expected = self._pose @ self._velocity
         return self.surface.move_to(expected[:3, 3], expected[:3, 3] - self._pose[:3, 3])
 
-    def _outside(self) -> Tracked:
+    def _outside(self) -> FrontEndResult:
         if self._pose is None:
             reason = "no start pose, and nothing to look the place up by or nothing that looks like it"
-            return Tracked(np.full((4, 4), np.nan), LocalizationStatus.LOST, 0.0, 0.0, reason)
+            return FrontEndResult(np.full((4, 4), np.nan), LocalizationStatus.LOST, 0.0, 0.0, reason)
         x, y, z = self._pose[:3, 3]
         reason = f"the map has nothing around ({x:.2f}, {y:.2f}, {z:.2f})"
-        return Tracked(self._pose.copy(), LocalizationStatus.OUTSIDE, 0.0, 0.0, reason)
+        return FrontEndResult(self._pose.copy(), LocalizationStatus.OUTSIDE, 0.0, 0.0, reason)
 
-    def _follow(self, found: Tracked) -> None:
+    def _follow(self, found: FrontEndResult) -> None:
         if not found.status.is_located:
             self._velocity, self._lost = np.eye(4), True
             return
@@ -190,7 +190,7 @@ class ScanTracker:
         self._pose = np.array(T_world_sensor, float)
         self._velocity = np.eye(4)
 
-    def track(self, item: np.ndarray, surface: Surface, target: GicpTarget) -> Tracked:
+    def track(self, item: np.ndarray, surface: Surface, target: GicpTarget) -> FrontEndResult:
         """See `FrontEnd`. Tries constant velocity, and if that does not convince, standing still."""
         best: AlignmentResult | None = None
         source = scan_points(item, self.settings.scan)
@@ -206,19 +206,19 @@ class ScanTracker:
         assert best is not None
         return self._outcome(best, len(source))
 
-    def look_up(self, item: np.ndarray, surface: Surface) -> Tracked | None:
+    def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
         """See `FrontEnd`."""
         return None
 
     def _convinces(self, found: AlignmentResult) -> bool:
         return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.min_overlap
 
-    def _outcome(self, found: AlignmentResult, count: int) -> Tracked:
+    def _outcome(self, found: AlignmentResult, count: int) -> FrontEndResult:
         if not self._convinces(found):
             self._velocity = np.eye(4)
             reason = f"{found.overlap:.0%} of {count} points match the map, {self.settings.min_overlap:.0%} needed"
-            return Tracked(self._pose.copy(), LocalizationStatus.LOST, found.overlap, found.rmse, reason)
-        T = orthonormalized(found.T_world_camera)
+            return FrontEndResult(self._pose.copy(), LocalizationStatus.LOST, found.overlap, found.rmse, reason)
+        T = orthonormalize(found.T_world_camera)
         self._velocity, self._pose = inverse(self._pose) @ T, T
         status = LocalizationStatus.DEGENERATE if found.degenerate else LocalizationStatus.OK
-        return Tracked(T.copy(), status, found.overlap, found.rmse)
+        return FrontEndResult(T.copy(), status, found.overlap, found.rmse)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.errors import ConfigError, FormatError
-from ggslam.features.orb import View
+from ggslam.features.orb import FeatureView
 from ggslam.loops.places import Place, PlaceIndex, PlaceMatch
 from ggslam.loops.settings import PlaceSettings
 from ggslam.scene.arrays import arrays_to_bytes
@@ -40,7 +40,7 @@ class StoredView:
     T_world_camera: np.ndarray
 
 
-def places_to_bytes(views: Sequence[StoredView], camera: Camera) -> bytes:
+def stored_places_to_bytes(views: Sequence[StoredView], camera: Camera) -> bytes:
     """The part `PLACES` of these views."""
     landmarks = [view.place.landmarks for view in views]
     return arrays_to_bytes(
@@ -89,7 +89,7 @@ class StoredPlaces:
     def __len__(self) -> int:
         return len(self.index)
 
-    def describe(self, view: View) -> Place:
+    def describe(self, view: FeatureView) -> Place:
         """What a view is known by."""
         return self.index.describe(view)
 

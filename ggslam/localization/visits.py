@@ -14,15 +14,15 @@ from functools import partial
 
 import numpy as np
 
-from ggslam.features.orb import View
-from ggslam.localization.places import PLACES, StoredView, places_to_bytes, stored_views
+from ggslam.features.orb import FeatureView
+from ggslam.localization.places import PLACES, StoredView, stored_places_to_bytes, stored_views
 from ggslam.localization.scans import LaserScan
 from ggslam.localization.surface import NORMAL, packed_normals, surface_normals
 from ggslam.loops.places import PlaceIndex
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, separation, transformed
+from ggslam.scene.poses import inverse, separation, transform_points
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import POINTS
 from ggslam.submaps.grid import GridStore
@@ -87,11 +87,11 @@ class FrameSights:
         """What a frame adds."""
         self._noise = self._noise or estimate_noise(item.depth, self.camera)
         found = extract_points(item.depth, self.camera, self._settings, self._noise or DepthNoise(), self._context)
-        place = self._places.describe(View(item.color, item.depth, T_world_sensor))
+        place = self._places.describe(FeatureView(item.color, item.depth, T_world_sensor))
         normals = found.normals @ T_world_sensor[:3, :3].T
         small = item.depth[::_STEP, ::_STEP].copy()
         looked_at = partial(_in_view, small, self.camera, inverse(T_world_sensor))
-        points = transformed(found.points, T_world_sensor)
+        points = transform_points(found.points, T_world_sensor)
         return Sight(points, normals, looked_at, StoredView(place, T_world_sensor))
 
 
@@ -104,7 +104,7 @@ class ScanSights:
     def of(self, item: LaserScan, T_world_sensor: np.ndarray) -> Sight:
         """What a scan adds."""
         seen = item.points[np.isfinite(item.points).all(1)].astype(np.float64)
-        points = transformed(seen, T_world_sensor)
+        points = transform_points(seen, T_world_sensor)
         normals = surface_normals(points)
         away = ((points - T_world_sensor[:3, 3]) * normals).sum(1) > 0
         normals[away] *= -1
@@ -114,7 +114,7 @@ class ScanSights:
 def _in_view(depth: np.ndarray, camera: Camera, T_camera_world: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Whether world points [n, 3] are in view of every `_STEP`-th pixel of a depth image and not behind what is there,
     bool [n]."""
-    x, y, z = transformed(points.astype(np.float64), T_camera_world).T
+    x, y, z = transform_points(points.astype(np.float64), T_camera_world).T
     ahead = np.where(z > 0, z, np.inf)
     column = np.rint((x / ahead * camera.fx + camera.cx) / _STEP).astype(np.int64)
     row = np.rint((y / ahead * camera.fy + camera.cy) / _STEP).astype(np.int64)
@@ -171,7 +171,7 @@ class VisitRecorder:
         camera, parts, counts = self._sights.camera, {}, {}
         if views and camera is not None:
             views = [*self._earlier_views(gathered.key, camera), *views][-_MOST_VIEWS:]
-            parts, counts = {PLACES: places_to_bytes(views, camera)}, {PLACES: len(views)}
+            parts, counts = {PLACES: stored_places_to_bytes(views, camera)}, {PLACES: len(views)}
         # The cell's time is that of the last sight: T counts from then on.
         key = self._recorder.record(
             gathered.T_world_sensor, np.concatenate([points, left]), gathered.timestamp,

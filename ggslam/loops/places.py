@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.features.orb import Landmarks, View
+from ggslam.features.orb import FeatureView, Landmarks
 from ggslam.loops.settings import PlaceSettings
 from ggslam.loops.word_lists import WordLists
 from ggslam.scene.camera import Camera
@@ -87,7 +87,7 @@ class PlaceIndex:
     def __getitem__(self, number: int) -> Place:
         return self._places[self._positions[number]]
 
-    def describe(self, view: View) -> Place:
+    def describe(self, view: FeatureView) -> Place:
         """What a view is known by; for `add`, `query`, or both."""
         landmarks = view.landmarks(self.camera, self.settings.features)
         return Place(landmarks, self._words(landmarks.descriptors), self._fern_codes(view))
@@ -172,7 +172,7 @@ class PlaceIndex:
         tables = np.arange(self.settings.tables) << self.settings.bits
         return np.unique(bits @ (1 << np.arange(self.settings.bits)) + tables)
 
-    def _fern_codes(self, view: View) -> np.ndarray:
+    def _fern_codes(self, view: FeatureView) -> np.ndarray:
         soft = cv2.resize(view.color, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         color = cv2.GaussianBlur(soft, (0, 0), 0.5).reshape(-1, 3)[self._fern_pixels]
         depth = cv2.resize(view.depth, _THUMBNAIL, interpolation=cv2.INTER_NEAREST).reshape(-1)[self._fern_pixels]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ggslam.objects.overlap import Overlap
+from ggslam.objects.overlap import SegmentOverlap
 
 _MIN_PIXELS = 20
 _MIN_CHANGE = 0.02
@@ -30,14 +30,14 @@ class ConsistencyJudge:
         self._agreement: list[float] = []
         self._previous: np.ndarray | None = None
 
-    def observe(self, segments: np.ndarray, overlap: Overlap) -> bool | None:
+    def observe(self, segments: np.ndarray, overlap: SegmentOverlap) -> bool | None:
         """Takes one keyframe into account; returns the verdict.
 
         Args:
             segments: uint16 [H, W], the mask as stored.
             overlap: of this mask with the map.
         """
-        changed = self._changed(segments)
+        changed = self._has_changed(segments)
         if self.consistent is False or not changed:
             return self.consistent
         agreement = agreement_of(overlap)
@@ -46,7 +46,7 @@ class ConsistencyJudge:
             self._settle()
         return self.consistent
 
-    def _changed(self, segments: np.ndarray) -> bool:
+    def _has_changed(self, segments: np.ndarray) -> bool:
         previous, self._previous = self._previous, segments
         if previous is None or previous.shape != segments.shape:
             return True
@@ -62,7 +62,7 @@ class ConsistencyJudge:
             self.consistent = sum(recent) / len(recent) >= (_AGREE + _DISAGREE) / 2
 
 
-def agreement_of(overlap: Overlap) -> float | None:
+def agreement_of(overlap: SegmentOverlap) -> float | None:
     """How well ids agree with the map's, 0 to 1 = as well as their best renaming; None: nothing to compare."""
     shared = overlap.shared
     seen = shared.sum(1) >= _MIN_PIXELS

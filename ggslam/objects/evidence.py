@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.objects.overlap import Overlap
+from ggslam.objects.overlap import SegmentOverlap
 from ggslam.objects.settings import AssociationSettings
 
 _MIN_WEIGHT = 0.05
@@ -33,7 +33,7 @@ class PairEvidence:
         self._pairs: dict[tuple[int, int], _Pair] = {}
         self._largest: dict[int, int] = {}
 
-    def observe(self, overlap: Overlap, neighbours: set[tuple[int, int]]) -> None:
+    def observe(self, overlap: SegmentOverlap, neighbours: set[tuple[int, int]]) -> None:
         """Takes a keyframe into account.
 
         Args:
@@ -98,7 +98,7 @@ class PairEvidence:
             into.observations += pair.observations
 
 
-def touching(ids: np.ndarray) -> set[tuple[int, int]]:
+def find_touching_pairs(ids: np.ndarray) -> set[tuple[int, int]]:
     """Pairs of different ids (smaller first, 0 left out) on neighbouring pixels of a uint16 image."""
     pairs = []
     for a, b in ((ids[:, :-1], ids[:, 1:]), (ids[:-1], ids[1:])):

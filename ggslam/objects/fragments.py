@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.objects.overlap import Overlap
+from ggslam.objects.overlap import SegmentOverlap
 from ggslam.objects.settings import AssociationSettings
 from ggslam.scene.camera import Camera
 
@@ -58,7 +58,7 @@ class FragmentMemory:
         """Parent -> its fragments."""
 
     def observe(
-        self, overlap: Overlap, best: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
+        self, overlap: SegmentOverlap, best: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
     ) -> dict[int, Fragment]:
         """Takes a keyframe into account.
 
@@ -110,7 +110,7 @@ class FragmentMemory:
         enough = fragment.apart >= self._settings.split_observations
         return enough and fragment.apart > self._settings.split_ratio * fragment.together
 
-    def _minor_segments(self, overlap: Overlap, best: np.ndarray) -> list[int]:
+    def _minor_segments(self, overlap: SegmentOverlap, best: np.ndarray) -> list[int]:
         """Segments that lie in an object of which another segment has more."""
         rows = np.flatnonzero(best >= 0)
         within, covers = overlap.within[rows, best[rows]], overlap.covers[rows, best[rows]]
@@ -120,7 +120,7 @@ class FragmentMemory:
         return rows[minor & large & (within >= _INSIDE) & (covers < _MINOR)].tolist()
 
     def _note_absent(
-        self, seen: list[Fragment], minor: list[int], overlap: Overlap, best: np.ndarray, depth: np.ndarray,
+        self, seen: list[Fragment], minor: list[int], overlap: SegmentOverlap, best: np.ndarray, depth: np.ndarray,
         camera: Camera, T_world_camera: np.ndarray,
     ) -> None:  # fmt: skip
         """Fragments whose place is in view, but in the segment of the rest of their object."""

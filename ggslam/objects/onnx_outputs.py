@@ -59,7 +59,7 @@ class Letterbox:
 
 
 @dataclass(frozen=True)
-class Candidates:
+class MaskCandidates:
     """Masks a model proposes.
 
     Attributes:
@@ -97,7 +97,7 @@ def best(scores: np.ndarray, threshold: float, count: int) -> np.ndarray:
     return found[np.argsort(-scores[found], kind="stable")][:count]
 
 
-def yolo_candidates(detections: np.ndarray, prototypes: np.ndarray, threshold: float, count: int) -> Candidates:
+def yolo_candidates(detections: np.ndarray, prototypes: np.ndarray, threshold: float, count: int) -> MaskCandidates:
     """Of a YOLO-seg model: a mask is the sum of prototypes weighted by the detection's coefficients, cut to its box.
 
     Args:
@@ -127,12 +127,12 @@ def yolo_candidates(detections: np.ndarray, prototypes: np.ndarray, threshold: f
         )
     chosen = best(scores, threshold, count)
     grids = np.tensordot(weights[chosen], prototypes[0].astype(np.float32), axes=1)
-    return Candidates(scores[chosen], grids, boxes[chosen])
+    return MaskCandidates(scores[chosen], grids, boxes[chosen])
 
 
 def mask_candidates(
     masks: np.ndarray, scores: np.ndarray, size: tuple[int, int], threshold: float, count: int
-) -> Candidates:
+) -> MaskCandidates:
     """Of a model that gives whole masks, as exports of the SAM family with a built-in grid of points do.
 
     Args:
@@ -153,4 +153,4 @@ def mask_candidates(
     if grids.size and grids.min() >= 0 and grids.max() <= 1:  # no logits
         grids -= 0.5
     boxes = np.tile(np.array([0, 0, *size], np.float32), (len(chosen), 1))
-    return Candidates(flat[chosen], grids, boxes)
+    return MaskCandidates(flat[chosen], grids, boxes)

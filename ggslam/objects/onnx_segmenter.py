@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError, MissingDependency
 from ggslam.objects.mask_painting import distinct_masks, paint_segments
-from ggslam.objects.onnx_outputs import PROTOTYPE_GREY, Candidates, Letterbox, mask_candidates, yolo_candidates
+from ggslam.objects.onnx_outputs import PROTOTYPE_GREY, Letterbox, MaskCandidates, mask_candidates, yolo_candidates
 from ggslam.system.settings import setting, settings_class
 
 IMAGENET_MEAN = np.array((0.485, 0.456, 0.406), np.float32)
@@ -92,7 +92,7 @@ class OnnxSegmenter:
                 image = (image - IMAGENET_MEAN) / IMAGENET_DEVIATION
         return np.ascontiguousarray(image.transpose(2, 0, 1)[None], dtype)
 
-    def _candidates(self, tensor: np.ndarray) -> Candidates:
+    def _candidates(self, tensor: np.ndarray) -> MaskCandidates:
         settings = self.settings
         try:
             first, second = self._session.run(self._outputs, {self._input.name: tensor})

@@ -26,7 +26,7 @@ class MapView:
 
 
 @dataclass(frozen=True)
-class Overlap:
+class SegmentOverlap:
     """Pixels that segments of a keyframe share with objects of the map.
 
     Attributes:
@@ -56,7 +56,7 @@ class Overlap:
         return self.shared / np.maximum(self.shared.sum(0), 1)
 
 
-def numbered(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def number_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The distinct ids of a uint16 image but 0, ascending, and the number of each pixel's among them (-1 for 0)."""
     present = np.bincount(ids.ravel(), minlength=1) > 0
     present[0] = False
@@ -72,14 +72,14 @@ def same_surface(view: MapView, depth: np.ndarray, settings: AssociationSettings
     return (view.depth > 0) & ((depth <= 0) | (np.abs(view.depth - depth) < tolerance))
 
 
-def overlap_of(segments: np.ndarray, view: MapView, depth: np.ndarray, settings: AssociationSettings) -> Overlap:
+def overlap_of(segments: np.ndarray, view: MapView, depth: np.ndarray, settings: AssociationSettings) -> SegmentOverlap:
     """Counts the pixels that `segments` (uint16 [H, W]) and the objects of `view` share."""
     known = same_surface(view, depth, settings) & (view.confidence >= settings.min_confidence)
-    segment_ids, row = numbered(segments)
-    object_ids, column = numbered(np.where(known, view.ids, np.uint16(0)))
+    segment_ids, row = number_ids(segments)
+    object_ids, column = number_ids(np.where(known, view.ids, np.uint16(0)))
     both = (row >= 0) & (column >= 0)
     shape = len(segment_ids), len(object_ids)
     pairs = row[both].astype(np.int64) * shape[1] + column[both]
     shared = np.bincount(pairs, minlength=shape[0] * shape[1]).reshape(shape)
     area = np.bincount(row[row >= 0], minlength=shape[0])
-    return Overlap(segment_ids, object_ids, shared, area, row, column)
+    return SegmentOverlap(segment_ids, object_ids, shared, area, row, column)

@@ -23,14 +23,14 @@ _FILLED = 1.04
 
 
 @dataclass(frozen=True)
-class View:
+class CloudView:
     """Where a cloud is looked at from; T_world_camera float64 [4, 4], OpenCV axes."""
 
     camera: Camera
     T_world_camera: np.ndarray
 
 
-def view_of(points: np.ndarray, width: int = 960, height: int = 720) -> View:
+def view_of(points: np.ndarray, width: int = 960, height: int = 720) -> CloudView:
     """A view that shows a cloud [N, 3].
 
     A cloud around the origin is taken for the map of a run, whose world is the first camera: it is seen from there,
@@ -41,11 +41,11 @@ def view_of(points: np.ndarray, width: int = 960, height: int = 720) -> View:
     if (points.min(0) <= 0).all() and (points.max(0) >= 0).all() and high[2] > 0.5 * size:
         pose = np.eye(4)
         pose[2, 3] = -0.1 * size
-        return View(_camera(width, height), pose)
+        return CloudView(_camera(width, height), pose)
     return outside_view(points, np.eye(3)[int(np.argmin(high - low))], width, height)
 
 
-def outside_view(points: np.ndarray, upwards: np.ndarray, width: int = 960, height: int = 720) -> View:
+def outside_view(points: np.ndarray, upwards: np.ndarray, width: int = 960, height: int = 720) -> CloudView:
     """A view of a whole cloud [N, 3] from outside, obliquely from above; `upwards` is a direction [3]."""
     low, high = np.percentile(points, [1, 99], axis=0)
     up = np.asarray(upwards, float) / np.linalg.norm(upwards)
@@ -54,7 +54,7 @@ def outside_view(points: np.ndarray, upwards: np.ndarray, width: int = 960, heig
     side /= np.linalg.norm(side)
     direction = 1.2 * up + 0.4 * side + np.cross(up, side)
     direction /= np.linalg.norm(direction)
-    view = looking(np.zeros(3), -direction, up, width, height)
+    view = view_along(np.zeros(3), -direction, up, width, height)
     pose, camera = view.T_world_camera, view.camera
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - (low + high) / 2
     x, y, z = (corners @ pose[:3, :3]).T
@@ -62,10 +62,12 @@ def outside_view(points: np.ndarray, upwards: np.ndarray, width: int = 960, heig
     wide, tall = np.abs(x) / width, np.abs(y) / height
     distance = (2 * _FILLED * camera.fx * np.maximum(wide, tall) - z).max()
     pose[:3, 3] = (low + high) / 2 + direction * distance
-    return View(camera, pose)
+    return CloudView(camera, pose)
 
 
-def looking(position: np.ndarray, forward: np.ndarray, up: np.ndarray, width: int = 960, height: int = 720) -> View:
+def view_along(
+    position: np.ndarray, forward: np.ndarray, up: np.ndarray, width: int = 960, height: int = 720
+) -> CloudView:
     """A view from a position [3] in a direction [3] of any length, with `up` [3] upwards in the picture."""
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, up)
@@ -73,7 +75,7 @@ def looking(position: np.ndarray, forward: np.ndarray, up: np.ndarray, width: in
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
     pose[:3, 3] = position
-    return View(_camera(width, height), pose)
+    return CloudView(_camera(width, height), pose)
 
 
 def _camera(width: int, height: int) -> Camera:
@@ -81,7 +83,7 @@ def _camera(width: int, height: int) -> Camera:
     return Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
 
 
-def draw_cloud(points: np.ndarray, colors: np.ndarray, view: View, point_size: float) -> np.ndarray:
+def draw_cloud(points: np.ndarray, colors: np.ndarray, view: CloudView, point_size: float) -> np.ndarray:
     """A picture, uint8 [H, W, 3], of points float [N, 3] with colours uint8 [N, 3]; white where there is none.
 
     Args:

@@ -27,20 +27,20 @@ class Html(str):
     """Text that is HTML already."""
 
 
-def escaped(text: str) -> Html:
+def escape(text: str) -> Html:
     """Plain text as HTML; `Html` as it is."""
     return text if isinstance(text, Html) else Html(html.escape(text, quote=True))
 
 
-def joined(parts: Iterable[str]) -> Html:
+def join(parts: Iterable[str]) -> Html:
     """Pieces one after the other."""
-    return Html("".join(escaped(part) for part in parts))
+    return Html("".join(escape(part) for part in parts))
 
 
 def tag(name: str, *content: str, **attributes: str) -> Html:
     """An element; `class_` is the attribute class."""
     given = "".join(f' {key.rstrip("_")}="{html.escape(value, quote=True)}"' for key, value in attributes.items())
-    return Html(f"<{name}{given}>{joined(content)}</{name}>")
+    return Html(f"<{name}{given}>{join(content)}</{name}>")
 
 
 def section(title: str, anchor: str, *content: str) -> Html:
@@ -67,7 +67,7 @@ def table(
         return tag("th", value, scope="row") if number == 0 else tag("td", value, **css.get(number, {}))
 
     top = tag("tr", *(tag("th", name, scope="col", **css.get(k, {})) for k, name in enumerate(head)))
-    body = joined(tag("tr", *(cell(k, value) for k, value in enumerate(row))) for row in rows)
+    body = join(tag("tr", *(cell(k, value) for k, value in enumerate(row))) for row in rows)
     whole = tag("table", tag("thead", top), tag("tbody", body), **({"class_": "sorts"} if sorts else {}))
     return tag("div", whole, class_="scroll", tabindex="0")
 
@@ -115,7 +115,7 @@ def cells(pictures: Iterable[tuple[str, np.ndarray]], columns: int = 3) -> Html:
 
 def definitions(entries: Iterable[tuple[str, str]]) -> Html:
     """Words and what they mean."""
-    return tag("dl", *(joined([tag("dt", word), tag("dd", meaning)]) for word, meaning in entries))
+    return tag("dl", *(join([tag("dt", word), tag("dd", meaning)]) for word, meaning in entries))
 
 
 def bullets(lines: Iterable[str]) -> Html:
@@ -138,7 +138,7 @@ def page(title: str, lead: str, content: Sequence[Html], links: Sequence[tuple[s
     body = tag("main", header, *content, tag("footer", footer))
     head = (
         '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escaped(title)}</title><style>{_file('page.css')}</style>"
+        f"<title>{escape(title)}</title><style>{_file('page.css')}</style>"
     )
     script = f"<script>{_file('page.js')}</script>"
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>{body}{script}</body></html>\n'

@@ -111,7 +111,7 @@ def side_by_side(pictures: list[np.ndarray], gap: int = 4) -> np.ndarray:
     return np.concatenate(row, axis=1)
 
 
-def compare(
+def compare_pictures(
     truth: np.ndarray,
     rendered: np.ndarray,
     true_depth: np.ndarray,

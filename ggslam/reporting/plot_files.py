@@ -77,7 +77,7 @@ def _rgb(name: str) -> tuple[int, int, int]:
     return int(code[1:3], 16), int(code[3:5], 16), int(code[5:7], 16)
 
 
-def picture(drawing: Drawing) -> np.ndarray:
+def rasterize(drawing: Drawing) -> np.ndarray:
     """A drawing as pixels, uint8 [2 height, 2 width, 3]. Letters that are not ASCII become question marks."""
     s = _SHARPNESS
     canvas = np.full((s * drawing.height, s * drawing.width, 3), 255, np.uint8)
@@ -160,5 +160,5 @@ def write_sheet(stem: Path, plots: Sequence[Plot]) -> list[Path]:
                 f"<style>{_FILE_STYLE}</style>{''.join(parts)}</svg>")  # fmt: skip
     files = [stem.with_name(stem.name + suffix) for suffix in (".svg", ".png")]
     write_text(files[0], text + "\n")
-    write_picture(files[1], np.concatenate([picture(drawing) for drawing in drawings], axis=1))
+    write_picture(files[1], np.concatenate([rasterize(drawing) for drawing in drawings], axis=1))
     return files

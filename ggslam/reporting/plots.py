@@ -166,7 +166,7 @@ def draw(plot: Plot, width: int = 640, height: int = 300, titled: bool = False) 
     x0, x1, y0, y1 = _limits(plot)
     left, right, bottom = float(_LEFT), float(width - _RIGHT), float(height - _BOTTOM)
     if plot.equal:
-        x0, x1, y0, y1 = _equalised((x0, x1, y0, y1), right - left, bottom - top)
+        x0, x1, y0, y1 = _equalise((x0, x1, y0, y1), right - left, bottom - top)
     drawing = Drawing(width, height, (left, top, right, bottom), (x0, x1, y0, y1))
     if titled:
         drawing.items.append(Word(plot.title, width / 2, 22, strong=True))
@@ -198,10 +198,10 @@ def _parts(series: Series) -> list[np.ndarray]:
         return [xy[finite]] if finite.any() else []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], finite, [False]]).astype(int)))
     stride = max(1, math.ceil(len(xy) / MOST_POINTS))
-    return [_thinned(xy[a:b], 2 * stride) for a, b in edges.reshape(-1, 2)]
+    return [_thin(xy[a:b], 2 * stride) for a, b in edges.reshape(-1, 2)]
 
 
-def _thinned(xy: np.ndarray, stretch: int) -> np.ndarray:
+def _thin(xy: np.ndarray, stretch: int) -> np.ndarray:
     """Of every `stretch` points those of lowest and highest y; all, if that is 2."""
     if stretch <= 2 or len(xy) <= 2:
         return xy
@@ -228,7 +228,7 @@ def _limits(plot: Plot) -> tuple[float, float, float, float]:
     return x0, x1, y0 - (0 if plot.from_zero and y0 == 0 else margin), y1 + margin
 
 
-def _equalised(
+def _equalise(
     limits: tuple[float, float, float, float], width: float, height: float
 ) -> tuple[float, float, float, float]:
     """Limits around the same centre with one unit as long along both axes, and a margin."""

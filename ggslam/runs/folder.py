@@ -165,7 +165,7 @@ class RunFolder:
         elif result.objects is None:
             write_gaussian_ply(self.path / "map.ply", result.gaussians)
         else:
-            self.save_objects(segmented(result, names))
+            self.save_objects(segment_map(result, names))
         if result.places is not None:
             write_bytes(self.path / PLACES_FILE, result.places)
         mark.model_copy(update={"complete": error is None, "stopped_by": error}).write(self.path)
@@ -314,7 +314,7 @@ def as_written(path: Path) -> Iterator[None]:
         raise RunFolderError(f"{path}: not as ggslam writes it: {error!r}") from error
 
 
-def segmented(result: SlamResult, names: Mapping[int, str] | None = None) -> SegmentedMap:
+def segment_map(result: SlamResult, names: Mapping[int, str] | None = None) -> SegmentedMap:
     """A run's map with its objects. Names are taken only where ids are the masks' own."""
     assert result.objects is not None
     found = result.objects

@@ -16,7 +16,7 @@ WIDE_TOLERANCE = 0.08
 """Tried when almost nothing pairs up within `TOLERANCE`."""
 
 
-def associate(first: np.ndarray, second: np.ndarray, tolerance: float) -> list[tuple[int, int]]:
+def pair_times(first: np.ndarray, second: np.ndarray, tolerance: float) -> list[tuple[int, int]]:
     """Pairs (i, j) of times first[i], second[j] at most `tolerance` seconds apart, each used once, closest pairs first.
 
     Args:
@@ -54,10 +54,10 @@ def pair_images(
     Raises:
         SequenceError: nothing pairs up.
     """
-    pairs = associate(color, depth, TOLERANCE)
+    pairs = pair_times(color, depth, TOLERANCE)
     if pairs and 2 * len(pairs) >= min(len(color), len(depth)):
         return pairs, []
-    wide = associate(color, depth, WIDE_TOLERANCE)
+    wide = pair_times(color, depth, WIDE_TOLERANCE)
     if not wide:
         gap = min((np.abs(depth - t).min() for t in color), default=np.inf) if len(depth) else np.inf
         raise SequenceError(

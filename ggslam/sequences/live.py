@@ -96,7 +96,7 @@ def _call(place: str, module: str, function: str) -> LiveSource:
 
 
 class LiveSequence:
-    """A live source as a run sees it: a sequence that ends when it is told to, with Ctrl-C or after `stop` frames.
+    """A live source as a run sees it: a sequence that ends on request, with Ctrl-C or after `stop` frames.
 
     Args:
         source: the camera.
@@ -113,7 +113,7 @@ class LiveSequence:
         self.path = Path(source.name) if record is None else record
         self.record, self._stop = record, stop
         self.warnings: list[str] = []
-        self.skipped: list[SkippedFrame] = []
+        self.skipped_frames: list[SkippedFrame] = []
         self.mask_problems: dict[int, str] = {}
         self.instance_names: dict[int, str] = {}
         self._times: list[float] = []

@@ -27,14 +27,14 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class IdTable:
+class InstanceCodes:
     """Every code that means an instance.
 
     If all of them fit in uint16 they are the ids; else the ids are 1, 2, ... in the order of the codes.
 
     Attributes:
         codes: int32 [n], increasing, without 0.
-        source: what told them, for messages.
+        source: where they come from, for messages.
         coded: whether RGB images hold codes, as far as known; false: grey ids in three equal channels.
     """
 
@@ -56,7 +56,7 @@ class IdTable:
         return np.where(listed, ids, 0).astype(np.uint16), (codes > 0) & ~listed
 
 
-def read_id_table(files: list[Path]) -> IdTable:
+def read_id_table(files: list[Path]) -> InstanceCodes:
     """The codes of a set of masks: those that pred.json lists beside or above them, else all that occur in the files.
 
     Raises:
@@ -65,13 +65,13 @@ def read_id_table(files: list[Path]) -> IdTable:
     folder = files[0].parent
     for path in (folder / "pred.json", folder.parent / "pred.json"):
         if path.is_file() and (listed := _listed_codes(path)) is not None:
-            return _check_size(IdTable(listed, str(path)), folder)
+            return _check_size(InstanceCodes(listed, str(path)), folder)
     _log.info("reading all %d masks in %s once for their ids", len(files), folder)
     codes, coded = _occurring_codes(files)
-    return _check_size(IdTable(codes, "the masks themselves", coded), folder)
+    return _check_size(InstanceCodes(codes, "the masks themselves", coded), folder)
 
 
-def _check_size(table: IdTable, folder: Path) -> IdTable:
+def _check_size(table: InstanceCodes, folder: Path) -> InstanceCodes:
     if len(table.codes) > LARGEST_ID:
         raise SequenceError(
             f"masks folder {folder}: expected at most {LARGEST_ID} different ids, found {len(table.codes)} by "

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.mask_ids import IdTable, read_id_table
+from ggslam.sequences.mask_ids import InstanceCodes, read_id_table
 from ggslam.sequences.mask_images import mask_kind, read_mask_image
 from ggslam.sequences.pixel_grid import Size, same_aspect
 from ggslam.sequences.recording import ImageFile, image_files, last_number
@@ -85,7 +85,7 @@ class MaskReader:
         self._files = [path for path in files if path is not None]
         self._lock = threading.Lock()
         self._prepared = False
-        self._table: IdTable | None = None
+        self._table: InstanceCodes | None = None
         self._failure: SequenceError | None = None
         self._warned: set[object] = set()
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ggslam.features.orb import View
+from ggslam.features.orb import FeatureView
 from ggslam.loops.activity import ActiveKeyframes, ActivitySettings
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.loops.pose_graph import PoseGraph
@@ -21,7 +21,7 @@ from ggslam.loops.verification import LocalMap, Verification, verify
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, separation, transformed
+from ggslam.scene.poses import inverse, separation, transform_points
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
 from ggslam.tracking.points import FramePoints, PointSource
@@ -149,14 +149,14 @@ class LoopCloser:
         than to compute on the CPU until then."""
         if self._helper is None:
             self._helper = ThreadPoolExecutor(1, thread_name_prefix="places")
-        view = View(frame.color, frame.depth, np.eye(4))
+        view = FeatureView(frame.color, frame.depth, np.eye(4))
         self._begun = frame.index, self._helper.submit(self.places.describe, view)
 
-    def _described(self, frame: Frame, T_world_camera: np.ndarray) -> Place:
+    def _describe(self, frame: Frame, T_world_camera: np.ndarray) -> Place:
         begun, self._begun = self._begun, None
         if begun is not None and begun[0] == frame.index:
             return begun[1].result()
-        return self.places.describe(View(frame.color, frame.depth, T_world_camera))
+        return self.places.describe(FeatureView(frame.color, frame.depth, T_world_camera))
 
     def add(self, frame: Frame, tracking: TrackingResult) -> Correction | None:
         """A keyframe was made of a frame, and its points are in the surface. Puts aside and takes back keyframes.
@@ -167,7 +167,7 @@ class LoopCloser:
         start = time.perf_counter()
         with self._lock:
             T = tracking.T_world_camera
-            place = self._described(frame, T)
+            place = self._describe(frame, T)
             # In real time, keyframes from before the camera was lost may still come after it was found.
             belated = self._found_at is not None and frame.index < self._found_at[0]
             self._connect(tracking, belated)
@@ -219,7 +219,7 @@ class LoopCloser:
             loop = self.graph.add_loop(match.number, number, found.T_old_new, found.information)
             correction = self.poses[match.number] @ found.T_old_new @ inverse(self.poses[number])
             self._verified.append(_Found(number, correction, self.poses[number]))
-            return self._close(frame, match.number, loop) if self._confirmed() else None
+            return self._close(frame, match.number, loop) if self._is_confirmed() else None
         return None
 
     def _verify(
@@ -237,14 +237,14 @@ class LoopCloser:
             information = information_in_frame(last.information, T_old_world)
             return replace(last, T_world_camera=T_old_world @ last.T_world_camera, information=information)
 
-        surface = transformed(self._surface.points(around), T_old_world)
+        surface = transform_points(self._surface.points(around), T_old_world)
         found = verify(
             LocalMap(self.places[old].landmarks, surface), LocalMap(place.landmarks, points.points),
             self._camera, self._noise().sigma, align_at, self.settings.verification,
         )  # fmt: skip
         return found, last
 
-    def _confirmed(self) -> bool:
+    def _is_confirmed(self) -> bool:
         """Whether the last loops found agree on the correction."""
         s, newest, count = self.settings, self._verified[-1], 0
         here = newest.T_world_camera
@@ -289,7 +289,7 @@ class LoopCloser:
         return result
 
     def _found_among(self, frame: Frame, lost: TrackingResult) -> tuple[TrackingResult, int] | None:
-        view = View(frame.color, frame.depth, lost.T_world_camera)
+        view = FeatureView(frame.color, frame.depth, lost.T_world_camera)
         place = self.places.describe(view)
         for match in self.places.query(place, self.settings.candidates):
             found, alignment = self._verify(lost.points, place, match.number)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 PLACES_FILE = "places.npz"
 
 
-def places_to_bytes(
+def saved_places_to_bytes(
     camera: Camera, surface: MeasuredSurface, loops: LoopCloser, noise: DepthNoise, scale: float,
     keyframe_poses: np.ndarray, parts: Iterable[GaussianMap],
 ) -> bytes:  # fmt: skip

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def uninterrupted() -> Iterator[None]:
+def delay_interrupts() -> Iterator[None]:
     """Ctrl-C waits until the block is done (in the main thread; elsewhere it does not arrive anyway)."""
     if threading.current_thread() is not threading.main_thread():
         yield

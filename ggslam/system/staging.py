@@ -33,7 +33,7 @@ def new_staging(target: Path) -> Path:
 def leftovers(target: Path) -> list[Path]:
     """Hidden folders in `target` whose writers do not run any more, less one that waits to be put into place."""
     found = [path for path in target.iterdir() if (match := _NAME.fullmatch(path.name)) and not _runs(int(match[1]))]
-    waiting = [_saving(marker) for marker in target.glob("*.json")] if found else []
+    waiting = [_read_saving(marker) for marker in target.glob("*.json")] if found else []
     return [path for path in found if all(record is None or record["from"] != path.name for record in waiting)]
 
 
@@ -63,7 +63,7 @@ def finish_saving(target: Path, marker: str) -> None:
     Raises:
         RunFolderError: the folder cannot be written to.
     """
-    record = _saving(target / marker)
+    record = _read_saving(target / marker)
     if record is None or not (target / record["from"]).is_dir():
         return
     try:
@@ -88,7 +88,7 @@ def _exchange(staged: Path, target: Path, marker: str, stale: Sequence[str]) -> 
     shutil.rmtree(staged, ignore_errors=True)
 
 
-def _saving(marker: Path) -> dict[str, Any] | None:
+def _read_saving(marker: Path) -> dict[str, Any] | None:
     """What a marker says of a saving under way; None if nothing, or if it was not written by `publish`."""
     try:
         values = json.loads(marker.read_text())

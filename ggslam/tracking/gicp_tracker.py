@@ -7,11 +7,11 @@ import dataclasses
 
 import numpy as np
 
-from ggslam.features.orb import View, pose_from_matches
+from ggslam.features.orb import FeatureView, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import orthonormalized
+from ggslam.scene.poses import orthonormalize
 from ggslam.tracking.engine import CpuTrackingEngine, TrackingEngine
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
 from ggslam.tracking.noise import estimate_noise
@@ -49,7 +49,7 @@ class GicpTracker(Tracker):
         self._median_depth: float | None = None
 
     @classmethod
-    def sharing(cls, state: TrackerState) -> GicpTracker:
+    def with_state(cls, state: TrackerState) -> GicpTracker:
         """A tracker that works with the state of another."""
         tracker = cls(state.camera, state.settings, state.context)
         tracker.state = state
@@ -67,14 +67,14 @@ class GicpTracker(Tracker):
             self.noise = estimate_noise(frame.depth, self.camera)
         noise = self.noise or DepthNoise()
         points = self.engine.points(frame.depth, self.settings.points, noise)
-        view = View(frame.color, frame.depth, motion.T_world_camera)
+        view = FeatureView(frame.color, frame.depth, motion.T_world_camera)
         if target is None:
             return self._begin(view, points)
         self.noise = noise  # what could not be measured before the first keyframe is taken as usual
         found, reason = self._locate(view, points, target)
         if not self._is_acceptable(found):
             return self._give_up(points, found)
-        T = orthonormalized(found.T_world_camera)
+        T = orthonormalize(found.T_world_camera)
         motion.follow(view, T)
         motion.remember(view, points, self.settings)
         status = TrackingStatus.DEGENERATE if found.degenerate else TrackingStatus.OK
@@ -83,7 +83,7 @@ class GicpTracker(Tracker):
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
-    def _locate(self, view: View, points: PointSource, target: GicpTarget) -> tuple[AlignmentResult, str]:
+    def _locate(self, view: FeatureView, points: PointSource, target: GicpTarget) -> tuple[AlignmentResult, str]:
         """The best alignment, and which start it came from (empty: constant velocity)."""
         depth = points.median_depth_if_known()
         expected = self._median_depth if depth is None else depth
@@ -96,7 +96,7 @@ class GicpTracker(Tracker):
         return found
 
     def _locate_by(
-        self, mode: PhotometricMode, view: View, points: PointSource, target: GicpTarget
+        self, mode: PhotometricMode, view: FeatureView, points: PointSource, target: GicpTarget
     ) -> tuple[AlignmentResult, str]:
         """As `_locate`, in a photometric mode."""
         guess = self.state.motion.predict()
@@ -130,7 +130,7 @@ class GicpTracker(Tracker):
         settings = self.settings.align if coarse else dataclasses.replace(self.settings.align, coarse_iterations=0)
         return self.engine.align(points, target, guess, settings, self.noise, photometric)
 
-    def _photometric_part(self, view: View) -> PhotometricPart | None:
+    def _photometric_part(self, view: FeatureView) -> PhotometricPart | None:
         """Textured points of the view and the reference; None without either."""
         settings = self.settings.photometric
         reference = self._current_reference()
@@ -146,7 +146,7 @@ class GicpTracker(Tracker):
             motion.reference = PhotometricReference.from_view(self._shrink(view), view.T_world_camera)
         return motion.reference
 
-    def _shrink(self, view: View) -> GreyDepth:
+    def _shrink(self, view: FeatureView) -> GreyDepth:
         shrink = self.settings.photometric.shrink * max(1, round(self.camera.width / 320))
         return GreyDepth.from_images(view.color, view.depth, self.camera, shrink)
 
@@ -176,7 +176,7 @@ class GicpTracker(Tracker):
         return seen and found.photometric_residual <= tolerance * recovery.convincing_residual
 
     def _retry(
-        self, view: View, points: PointSource, target: GicpTarget, found: AlignmentResult,
+        self, view: FeatureView, points: PointSource, target: GicpTarget, found: AlignmentResult,
         photometric: PhotometricPart | None,
     ) -> tuple[AlignmentResult, str]:  # fmt: skip
         """The best alignment over all starts."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ggslam.features.orb import View
-from ggslam.scene.poses import inverse, orthonormalized, separation
+from ggslam.features.orb import FeatureView
+from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.tracking.photometric import PhotometricReference
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import PhotometricSettings, TrackerSettings
@@ -30,15 +30,15 @@ class CameraMotion:
     T_world_camera: np.ndarray
     velocity: np.ndarray = field(default_factory=lambda: np.eye(4))
     lost: bool = False
-    views: list[View] = field(default_factory=list)
-    reference_view: View | None = None
+    views: list[FeatureView] = field(default_factory=list)
+    reference_view: FeatureView | None = None
     reference: PhotometricReference | None = None
 
     def predict(self) -> np.ndarray:
         """The next pose [4, 4] at constant velocity."""
         return self.T_world_camera @ self.velocity
 
-    def follow(self, view: View, T_world_camera: np.ndarray) -> None:
+    def follow(self, view: FeatureView, T_world_camera: np.ndarray) -> None:
         """A frame was located at `T_world_camera` [4, 4], which becomes its view's pose."""
         self.velocity = np.eye(4) if self.lost else inverse(self.T_world_camera) @ T_world_camera
         self.lost = False
@@ -48,7 +48,7 @@ class CameraMotion:
         """A frame was not located: the camera stays where it was last known, standing still."""
         self.velocity, self.lost = np.eye(4), True
 
-    def restart(self, view: View, T_world_camera: np.ndarray) -> None:
+    def restart(self, view: FeatureView, T_world_camera: np.ndarray) -> None:
         """The camera was found at `T_world_camera` [4, 4] by other means; the frames remembered are of elsewhere."""
         self.velocity, self.lost = np.eye(4), False
         self.T_world_camera = view.T_world_camera = T_world_camera
@@ -56,18 +56,18 @@ class CameraMotion:
 
     def move(self, T_new_old: np.ndarray) -> None:
         """The world about the camera was moved by a correction [4, 4]."""
-        self.T_world_camera = orthonormalized(T_new_old @ self.T_world_camera)
+        self.T_world_camera = orthonormalize(T_new_old @ self.T_world_camera)
         for view in {id(v): v for v in (*self.views, self.reference_view) if v is not None}.values():
             view.T_world_camera = T_new_old @ view.T_world_camera
         self.reference = None
 
-    def remember(self, view: View, points: PointSource, settings: TrackerSettings) -> None:
+    def remember(self, view: FeatureView, points: PointSource, settings: TrackerSettings) -> None:
         """Keeps the last located frames for feature matching, and a not too distant one for its grey values."""
         self.views = [view, *self.views[: settings.recovery.views - 1]]
         if self.reference_view is None or self._is_far(self.reference_view, view, points, settings.photometric):
             self.reference_view, self.reference = view, None
 
     @staticmethod
-    def _is_far(reference: View, view: View, points: PointSource, settings: PhotometricSettings) -> bool:
+    def _is_far(reference: FeatureView, view: FeatureView, points: PointSource, settings: PhotometricSettings) -> bool:
         moved, turned = separation(reference.T_world_camera, view.T_world_camera)
         return moved > settings.renew_translation * points.median_depth or turned > settings.renew_rotation_deg

@@ -106,8 +106,8 @@ class AlignSettings:
     """A match is an inlier if its point-to-plane distance is below this..."""
     overlap_sigmas: float = setting(2.0, 0, 100)
     """...plus this many standard deviations sigma(z) of the depth noise."""
-    min_normal_dot: float = setting(0.5, -1, 1)
-    """Normals of a match agree to this cosine."""
+    min_normal_dot: float = setting(0.5, -2, 1)
+    """Normals of a match agree to this cosine; -2: whatever their directions."""
     min_matches: int = setting(100, 6, 10**6)
     """Points that need a match; else the alignment fails."""
     degenerate_below: float = setting(0.01, 0, 1)

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.features.orb import View
+from ggslam.features.orb import FeatureView
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import orthonormalized
+from ggslam.scene.poses import orthonormalize
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.points import PointSource
@@ -164,7 +164,7 @@ class Tracker(ABC):
         """Moves the tracker's own pose, after the world about it was moved by a correction [4, 4]."""
         self.state.motion.move(T_new_old)
 
-    def relocate(self, view: View, points: PointSource, found: AlignmentResult, source: str) -> TrackingResult:
+    def relocate(self, view: FeatureView, points: PointSource, found: AlignmentResult, source: str) -> TrackingResult:
         """A frame that was lost was located by other means; tracking goes on from there.
 
         Args:
@@ -173,12 +173,12 @@ class Tracker(ABC):
             found: where it is.
             source: how that is known, for `TrackingResult.reason`.
         """
-        motion, T = self.state.motion, orthonormalized(found.T_world_camera)
+        motion, T = self.state.motion, orthonormalize(found.T_world_camera)
         motion.restart(view, T)
         motion.remember(view, points, self.settings)
         return TrackingResult(T.copy(), TrackingStatus.RECOVERED, found.overlap, found.rmse, source, points, found)
 
-    def _begin(self, view: View, points: PointSource) -> TrackingResult:
+    def _begin(self, view: FeatureView, points: PointSource) -> TrackingResult:
         """Before the first keyframe: the pose is given, and all a frame needs is depth to begin with."""
         motion, needed = self.state.motion, self.settings.align.min_matches
         if len(points) < needed:

@@ -111,7 +111,7 @@ class EditableMap(ViewedMap, Protocol):
     def edits(self) -> list[str]:
         """What was done so far."""
 
-    def exported(self, object_id: int) -> tuple[str, bytes]:
+    def export(self, object_id: int) -> tuple[str, bytes]:
         """Name and content of a PLY file of an object."""
 
     def default_target(self) -> str:

@@ -55,15 +55,15 @@ class ObjectsTab:
 
     def _connect(self) -> None:
         alone = self._alone
-        self._choice.on_update(alone(lambda event: self._chosen() if event.client is not None else None))
-        self._act.on_click(alone(lambda event: self._acted(event.client)))
-        self._only.on_click(alone(lambda event: self._shown()))
+        self._choice.on_update(alone(lambda event: self._on_choice() if event.client is not None else None))
+        self._act.on_click(alone(lambda event: self._on_action(event.client)))
+        self._only.on_click(alone(lambda event: self._on_show()))
         self._rename.on_click(alone(lambda event: self._edit(self._model.rename(self._one(), self._name.value))))
         self._moving.on_update(alone(lambda event: self._set_gizmo()))
-        self._keep.on_click(alone(lambda event: self._moved()))
+        self._keep.on_click(alone(lambda event: self._on_move()))
         self._undo.on_click(alone(lambda event: self._edit(self._model.undo())))
-        self._save.on_click(self._stage.guarded(lambda event: self._saved(event.client)))  # may take minutes
-        self._stage.server.scene.on_click()(alone(self._clicked))
+        self._save.on_click(self._stage.guard(lambda event: self._on_save(event.client)))  # may take minutes
+        self._stage.server.scene.on_click()(alone(self._on_click))
 
     def _alone(self, action: Callable[[Any], str | None]) -> Callable[[Any], None]:
         """A callback that waits for those of other pages: what is selected and drawn is common to all."""
@@ -72,7 +72,7 @@ class ObjectsTab:
             with self._turn:
                 return action(event)
 
-        return self._stage.guarded(in_turn)
+        return self._stage.guard(in_turn)
 
     # --- selecting ---------------------------------------------------------------------------------------------------
 
@@ -111,11 +111,11 @@ class ObjectsTab:
             raise ConfigError("no object is selected any more")
         return self.selected
 
-    def _chosen(self) -> None:
+    def _on_choice(self) -> None:
         found = [record.id for record in self._records.values() if record.label == self._choice.value]
         self.select(found[0] if found else None)
 
-    def _clicked(self, event: Any) -> None:
+    def _on_click(self, event: Any) -> None:
         camera = event.client.camera
         focal = camera.image_height / 2 / np.tan(camera.fov / 2)
         origin, direction = np.array(event.ray_origin, float), np.array(event.ray_direction, float)
@@ -123,18 +123,18 @@ class ObjectsTab:
 
     # --- doing -------------------------------------------------------------------------------------------------------
 
-    def _acted(self, client: viser.ClientHandle) -> str | None:
+    def _on_action(self, client: viser.ClientHandle) -> str | None:
         action, object_id = self._act.value, self._one()
         if action == "Delete":
             return self._edit(self._model.remove(object_id))
         if action == "Export":
-            name, content = self._model.exported(object_id)
+            name, content = self._model.export(object_id)
             client.send_file_download(name, content, save_immediately=True)
             return f"{name}: {self._records[object_id].gaussians} Gaussians, {len(content):,} bytes"
         self._hide(self._stage.hidden ^ {object_id})
         return None
 
-    def _shown(self) -> None:
+    def _on_show(self) -> None:
         if self._only.value == "All":
             self._hide(set())
         elif self.selected is not None:
@@ -157,7 +157,7 @@ class ObjectsTab:
         self._stage.edited()
         return text
 
-    def _saved(self, client: viser.ClientHandle | None) -> str:
+    def _on_save(self, client: viser.ClientHandle | None) -> str:
         if client is not None:
             client.add_notification("Saving", "The edits are done to the run's files.", auto_close_seconds=4.0)
         self._save.disabled = True
@@ -186,14 +186,14 @@ class ObjectsTab:
         self._gizmo = gizmo
 
         @gizmo.on_update
-        def _dragged(event: Any) -> None:
+        def _on_drag(event: Any) -> None:
             R = quaternion_to_matrix(np.array(gizmo.wxyz)) @ upright.T
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = R, np.array(gizmo.position) - R @ record.centroid
             self._motion = T
             self._stage.nodes.displace(record.id, T)
 
-    def _moved(self) -> str | None:
+    def _on_move(self) -> str | None:
         if self._keep.value == "Put back" or np.allclose(self._motion, np.eye(4)):
             self._put_back()
             self._set_gizmo()

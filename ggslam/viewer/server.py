@@ -71,7 +71,7 @@ def keep_fitting(server: viser.ViserServer, camera: Camera) -> None:
         view.fov = fitting_fov(camera, view.aspect)
 
     @server.on_client_connect
-    def connected(client: viser.ClientHandle) -> None:
+    def on_connect(client: viser.ClientHandle) -> None:
         client.camera.on_update(fit)
         fit(client.camera)
 

@@ -101,7 +101,7 @@ class Stage:
 
     # --- what goes wrong ---------------------------------------------------------------------------------------------
 
-    def guarded(self, action: Callable[[Any], str | None]) -> Callable[[Any], None]:
+    def guard(self, action: Callable[[Any], str | None]) -> Callable[[Any], None]:
         """Makes a callback of an action: its sentence, or why it failed, is shown to who asked."""
 
         @functools.wraps(action)

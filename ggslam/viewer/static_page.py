@@ -91,7 +91,7 @@ def static_page(
     top = top_view(gaussians.means.numpy()[rows], poses[:, :3, 3], poses[0, :3, 2], model.up, fov)
     scene = {
         "count": len(rows), "low": low, "high": high, "scales": SCALES, "identity": identity is not None,
-        "objects": [_listed(record) for record in objects], "unlabelled": int((owners == 0).sum()),
+        "objects": [_object_values(record) for record in objects], "unlabelled": int((owners == 0).sum()),
         "about": model.describe(), "up": model.up, "fov": fov,
         "views": {"Start": _view(start), "Top": _view(top)},
         "path": poses[:: max(1, len(poses) // _PATH), :3, 3].round(4),
@@ -106,7 +106,7 @@ def static_page(
     return page.replace("@SCENE@", _json(scene)).replace("@SPLATS@", base64.b64encode(packed).decode("ascii"))
 
 
-def _listed(record: ListedObject) -> dict[str, Any]:
+def _object_values(record: ListedObject) -> dict[str, Any]:
     return {"id": record.id, "name": record.name, "color": record.color, "gaussians": record.gaussians}
 
 

@@ -32,18 +32,18 @@ class TimeTab:
         threading.Thread(target=self._follow_slider, name="viewer-frames", daemon=True).start()
 
         @self.slider.on_update
-        @stage.guarded
-        def _moved(event: Any) -> None:
+        @stage.guard
+        def _on_move(event: Any) -> None:
             self._wanted.set()
 
         @self._follow.on_update
-        @stage.guarded
-        def _followed(event: Any) -> None:
+        @stage.guard
+        def _on_follow(event: Any) -> None:
             self._look()
 
         @self._play.on_update
-        @stage.guarded
-        def _played(event: Any) -> None:
+        @stage.guard
+        def _on_play(event: Any) -> None:
             if self._play.value:
                 threading.Thread(target=self._run, name="viewer-play", daemon=True).start()
 

@@ -34,13 +34,13 @@ class ViewTab:
         save = gui.add_button("Save picture", icon="camera", hint=f"Rendered by ggslam, {PICTURE_SIZE} pixels wide")
 
         @coloring.on_update
-        @stage.guarded
+        @stage.guard
         def _recolor(event: Any) -> None:
             stage.coloring = names[coloring.value]
             stage.draw_map()
 
         @places.on_click
-        @stage.guarded
+        @stage.guard
         def _go(event: Any) -> None:
             seen = event.client.camera
             views = {"Start": stage.start_view, "Frame": stage.frame_view,
@@ -48,7 +48,7 @@ class ViewTab:
             stage.go(event.client, views[places.value]())
 
         @save.on_click
-        @stage.guarded
+        @stage.guard
         def _save(event: Any) -> str:
             return self._save(event.client)
 
@@ -56,7 +56,7 @@ class ViewTab:
         box = self._stage.server.gui.add_checkbox(label, True)
 
         @box.on_update
-        @self._stage.guarded
+        @self._stage.guard
         def _show(event: Any) -> None:
             self._stage.nodes.show_lines(name, box.value)
 

@@ -19,7 +19,7 @@ _CHUNK = 1 << 22
 
 
 @dataclass(frozen=True)
-class View:
+class DeviceView:
     """A view on the device: depth float32 [H, W] with 0 for none, camera, rotation [3, 3] and translation [3] of
     T_camera_world (float64)."""
 
@@ -30,7 +30,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Candidates:
+class BlockCandidates:
     """Blocks in view: coordinates int64 [n, 3], z [n] of their centres, and what is seen of each: a surface within the
     truncation, or free space throughout."""
 
@@ -51,12 +51,12 @@ class _Tiles:
     sums: Tensor
 
 
-def find_candidates(view: View, block: float, truncation: float, free_share: float) -> Candidates:
+def find_candidates(view: DeviceView, block: float, truncation: float, free_share: float) -> BlockCandidates:
     """Blocks of edge `block` metres that show a surface, are free throughout, or are in view otherwise."""
     device = view.depth.device
     if not bool((view.depth > 0).any()):
         none = torch.zeros(0, device=device)
-        return Candidates(none.long().reshape(0, 3), none, none.bool(), none.bool())
+        return BlockCandidates(none.long().reshape(0, 3), none, none.bool(), none.bool())
     tiles = _tiles(view.depth)
     at = _frustum_blocks(view, block, float(view.depth.max()) + truncation)
     centre = ((at.double() + 0.5) * block) @ view.rotation.T + view.translation
@@ -77,7 +77,7 @@ def find_candidates(view: View, block: float, truncation: float, free_share: flo
     behind[unsure], hidden[unsure], surface[unsure] = seen
     keep = behind | surface
     free = behind & ~hidden & ~surface & whole & (_valid_share(tiles, area, view.camera) >= free_share)
-    return Candidates(at[keep], centre[keep, 2], surface[keep], free[keep])
+    return BlockCandidates(at[keep], centre[keep, 2], surface[keep], free[keep])
 
 
 def _tiles(depth: Tensor) -> _Tiles:
@@ -102,7 +102,7 @@ def _tiles(depth: Tensor) -> _Tiles:
     )  # fmt: skip
 
 
-def _frustum_blocks(view: View, block: float, far: float) -> Tensor:
+def _frustum_blocks(view: DeviceView, block: float, far: float) -> Tensor:
     c, rotation, translation = view.camera, view.rotation, view.translation
     x = torch.tensor([-0.5 - c.cx, c.width - 0.5 - c.cx], dtype=torch.float64) / c.fx
     y = torch.tensor([-0.5 - c.cy, c.height - 0.5 - c.cy], dtype=torch.float64) / c.fy
@@ -146,7 +146,8 @@ def _range_over(tiles: _Tiles, area: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _look(
-    view: View, tiles: _Tiles, area: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float, truncation: float
+    view: DeviceView, tiles: _Tiles, area: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float,
+    truncation: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Whether depth lies behind, in front of, and at blocks, tile by tile of their footprints; bool [n] each."""
     n, device = len(area), area.device
@@ -177,7 +178,7 @@ def _look(
 
 
 def _meeting(
-    view: View, u: Tensor, v: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float
+    view: DeviceView, u: Tensor, v: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Whether rays through tiles (u, v) meet cubes, and the stretch of depth in which they do."""
     c = view.camera

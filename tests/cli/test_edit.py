@@ -53,6 +53,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.long("all edits in one command, and all commands on what comes of it")
 def test_several_edits_at_once_leave_a_whole_run(finished: Path, tmp_path: Path) -> None:
     before, out = contents(finished), tmp_path / "new"
     text = done(

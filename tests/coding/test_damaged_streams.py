@@ -4,14 +4,25 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ggslam.coding import AttributeSettings, CodecSettings, decode_cloud, encode_cloud
+from ggslam.coding.attribute_syntax import (
+    LIFTING,
+    PREDICTING,
+    RAW,
+    AttributeHeader,
+    AttributeParameters,
+    DetailSettings,
+)
 from ggslam.coding.container import HEADER, UnitType, read_units, unit_bytes
-from ggslam.coding.native import RahtSettings, SliceCoder
-from ggslam.coding.syntax import GeometryParameters
+from ggslam.coding.geometry_syntax import ALL_AXES, GeometryHeader, GeometryParameters
+from ggslam.coding.native_settings import AttributePayload, CodingContext, RahtSettings
+from ggslam.coding.sequence_parameters import AttributeDescription
+from ggslam.coding.slice_coder import SliceCoder
 from ggslam.errors import FormatError
 
 
@@ -32,6 +43,10 @@ def streams() -> list[bytes]:
         )  # fmt: skip
         made.append(encode_cloud(rng.integers(0, 1 << bits, (count, 3)), values, settings).data)
     return made
+
+
+def header_of(depth: int, points: int) -> GeometryHeader:
+    return GeometryHeader(0, (0, 0, 0), (ALL_AXES,) * depth, points)
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
@@ -93,9 +108,9 @@ def test_a_truncated_payload_is_noticed() -> None:
     payload = coder.encode_geometry(parameters)
     for length in (0, 1, 2, 100, len(payload) // 2, len(payload) - 20):
         with pytest.raises(FormatError, match=r"ends early|number of points"):
-            SliceCoder().decode_geometry(parameters, 12, payload[:length], 3000)
+            SliceCoder().decode_geometry(parameters, header_of(12, 3000), payload[:length])
     with pytest.raises(FormatError, match="another number of points"):
-        SliceCoder().decode_geometry(parameters, 12, payload, 2999)
+        SliceCoder().decode_geometry(parameters, header_of(12, 2999), payload)
 
 
 @pytest.mark.parametrize("fill", [0, 255, None])
@@ -106,12 +121,12 @@ def test_made_up_payloads(fill: int | None) -> None:
         payload = rng.integers(0, 256, 400, dtype=np.uint8).tobytes() if fill is None else bytes([fill]) * 400
         for unique in (False, True):
             with pytest.raises(FormatError):
-                SliceCoder().decode_geometry(GeometryParameters(unique, 8), depth, payload, 1 << 24)
+                SliceCoder().decode_geometry(GeometryParameters(unique, 8), header_of(depth, 1 << 24), payload)
         coder = SliceCoder()
         coder.build(rng.integers(0, 1 << depth, (50, 3)), depth)
         for components in (1, 3):
             try:
-                values = coder.decode_attribute(RahtSettings(components, 8, 51, 51, 1, 2, 6, 0, 0.0), payload)
+                values = coder.decode_attribute(RahtSettings(components, 8, 51, 51, 1, 2, 6, index=-1), payload)
                 assert values.min() >= 0 and values.max() <= 255
             except FormatError:
                 pass
@@ -164,3 +179,64 @@ def test_nothing_is_no_stream() -> None:
         decode_cloud(b"")
     with pytest.raises(FormatError, match="type"):
         decode_cloud(b"ply\nformat ascii 1.0\n" + bytes(HEADER.size))
+
+
+def test_damage_to_streams_of_every_tool(gpcc_data: Path) -> None:
+    """Streams of the reference encoder with planes, partial splits, direct points, prediction, lifting, ..."""
+    rng = np.random.default_rng(3)
+    files = sorted((gpcc_data / "golden_more").glob("*__*.bin"))
+    if not files:
+        pytest.skip("no streams of single tools")
+    outcomes = {"decoded": 0, "refused": 0}
+    for path in files:
+        data = path.read_bytes()
+        for _ in range(12):
+            start = time.perf_counter()
+            try:
+                decode_cloud(damaged(data, rng), workers=1)
+                outcomes["decoded"] += 1
+            except FormatError as error:
+                assert str(error)
+                outcomes["refused"] += 1
+            assert time.perf_counter() - start < 5
+    assert outcomes["refused"] > len(files)
+
+
+@pytest.mark.parametrize("fill", [0, 255, None])
+@pytest.mark.parametrize("boundary", [0, 4, 8])
+def test_made_up_payloads_of_other_trees(fill: int | None, boundary: int) -> None:
+    """A tree may claim anything, too, whatever its levels split and whatever tools it has."""
+    rng = np.random.default_rng(0)
+    tools = {"direct_mode": 3, "direct_pairs": True, "planes": True, "plane_thresholds": (1, 1, 1)}
+    for levels in (1, 8, 21, 60):
+        axes = (7,) * levels if levels <= 21 else (4, 2, 1) * 20
+        header = GeometryHeader(0, (0, 0, 0), axes, 1 << 24, codewords=min(3, levels), qp_offset=40)
+        payload = rng.integers(0, 256, 400, dtype=np.uint8).tobytes() if fill is None else bytes([fill]) * 400
+        for unique, scaling, bits in ((True, False, False), (False, True, True)):
+            parameters = GeometryParameters(
+                unique, boundary, boundary > 0, 6 if boundary else 0, partial_splits=True, scaling=scaling, **tools
+            )
+            with pytest.raises(FormatError):
+                SliceCoder().decode_geometry(parameters, header, payload, CodingContext(bits))
+    predictive = GeometryParameters(False, predictive=True, scaling=True)
+    header = GeometryHeader(0, (0, 0, 0), (), 1 << 24, residual_bits=(7, 7, 7))
+    with pytest.raises(FormatError):
+        SliceCoder().decode_geometry(predictive, header, payload)
+
+
+@pytest.mark.parametrize("encoding", [PREDICTING, LIFTING, RAW])
+@pytest.mark.parametrize("fill", [0, 255, None])
+def test_made_up_attributes(encoding: int, fill: int | None) -> None:
+    rng = np.random.default_rng(0)
+    payload = rng.integers(0, 256, 300, dtype=np.uint8).tobytes() if fill is None else bytes([fill]) * 300
+    details = DetailSettings(3, 128, (1, 1, 8), 6, direct_predictors=3, search_within=64, skip_layers=0, blend=True)
+    for components, bits in ((1, 8), (3, 16)):
+        coder = SliceCoder()
+        coder.build(rng.integers(0, 1 << 6, (80, 3)), 6)
+        parameters = AttributeParameters(51, encoding=encoding, details=details, variable_length=components == 1)
+        unit = AttributePayload(AttributeHeader(0), parameters, memoryview(payload))
+        try:
+            values = coder.decode_unit(unit, AttributeDescription("color", components, bits), CodingContext())
+            assert values.min() >= 0 and values.max() < 1 << 16
+        except FormatError:
+            pass

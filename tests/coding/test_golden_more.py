@@ -14,7 +14,9 @@ from ggslam.coding import decode_cloud
 from ggslam.coding.stream import read_stream
 
 LARGE = ["room_1m_qp22", "room_1m_qp10_4slices", "dense_noise_qp22"]
-TOOLS = ["coding_scale_half", "idcm1", "tiles"]
+TOOLS = ["axis_order_zyx", "bypass", "coding_scale_half", "colour_matrix_ycgco", "ctc_raht", "entropy_continuation",
+         "entropy_streams", "geometry_qp", "idcm1", "idcm3", "lifting", "planar", "pred_transform", "predgeom", "qtbt",
+         "reference_defaults", "tiles"]  # fmt: skip
 CLOUDS = ["angel10", "lidar_mm_neg"]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from ggslam.coding import CodecSettings, decode_cloud, decode_slice, encode_cloud, list_slices
 from ggslam.coding.container import UnitType, read_units
-from ggslam.coding.native import SliceCoder
+from ggslam.coding.slice_coder import SliceCoder
 from ggslam.coding.stream import read_stream
 
 NAMES = [
@@ -43,7 +43,7 @@ def test_geometry_is_coded_byte_for_byte(gpcc_data: Path, name: str) -> None:
     """From shuffled positions of each slice, on the golden stream's own partition."""
     for units in read_stream(stream(gpcc_data, name)).slices:
         header = units.header
-        decoded = SliceCoder().decode_geometry(units.geometry, header.depth, units.payload, header.points)
+        decoded = SliceCoder().decode_geometry(units.geometry, header, units.payload)
         coder = SliceCoder()
         coder.build(np.random.default_rng(0).permutation(decoded), header.depth)
         assert coder.encode_geometry(units.geometry) == bytes(units.payload)

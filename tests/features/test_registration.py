@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ggslam.features.orb import FeatureSettings, Landmarks, View
+from ggslam.features.orb import FeatureSettings, FeatureView, Landmarks
 from ggslam.features.registration import RegistrationSettings, pixels_of, register
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, se3_exp, se3_log
@@ -66,7 +66,7 @@ def test_landmarks_are_the_features_with_depth() -> None:
     color = np.kron(random.integers(0, 256, (12, 16, 3)), np.ones((20, 20, 1))).astype(np.uint8)
     depth = np.full((240, 320), 2.0, np.float32)
     depth[:, :160] = 0
-    view, settings = View(color, depth, np.eye(4)), FeatureSettings(count=300)
+    view, settings = FeatureView(color, depth, np.eye(4)), FeatureSettings(count=300)
     found, features = view.landmarks(CAMERA, settings), view.features(settings)
     right = np.rint(features.pixels[:, 0]) >= 160
     assert 20 < len(found) == right.sum() < len(features.pixels)

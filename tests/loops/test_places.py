@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 
 from ggslam.errors import FormatError
-from ggslam.features.orb import View
+from ggslam.features.orb import FeatureView
 from ggslam.loops.places import PlaceIndex
 from ggslam.scene.camera import Camera
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 
 
-def view(place: int, shift: int = 0, noise: float = 2.0) -> View:
+def view(place: int, shift: int = 0, noise: float = 2.0) -> FeatureView:
     """A picture of one of many walls, each with a pattern of its own; the camera moves along it by pixels."""
     coarse = np.random.default_rng(place).integers(0, 256, (15, 30, 3)).astype(np.uint8)
     wall = cv2.resize(coarse, (300, 150), interpolation=cv2.INTER_NEAREST)
     shown = wall[10:130, 40 + shift : 200 + shift].astype(float)
     shown += np.random.default_rng(1000 + place + shift).normal(0, noise, shown.shape)
     depth = np.full((120, 160), 1.0 + 0.1 * (place % 20), np.float32)
-    return View(shown.clip(0, 255).astype(np.uint8), depth, np.eye(4))
+    return FeatureView(shown.clip(0, 255).astype(np.uint8), depth, np.eye(4))
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +95,8 @@ def test_damaged_arrays_are_told(index: PlaceIndex) -> None:
 def test_views_without_features_or_depth_are_no_places() -> None:
     index = PlaceIndex(CAMERA)
     empty = PlaceIndex.from_arrays(CAMERA, index.to_arrays())
-    blank = View(np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32), np.eye(4))
-    blind = View(view(0).color, np.zeros((120, 160), np.float32), np.eye(4))
+    blank = FeatureView(np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32), np.eye(4))
+    blind = FeatureView(view(0).color, np.zeros((120, 160), np.float32), np.eye(4))
     for number, nothing in enumerate((blank, blind)):
         place = index.describe(nothing)
         assert len(place.landmarks) == 0

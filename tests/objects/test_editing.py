@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from ggslam.errors import ConfigError
-from ggslam.jobs.edit.editing import Edit, apply_edit
+from ggslam.jobs.edit.edits import Edit, apply_edit
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.editing import (
     duplicate_objects,

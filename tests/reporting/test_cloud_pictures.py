@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ggslam.reporting.cloud_pictures import View, contact_sheet, draw_cloud, view_of
+from ggslam.reporting.cloud_pictures import CloudView, contact_sheet, draw_cloud, view_of
 from ggslam.scene.camera import Camera
 
-VIEW = View(Camera(100, 80, 100.0, 100.0, 50.0, 40.0), np.eye(4))
+VIEW = CloudView(Camera(100, 80, 100.0, 100.0, 50.0, 40.0), np.eye(4))
 RED, BLUE = [255, 0, 0], [0, 0, 255]
 
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from ggslam.native.loader import NativeContext
-from ggslam.reporting.cloud_pictures import View, outside_view
+from ggslam.reporting.cloud_pictures import CloudView, outside_view
 from ggslam.reporting.mesh_pictures import draw_mesh
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 
 CAMERA = Camera(120, 90, 100, 100, 59.5, 44.5)
-FRONT = View(CAMERA, np.eye(4))
+FRONT = CloudView(CAMERA, np.eye(4))
 
 
 def square(z: float, half: float, color: tuple[int, int, int]) -> tuple[np.ndarray, ...]:

@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 import pytest
 
-from ggslam.reporting.pictures import IdentityColors, color_of_ids, compare, legend
+from ggslam.reporting.pictures import IdentityColors, color_of_ids, compare_pictures, legend
 
 
 def test_ids_have_their_colours_and_outlines_only_where_they_meet() -> None:
@@ -55,6 +55,6 @@ def test_a_legend_shows_every_colour() -> None:
 
 def test_a_comparison_takes_a_third_row() -> None:
     color, depth = np.zeros((10, 12, 3), np.uint8), np.ones((10, 12), np.float32)
-    two = compare(color, color, depth, depth)
-    three = compare(color, color, depth, depth, [color + 50, color, color])
+    two = compare_pictures(color, color, depth, depth)
+    three = compare_pictures(color, color, depth, depth, [color + 50, color, color])
     assert three.shape[0] == two.shape[0] + 14 and (three[: len(two)] == two).all() and (three[-1, 0] == 50).all()

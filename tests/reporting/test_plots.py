@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ggslam.reporting.plot_files import picture, svg, write_plots, write_sheet
+from ggslam.reporting.plot_files import rasterize, svg, write_plots, write_sheet
 from ggslam.reporting.plots import MOST_POINTS, Band, Plot, Series, Stroke, Word, draw, tick_text, ticks
 
 
@@ -99,7 +99,7 @@ def test_files_show_curves_in_their_colours(tmp_path: Path) -> None:
     assert [path.name for path in written] == ["error.svg", "error.png"]
     ElementTree.parse(written[0])
     pixels = cv2.imread(str(written[1]))[..., ::-1]
-    np.testing.assert_array_equal(pixels, picture(draw(plot, height=340, titled=True)))
+    np.testing.assert_array_equal(pixels, rasterize(draw(plot, height=340, titled=True)))
     blue = (pixels == (0, 0x72, 0xB2)).all(-1).sum()
     orange = (pixels == (0xD5, 0x5E, 0)).all(-1).sum()
     assert 0.4 * blue < orange < 0.8 * blue  # three fifths of it
@@ -114,7 +114,7 @@ def test_a_sheet_holds_plots_side_by_side(tmp_path: Path) -> None:
     parts = ElementTree.parse(written[0]).getroot().findall(f"{space}svg")
     assert [float(part.get("x", -1)) for part in parts] == [0.0, float(parts[0].get("width", 0))]
     assert all(len(part.findall(f"{space}path")) == 1 for part in parts)  # the dots
-    left = picture(draw(one, height=340, titled=True))
+    left = rasterize(draw(one, height=340, titled=True))
     pixels = cv2.imread(str(written[1]))[..., ::-1]
     assert pixels.shape[1] == 2 * left.shape[1]
     np.testing.assert_array_equal(pixels[:, : left.shape[1]], left)

@@ -14,7 +14,7 @@ import torch
 
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.evaluation.trajectory import score_trajectory
-from ggslam.jobs.edit.editing import Edit, edit_run
+from ggslam.jobs.edit.edits import Edit, edit_run
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
 from ggslam.loops.activity import ActivitySettings
 from ggslam.rendering.cpu import CpuRasterizer

@@ -67,7 +67,7 @@ def test_shuffled_ids_become_objects(room: Path, tmp_path: Path) -> None:
     outcome = run(room, tmp_path / "run", masks=tmp_path / "masks", evaluate=False)
     assert table(tmp_path / "run")["supervision"] == "associated masks"
     from ggslam.jobs.progress import SilentObserver
-    from ggslam.jobs.score.scoring import score_run
+    from ggslam.jobs.score.run import score_run
     from ggslam.runs.recordings import open_recording_of
 
     truth = open_recording_of(outcome.folder, masks=room / "masks")

@@ -19,7 +19,7 @@ from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.trajectory import read_tum
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
-from ggslam.jobs.score.scoring import score_run
+from ggslam.jobs.score.run import score_run
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.runs.recordings import SequenceRequest

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ggslam.cuda.transfers import Download
-from ggslam.features.orb import View
+from ggslam.features.orb import FeatureView
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -130,7 +130,7 @@ def test_alignments_are_those_of_the_core(
 
 
 @pytest.mark.parametrize(
-    "change", [{"coarse_iterations": 0}, {"fine_iterations": 1}, {"coarse_points": 100}, {"min_normal_dot": -2.0}]
+    "change", [{"coarse_iterations": 0}, {"fine_iterations": 1}, {"coarse_points": 100}, {"min_normal_dot": -1.0}]
 )
 def test_every_setting_means_the_same(
     engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget,
@@ -308,7 +308,7 @@ def test_the_mode_goes_with_the_median_depth_of_the_frame_itself(
 
     class Watching(GicpTracker):
         def _locate_by(
-            self, mode: PhotometricMode, view: View, points: PointSource, target: GicpTarget
+            self, mode: PhotometricMode, view: FeatureView, points: PointSource, target: GicpTarget
         ) -> tuple[AlignmentResult, str]:
             modes.append((len(depths), mode))
             return super()._locate_by(mode, view, points, target)

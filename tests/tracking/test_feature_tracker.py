@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from feature_scenes import CAMERA, room_view
 
-from ggslam.features.orb import View
+from ggslam.features.orb import FeatureView
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.raw_points import read_pose_graph, read_raw_points
 from ggslam.native.loader import NativeContext
@@ -151,7 +151,7 @@ def test_relocation_begins_a_new_local_map() -> None:
     points = extract_points(frame.depth, CAMERA, PointSettings(), noise, tracker.context)
     assert tracker.target is not None
     found = align(points, tracker.target, jump, TrackerSettings().align, noise, tracker.context)
-    result = tracker.relocate(View(frame.color, frame.depth, np.eye(4)), points, found, "keyframe 3")
+    result = tracker.relocate(FeatureView(frame.color, frame.depth, np.eye(4)), points, found, "keyframe 3")
     assert result.status is TrackingStatus.RECOVERED and result.reason == "keyframe 3"
     after = run(tracker, [jump])[0]
     assert after.status is TrackingStatus.OK and error_m(after.T_world_camera, jump) < 3e-3

@@ -6,10 +6,11 @@ import ctypes
 import numpy as np
 import pytest
 
-from ggslam.native.loader import NativeContext, available_instruction_sets
+from ggslam.interface.arrays import address
+from ggslam.native.loader import NativeContext, available_instruction_sets, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, se3_exp, se3_log
-from ggslam.tracking import native, reference
+from ggslam.tracking import reference
 from ggslam.tracking.gicp import (
     PLANE_VARIANCE,
     AlignmentStatus,
@@ -74,9 +75,9 @@ def kernel_linearization(
     H, b = np.empty((6, 6)), np.empty(6)
     match, squared = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
     pose = np.ascontiguousarray(T)
-    native.library().ggslam_gicp_linearize(
+    load_library().ggslam_gicp_linearize(
         context.handle, target.handle, native_points(points), ctypes.byref(native_align_settings(SETTINGS, NOISE)), 0,
-        *(native.address(a) for a in (pose, match, squared, H, b)),
+        *(address(a) for a in (pose, match, squared, H, b)),
     )  # fmt: skip
     return H, b, match
 
@@ -231,7 +232,7 @@ def test_the_number_of_points_depends_neither_on_resolution_nor_on_holes(context
     counts = []
     for scale in (2, 4, 8):
         for known in (1.0, 0.3):  # share of the image with depth
-            camera = CAMERA.scaled(scale)
+            camera = CAMERA.scale(scale)
             depth = np.full((camera.height, camera.width), 2.0, np.float32)
             depth[:, round(known * camera.width) :] = 0
             counts.append(len(extract_points(depth, camera, PointSettings(count=5000), NOISE, context)))

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ggslam.features.orb import FeatureSettings, View, pose_from_matches
+from ggslam.features.orb import FeatureSettings, FeatureView, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -124,17 +124,18 @@ def test_feature_matches_give_the_pose() -> None:
     truth = se3_exp(np.array([0.2, -0.1, 0.1, 0.03, 0.1, -0.1]))
     one, two = wall_view(STILL, True), wall_view(truth, True)
     found = pose_from_matches(
-        View(two.color, two.depth, np.eye(4)), View(one.color, one.depth, STILL), CAMERA, FeatureSettings()
+        FeatureView(two.color, two.depth, np.eye(4)), FeatureView(one.color, one.depth, STILL), CAMERA,
+        FeatureSettings(),
     )
     assert found is not None and found.matches >= found.inliers >= FeatureSettings().min_inliers
     assert error_m(found.T_world_camera, truth) < 0.04
 
 
 def test_nothing_to_match_gives_no_start() -> None:
-    blank = View(np.zeros((240, 320, 3), np.uint8), np.ones((240, 320), np.float32), STILL)
+    blank = FeatureView(np.zeros((240, 320, 3), np.uint8), np.ones((240, 320), np.float32), STILL)
     view = wall_view(STILL, True)
-    textured = View(view.color, view.depth, STILL)
-    no_depth = View(view.color, np.zeros((240, 320), np.float32), STILL)
+    textured = FeatureView(view.color, view.depth, STILL)
+    no_depth = FeatureView(view.color, np.zeros((240, 320), np.float32), STILL)
     for frame, earlier in ((blank, textured), (textured, blank), (textured, no_depth)):
         assert pose_from_matches(frame, earlier, CAMERA, FeatureSettings()) is None
 

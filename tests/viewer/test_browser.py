@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.jobs.view.serve import serve_run, show_run, write_page
 from ggslam.jobs.view.viewed_run import ViewedRun
-from ggslam.jobs.view.viewing import serve_run, show_run, write_page
 from ggslam.runs.folder import RunFolder
 from ggslam.viewer.model import ListedObject
 from ggslam.viewer.server import address, close_server

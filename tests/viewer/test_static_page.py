@@ -50,4 +50,4 @@ def test_the_command_writes_a_page(run: RunFolder, tmp_path: Path) -> None:
     assert "@SPLATS@" not in text and "http://" not in text and "https://" not in text
     scene = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S).group(1))  # type: ignore[union-attr]
     assert scene["count"] == 2000 and len(scene["objects"]) == len(run.object_table())
-    assert len(scene["frames"]) == 6 and set(scene["views"]) == {"Start", "Top"}
+    assert len(scene["frames"]) == len(run.keyframes().poses()) and set(scene["views"]) == {"Start", "Top"}

@@ -10,9 +10,9 @@ import pytest
 
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
-from ggslam.jobs.edit.editing import Edit, edit_run
+from ggslam.jobs.edit.edits import Edit, edit_run
+from ggslam.jobs.view.serve import serve_run, write_page
 from ggslam.jobs.view.viewed_run import ViewedRun
-from ggslam.jobs.view.viewing import serve_run, write_page
 from ggslam.objects.editing import remove_objects
 from ggslam.objects.segmented_rows import keep_rows
 from ggslam.rendering.cpu import CpuRasterizer
@@ -119,7 +119,7 @@ def test_edits_can_be_taken_back(viewed: ViewedRun) -> None:
 
 def test_an_exported_object_is_a_splat_file(viewed: ViewedRun, tmp_path: Path) -> None:
     record = viewed.objects()[0]
-    name, content = viewed.exported(record.id)
+    name, content = viewed.export(record.id)
     (tmp_path / name).write_bytes(content)
     found = read_gaussian_ply(tmp_path / name, with_moments=False)
     assert len(found) == record.gaussians and (found.object_id == record.id).all()

@@ -21,7 +21,7 @@ from ggslam.coding.cloud import PointCloud
 from ggslam.coding.energy import EnergyMeter
 from ggslam.coding.settings import CodecSettings
 from ggslam.coding.study import GridCloud, StudyRow, SweepStep, run_sweep
-from ggslam.reporting.cloud_pictures import View, contact_sheet, draw_cloud, view_of
+from ggslam.reporting.cloud_pictures import CloudView, contact_sheet, draw_cloud, view_of
 from ggslam.reporting.pictures import write_picture
 from ggslam.reporting.plot_files import write_sheet
 from ggslam.reporting.plots import Plot, Series
@@ -103,7 +103,7 @@ class _Pictures:
     def __init__(self, cloud: GridCloud, folder: Path) -> None:
         self._folder, self._cloud = folder, cloud
         points = self._placed(cloud.grid)
-        self._view: View = view_of(points)
+        self._view: CloudView = view_of(points)
         original = draw_cloud(points, cloud.colors, self._view, 1 / cloud.quantization.scale)
         self._original = (original, f"original, {len(cloud.grid)} points")
         self._drawn: dict[str, list[tuple[np.ndarray, str]]] = {}

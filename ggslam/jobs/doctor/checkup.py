@@ -173,6 +173,7 @@ def _version(distribution: str) -> str | None:
 
 
 def _core() -> Iterator[Finding]:
+    from ggslam.interface.binding import core_hash
     from ggslam.native import loader
 
     advice = "run `pip install .` or, in a checkout, `bash scripts/build_native.sh`; see the message above"
@@ -182,7 +183,7 @@ def _core() -> Iterator[Finding]:
     except (GgslamError, OSError, AttributeError) as error:
         yield Finding("core", "compiled core", "broken", str(error), advice)
         return
-    yield Finding("core", "compiled core", "ok", f"interface {loader.ABI_VERSION}, {library._name}")
+    yield Finding("core", "compiled core", "ok", f"interface {core_hash()[:12]}, {library._name}")
     chosen = " (GGSLAM_ISA)" if "GGSLAM_ISA" in os.environ else ""
     yield Finding("core", "instruction set", "ok", f"{context.instruction_set}{chosen}, of {', '.join(offered)}")
     yield Finding("core", "threads", "ok", str(context.threads))
@@ -275,10 +276,10 @@ def _self_test() -> Iterator[Finding]:
     from ggslam.jobs.doctor.self_test import checks
 
     for name, check in checks().items():
-        yield _tested(name, check)
+        yield _test(name, check)
 
 
-def _tested(name: str, check: Callable[[], str]) -> Finding:
+def _test(name: str, check: Callable[[], str]) -> Finding:
     start = time.perf_counter()
     try:
         detail = check()

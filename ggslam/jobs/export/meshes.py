@@ -88,7 +88,7 @@ def export_mesh(
     views = _views(folder, request)
     for note in views.notes:
         observer.note(note)
-    mesh = _fused(folder, views, request.voxel, observer)
+    mesh = _fuse(folder, views, request.voxel, observer)
     names = {} if table is None else {o.id: o.name for o in table.objects if o.name}
     if ids is None:
         return _write(out, mesh, names, views.origin)
@@ -101,7 +101,7 @@ def export_mesh(
     return _write(out, mesh.part(np.isin(labels, ids)), names, views.origin)
 
 
-def _fused(folder: RunFolder, views: _Views, voxel: float | None, observer: Observer) -> Mesh:
+def _fuse(folder: RunFolder, views: _Views, voxel: float | None, observer: Observer) -> Mesh:
     settings = folder.config().volumes
     if voxel is not None:
         settings = replace(settings, tsdf=replace(settings.tsdf, voxel=voxel))
@@ -122,9 +122,9 @@ def _fused(folder: RunFolder, views: _Views, voxel: float | None, observer: Obse
 
 def _views(folder: RunFolder, request: MeshRequest) -> _Views:
     if request.rendered:
-        return _rendered(folder)
+        return _map_views(folder)
     if folder.mark().edits:
-        views = _rendered(folder)
+        views = _map_views(folder)
         views.notes.append("the run was edited: depth is rendered from the edited map")
         return views
     try:
@@ -132,13 +132,13 @@ def _views(folder: RunFolder, request: MeshRequest) -> _Views:
     except (SequenceError, RunFolderError) as missing:
         if request.recording is not None:
             raise
-        views = _rendered(folder)
+        views = _map_views(folder)
         views.notes.append(f"depth is rendered from the map: {missing}")
         return views
     return _Views(iter(source), len(source), f"{len(source)} depth images of the recording", source.notes)
 
 
-def _rendered(folder: RunFolder) -> _Views:
+def _map_views(folder: RunFolder) -> _Views:
     """The map as the keyframes see it."""
     keyframes = folder.keyframes().keyframes
     if not keyframes:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from ggslam.jobs.render.rendering import render_frames, select_frames
+from ggslam.jobs.render.frames import render_frames, select_frames
 from ggslam.runs.folder import RunFolder
 
 

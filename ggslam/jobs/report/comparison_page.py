@@ -72,7 +72,7 @@ def _each(groups: Sequence[Sequence[RunData]], contents: Sequence[Html]) -> Html
     """What is shown of each recording, under its name if there are several."""
     if len(groups) == 1:
         return contents[0]
-    return p.joined(
+    return p.join(
         p.tag("div", p.tag("h3", f"{', '.join(run.name for run in group)}: {group[0].recording_name()}"), content,
               class_="recording")
         for group, content in zip(groups, contents, strict=True)
@@ -86,7 +86,7 @@ def _scores(runs: Sequence[RunData]) -> Html:
         if any(value is not None for value in values):
             unit = f", {metric.unit}" if metric.unit else ""
             texts = [metric.text(value) for value in values]
-            rows.append([f"{metric.name}{unit}", *(_marked(metric, values) if one else texts)])
+            rows.append([f"{metric.name}{unit}", *(_mark_best(metric, values) if one else texts)])
     if not rows:
         return p.tag("p", "None of these runs was scored; ggslam eval does that.")
     unscored = [run.name for run in runs if run.metrics is None]
@@ -97,10 +97,10 @@ def _scores(runs: Sequence[RunData]) -> Html:
         note.append(p.tag("p", "The runs are of different frames of the recording; so are their scores."))
     if one:
         note.insert(0, p.tag("p", "The best of each row is marked, unless all are equal as printed.", class_="note"))
-    return p.joined([p.table(["", *(run.name for run in runs)], rows), *note])
+    return p.join([p.table(["", *(run.name for run in runs)], rows), *note])
 
 
-def _marked(metric: Metric, values: Sequence[float | None]) -> list[str]:
+def _mark_best(metric: Metric, values: Sequence[float | None]) -> list[str]:
     """Cells of a row, the best one marked."""
     texts = [metric.text(value) for value in values]
     known = [value for value in values if value is not None and math.isfinite(value)]
@@ -132,7 +132,7 @@ def _views(views: Sequence[FrameView], runs: int) -> Html:
     if not views:
         return p.tag("p", "No frame was located in all of these runs.")
     columns = min(runs + 1, 4)  # the recorded image comes first
-    return p.joined(
+    return p.join(
         p.tag("div", p.tag("h3", f"frame {view.frame}"), p.cells(view.pictures.items(), columns), class_="view")
         for view in views
     )

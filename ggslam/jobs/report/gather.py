@@ -49,7 +49,7 @@ def _load(folder: RunFolder, sequence: Sequence | None, views: list[FrameView]) 
     timing, recording = TimingRecord.read_if_there(folder.path), SequenceRecord.read_if_there(folder.path)
     path = folder.path.absolute()
     return RunData(
-        name=path.name, path=str(path), camera_path=camera_path(folder, record, sequence), tracked=_columns(record),
+        name=path.name, path=str(path), camera_path=path_of_run(folder, record, sequence), tracked=_columns(record),
         keyframes=np.array([k.frame for k in record.keyframes], int),
         steps=_table(folder, STEPS_FILE), scores=_table(folder, "frames.csv"), metrics=metrics, timing=timing,
         settings=_settings(folder), defaults=flat(config_to_dict(Config())), recording=recording, mark=mark,
@@ -116,7 +116,7 @@ def level_axes(folder: RunFolder, record: KeyframesRecord) -> LevelAxes:
     return LevelAxes(np.stack([np.cross(forward, found.up), forward, found.up]), source, found.floor)
 
 
-def camera_path(folder: RunFolder, record: KeyframesRecord, sequence: Sequence | None = None) -> Path3D:
+def path_of_run(folder: RunFolder, record: KeyframesRecord, sequence: Sequence | None = None) -> Path3D:
     """The camera's path from keyframes.json, with the truth laid upon it if it is known.
 
     Args:

@@ -15,7 +15,7 @@ from ggslam.jobs.report.gather import has_limit, load_run, save_truth
 from ggslam.jobs.report.run_data import FrameView, RunData
 from ggslam.jobs.report.run_page import run_page
 from ggslam.jobs.report.run_plots import all_plots
-from ggslam.jobs.report.views import RENDER, TRUTH, rendered_views, saved_views, spread
+from ggslam.jobs.report.views import RENDER, TRUTH, pick_frames, rendered_views, saved_views
 from ggslam.reporting.plot_files import write_plots
 from ggslam.runs.folder import REPORT_FILE, RunFolder, as_written
 from ggslam.runs.recordings import open_recording_of
@@ -42,7 +42,7 @@ def write_report(folder: RunFolder, sequence: Sequence | None = None, plots: Pat
     recording = sequence if sequence is not None else _recording(folder)
     views = saved_views(folder)
     if not views and not has_limit(folder):  # a view may see far more than a run with a limit holds
-        views = rendered_views(folder, recording, spread(folder.keyframes().poses()))
+        views = rendered_views(folder, recording, pick_frames(folder.keyframes().poses()))
     run = load_run(folder, recording, views)
     path = folder.path / REPORT_FILE
     with as_written(folder.path):
@@ -80,7 +80,8 @@ def write_comparison(folders: list[RunFolder], out: Path, plots: Path | None = N
     runs = _named_apart([load_run(f, recording) for f, recording in zip(folders, recordings, strict=True)])
     groups, views = [], []
     for numbers in by_recording(runs):
-        frames = spread(set.intersection(*({*runs[i].camera_path.frames.tolist()} for i in numbers)), COMPARED_VIEWS)
+        common = set.intersection(*({*runs[i].camera_path.frames.tolist()} for i in numbers))
+        frames = pick_frames(common, COMPARED_VIEWS)
         group = [replace(runs[i], views=rendered_views(folders[i], recordings[i], frames)) for i in numbers]
         groups.append(_in_one_world(group))
         views.append(_same_views(group, frames))

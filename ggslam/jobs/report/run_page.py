@@ -29,7 +29,7 @@ def run_page(run: RunData) -> str:
     """The whole page as text."""
     parts = [
         ("scores", "Scores", _scores(run)), ("views", "Views", _views(run)), ("trajectory", "Trajectory", _path(run)),
-        ("quality", "Image quality", _quality(run)), ("tracking", "Tracking", _tracking(run)),
+        ("quality", "Image quality", _quality(run)), ("tracking", "Tracking", _tracking_part(run)),
         ("time", "Time", _time(run)), ("map", "Map and memory", _map(run)), ("losses", "Losses", _losses(run)),
         ("meaning", "What the numbers mean", p.definitions(MEANINGS)), ("settings", "Settings", _settings(run)),
         ("versions", "Recording and versions", _versions(run)),
@@ -68,7 +68,7 @@ def _scores(run: RunData) -> Html:
     parts = [_image_scores(run.metrics), _trajectory_scores(run, run.metrics)]
     if run.metrics.segmentation is not None:
         parts.append(_object_scores(run.metrics.segmentation))
-    return p.joined(parts)
+    return p.join(parts)
 
 
 def _numbers(scores: Record | None, columns: tuple[tuple[str, str, float, str], ...]) -> list[str]:
@@ -107,7 +107,7 @@ def _object_scores(scores: SegmentationRecord) -> Html:
         [i, o.name or "", *_numbers(o, (("", "iou", 100.0, ".1f"),))] for i, o in scores.per_object.items()
     ]
     listed = p.table(["id", "name", "IoU, %"], each, sorts=True, text_columns=(1,))
-    return p.joined([overall, p.tag("details", p.tag("summary", f"{len(each)} objects one by one"), listed)])
+    return p.join([overall, p.tag("details", p.tag("summary", f"{len(each)} objects one by one"), listed)])
 
 
 def _views(run: RunData) -> Html:
@@ -119,7 +119,7 @@ def _views(run: RunData) -> Html:
     ]
     more = shown[_OPEN_VIEWS:]
     folded = [p.tag("details", p.tag("summary", f"{len(more)} more"), *more)] if more else []
-    return p.joined([*shown[:_OPEN_VIEWS], *folded])
+    return p.join([*shown[:_OPEN_VIEWS], *folded])
 
 
 def _path(run: RunData) -> Html:
@@ -130,7 +130,7 @@ def _path(run: RunData) -> Html:
     missing = []
     if run.camera_path.truth is None:
         missing = [p.tag("p", f"No comparison with true poses: {run.camera_path.reason}.")]
-    return p.joined(
+    return p.join(
         [p.tag("p", words, class_="note"), p.figures([*trajectory_plots([run]), error_plot([run])]), *missing]
     )
 
@@ -139,13 +139,13 @@ def _quality(run: RunData) -> Html:
     if not run.scores:
         return p.tag("p", "This run was not scored; ggslam eval does that, and writes this page anew.")
     missing = [p.tag("p", f"{plot.title} was not scored.") for plot in score_plots([run]) if not plot.has_data()]
-    return p.joined([p.figures(score_plots([run])), *missing])
+    return p.join([p.figures(score_plots([run])), *missing])
 
 
-def _tracking(run: RunData) -> Html:
+def _tracking_part(run: RunData) -> Html:
     counts = {name: int((run.tracked["status"] == name).sum()) for name in dict.fromkeys(run.tracked["status"])}
     words = ", ".join(f"{count} {name}" for name, count in counts.items())
-    return p.joined([p.tag("p", f"Frames: {words}."), p.figures(tracking_plots([run]))])
+    return p.join([p.tag("p", f"Frames: {words}."), p.figures(tracking_plots([run]))])
 
 
 def _time(run: RunData) -> Html:
@@ -159,12 +159,12 @@ def _time(run: RunData) -> Html:
     ), class_="bar")  # fmt: skip
     frames = 1 if run.timing is None else max(1, run.timing.frames)
     rows = [
-        [p.joined([p.tag("span", class_=f"swatch fill{n}"), name]), f"{seconds:.2f}", f"{1000 * seconds / frames:.1f}",
+        [p.join([p.tag("span", class_=f"swatch fill{n}"), name]), f"{seconds:.2f}", f"{1000 * seconds / frames:.1f}",
          f"{100 * seconds / total:.0f}", words] for n, (name, words, seconds) in enumerate(stages)
     ]  # fmt: skip
     listed = p.table(["stage", "seconds", "ms a frame", "%", ""], rows, text_columns=(4,))
     course = p.figures(time_plots([run])) if run.steps else p.tag("p", _NO_STEPS)
-    return p.joined([bar, listed, course])
+    return p.join([bar, listed, course])
 
 
 def _map(run: RunData) -> Html:
@@ -191,7 +191,7 @@ def _settings(run: RunData) -> Html:
     )  # fmt: skip
     rows = [[name, str(value)] for name, value in run.settings.items()]
     whole = p.table(["setting", "value"], rows, text_columns=(1,))
-    return p.joined([top, p.tag("details", p.tag("summary", f"All {len(rows)} settings"), whole)])
+    return p.join([top, p.tag("details", p.tag("summary", f"All {len(rows)} settings"), whole)])
 
 
 def _versions(run: RunData) -> Html:

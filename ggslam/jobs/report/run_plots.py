@@ -58,15 +58,16 @@ def error_plot(runs: Sequence[RunData]) -> Plot:
         for n, run in known if run.camera_path.error_m is not None
     ]  # fmt: skip
     return Plot(
-        "trajectory_error", "Distance from the true position, aligned", FRAME, "error (cm)", series, _lost(runs), True
-    )
+        "trajectory_error", "Distance from the true position, aligned", FRAME, "error (cm)", series, _lost_bands(runs),
+        from_zero=True,
+    )  # fmt: skip
 
 
 def _label(runs: Sequence[RunData], run: RunData, words: str) -> str:
     return words if len(runs) == 1 else run.name
 
 
-def _lost(runs: Sequence[RunData]) -> list[Band]:
+def _lost_bands(runs: Sequence[RunData]) -> list[Band]:
     """Stretches of frames without a pose, of a single run."""
     if len(runs) != 1 or "status" not in runs[0].tracked:
         return []
@@ -96,7 +97,7 @@ def score_plots(runs: Sequence[RunData]) -> list[Plot]:
                 for kind, label, color in (("keyframe", "keyframes", 1), ("held_out", "held out", 2)):
                     chosen = kinds == kind
                     series.append(Series(label, frame[chosen], value[chosen], "dots", color))
-        plots.append(Plot(column, title, FRAME, y_label, series, _lost(runs)))
+        plots.append(Plot(column, title, FRAME, y_label, series, _lost_bands(runs)))
     return plots
 
 
@@ -110,7 +111,7 @@ def tracking_plots(runs: Sequence[RunData]) -> list[Plot]:
         Plot(f"tracking_{column}", title, FRAME, y_label, [
             _curve(_label(runs, run, title), run.tracked["frame"], factor * run.tracked[column], n)
             for n, run in enumerate(runs) if column in run.tracked
-        ], _lost(runs), from_zero=column != "overlap")
+        ], _lost_bands(runs), from_zero=column != "overlap")
         for column, title, y_label, factor in columns
     ]  # fmt: skip
 
@@ -156,12 +157,12 @@ def loss_plots(runs: Sequence[RunData]) -> list[Plot]:
     """What the optimiser made small."""
     note = f"Means over the iterations of {_SMOOTH} frames."
     plots = [
-        Plot("loss", "Loss", FRAME, "loss", _steps(runs, [("loss_total", "loss")], _smoothed), from_zero=True,
+        Plot("loss", "Loss", FRAME, "loss", _steps(runs, [("loss_total", "loss")], _smooth), from_zero=True,
              note=note),
     ]  # fmt: skip
     if len(runs) == 1:
         terms = [("loss_color", "colour, mean absolute difference"), ("loss_depth", "depth (m)")]
-        plots.append(Plot("loss_terms", "Its terms, unweighted", FRAME, "value", _steps(runs, terms, _smoothed),
+        plots.append(Plot("loss_terms", "Its terms, unweighted", FRAME, "value", _steps(runs, terms, _smooth),
                           from_zero=True, note=note))  # fmt: skip
     return plots
 
@@ -170,7 +171,7 @@ def _as_is(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _smoothed(values: np.ndarray) -> np.ndarray:
+def _smooth(values: np.ndarray) -> np.ndarray:
     """Running mean of what is finite."""
     known, window = np.isfinite(values), np.ones(_SMOOTH)
     count = np.convolve(known, window, "same")[: len(values)] if len(values) >= _SMOOTH else known

@@ -90,7 +90,7 @@ def rendered_views(folder: RunFolder, sequence: Sequence | None, frames: Iterabl
         shown = rasterizer.forward(gaussians, camera, T_camera_world, features=objects is not None)
         color = color_to_uint8(shown.image.numpy())
         depth = np.where(shown.alpha.numpy() > 0.5, shown.expected_depth.numpy(), 0)
-        pictures = _beside(_recorded(sequence, number), color, depth)
+        pictures = _beside(_recorded_frame(sequence, number), color, depth)
         if objects is not None:
             ids = object_ids(rasterizer, shown, objects.around(gaussians))
             pictures[_CAPTIONS[2][1]] = color_of_ids(ids, objects.table.palette(), outlines=True)
@@ -98,7 +98,7 @@ def rendered_views(folder: RunFolder, sequence: Sequence | None, frames: Iterabl
     return views
 
 
-def _recorded(sequence: Sequence | None, number: int) -> Frame | None:
+def _recorded_frame(sequence: Sequence | None, number: int) -> Frame | None:
     if sequence is None:
         return None
     try:
@@ -120,7 +120,7 @@ def _beside(frame: Frame | None, color: np.ndarray, depth: np.ndarray) -> dict[s
     }  # fmt: skip
 
 
-def spread(frames: Iterable[int], count: int = VIEWS) -> list[int]:
+def pick_frames(frames: Iterable[int], count: int = VIEWS) -> list[int]:
     """Some of the frames, first and last among them."""
     known = sorted(frames)
     chosen = np.unique(np.linspace(0, len(known) - 1, min(count, len(known))).round().astype(int))

@@ -15,7 +15,7 @@ from ggslam.cuda.availability import kernels_to_compile
 from ggslam.errors import ConfigError, DeviceError, GgslamError, SequenceError
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.report.pages import write_report
-from ggslam.jobs.score.scoring import score_run
+from ggslam.jobs.score.run import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe, open_recording_of
 from ggslam.runs.records.loops import LoopsRecord
@@ -28,7 +28,7 @@ from ggslam.slam.config import Config, load_config
 from ggslam.slam.realtime import RealtimeSlam
 from ggslam.slam.result import SlamResult, StepReport, tracked_poses
 from ggslam.slam.slam import Slam
-from ggslam.system.interrupts import uninterrupted
+from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.staging import new_staging
 
 
@@ -114,14 +114,14 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     lacking = _objects_notes(sequence, result, config, earlier)
     for text in [*LoopsRecord.of_result(result).notes(), *described.notes(), *lacking, *result.notes]:
         observer.note(text)
-    with uninterrupted():
+    with delay_interrupts():
         names = {**_names(earlier), **sequence.instance_names}
         try:
             folder.save(config, described, result, None if error is None else repr(error), names)
         finally:
             result.close()
     outcome = RunOutcome(folder, result, error=error)
-    kept = sequence if isinstance(sequence, Sequence) else None if error else _kept(folder, sequence)
+    kept = sequence if isinstance(sequence, Sequence) else None if error else _kept_recording(folder, sequence)
     if request.evaluate and error is None:
         if kept is None:
             observer.note("not scored: the frames of a live camera are kept with `record` only")
@@ -143,7 +143,7 @@ def _objects_notes(
     return ["no objects were learned: the masks of the keyframes label nothing"]
 
 
-def _kept(folder: RunFolder, sequence: LiveSequence) -> Sequence | None:
+def _kept_recording(folder: RunFolder, sequence: LiveSequence) -> Sequence | None:
     """What a live run recorded, if it did."""
     return None if sequence.record is None else open_recording_of(folder)
 
@@ -191,9 +191,9 @@ def run_slam(
             observer.begin("refine", config.refine_iterations)
         return slam.finish(observer.advance), None
     except (Exception, KeyboardInterrupt) as stopped:  # whatever it is: finished work is saved, then it is raised
-        error = _named(stopped)
+        error = _for_people(stopped)
     try:
-        with uninterrupted():
+        with delay_interrupts():
             result = _what_there_is(slam)
     except KeyboardInterrupt as again:  # by now there is the result
         error = again
@@ -207,7 +207,7 @@ def run_slam(
     return result, error
 
 
-def _named(stopped: BaseException) -> BaseException:
+def _for_people(stopped: BaseException) -> BaseException:
     """The error as it is told to people."""
     if isinstance(stopped, torch.cuda.OutOfMemoryError):
         return DeviceError(f"the GPU's memory is full: {str(stopped).partition('. GPU')[0]}")

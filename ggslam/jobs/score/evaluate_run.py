@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ggslam.jobs.progress import Observer, SilentObserver
-from ggslam.jobs.score.scoring import score_run
+from ggslam.jobs.score.run import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.metrics import MetricsRecord

@@ -13,7 +13,7 @@ import numpy as np
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.raw_points import read_raw_points
-from ggslam.localization.places import PLACES, StoredView, places_to_bytes
+from ggslam.localization.places import PLACES, StoredView, stored_places_to_bytes
 from ggslam.localization.surface import NORMAL
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.runs.folder import RunFolder
@@ -21,7 +21,7 @@ from ggslam.runs.recordings import fingerprint
 from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import transformed
+from ggslam.scene.poses import transform_points
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.submaps.cell_keys import partition
 from ggslam.submaps.cell_records import CellWrite
@@ -167,7 +167,7 @@ def _surface(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np
     )  # fmt: skip
     points, normals = [np.zeros((0, 3))], [np.zeros((0, 3), np.int8)]
     for steps, turned, reach, T in parts:
-        points.append(transformed(steps * (float(reach) / 32767), T))
+        points.append(transform_points(steps * (float(reach) / 32767), T))
         normals.append(np.rint(turned @ T[:3, :3].T).astype(np.int8))
     return np.concatenate(points), {NORMAL: np.concatenate(normals)}
 
@@ -185,7 +185,7 @@ def _views(arrays: Mapping[str, np.ndarray]) -> tuple[list[StoredView], Camera]:
 def _place_parts(store: GridStore, views: list[StoredView], camera: Camera) -> Iterator[CellWrite]:
     positions = np.array([view.T_world_camera[:3, 3] for view in views]).reshape(-1, 3)
     for key, indices in partition(positions, store.grid):
-        data = places_to_bytes([views[i] for i in indices.tolist()], camera)
+        data = stored_places_to_bytes([views[i] for i in indices.tolist()], camera)
         yield CellWrite(key, {PLACES: data}, counts={PLACES: len(indices)})
 
 

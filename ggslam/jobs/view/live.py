@@ -127,7 +127,7 @@ class LiveView:
             first.position, first.look_at, first.fov = start.position, start.look_at, vertical_fov(camera)
             keep_fitting(self._server, camera)
         rows = most_visible(snapshot.gaussians, self._max_splats)
-        picture = self._compared(snapshot, camera)
+        picture = self._compare(snapshot, camera)
         with self._server.atomic():
             self._nodes.set_splats({0: splats_of(snapshot.gaussians, rows)})
             self._nodes.set_path(snapshot.poses[:, :3, 3])
@@ -137,7 +137,7 @@ class LiveView:
             self._text.content, self._image.image = snapshot.text, picture
         self.updates += 1
 
-    def _compared(self, snapshot: _Snapshot, camera: Camera) -> np.ndarray:
+    def _compare(self, snapshot: _Snapshot, camera: Camera) -> np.ndarray:
         """The newest frame beside what the map shows there."""
         frame, size = snapshot.frame, (CELL_WIDTH, round(camera.height * CELL_WIDTH / camera.width))
         near, far = depth_range(frame.depth)
@@ -146,7 +146,7 @@ class LiveView:
             if self._rasterizer is None:  # kernels of one context take turns; the run must not wait for these
                 self._rasterizer = CpuRasterizer(context=NativeContext(1))
             view = self._rasterizer.forward(
-                snapshot.gaussians, camera.resized(*size), inverse(snapshot.T_world_camera), features=False
+                snapshot.gaussians, camera.resize(*size), inverse(snapshot.T_world_camera), features=False
             )
             depth = np.where(view.alpha.numpy() > 0.5, view.expected_depth.numpy(), 0)
             cells += [("rendered", color_to_uint8(view.image.numpy()))]

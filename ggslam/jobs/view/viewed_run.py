@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
-from ggslam.jobs.edit.editing import Edit, apply_edit, edit_run
+from ggslam.jobs.edit.edits import Edit, apply_edit, edit_run
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS, object_file_name
 from ggslam.jobs.view.pictures import ViewPictures
 from ggslam.objects.segmented_map import SegmentedMap
@@ -83,10 +83,10 @@ class ViewedRun:
 
     def _map_changed(self) -> None:
         """What was worked out of the map before an edit holds no more."""
-        self._pictures = ViewPictures(self._gaussians, self._segmented, self.camera, self._recorded)
+        self._pictures = ViewPictures(self._gaussians, self._segmented, self.camera, self._recorded_frame)
         self._shown: tuple[np.ndarray, Splats] | None = None
 
-    def _recorded(self, frame: int) -> Frame | None:
+    def _recorded_frame(self, frame: int) -> Frame | None:
         if self._recording is None:
             return None
         try:
@@ -149,12 +149,12 @@ class ViewedRun:
     def objects(self) -> list[ListedObject]:
         """See `ViewedMap`."""
         with self._lock:
-            return [] if self._segmented is None else [_listed(record) for record in self._segmented.table.objects]
+            return [] if self._segmented is None else [_list_object(record) for record in self._segmented.table.objects]
 
     def frame_picture(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """See `ViewedMap`."""
         with self._lock:
-            return self._pictures.compared(frame, self.frame_poses[frame])
+            return self._pictures.compare(frame, self.frame_poses[frame])
 
     def object_at(self, origin: np.ndarray, direction: np.ndarray, focal: float, hidden: set[int]) -> int:
         """See `ViewedMap`."""
@@ -226,7 +226,7 @@ class ViewedRun:
         with self._lock:
             return list(self._texts)
 
-    def exported(self, object_id: int) -> tuple[str, bytes]:
+    def export(self, object_id: int) -> tuple[str, bytes]:
         """See `EditableMap`."""
         with self._lock, TemporaryDirectory() as folder:
             record = self._scene().table.record(object_id)
@@ -265,7 +265,7 @@ class ViewedRun:
         return self._segmented
 
 
-def _listed(record: ObjectRecord) -> ListedObject:
+def _list_object(record: ObjectRecord) -> ListedObject:
     box = record.box
     return ListedObject(
         record.id, record.name, record.color, record.gaussians, np.array(box.center), np.array(box.axes),

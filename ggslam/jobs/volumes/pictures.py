@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ggslam.objects.colors import id_palette
-from ggslam.reporting.cloud_pictures import View, draw_cloud, looking
+from ggslam.reporting.cloud_pictures import CloudView, draw_cloud, view_along
 from ggslam.reporting.mesh_pictures import draw_mesh
 from ggslam.reporting.pictures import side_by_side
 from ggslam.volumes.mesh import Mesh
@@ -20,7 +20,7 @@ _ELEVATION = math.radians(40)
 """Angle at which one looks down."""
 
 
-def from_above(poses: np.ndarray, points: np.ndarray, up: np.ndarray) -> View:
+def from_above(poses: np.ndarray, points: np.ndarray, up: np.ndarray) -> CloudView:
     """A view from outside obliquely down upon points [N, 3], from behind where the cameras [n, 4, 4] mostly stood."""
     low, high = np.percentile(points, [2, 98], axis=0)
     middle = (low + high) / 2
@@ -30,18 +30,18 @@ def from_above(poses: np.ndarray, points: np.ndarray, up: np.ndarray) -> View:
         forward = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     forward /= np.linalg.norm(forward)
     direction = math.cos(_ELEVATION) * forward - math.sin(_ELEVATION) * up
-    view = looking(middle, direction, up, _WIDTH, _HEIGHT)
+    view = view_along(middle, direction, up, _WIDTH, _HEIGHT)
     x, y, z = ((points[:: max(1, len(points) // 20_000)] - middle) @ view.T_world_camera[:3, :3]).T
     camera = view.camera
     tangents = 2 * np.maximum(np.abs(x) / camera.width, np.abs(y) / camera.height) * camera.fx
     back = float(np.percentile(tangents - z, 98))
-    return looking(middle - back * direction, direction, up, _WIDTH, _HEIGHT)
+    return view_along(middle - back * direction, direction, up, _WIDTH, _HEIGHT)
 
 
-def from_a_camera(poses: np.ndarray, up: np.ndarray) -> View:
+def from_a_camera(poses: np.ndarray, up: np.ndarray) -> CloudView:
     """The view of the frame in the middle of the recording, from a step behind it."""
     pose = poses[len(poses) // 2]
-    return looking(pose[:3, 3] - 0.3 * pose[:3, 2], pose[:3, 2], up, _WIDTH, _HEIGHT)
+    return view_along(pose[:3, 3] - 0.3 * pose[:3, 2], pose[:3, 2], up, _WIDTH, _HEIGHT)
 
 
 def mesh_picture(mesh: Mesh, poses: np.ndarray, up: np.ndarray, by_object: bool = False) -> np.ndarray:

@@ -46,7 +46,7 @@ class FrameRecord(Record):
     reason: str = ""
 
     @property
-    def lost(self) -> bool:
+    def is_lost(self) -> bool:
         """Whether it has no pose."""
         return self.status == "lost"
 
@@ -87,7 +87,7 @@ class KeyframesRecord(RecordFile):
         Raises:
             RunFolderError: a pose is no finite matrix [4, 4].
         """
-        tracked = [f for f in self.frames if not f.lost and f.keyframe < len(self.keyframes)]
+        tracked = [f for f in self.frames if not f.is_lost and f.keyframe < len(self.keyframes)]
         poses = {}
         for f in tracked:
             matrices = (self.keyframes[f.keyframe].T_world_camera, f.T_keyframe_camera)

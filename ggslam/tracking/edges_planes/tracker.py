@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ggslam.features.orb import View, pose_from_matches
+from ggslam.features.orb import FeatureView, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -65,7 +65,7 @@ class FeatureTracker(Tracker):
         T_world_camera: np.ndarray | None = None,
     ) -> None:
         super().__init__(TrackerState.begin(camera, settings, context, T_world_camera))
-        self._gicp = GicpTracker.sharing(self.state)
+        self._gicp = GicpTracker.with_state(self.state)
         self.features = features or FeatureTrackerSettings()
         self.local_map = LocalFeatureMap(self.features)
         self.counts = FeatureCounts()
@@ -80,7 +80,7 @@ class FeatureTracker(Tracker):
             self.noise = estimate_noise(frame.depth, self.camera)
         scan = self._extractor.extract(frame.depth, self.noise or DepthNoise())
         points = DeferredPoints(lambda: self._points(frame), scan.median_depth)
-        view = View(frame.color, frame.depth, motion.T_world_camera)
+        view = FeatureView(frame.color, frame.depth, motion.T_world_camera)
         self.counts = FeatureCounts(len(scan.planes), len(scan.edges))
         if self.local_map.is_empty:
             return self._start_in_target(frame, scan) if motion.lost else self._begin_map(view, points, scan)
@@ -108,7 +108,7 @@ class FeatureTracker(Tracker):
         super().move(T_new_old)
         self.local_map.move(T_new_old)
 
-    def relocate(self, view: View, points: PointSource, found: AlignmentResult, source: str) -> TrackingResult:
+    def relocate(self, view: FeatureView, points: PointSource, found: AlignmentResult, source: str) -> TrackingResult:
         """As `Tracker.relocate`; the local map begins anew there."""
         result = super().relocate(view, points, found, source)
         self.local_map.clear()
@@ -128,13 +128,13 @@ class FeatureTracker(Tracker):
             self.local_map.add(scan, result.T_world_camera)
         return result
 
-    def _begin_map(self, view: View, points: PointSource, scan: ScanFeatures) -> TrackingResult:
+    def _begin_map(self, view: FeatureView, points: PointSource, scan: ScanFeatures) -> TrackingResult:
         result = self._begin(view, points)
         if result.status is not TrackingStatus.LOST:
             self.local_map.add(scan, result.T_world_camera)
         return result
 
-    def _search(self, view: View, scan: ScanFeatures, found: FeatureAlignment) -> tuple[FeatureAlignment, str]:
+    def _search(self, view: FeatureView, scan: ScanFeatures, found: FeatureAlignment) -> tuple[FeatureAlignment, str]:
         """The first convincing alignment from other starts, and which start it was; without one the alignment given,
         and no name. The budget does not count here."""
         self.local_map.clock.lift()
@@ -144,7 +144,7 @@ class FeatureTracker(Tracker):
                 return candidate, name
         return found, ""
 
-    def _starts(self, view: View) -> Iterator[tuple[str, np.ndarray]]:
+    def _starts(self, view: FeatureView) -> Iterator[tuple[str, np.ndarray]]:
         yield "last pose", self.state.motion.T_world_camera
         for number, earlier in enumerate(self.state.motion.views):
             pose = pose_from_matches(view, earlier, self.camera, self.settings.recovery.features)
@@ -152,7 +152,7 @@ class FeatureTracker(Tracker):
                 yield f"features of view {number}", pose.T_world_camera
 
     def _accept(
-        self, view: View, points: PointSource, scan: ScanFeatures, found: FeatureAlignment, reason: str
+        self, view: FeatureView, points: PointSource, scan: ScanFeatures, found: FeatureAlignment, reason: str
     ) -> TrackingResult:
         T = found.T_map_sensor
         self.state.motion.follow(view, T)

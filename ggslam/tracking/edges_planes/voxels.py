@@ -28,7 +28,7 @@ _MULTIPLIER = -7046029254386353131
 
 
 @dataclass(frozen=True)
-class Matches:
+class VoxelMatches:
     """What points were matched to; of points without match the rest means nothing.
 
     Attributes:
@@ -81,7 +81,7 @@ class FeatureMap:
 
     # --- looking up --------------------------------------------------------------------------------------------------
 
-    def match(self, points: Tensor, planes: int, normals: Tensor) -> Matches:
+    def match(self, points: Tensor, planes: int, normals: Tensor) -> VoxelMatches:
         """For each point the nearest voxel mean among the eight voxels about it.
 
         Args:
@@ -101,7 +101,7 @@ class FeatureMap:
         nearest, which = squared.masked_fill_(~good, math.inf).min(1, keepdim=True)
         slot = slots.gather(1, which)[:, 0]
         reach = self.settings.match_voxels / scale[:, 0]
-        return Matches(nearest[:, 0] < reach * reach, slot, self._surface.index_select(0, slot))
+        return VoxelMatches(nearest[:, 0] < reach * reach, slot, self._surface.index_select(0, slot))
 
     def _scale(self, n: int, planes: int) -> Tensor:
         """Voxels per metre of each point, [n, 1]."""

@@ -24,10 +24,18 @@ GGSLAM_DECLARE_KERNEL(void tree_encode(const gpcc::TreeSettings& settings, const
 GGSLAM_DECLARE_KERNEL(gpcc::Status tree_decode(const gpcc::TreeSettings& settings, const std::uint8_t* data,
                                                std::size_t size, std::uint64_t points, gpcc::Memory& memory,
                                                std::vector<std::int32_t>& out))
+GGSLAM_DECLARE_KERNEL(gpcc::Status predictive_decode(const gpcc::PredictiveSettings& settings, const std::uint8_t* data,
+                                                     std::size_t size, std::uint32_t points, gpcc::Memory& memory,
+                                                     std::vector<std::int32_t>& out))
 GGSLAM_DECLARE_KERNEL(gpcc::Status raht_encode(const gpcc::RahtSettings& settings, const gpcc::Octree& tree,
                                                std::int32_t* attributes, std::vector<std::uint8_t>& out))
 GGSLAM_DECLARE_KERNEL(gpcc::Status raht_decode(const gpcc::RahtSettings& settings, const gpcc::Octree& tree,
-                                               const std::uint8_t* data, std::size_t size, std::int32_t* attributes))
+                                               const std::uint8_t* data, std::size_t size, gpcc::Memory& memory,
+                                               std::int32_t* attributes))
+GGSLAM_DECLARE_KERNEL(gpcc::Status detail_decode(const gpcc::DetailSettings& settings, const std::int32_t* points,
+                                                 const std::uint64_t* codes, std::uint32_t count,
+                                                 const std::uint8_t* data, std::size_t size, gpcc::Memory& memory,
+                                                 std::int32_t* values))
 GGSLAM_DECLARE_KERNEL(void colours_to_ycbcr(const std::uint8_t* rgb, const std::uint32_t* order, std::uint32_t count,
                                             std::int32_t* out))
 GGSLAM_DECLARE_KERNEL(void colours_from_ycbcr(const std::int32_t* components, std::uint32_t count, std::uint8_t* rgb))
@@ -55,17 +63,30 @@ namespace {
 struct Slice {
   Octree tree;
   std::vector<std::uint8_t> bytes;
+  std::vector<std::uint32_t> stream_order;  // where each point of the coding order stands in the stream; empty: there
   Memory geometry_contexts;
   std::map<std::int32_t, Memory> attribute_contexts;
 };
 
 // Makes the octree of positions [*, 3] in [0, 2^depth).
-void build_octree(Isa isa, const std::vector<std::int32_t>& positions, int depth, Octree& tree) {
+void build_octree(Isa isa, const std::vector<std::int32_t>& positions, int depth, Slice& slice) {
   const auto count = static_cast<std::uint32_t>(positions.size() / 3);
   std::vector<std::uint64_t> codes(count);
-  std::vector<std::uint32_t> order(count);
-  GGSLAM_DISPATCH(isa, morton_order)(positions.data(), count, depth, order.data(), codes.data());
-  GGSLAM_DISPATCH(isa, octree_build)(codes.data(), count, depth, tree);
+  slice.stream_order.resize(count);
+  GGSLAM_DISPATCH(isa, morton_order)(positions.data(), count, depth, slice.stream_order.data(), codes.data());
+  GGSLAM_DISPATCH(isa, octree_build)(codes.data(), count, depth, slice.tree);
+}
+
+void from_stream_order(const std::vector<std::uint32_t>& order, int components, std::int32_t* values) {
+  const std::vector<std::int32_t> stream(values, values + order.size() * components);
+  for (std::size_t i = 0; i < order.size(); ++i)
+    for (int k = 0; k < components; ++k) values[i * components + k] = stream[std::size_t{order[i]} * components + k];
+}
+
+void to_stream_order(const std::vector<std::uint32_t>& order, int components, std::int32_t* values) {
+  const std::vector<std::int32_t> coding(values, values + order.size() * components);
+  for (std::size_t i = 0; i < order.size(); ++i)
+    for (int k = 0; k < components; ++k) values[std::size_t{order[i]} * components + k] = coding[i * components + k];
 }
 
 template <class Function>
@@ -90,7 +111,6 @@ GGSLAM_EXPORT void* ggslam_gpcc_slice_create() { return new (std::nothrow) Slice
 
 GGSLAM_EXPORT void ggslam_gpcc_slice_destroy(void* slice) { delete static_cast<Slice*>(slice); }
 
-// Builds the octree of points [count, 3] in [0, 2^depth). `order` [count] receives their coding order.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_build(void* context, void* slice, const std::int32_t* points, std::uint32_t count,
                                              std::int32_t depth, std::uint32_t* order) {
   return gpcc::guarded([&]() -> std::int64_t {
@@ -103,18 +123,15 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_build(void* context, void* slice, const s
 
 GGSLAM_EXPORT std::uint32_t ggslam_gpcc_leaves(void* slice) { return static_cast<Slice*>(slice)->tree.leaves; }
 
-// Number of nodes at a level below the tree's depth.
 GGSLAM_EXPORT std::uint32_t ggslam_gpcc_nodes(void* slice, std::int32_t level) {
   return static_cast<Slice*>(slice)->tree.levels[level].size();
 }
 
-// Number of points in each leaf, `counts` [leaves].
 GGSLAM_EXPORT void ggslam_gpcc_leaf_points(void* slice, std::uint32_t* counts) {
   const gpcc::Octree& tree = static_cast<Slice*>(slice)->tree;
   for (std::uint32_t leaf = 1; leaf <= tree.leaves; ++leaf) counts[leaf - 1] = tree.weight_of_leaf(leaf);
 }
 
-// Makes every leaf one point.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_merge(void* slice) {
   return gpcc::guarded([&]() -> std::int64_t {
     gpcc::Octree& tree = static_cast<Slice*>(slice)->tree;
@@ -125,7 +142,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_merge(void* slice) {
   });
 }
 
-// Returns the number of bytes, which ggslam_gpcc_take copies.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slice, const gpcc::OctreeSettings* settings) {
   return gpcc::guarded([&]() -> std::int64_t {
     Slice& s = *static_cast<Slice*>(slice);
@@ -135,8 +151,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slic
   });
 }
 
-// `attributes` [points, components] in coding order; replaced by what a decoder will reconstruct. Returns the number of
-// bytes.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_attribute(void* context, void* slice, const gpcc::RahtSettings* settings,
                                                         std::int32_t* attributes) {
   return gpcc::guarded([&]() -> std::int64_t {
@@ -154,7 +168,6 @@ GGSLAM_EXPORT void ggslam_gpcc_take(void* slice, std::uint8_t* out) {
   bytes.clear();
 }
 
-// Decodes a geometry payload that is said to hold `points` points.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slice, const gpcc::OctreeSettings* settings,
                                                        const std::uint8_t* data, std::size_t size,
                                                        std::uint32_t points) {
@@ -163,12 +176,11 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slic
     const gpcc::Status status =
         GGSLAM_DISPATCH(gpcc::isa_of(context), octree_decode)(*settings, data, size, points, s.tree);
     if (status == gpcc::kOk) gpcc::sum_weights(s.tree);
+    s.stream_order.clear();
     return -static_cast<std::int64_t>(status);
   });
 }
 
-// The same where the tree does not split every node along all axes, or has other tools than an octree. Its root lies in
-// [0, 2^depth)^3.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_tree(void* context, void* slice, const gpcc::TreeSettings* settings,
                                                    std::int32_t depth, const std::uint8_t* data, std::size_t size,
                                                    std::uint32_t points) {
@@ -177,12 +189,25 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_tree(void* context, void* slice, c
     std::vector<std::int32_t> positions;
     const gpcc::Status status = GGSLAM_DISPATCH(gpcc::isa_of(context), tree_decode)(
         *settings, data, size, points, s.geometry_contexts, positions);
-    if (status == gpcc::kOk) gpcc::build_octree(gpcc::isa_of(context), positions, depth, s.tree);
+    if (status == gpcc::kOk) gpcc::build_octree(gpcc::isa_of(context), positions, depth, s);
     return -static_cast<std::int64_t>(status);
   });
 }
 
-// Codes the slice's points by such a tree. Returns the number of bytes.
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_predictive(void* context, void* slice,
+                                                         const gpcc::PredictiveSettings* settings, std::int32_t depth,
+                                                         const std::uint8_t* data, std::size_t size,
+                                                         std::uint32_t points) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    Slice& s = *static_cast<Slice*>(slice);
+    std::vector<std::int32_t> positions;
+    const gpcc::Status status = GGSLAM_DISPATCH(gpcc::isa_of(context), predictive_decode)(
+        *settings, data, size, points, s.geometry_contexts, positions);
+    if (status == gpcc::kOk) gpcc::build_octree(gpcc::isa_of(context), positions, depth, s);
+    return -static_cast<std::int64_t>(status);
+  });
+}
+
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_tree(void* context, void* slice, const gpcc::TreeSettings* settings) {
   return gpcc::guarded([&]() -> std::int64_t {
     Slice& s = *static_cast<Slice*>(slice);
@@ -197,7 +222,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_tree(void* context, void* slice, c
   });
 }
 
-// Hands on the contexts of the slice before, for slices that go on with them.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_go_on(void* slice, const void* before) {
   return gpcc::guarded([&]() -> std::int64_t {
     const Slice& b = *static_cast<const Slice*>(before);
@@ -207,7 +231,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_go_on(void* slice, const void* before) {
   });
 }
 
-// Positions [points, 3] in coding order.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_positions(void* context, void* slice, std::int32_t* out) {
   return gpcc::guarded([&]() -> std::int64_t {
     GGSLAM_DISPATCH(gpcc::isa_of(context), octree_positions)(static_cast<Slice*>(slice)->tree, out);
@@ -219,12 +242,40 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_attribute(void* context, void* sli
                                                         const std::uint8_t* data, std::size_t size,
                                                         std::int32_t* attributes) {
   return gpcc::guarded([&]() -> std::int64_t {
+    Slice& s = *static_cast<Slice*>(slice);
     return -static_cast<std::int64_t>(GGSLAM_DISPATCH(gpcc::isa_of(context), raht_decode)(
-        *settings, static_cast<Slice*>(slice)->tree, data, size, attributes));
+        *settings, s.tree, data, size, s.attribute_contexts[settings->index], attributes));
   });
 }
 
-// Y, Cb, Cr [count, 3] of the colours rgb[order[i]].
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_details(void* context, void* slice, const gpcc::DetailSettings* settings,
+                                                      const std::uint8_t* data, std::size_t size,
+                                                      std::int32_t* attributes) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    Slice& s = *static_cast<Slice*>(slice);
+    const auto count = static_cast<std::uint32_t>(s.tree.points);
+    std::vector<std::int32_t> positions(3 * std::size_t{count});
+    GGSLAM_DISPATCH(gpcc::isa_of(context), octree_positions)(s.tree, positions.data());
+    const bool canonical = settings->canonical_order != 0 && !s.stream_order.empty();
+    if (canonical) gpcc::to_stream_order(s.stream_order, 3, positions.data());
+    std::vector<std::uint64_t> codes(count);
+    std::vector<std::uint32_t> order(count);
+    GGSLAM_DISPATCH(gpcc::isa_of(context), morton_order)(
+        positions.data(), count, s.tree.depth(), order.data(), codes.data());
+    const gpcc::Status status = GGSLAM_DISPATCH(gpcc::isa_of(context), detail_decode)(
+        *settings, positions.data(), codes.data(), count, data, size, s.attribute_contexts[settings->index], attributes);
+    if (canonical) gpcc::from_stream_order(s.stream_order, settings->components, attributes);
+    return -static_cast<std::int64_t>(status);
+  });
+}
+
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_sort_values(void* slice, std::int32_t components, std::int32_t* values) {
+  return gpcc::guarded([&]() -> std::int64_t {
+    gpcc::from_stream_order(static_cast<Slice*>(slice)->stream_order, components, values);
+    return gpcc::kOk;
+  });
+}
+
 GGSLAM_EXPORT void ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, const std::uint32_t* order,
                                         std::uint32_t count, std::int32_t* out) {
   GGSLAM_DISPATCH(gpcc::isa_of(context), colours_to_ycbcr)(rgb, order, count, out);

@@ -106,11 +106,13 @@ class CoefficientWriter {
   std::uint32_t run_ = 0;
 };
 
-template <int Components>
+template <int Components, class Decoder = BinaryDecoder>
 class CoefficientReader {
  public:
   static constexpr bool kEncoder = false;
-  explicit CoefficientReader(BinaryDecoder& coder) : coder_(coder) {}
+  explicit CoefficientReader(Decoder& coder) : coder_(coder) {}
+
+  CoefficientModel<Components>& model() { return model_; }
 
   void code(Coefficients<Components>& q) {
     if (!have_run_) run_ = model_.code_run(coder_, 0), have_run_ = true;
@@ -125,7 +127,7 @@ class CoefficientReader {
   bool failed() const { return coder_.failed(); }
 
  private:
-  BinaryDecoder& coder_;
+  Decoder& coder_;
   CoefficientModel<Components> model_;
   std::uint32_t run_ = 0;
   bool have_run_ = false;

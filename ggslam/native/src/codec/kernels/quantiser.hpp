@@ -14,9 +14,12 @@ inline std::int64_t quantiser_step(int qp) {
 
 class Quantiser {
  public:
-  explicit Quantiser(const gpcc::RahtSettings& settings) {
+  // `layer`: level of the tree from the root.
+  Quantiser(const gpcc::RahtSettings& settings, int layer) {
+    const int layers = settings.layers;
     for (int k = 0; k < 3; ++k) {
-      const int qp = k == 0 ? settings.qp : settings.qp_secondary;
+      int qp = k == 0 ? settings.qp : settings.qp_secondary;
+      if (layers > 0) qp = settings.layer_qps[layer < layers ? layer : layers - 1][k > 0];
       step_[k] = quantiser_step(qp);
       const std::int64_t unshifted = quantiser_step(qp % 6);
       inverse_[k] = qp <= kFineInverse ? ((std::int64_t{1} << kInverseBits) + unshifted / 2) / unshifted >> (qp / 6) : 0;

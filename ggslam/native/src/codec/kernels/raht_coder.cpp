@@ -10,6 +10,7 @@
 #include "codec/kernels/coefficient_coder.hpp"
 #include "codec/kernels/quantiser.hpp"
 #include "codec/kernels/raht_prediction.hpp"
+#include "codec/kernels/stream_decoder.hpp"
 
 namespace ggslam::GGSLAM_ISA {
 namespace codec {
@@ -42,7 +43,7 @@ class Transform {
   // reconstructs by both.
   Transform(const RahtSettings& settings, const Octree& tree, Coder& coder, std::int32_t* attributes)
       : settings_(settings), tree_(tree), coder_(coder), attributes_(attributes),
-        weights_(weight_tables(settings.first_version != 0)), quantiser_(settings), max_value_((std::int64_t{1} << settings.bit_depth) - 1),
+        weights_(weight_tables(settings.first_version != 0)), quantiser_(settings, 0), max_value_((std::int64_t{1} << settings.bit_depth) - 1),
         leaf_depth_(tree.depth()), leaves_are_points_(tree.leaf_points.empty()) {}
 
   Status run() {
@@ -55,6 +56,7 @@ class Transform {
       begin_parents(1);
       code_root(root);
       for (int depth = root + 1; depth < tree_.depth(); ++depth) {
+        if (settings_.layers > 0) quantiser_ = Quantiser(settings_, depth - root);
         std::swap(parent_values_, values_);
         std::swap(parent_scaled_, scaled_);
         std::swap(parent_links_, links_);
@@ -347,7 +349,7 @@ class Transform {
   Coder& coder_;
   std::int32_t* attributes_;
   const WeightTables& weights_;
-  const Quantiser quantiser_;
+  Quantiser quantiser_;
   const std::int64_t max_value_;
   const int leaf_depth_;
   const bool leaves_are_points_;
@@ -370,7 +372,15 @@ Status encode(const RahtSettings& settings, const Octree& tree, std::int32_t* at
 
 template <int Components>
 Status decode(const RahtSettings& settings, const Octree& tree, const std::uint8_t* data, std::size_t size,
-              std::int32_t* attributes) {
+              gpcc::Memory& memory, std::int32_t* attributes) {
+  if (settings.separate_bits != 0 || settings.index >= 0) {
+    StreamDecoder coder(data, size, settings.separate_bits != 0);
+    CoefficientReader<Components, StreamDecoder> reader(coder);
+    memory.load(reader.model());
+    const Status status = Transform<decltype(reader), Components>(settings, tree, reader, attributes).run();
+    memory.save(reader.model());
+    return status;
+  }
   BinaryDecoder coder(data, size);
   CoefficientReader<Components> reader(coder);
   return Transform<CoefficientReader<Components>, Components>(settings, tree, reader, attributes).run();
@@ -386,9 +396,9 @@ gpcc::Status raht_encode(const gpcc::RahtSettings& settings, const gpcc::Octree&
 }
 
 gpcc::Status raht_decode(const gpcc::RahtSettings& settings, const gpcc::Octree& tree, const std::uint8_t* data,
-                         std::size_t size, std::int32_t* attributes) {
-  return settings.components == 1 ? codec::decode<1>(settings, tree, data, size, attributes)
-                                  : codec::decode<3>(settings, tree, data, size, attributes);
+                         std::size_t size, gpcc::Memory& memory, std::int32_t* attributes) {
+  return settings.components == 1 ? codec::decode<1>(settings, tree, data, size, memory, attributes)
+                                  : codec::decode<3>(settings, tree, data, size, memory, attributes);
 }
 
 }  // namespace ggslam::GGSLAM_ISA

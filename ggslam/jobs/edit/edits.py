@@ -1,0 +1,299 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Edits of a run's map: a new run folder with the edited map and pictures of before and after. What `ggslam edit` does,
+usable from Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.jobs.edit.edited_run import save_edited
+from ggslam.jobs.edit.pictures import before_and_after
+from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.objects.displacement import Displacement
+from ggslam.objects.editing import (
+    Change,
+    duplicate_objects,
+    keep_objects,
+    merge_objects,
+    move_objects,
+    rebuild_table,
+    recolor_objects,
+    remove_objects,
+    rename_object,
+)
+from ggslam.objects.hole_refinement import Recorded
+from ggslam.objects.hole_views import CameraView
+from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
+from ggslam.objects.recoloring import parse_color
+from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.objects.segmented_rows import join_gaussians
+from ggslam.objects.table import ObjectTable
+from ggslam.objects.traces import drop_traces, places
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.keyframes import KeyframesRecord
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse
+from ggslam.system.interrupts import delay_interrupts
+
+KINDS = ("remove", "keep", "move", "duplicate", "recolor", "merge", "rename")
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One edit, as people write it.
+
+    Attributes:
+        kind: one of `KINDS`.
+        objects: names or ids, e.g. "mug,7"; of merge the object that stays; of rename exactly one.
+        value: what `kind` needs: "dx dy dz" in metres (move, duplicate; of the latter also "", just beside), a colour
+            (recolor), the object that is merged into the other (merge), the new name (rename); else "".
+        rotation: of move, "rx ry rz" in degrees, or "".
+    """
+
+    kind: Literal["remove", "keep", "move", "duplicate", "recolor", "merge", "rename"]
+    objects: str
+    value: str = ""
+    rotation: str = ""
+
+
+@dataclass
+class EditOutcome:
+    """What came of it.
+
+    Attributes:
+        folder: the edited run.
+        changes: the edits as sentences.
+        filling: what happened to the places that removed and moved objects left; None if none did.
+        inpainted: whether they were to be closed; if not, only traces were dropped.
+        pictures: files.
+        notes: what the user should know.
+    """
+
+    folder: RunFolder
+    changes: list[str]
+    filling: Filling | None = None
+    inpainted: bool = False
+    pictures: list[Path] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def edit_run(
+    folder: RunFolder,
+    edits: Sequence[Edit],
+    out: Path | None = None,
+    *,
+    in_place: bool = False,
+    overwrite: bool = False,
+    inpainting: bool = False,
+    settings: InpaintSettings | None = None,
+    sequence: Path | None = None,
+) -> EditOutcome:
+    """Edits a run's map, in the order given, and writes the result.
+
+    Args:
+        folder: the run, with objects.
+        edits: what to do.
+        out: folder for the edited run; default: beside the run, with "-edited" added to its name.
+        in_place: write into the run's own folder instead.
+        overwrite: replace a run that is already at `out`.
+        inpainting: close the holes that removed and moved objects leave.
+        settings: of inpainting.
+        sequence: where the recording is now, if it was moved; only for inpainting, which does without the recording
+            if this is None and it is not where it was.
+
+    Raises:
+        ConfigError: unknown objects, values that cannot be read, no edits, or a folder that is the run's own.
+        RunFolderError: the run has no objects, or is damaged, or the folder cannot be written.
+        SequenceError: the recording is not at `sequence`.
+    """
+    if not edits:
+        raise ConfigError("no edit was given; there are " + ", ".join(f"`{kind}`" for kind in KINDS))
+    if sequence is not None and not inpainting:
+        raise ConfigError("`sequence`: only `inpainting` looks at the recording")
+    target = _target(folder, out, in_place)
+    source = _Source.of(folder)
+    notes: list[str] = []
+    recording = _open_recording(folder, sequence, notes) if inpainting else None
+    scene, original = folder.segmented_map(), folder.gaussians()
+    changes = _apply_all(scene, edits, source.displacement)
+    if in_place:
+        target.check_writable()
+    written = target if in_place else RunFolder.create(target.path, overwrite)
+    outcome = EditOutcome(written, [change.text for change in changes], inpainted=inpainting, notes=notes)
+    try:
+        outcome.filling = _mend(source, scene, recording, settings or InpaintSettings() if inpainting else None, notes)
+        pictures = before_and_after(original, scene.gaussians, changes, source.camera, source.keyframes)
+        named_only = all(edit.kind == "rename" for edit in edits)
+        with delay_interrupts():
+            outcome.pictures = save_edited(
+                folder, written, scene, outcome.changes, source.displacement, pictures, named_only, sequence
+            )
+    except BaseException:
+        written.discard()
+        raise
+    return outcome
+
+
+def _target(folder: RunFolder, out: Path | None, in_place: bool) -> RunFolder:
+    """Where to.
+
+    Raises:
+        ConfigError: into the run itself without `in_place`.
+    """
+    path = folder.path if in_place else out or folder.path.with_name(folder.path.name + "-edited")
+    if not in_place and path.resolve() == folder.path.resolve():
+        raise ConfigError(f"{path}: is the run itself; use `in_place` to edit it there, or another `out`")
+    if folder.path.resolve() in path.resolve().parents:
+        raise ConfigError(f"{path}: lies within the run that is edited; use another `out`")
+    return RunFolder(path)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What an edit needs of a run besides its map.
+
+    Attributes:
+        camera: it saw with.
+        keyframes: where they are, and how frames were tracked.
+        views: of the keyframes.
+        displacement: by earlier edits; follows this one.
+    """
+
+    camera: Camera
+    keyframes: KeyframesRecord
+    views: list[CameraView]
+    displacement: Displacement
+
+    @staticmethod
+    def of(folder: RunFolder) -> _Source:
+        """Reads it, before any work is done.
+
+        Raises:
+            RunFolderError: a file is missing or damaged, naming it.
+        """
+        displacement, camera = folder.mark().displacement(), folder.sequence().camera
+        folder.timing()
+        record = folder.keyframes()
+        if not record.keyframes or not record.poses():
+            raise RunFolderError(f"{folder.path / record.FILE}: it lists no keyframes or no tracked frames")
+        # Keyframes of the map that the run began with have no images here.
+        views = [
+            CameraView(camera, inverse(k.T_world_camera), None if k.frame == ELSEWHERE else k.frame)
+            for k in record.keyframes
+        ]  # fmt: skip
+        return _Source(camera, record, views, displacement)
+
+
+def _apply_all(scene: SegmentedMap, edits: Sequence[Edit], displacement: Displacement) -> list[Change]:
+    """Does the edits."""
+    original, changes = scene.table, list[Change]()
+    for edit in edits:
+        try:
+            changes.append(apply_edit(scene, edit))
+        except ConfigError as error:
+            if changes and set(_ids_of(original, edit)) - set(scene.table.ids()):
+                raise ConfigError(f"`{edit.kind}` {edit.objects}: an earlier edit left none of it: {error}") from None
+            raise
+        displacement.follow(changes[-1], scene)
+    return changes
+
+
+def _ids_of(table: ObjectTable, edit: Edit) -> list[int]:
+    """Ids of an edit's objects by a table; none if it knows them not."""
+    try:
+        return table.select(edit.objects)
+    except ConfigError:
+        return []
+
+
+def apply_edit(scene: SegmentedMap, edit: Edit) -> Change:
+    """Does one edit to a map.
+
+    Raises:
+        ConfigError: unknown objects, or values that cannot be read.
+    """
+    if edit.kind not in KINDS:
+        raise ConfigError(f"edit {edit.kind!r}: expected one of {', '.join(KINDS)}")
+    ids = scene.table.select(edit.objects)
+    if edit.kind == "remove":
+        return remove_objects(scene, ids)
+    if edit.kind == "keep":
+        return keep_objects(scene, ids)
+    if edit.kind == "move":
+        turn = _vector("rotation", edit.rotation) if edit.rotation else (0.0, 0.0, 0.0)
+        return move_objects(scene, ids, _vector("move", edit.value), turn)
+    if edit.kind == "duplicate":
+        return duplicate_objects(scene, ids, _vector("duplicate", edit.value) if edit.value else None)
+    if edit.kind == "recolor":
+        return recolor_objects(scene, ids, parse_color(edit.value))
+    if edit.kind == "merge":
+        merged = _single(scene.table, "merge", edit.value)
+        return merge_objects(scene, _single(scene.table, "merge", edit.objects), merged)
+    return rename_object(scene, _single(scene.table, "rename", edit.objects), edit.value)
+
+
+def _single(table: ObjectTable, argument: str, text: str) -> int:
+    ids = table.select(text)
+    if len(ids) != 1:
+        raise ConfigError(f"`{argument}`: expected one object, but {text!r} are {len(ids)}: {', '.join(map(str, ids))}")
+    return ids[0]
+
+
+def _vector(argument: str, text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(part) for part in text.replace(",", " ").split())
+    except ValueError:
+        raise ConfigError(f'`{argument}`: expected three numbers like "0.1 0 -0.2", found {text!r}') from None
+    if not np.isfinite([x, y, z]).all():
+        raise ConfigError(f"`{argument}`: expected finite numbers, found {text!r}")
+    return x, y, z
+
+
+# --- the places that objects left -------------------------------------------------------------------------------------
+
+
+def _mend(
+    source: _Source, scene: SegmentedMap, recording: Callable[[int], Recorded] | None,
+    settings: InpaintSettings | None, notes: list[str],
+) -> Filling | None:  # fmt: skip
+    """After all edits: drops the traces of removed and moved objects and, given settings, closes the holes."""
+    left, displaced = source.displacement.left(), source.displacement.ids()
+    if not left:
+        if settings is not None:
+            notes.append("nothing to inpaint: no object left its place")
+        return None
+    removed = join_gaussians(left)
+    if settings is not None:
+        filling = inpaint(scene, removed, source.views, displaced, recording, settings)
+    else:
+        filling = Filling(dropped=sum(drop_traces(scene, part, source.views, displaced) for part in places(removed)))
+    rebuild_table(scene)
+    return filling
+
+
+def _open_recording(folder: RunFolder, sequence: Path | None, notes: list[str]) -> Callable[[int], Recorded] | None:
+    """Gives the images of a frame; None if the recording is not where the run had it.
+
+    Raises:
+        SequenceError, RunFolderError: it is not at `sequence`, either.
+    """
+    try:
+        recording = open_recording_of(folder, sequence)
+    except GgslamError as error:
+        if sequence is not None:
+            raise
+        notes.append(f"inpainted without the recording: {error}")
+        return None
+
+    def images(frame: int) -> Recorded:
+        found = recording.frame(frame, masks=False)
+        return Recorded(found.color, found.depth)
+
+    return images

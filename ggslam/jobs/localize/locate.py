@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The work behind `ggslam localize`: opens map and recording, locates every frame, writes what came of it."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterable
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import ConfigError, GgslamError, SequenceError
+from ggslam.jobs.localize.report import LocalizationReport, write_localization
+from ggslam.jobs.progress import Observer
+from ggslam.jobs.submaps.stores import INDOORS, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
+from ggslam.localization.frames import FrameTracker
+from ggslam.localization.localizer import Localization, Localizer, ScanTracker, ScanTrackerSettings
+from ggslam.localization.places import StoredPlaces
+from ggslam.localization.scans import ScanSequence, scan_files
+from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface, Surface
+from ggslam.native.loader import NativeContext
+from ggslam.runs.folder import MARKER, RunFolder
+from ggslam.runs.recordings import SequenceRequest
+from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.sequences.sequence import Sequence
+from ggslam.submaps.grid import GridStore
+from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.interrupts import delay_interrupts
+from ggslam.tracking.settings import TargetSettings, TrackerSettings
+
+GIVEN = "given"
+"""As a start pose: the recording's own first pose."""
+_CELLS = "cells"
+_FARTHEST = 1e7
+"""Metres from the origin of the map that a start pose may be."""
+_FINEST = 1.5
+"""A target's voxels are at least this many times as wide as those that the map was thinned with."""
+
+
+@dataclass(frozen=True)
+class LocalizeRequest:
+    """What is asked for.
+
+    Attributes:
+        map: folder of a grid store or a run, or a cloud.
+        sequence: the recording.
+        start_pose: pose of the first frame or scan: 7 numbers (position, quaternion xyzw), or `GIVEN`, or None.
+        no_start_pose: the first frame is looked up among the map's places.
+        full: against the whole map.
+        out: folder for the results; None: localized/NAME.
+        radius: R' in metres; None: the store's.
+        voxel: edge of the target's voxels in metres; None: 0.03 for images, 0.15 for scans, or what the map allows.
+        columns: numbers of a point in .bin scans.
+        threads: None: all processors.
+        tracker, scans: settings of the front-ends.
+    """
+
+    map: Path
+    sequence: SequenceRequest
+    start_pose: str | None = None
+    no_start_pose: bool = False
+    full: bool = False
+    out: Path | None = None
+    radius: float | None = None
+    voxel: float | None = None
+    columns: int = 4
+    threads: int | None = None
+    tracker: TrackerSettings = field(default_factory=TrackerSettings)
+    scans: ScanTrackerSettings = field(default_factory=ScanTrackerSettings)
+
+
+def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport:
+    """Locates a recording in a map and writes trajectory.txt, localization.json and plots.
+
+    Raises:
+        GgslamError: map or recording cannot be read, or nothing says where to begin. If that happens in the middle, or
+            on Ctrl-C, what was located is written all the same.
+    """
+    if request.start_pose is not None and request.no_start_pose:
+        raise ConfigError("`start_pose` and `no_start_pose`: one of them")
+    out = request.out or Path("localized") / request.sequence.path.resolve().name
+    with ExitStack() as opened:
+        recording = _open_recording(request)
+        start = _start(request, recording.ground_truth)
+        if start is None and isinstance(recording, ScanSequence):
+            raise ConfigError(
+                f"{recording.path}: laser scans have no images to look the place of the first one up by: give its "
+                f'pose with `start_pose` "x y z qx qy qz qw", or `start_pose` {GIVEN} where the recording has poses'
+            )
+        store = open_map(request.map, opened, observer)
+        context = NativeContext(request.threads)
+        settings = store.settings
+        submaps = settings if request.radius is None else replace(settings, partial_radius=request.radius)
+        target = _target(request, submaps, isinstance(recording, ScanSequence))
+        surface: Surface = (
+            FullSurface(store, target, context) if request.full else PartialSurface(store, target, context, submaps)
+        )
+        opened.callback(surface.close)
+        places = None if isinstance(recording, ScanSequence) else _places(request, recording, store, start, observer)
+        localizer = _localizer(request, recording, places, surface, context, start)
+        results, error = _run(localizer, recording, observer)
+        if error is not None and not results:
+            raise error
+        damaged = sorted([*surface.damage, *(places.damaged if places is not None else [])])
+        report = LocalizationReport(
+            str(request.map), str(request.sequence.path), request.full, recording.timestamps[: len(results)], results,
+            None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
+        )  # fmt: skip
+    with delay_interrupts():
+        write_localization(report, out, observer)
+    if error is not None:
+        observer.note(f"stopped after {len(results)} of {len(recording)} frames, which are in {out}")
+        raise error
+    return report
+
+
+def open_map(path: Path, opened: ExitStack, observer: Observer) -> GridStore:
+    """The store of a folder, of a run (made in RUN/cells if it is not there or not of this run), or of a cloud (made in
+    a temporary folder). `opened` closes and removes what is to be.
+
+    Raises:
+        FormatError, RunFolderError: it is none of them, or damaged.
+    """
+    path = Path(path)
+    if is_store(path):
+        return opened.enter_context(GridStore.open(path))
+    if is_cloud(path):
+        observer.note(f"{path} is cut into cells; `ggslam submaps` keeps them for the next time")
+        folder = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="ggslam-")))
+        store = opened.enter_context(GridStore.create(folder / _CELLS, replace(INDOORS, voxel=0.0)))
+        store_of_cloud(path, store)
+        return store
+    return opened.enter_context(_store_in_run(path, observer))
+
+
+def _store_in_run(path: Path, observer: Observer) -> GridStore:
+    if path.is_dir() and not (path / MARKER).is_file():
+        raise ConfigError(f"{path}: neither a grid store (no index.sqlite) nor a run (no {MARKER})")
+    folder = RunFolder.open(path)
+    cells = folder.path / _CELLS
+    if is_store(cells):
+        store = GridStore.open(cells)
+        if store.visits()[-1:] == [visit_of(folder)]:
+            return store
+        store.close()
+        shutil.rmtree(cells)
+    observer.note(f"the map of {path} is cut into cells: {cells}")
+    making = folder.path / (_CELLS + ".new")
+    shutil.rmtree(making, ignore_errors=True)
+    with GridStore.create(making, INDOORS) as store:
+        store_of_run(path, store)
+    making.rename(cells)  # a store that was not finished has another name
+    return GridStore.open(cells)
+
+
+def parse_pose(text: str) -> np.ndarray:
+    """T_world_sensor of "x y z qx qy qz qw". Raises ConfigError for anything else."""
+    try:
+        numbers = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        numbers = np.zeros(0)
+    norm = float(np.linalg.norm(numbers[3:]))
+    if len(numbers) != 7 or not (np.abs(numbers) <= _FARTHEST).all() or not 0.9 < norm < 1.1:
+        expected = f'"x y z qx qy qz qw", metres and a unit quaternion, or "{GIVEN}"'
+        frame = " (the first frame to use is `start`)" if text.strip().isdecimal() else ""
+        raise ConfigError(f"`start_pose`: expected {expected}, found {text!r}{frame}")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = quaternion_to_matrix(numbers[[6, 3, 4, 5]] / norm), numbers[:3]
+    return T
+
+
+def _open_recording(request: LocalizeRequest) -> Sequence | ScanSequence:
+    path = request.sequence.path
+    if request.sequence.format is None and scan_files(path):
+        wanted = request.sequence
+        return ScanSequence(path, wanted.start, wanted.stop, wanted.stride, request.columns)
+    return request.sequence.open()
+
+
+def _start(request: LocalizeRequest, truth: np.ndarray | None) -> np.ndarray | None:
+    if request.start_pose is None:
+        return None
+    if request.start_pose != GIVEN:
+        return parse_pose(request.start_pose)
+    if truth is None or not np.isfinite(truth[0]).all():
+        raise SequenceError(f"{request.sequence.path}: `start_pose` {GIVEN}: the first frame has no pose")
+    return truth[0]
+
+
+def _target(request: LocalizeRequest, submaps: SubmapSettings, scans: bool) -> TargetSettings:
+    own = SCAN_TARGET if scans else request.tracker.target
+    voxel = max(own.voxel, _FINEST * submaps.voxel)
+    return replace(own, voxel=voxel if request.voxel is None else request.voxel)
+
+
+def _places(
+    request: LocalizeRequest, recording: Sequence, store: GridStore, start: np.ndarray | None, observer: Observer
+) -> StoredPlaces | None:
+    """The places of the map; None if they cannot be used and are not needed for the start."""
+    try:
+        places = StoredPlaces(store, recording.camera)
+    except ConfigError as error:
+        if start is None:
+            raise
+        observer.note(f"lost frames are not looked up: {error}")
+        return None
+    if start is None and not len(places):
+        reason = f"; left out: {places.damaged[0]}" if places.damaged else ""
+        raise ConfigError(f"{request.map}: has no places to look up: `start_pose` is needed{reason}")
+    return places
+
+
+def _localizer(
+    request: LocalizeRequest, recording: Sequence | ScanSequence, places: StoredPlaces | None, surface: Surface,
+    context: NativeContext, start: np.ndarray | None,
+) -> Localizer[Any]:  # fmt: skip
+    if isinstance(recording, ScanSequence):
+        assert start is not None
+        return Localizer(surface, ScanTracker(request.scans, context, start), start)
+    front_end = FrameTracker(recording.camera, request.tracker, context, start, places)
+    return Localizer(surface, front_end, start)
+
+
+def _run(
+    localizer: Localizer[Any], recording: Sequence | ScanSequence, observer: Observer
+) -> tuple[list[Localization], BaseException | None]:
+    """What was located, and what stopped it before the end."""
+    results: list[Localization] = []
+    observer.begin("localize", len(recording))
+    items: Iterable[Any]
+    if isinstance(recording, ScanSequence):
+        items = (scan.points for scan in recording.stream())
+    else:
+        items = recording.stream(masks=False)
+    try:
+        for item in items:
+            results.append(localizer.locate(item))
+            observer.advance(len(results), len(recording))
+    except (GgslamError, KeyboardInterrupt) as stopped:  # what was located is written first
+        return results, stopped
+    return results, None

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scores of a run: `metrics.json`, one line per frame in `frames.csv`, and a few pictures in `renders/`."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import MissingDependency
+from ggslam.evaluation.image_sets import score_images
+from ggslam.evaluation.images import ImageScores
+from ggslam.evaluation.lpips import Lpips
+from ggslam.evaluation.trajectory import score_trajectory
+from ggslam.jobs.progress import Observer
+from ggslam.jobs.score.objects import ObjectScorer
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.reporting.pictures import color_to_uint8, compare_pictures, write_picture
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.objects_in_parts import ObjectsInParts
+from ggslam.runs.records.keyframes import KeyframesRecord
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.timing import TimingRecord
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse
+from ggslam.sequences import Sequence
+from ggslam.system.atomic import make_folder, write_text
+
+PICTURES = 6
+"""Comparison pictures written to renders/, spread over the recording."""
+
+
+def score_run(
+    folder: RunFolder, sequence: Sequence, observer: Observer, lpips: bool = True, every: int = 1,
+    masks: Path | None = None,
+) -> MetricsRecord:  # fmt: skip
+    """Scores a run against its recording and writes the results into the run folder.
+
+    Args:
+        folder: of the run.
+        sequence: the recording, opened as the run opened it.
+        observer: is told of the progress.
+        lpips: score LPIPS too, if its weights are there.
+        every: score the images of every n-th frame only.
+        masks: where the masks of `sequence` come from, if they are not those that the run had; for the notes.
+
+    Returns:
+        What `metrics.json` holds.
+    """
+    notes: list[str] = []
+    metric = _lpips(notes) if lpips else None
+    record = folder.keyframes()
+    poses = record.poses()
+    sets = _sets(folder, record, every)
+    scorer = _object_scorer(folder, sequence, sets)
+    metrics = MetricsRecord.of({
+        "trajectory": _trajectory(sequence, poses),
+        "images": _images(folder, record, sequence, sets, scorer, metric, observer),
+        "segmentation": None if scorer is None else scorer.to_dict(),
+        "tracking": dict(Counter(f.status for f in record.frames)),
+        **_performance(folder.timing()),
+        "scored_every": every,
+        "notes": [],
+    })  # fmt: skip
+    if metrics.images.held_out is None or not metrics.images.held_out.frames:
+        notes.append("no frame was held out; every score is over frames that the map was or could be trained on")
+    if len(poses) and max(poses) + 1 < len(sequence):
+        notes.append(f"the run ends at frame {max(poses)} of {len(sequence)}; scores are of its part")
+    lost = [f.frame for f in record.frames if f.is_lost]
+    if lost:
+        notes.append(f"{len(lost)} frames were lost (the first: {lost[0]}); they have no pose and are in no score")
+    if metrics.trajectory is None:
+        known = sequence.ground_truth is not None
+        reason = "fewer than 3 frames have both poses" if known else "the recording has no ground-truth poses"
+        notes.append(f"{reason}; no trajectory scores")
+    if edits := folder.mark().edits:
+        notes.append(f"the map was edited ({'; '.join(edits)}); the recording was not, so edits count as errors")
+    notes.extend(_segmentation_notes(folder, metrics.segmentation is not None, masks))
+    metrics = metrics.model_copy(update={"notes": notes})
+    metrics.write(folder.path)
+    return metrics
+
+
+def _lpips(notes: list[str]) -> Lpips | None:
+    try:
+        return Lpips()
+    except MissingDependency as missing:
+        notes.append(f"LPIPS not scored: {missing}")
+        return None
+
+
+def _trajectory(sequence: Sequence, poses: dict[int, np.ndarray]) -> dict[str, Any] | None:
+    if sequence.ground_truth is None:
+        return None
+    truth = sequence.ground_truth
+    scores = score_trajectory([poses.get(i) for i in range(len(truth))], truth)
+    return None if scores is None else asdict(scores)
+
+
+def _sets(folder: RunFolder, record: KeyframesRecord, every: int) -> dict[str, set[int]]:
+    """Frames that each kind of score is about."""
+    keyframes = record.keyframe_numbers()
+    evaluation = folder.config().evaluation
+    chosen = {i for i in range(max(record.poses(), default=-1) + 1) if i % every == 0}
+    held_out = {i for i in chosen if evaluation.is_held_out(i) and i not in keyframes}
+    return {"keyframes": keyframes & chosen, "held_out": held_out, "all": chosen}
+
+
+def _object_scorer(folder: RunFolder, sequence: Sequence, sets: dict[str, set[int]]) -> ObjectScorer | None:
+    if not folder.has_objects():
+        return None
+    return ObjectScorer(ObjectsInParts.of(folder), sets, sequence.instance_names)
+
+
+def _segmentation_notes(folder: RunFolder, scored: bool, masks: Path | None) -> list[str]:
+    """Which masks served as truth, or why there are no scores of objects."""
+    if not folder.has_objects():
+        return ["the run has no objects; the masks are not used"] if masks is not None else []
+    if not scored and masks is not None:
+        return [f"no scored frame has a mask in {masks}; objects are not scored"]
+    if not scored:
+        return ["the recording has no masks; objects are not scored (true masks from elsewhere: ggslam eval --masks)"]
+    supervised = folder.object_table().supervision in ("masks", "associated masks")
+    own = folder.sequence().open.masks
+    same = masks is None or (own is not None and Path(own).resolve() == masks.resolve())
+    if supervised and same:
+        return ["objects are scored against the masks that supervised the map: this tells how well they were learned, "
+                "not how true they are (true masks from elsewhere: ggslam eval --masks)"]  # fmt: skip
+    return [f"objects are scored against the masks in {masks}" if masks else
+            "objects are scored against the masks of the recording, which did not supervise the map"]  # fmt: skip
+
+
+def _images(
+    folder: RunFolder, record: KeyframesRecord, sequence: Sequence, sets: dict[str, set[int]],
+    scorer: ObjectScorer | None, lpips: Lpips | None, observer: Observer,
+) -> dict[str, Any]:  # fmt: skip
+    poses = record.poses()
+    keyframes, held_out = sets["keyframes"], sets["held_out"]
+    spread = np.linspace(0, len(poses) - 1, min(PICTURES, len(poses))).round().astype(int)
+    pictured = set(np.array(sorted(poses))[spread].tolist())
+    make_folder(folder.path / "renders")
+    show = _shower(folder, poses, pictured, scorer)
+    rows: list[dict[str, Any]] = []
+    observer.begin("score", len(sequence))
+
+    def note(frame: Frame, scores: ImageScores | None) -> None:
+        observer.advance(frame.index + 1, len(sequence))
+        kind = "keyframe" if frame.index in keyframes else "held_out" if frame.index in held_out else "other"
+        rows.append({"frame": frame.index, "kind": kind, **(scores or ImageScores()).to_dict()})
+
+    frames = _up_to(max(poses, default=-1), sequence, masks=scorer is not None and sequence.has_masks)
+    means = score_images(show, frames, sets, lpips, note)
+    observer.advance(len(sequence), len(sequence))
+    _write_rows(folder, rows)
+    return {name: mean.to_dict() for name, mean in means.items()}
+
+
+def _up_to(last: int, sequence: Sequence, masks: bool) -> Iterator[Frame]:
+    """Frames 0 to `last`: a run that stopped early is not asked about what it never saw, least of all about the damaged
+    frame that stopped it."""
+    if last < 0:
+        return
+    for frame in sequence.stream(masks=masks):
+        yield frame
+        if frame.index >= last:
+            return
+
+
+def _shower(
+    folder: RunFolder, poses: dict[int, np.ndarray], pictured: set[int], scorer: ObjectScorer | None
+) -> Callable[[Frame], tuple[np.ndarray, np.ndarray] | None]:
+    """A function that renders the map as a frame's camera sees it, and keeps some of the pictures."""
+    parts = folder.map_in_parts() if scorer is None else scorer.map
+    rasterizer = CpuRasterizer()
+
+    def show(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
+        if frame.index not in poses:
+            return None
+        T_camera_world = inverse(poses[frame.index])
+        gaussians = parts.in_view(frame.camera, T_camera_world)
+        view = rasterizer.forward(gaussians, frame.camera, T_camera_world, features=scorer is not None)
+        color = np.clip(view.image.numpy(), 0, 1).transpose(1, 2, 0)
+        depth = np.where(view.alpha.numpy() > 0.5, view.expected_depth.numpy(), 0)
+        row = None
+        if scorer is not None:
+            row = scorer.add(frame, rasterizer, view, T_camera_world, frame.index in pictured)
+        if frame.index in pictured:
+            picture = compare_pictures(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth, row)
+            write_picture(folder.path / "renders" / f"compare{frame.index:06d}.png", picture)
+        return color, depth
+
+    return show
+
+
+def _write_rows(folder: RunFolder, rows: list[dict[str, Any]]) -> None:
+    text = io.StringIO()
+    if rows:
+        writer = csv.DictWriter(text, rows[0].keys(), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    write_text(folder.path / "frames.csv", text.getvalue())
+
+
+def _performance(timing: TimingRecord) -> dict[str, Any]:
+    iterations = timing.mapping.iterations - timing.refine_iterations
+    return {
+        "speed": {
+            "frames_per_s": timing.frames_per_s, "tracking_ms": timing.tracking_ms_per_frame,
+            "mapping_iteration_ms": timing.mapping_ms_per_iteration,
+            "iterations_per_frame": iterations / max(1, timing.frames),
+            "dropped_frames": len(timing.dropped_frames), "refinement_s": timing.refinement_s,
+        },
+        "map": {"gaussians": timing.gaussians, "keyframes": timing.mapping.keyframes},
+        "memory": {"peak_rss_mb": timing.peak_rss_mb},
+    }  # fmt: skip

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The work behind `ggslam submaps`: fills grid stores and says what is in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import ConfigError, FormatError, SequenceError
+from ggslam.formats.trajectory import read_trajectory
+from ggslam.jobs.progress import Observer
+from ggslam.jobs.submaps.stores import INDOORS, is_cloud, is_store, open_or_create, store_of_cloud, store_of_run
+from ggslam.localization.scans import LaserScan, ScanSequence, scan_files
+from ggslam.localization.visits import FrameSights, ScanSights, record_visit
+from ggslam.native.loader import NativeContext
+from ggslam.runs.folder import MARKER
+from ggslam.runs.recordings import SequenceRequest
+from ggslam.scene.frame import Frame
+from ggslam.submaps.cell_records import CellChange
+from ggslam.submaps.grid import GridStore
+from ggslam.submaps.settings import SubmapSettings
+
+_NEAR_IN_TIME = 0.02
+"""Seconds by which a pose of another file may differ from a frame."""
+
+
+@dataclass(frozen=True)
+class SubmapsRequest:
+    """What is asked for.
+
+    Attributes:
+        source: folder of a run, a cloud, or folder of a recording.
+        store: folder of the store.
+        visit: name; None: the source's.
+        poses: trajectory file of a recording, in the store's world; None: the recording's own poses.
+        at: seconds at which the visit began, on the clock of all visits; None: the recording's own clock.
+        settings: fields of `SubmapSettings` that are not the default's (of a new store) or the store's.
+        sequence: how the recording is read.
+        columns: numbers of a point in .bin scans.
+    """
+
+    source: Path
+    store: Path
+    visit: str | None
+    poses: Path | None
+    at: float | None
+    settings: Mapping[str, Any]
+    sequence: SequenceRequest
+    columns: int = 4
+
+
+@dataclass(frozen=True)
+class PartTotal:
+    """Of one part, over all cells: cells that have it, things in it, bytes."""
+
+    cells: int
+    count: int
+    bytes: int
+
+
+@dataclass(frozen=True)
+class VisitTotal:
+    """Cells that a visit added, and those it refreshed."""
+
+    name: str
+    added: int
+    refreshed: int
+
+
+@dataclass(frozen=True)
+class StoreListing:
+    """What is in a store."""
+
+    path: Path
+    settings: SubmapSettings
+    cells: int
+    bytes: int
+    parts: Mapping[str, PartTotal]
+    visits: Sequence[VisitTotal]
+    since: str | None
+    changes: Sequence[CellChange] | None
+    problems: Sequence[str] = ()
+    """What is wrong with files of it; the rest can be used."""
+
+
+def make_store(request: SubmapsRequest, observer: Observer) -> None:
+    """Makes a store, or adds a visit to one.
+
+    Raises:
+        GgslamError: the source or the store cannot be read, or the recording has no poses.
+    """
+    source = request.source
+    if is_store(source):
+        raise ConfigError(f"{source}: is a grid store already; `out` wants a run, a cloud or a recording")
+    if is_cloud(source) and not source.is_file():
+        raise FormatError(f"cannot read {source}: no such file")
+    recording = None if is_cloud(source) or (source / MARKER).is_file() else _open(request)
+    with open_or_create(request.store, _settings(request)) as store:
+        if recording is not None:
+            items, poses, sights = recording
+            observer.begin("record", len(poses))
+            watched = _with_progress(items, observer, len(poses))
+            written = record_visit(store, watched, poses, sights, request.visit or source.resolve().name, request.at)
+            observer.note(f"{len(written)} cells written")
+        elif is_cloud(source):
+            store_of_cloud(source, store, request.visit, request.at)
+        else:
+            store_of_run(source, store, request.visit, request.at)
+
+
+def list_store(path: Path, since: str | None = None) -> StoreListing:
+    """What is in a store; `since` a visit: with the cells that changed.
+
+    Raises:
+        FormatError: no store, or damaged.
+        ConfigError: there was no such visit.
+    """
+    if Path(path).exists() and not is_store(path):
+        raise ConfigError(f"{path}: no grid store (no index.sqlite); `out` names the store to make of it")
+    with GridStore.open(path) as store:
+        records = [store.cell(key) for key in store.cells()]
+        parts: dict[str, PartTotal] = {}
+        for record in records:
+            for name, part in record.parts.items():
+                total = parts.get(name, PartTotal(0, 0, 0))
+                parts[name] = PartTotal(total.cells + 1, total.count + part.count, total.bytes + part.bytes)
+        visits = [_visit_total(store, name, following) for name, following in _with_next(store.visits())]
+        changes = None if since is None else store.changed_since(since)
+        size = sum(record.bytes for record in records)
+        return StoreListing(
+            Path(path), store.settings, len(records), size, dict(sorted(parts.items())), visits, since, changes,
+            list(store.problems()),
+        )  # fmt: skip
+
+
+def _with_next(names: list[str]) -> Iterator[tuple[str, str | None]]:
+    yield from zip(names, [*names[1:], None], strict=False)  # none have none
+
+
+def _visit_total(store: GridStore, name: str, following: str | None) -> VisitTotal:
+    """What a visit alone did is not kept: cells that a later visit also wrote count with the later ones only."""
+    later = {c.key for c in store.changed_since(following)} if following else set()
+    own = [c for c in store.changed_since(name) if c.key not in later]
+    return VisitTotal(name, sum(c.added for c in own), sum(not c.added for c in own))
+
+
+def _settings(request: SubmapsRequest) -> SubmapSettings:
+    base = INDOORS
+    if is_store(request.store):
+        with GridStore.open(request.store) as store:
+            base = store.settings
+    return replace(base, **request.settings)
+
+
+def _open(
+    request: SubmapsRequest,
+) -> tuple[Iterator[Frame | LaserScan], np.ndarray, FrameSights | ScanSights]:
+    """Items, their poses and what takes sights from them."""
+    wanted = request.sequence
+    if scan_files(request.source):
+        scans = ScanSequence(request.source, wanted.start, wanted.stop, wanted.stride, request.columns)
+        return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights()
+    frames = wanted.open()
+    sights = FrameSights(frames.camera, NativeContext())
+    return frames.stream(masks=False), _poses(request, frames.timestamps, frames.ground_truth), sights
+
+
+def _poses(request: SubmapsRequest, timestamps: np.ndarray, own: np.ndarray | None) -> np.ndarray:
+    if request.poses is None:
+        if own is None or not np.isfinite(own).all((1, 2)).any():
+            raise SequenceError(f"{request.source}: no poses; `ggslam localize` finds them, `poses` names their file")
+        return own
+    found = read_trajectory(request.poses)
+    poses = np.full((len(timestamps), 4, 4), np.nan)
+    order = np.argsort(found.timestamps, kind="stable")
+    times = found.timestamps[order]
+    after = np.clip(np.searchsorted(times, timestamps), 1, max(len(times) - 1, 1))
+    before = after - 1
+    last = np.minimum(after, len(times) - 1)
+    nearest = np.where(np.abs(times[before] - timestamps) <= np.abs(times[last] - timestamps), before, last)
+    near = np.abs(times[nearest] - timestamps) <= _NEAR_IN_TIME
+    poses[near] = found.T_world_camera[order][nearest[near]]
+    if not near.any():
+        raise FormatError(f"{request.poses}: none of its times is within {_NEAR_IN_TIME} s of a frame")
+    return poses
+
+
+def _with_progress(items: Iterator[Frame | LaserScan], observer: Observer, total: int) -> Iterator[Frame | LaserScan]:
+    for done, item in enumerate(items, 1):
+        yield item
+        observer.advance(done, total)

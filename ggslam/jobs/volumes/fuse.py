@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `ggslam volumes` does, usable from Python: frames with poses in; volumes, files and pictures out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import ConfigError, RunFolderError, SequenceError
+from ggslam.formats.mesh_files import check_mesh_path
+from ggslam.jobs.progress import Observer, SilentObserver
+from ggslam.jobs.run.pipeline import RunRequest, execute
+from ggslam.jobs.volumes.frames import FrameSource, frames_of_recording, frames_of_run
+from ggslam.jobs.volumes.live import LiveVolumes
+from ggslam.jobs.volumes.outputs import RECORD, OutputRequest, Outputs, prepare_folder, write_outputs
+from ggslam.runs.folder import MARKER, RunFolder
+from ggslam.runs.recordings import SequenceRequest
+from ggslam.scene.frame import Frame
+from ggslam.slam.config import Config, config_to_dict, load_config
+from ggslam.system.atomic import make_folder
+from ggslam.system.interrupts import delay_interrupts
+from ggslam.volumes.maps import WINDOW, VolumeMaps
+from ggslam.volumes.tsdf_file import load_tsdf
+from ggslam.volumes.volume_settings import VolumeSettings
+
+
+@dataclass(frozen=True)
+class VolumesRequest:
+    """What is wanted of which run or recording.
+
+    Attributes:
+        source: folder of a run or a recording.
+        sequence: how to read a recording.
+        scale: of the images of a run's recording; None: as the run did.
+        recording: where a run's recording is now, if it was moved.
+        out: folder of the results; None: `RUN/volumes`, or `volumes/NAME` of a recording.
+        voxel: of the TSDF, metres; None: as the settings say.
+        esdf: whether a distance field is wanted.
+        occupancy: voxel of the occupancy map in metres; None: none is wanted.
+        mesh: file of the mesh; None: mesh.ply in `out`.
+        object_meshes: whether each object gets a mesh of its own.
+        objects: whether object ids are voted for.
+        live: track the recording and fuse its frames on the way; `out` is the folder of the run.
+        realtime: with `live`, frames a second.
+        onto: file of a TSDF to go on in.
+        slice_height: metres above the floor of the slice through the distance field; None: as high as the camera was.
+        band: lowest and highest obstacle of the ROS map, metres above the floor.
+        latency: whether it is to be known how long all maps take with a frame.
+        device: of torch, for the TSDF, e.g. cuda; None: the compiled core.
+        config, overrides: settings, as for a run; for volumes their part `volumes` counts.
+        overwrite: with `live`, replace an earlier run.
+    """
+
+    source: Path
+    sequence: SequenceRequest
+    scale: float | None = None
+    recording: Path | None = None
+    out: Path | None = None
+    voxel: float | None = None
+    esdf: bool = False
+    occupancy: float | None = None
+    mesh: Path | None = None
+    object_meshes: bool = False
+    objects: bool = True
+    live: bool = False
+    realtime: float | None = None
+    onto: Path | None = None
+    slice_height: float | None = None
+    band: tuple[float, float] = (0.1, 1.5)
+    latency: bool = False
+    device: str | None = None
+    config: str | None = None
+    overrides: list[str] = field(default_factory=list)
+    overwrite: bool = False
+
+
+@dataclass
+class VolumesOutcome:
+    """What was made.
+
+    Attributes:
+        out: folder of the results.
+        files: that were written.
+        lines: facts for people.
+        times: milliseconds a frame, see `VolumeTimes.summary`.
+        window: frames that a mean of `by_window_ms` is over.
+        map_latency_s: 95 % of the frames were in all maps after this many seconds.
+        depth_range_m: 95 % of the depth was nearer.
+        error: why fusing stopped early, if it did.
+    """
+
+    out: Path
+    files: list[Path]
+    lines: list[str]
+    times: dict[str, dict[str, Any]]
+    window: int
+    map_latency_s: float
+    depth_range_m: float
+    error: BaseException | None = None
+
+
+@dataclass
+class _Fused:
+    """What fusing gave: the maps, where the cameras were, names of objects, and why it stopped early."""
+
+    maps: VolumeMaps
+    name: str
+    poses: list[np.ndarray] = field(default_factory=list)
+    timestamps: list[float] = field(default_factory=list)
+    depth_ranges: list[float] = field(default_factory=list)
+    names: dict[int, str] = field(default_factory=dict)
+    error: BaseException | None = None
+
+    def saw(self, frame: Frame, T_world_camera: np.ndarray) -> None:
+        """Remembers where a frame was seen from, and how far it saw of what was fused."""
+        self.poses.append(T_world_camera)
+        self.timestamps.append(frame.timestamp)
+        limits, seen = self.maps.settings.tsdf, frame.depth[::8, ::8]
+        seen = seen[(seen >= limits.min_depth) & (seen <= limits.max_depth)]
+        if len(seen):
+            self.depth_ranges.append(float(np.percentile(seen, 95)))
+
+    def latency(self) -> float:
+        """Seconds after which 95 % of the frames are in all maps, the wait for a distance field that is not updated
+        with every frame included."""
+        whole, every = self.maps.times.whole(), max(1, self.maps.settings.esdf_every)
+        wait = float(np.median(np.diff(self.timestamps))) * (every - 1) if len(self.timestamps) > 1 else 0.0
+        return (float(np.percentile(whole, 95)) if len(whole) else 0.0) + wait
+
+
+def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> VolumesOutcome:
+    """Makes volumes of a run or a recording. If it stops in the middle (damaged frame, interrupt), what was fused is
+    written all the same and the outcome carries the error.
+
+    Raises:
+        GgslamError: nothing could be done at all: settings, source or output folder at fault.
+    """
+    observer = observer or SilentObserver()
+    is_run = (request.source / MARKER).is_file()
+    _check(request, is_run)
+    config = _config(request)
+    onto = None if request.onto is None else load_tsdf(request.onto)
+    maps = VolumeMaps(_set_pace(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
+    if request.live:
+        fused = _live(request, maps, observer)
+        out = Path(fused.name) / "volumes"
+        make_folder(out)
+        prepare_folder(out)
+    else:
+        source = _source(request, is_run)
+        out = _folder(request, is_run)
+        for note in [*source.sequence.warnings, *source.notes]:
+            observer.note(note)
+        fused = _fuse(source, maps, observer)
+    if not fused.poses:
+        raise fused.error if fused.error is not None else SequenceError(f"{request.source}: no frame could be fused")
+    with delay_interrupts():
+        maps.finish()
+        if not len(maps.tsdf):
+            limits = config.volumes.tsdf
+            raise SequenceError(
+                f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
+            )
+        outputs = write_outputs(
+            maps, out, OutputRequest(
+                request.mesh, request.object_meshes, request.slice_height, request.band, fused.names
+            ), fused.poses, _record(request, config, fused), observer,
+        )  # fmt: skip
+    return _outcome(out, fused, outputs)
+
+
+def _config(request: VolumesRequest) -> Config:
+    config = load_config(request.config, request.overrides)
+    if request.voxel is None:
+        return config
+    if request.onto is not None:
+        raise ConfigError("`voxel`: with `onto` the voxels are those of the file")
+    tsdf = replace(config.volumes.tsdf, voxel=request.voxel)
+    return replace(config, volumes=replace(config.volumes, tsdf=tsdf))
+
+
+def _set_pace(settings: VolumeSettings, request: VolumesRequest) -> VolumeSettings:
+    """The settings with the pace of the distance field."""
+    with_each = (request.live or request.latency) and settings.esdf_every == 0
+    return replace(settings, esdf_every=1) if with_each else settings
+
+
+def _check(request: VolumesRequest, is_run: bool) -> None:
+    """Raises GgslamError for wishes that do not go together."""
+    if request.live and is_run:
+        raise ConfigError(f"`live` tracks a recording, and {request.source} is a run: leave `live` out")
+    if request.live and request.onto is not None:
+        raise ConfigError("`onto` needs poses in the frame of that file: of a run or recording, not of `live`")
+    if request.realtime is not None and not request.live:
+        raise ConfigError("`realtime` needs `live`")
+    if request.overwrite and not request.live:
+        raise ConfigError("`overwrite` is for the run that `live` makes; volumes are replaced without it")
+    if request.latency and request.device is not None and request.esdf:
+        raise ConfigError("`latency`: with `device` the distance field waits for the end, so its latency is not known")
+    if request.occupancy is not None and not 1e-3 <= request.occupancy <= 10:
+        raise ConfigError(f"`occupancy`: expected a voxel of 0.001 to 10 m, found {request.occupancy:g}")
+    if request.slice_height is not None:
+        if not request.esdf:
+            raise ConfigError("`slice_height` needs `esdf`")
+        if not abs(request.slice_height) < 1e4:
+            raise ConfigError(f"`slice_height`: expected a height in metres, found {request.slice_height:g}")
+    if request.recording is not None and not is_run:
+        raise ConfigError(f"`recording` says where the recording of a run is; {request.source} is no run")
+    if is_run and request.sequence != SequenceRequest(request.source, scale=request.sequence.scale):
+        raise ConfigError(
+            f"{request.source} is a run, read as it was made: `start`, `stop`, `stride`, `format`, `depth_scale`, "
+            "`pose_convention` and `on_bad_frame` are for recordings"
+        )
+    if request.mesh is not None:
+        _check_mesh(request.mesh, request.source)
+
+
+def _check_mesh(path: Path, source: Path) -> None:
+    check_mesh_path(path)
+    protected = (path.parent / MARKER).is_file() or source.resolve() in path.resolve().parents
+    if path.exists() and protected and path.parent.name != "volumes":
+        raise ConfigError(f"`mesh` {path}: is a file of a run or recording; choose another name")
+    make_folder(path.parent)
+    RunFolder(path.parent).check_writable()
+
+
+def _folder(request: VolumesRequest, is_run: bool) -> Path:
+    """The folder of the results, made or already ours."""
+    if request.out is not None:
+        out = request.out
+    else:
+        out = request.source / "volumes" if is_run else Path("volumes") / request.source.resolve().name
+    if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
+        raise RunFolderError(f"{out}: not empty and not made by `ggslam volumes`; choose another folder with `out`")
+    make_folder(out)
+    prepare_folder(out)
+    return out
+
+
+def _source(request: VolumesRequest, is_run: bool) -> FrameSource:
+    if is_run:
+        return frames_of_run(RunFolder.open(request.source), request.recording, request.scale, request.objects)
+    return frames_of_recording(request.sequence, request.objects)
+
+
+def _fuse(source: FrameSource, maps: VolumeMaps, observer: Observer) -> _Fused:
+    fused = _Fused(maps, source.name, names=source.names)
+    observer.begin("fuse", len(source))
+    try:
+        for posed in source:
+            maps.add(posed.frame, posed.T_world_camera, posed.labels)
+            fused.saw(posed.frame, posed.T_world_camera)
+            observer.advance(len(fused.poses), len(source))
+    except (Exception, KeyboardInterrupt) as stopped:  # what was fused is written, then it is raised
+        fused.error = stopped
+    return fused
+
+
+def _live(request: VolumesRequest, maps: VolumeMaps, observer: Observer) -> _Fused:
+    """Tracks the recording into a run folder and fuses on the way."""
+    fused = _Fused(maps, str(request.source))
+    follower = LiveVolumes(maps, fused.saw, request.objects)
+    pace = [] if request.realtime is None else [f"realtime_fps={request.realtime}"]
+    run = RunRequest(
+        request.sequence, request.out, request.config, [*request.overrides, *pace], evaluate=False,
+        overwrite=request.overwrite,
+    )  # fmt: skip
+    outcome = execute(run, observer, follower)
+    fused.name, fused.error = str(outcome.folder.path), outcome.error
+    if outcome.folder.has_objects():
+        objects = outcome.folder.object_table()
+        follower.settle(objects.ids())
+        fused.names = {o.id: o.name for o in objects.objects if o.name}
+    observer.note(f"{outcome.folder.path}: {outcome.headline()}")
+    return fused
+
+
+def _record(request: VolumesRequest, config: Config, fused: _Fused) -> dict[str, Any]:
+    """What volumes.json says of where the volumes come from."""
+    return {
+        "source": fused.name, "live": request.live, "frames": len(fused.poses), "onto": request.onto,
+        "settings": config_to_dict(config)["volumes"], "times": fused.maps.times.summary(),
+        "frames_a_window": WINDOW, "blocks_by_window": fused.maps.times.blocks[WINDOW - 1 :: WINDOW],
+        "rebuilds_s": fused.maps.times.rebuilds,
+        "stopped_by": None if fused.error is None else repr(fused.error),
+    }  # fmt: skip
+
+
+def _outcome(out: Path, fused: _Fused, outputs: Outputs) -> VolumesOutcome:
+    times = fused.maps.times
+    return VolumesOutcome(
+        out, outputs.files, outputs.lines, times.summary(), WINDOW, fused.latency(),
+        float(np.median(fused.depth_ranges)) if fused.depth_ranges else 0.0, fused.error,
+    )  # fmt: skip
