@@ -35,7 +35,7 @@ def _library() -> ctypes.CDLL:
         "number_planes": [points, grid, c_int32, c_void_p, c_void_p, c_void_p, c_void_p],
     }
     core.ggslam_gpcc_sample_cubes.restype = c_int64
-    core.ggslam_gpcc_sample_cubes.argtypes = [points, grid, c_uint32, c_void_p]
+    core.ggslam_gpcc_sample_cubes.argtypes = [points, grid, c_int32, c_uint32, c_void_p]
     for name, arguments in signatures.items():
         function = getattr(core, f"ggslam_gpcc_{name}")
         function.restype, function.argtypes = None, arguments
@@ -81,11 +81,13 @@ class GridPoints:
         _library().ggslam_gpcc_along_axis(chosen, self._grid, axis, out.ctypes.data)
         return out
 
-    def sample_cubes(self, one_in: int) -> np.ndarray:
+    def sample_cubes(self, cube_bits: int, one_in: int) -> np.ndarray:
         """Codes uint64 [M] of 21 bits a coordinate, x first, of the points in one of so many (a power of two) cubes of
-        4 x 4 x 4 voxels."""
+        an edge of 2^cube_bits voxels."""
         codes = np.empty(len(self), np.uint64)
-        count = _library().ggslam_gpcc_sample_cubes(self._chosen(None), self._grid, one_in - 1, codes.ctypes.data)
+        count = _library().ggslam_gpcc_sample_cubes(
+            self._chosen(None), self._grid, cube_bits, one_in - 1, codes.ctypes.data
+        )
         return codes[:count].copy()
 
     def plane_counts(self, axis: int, rows: np.ndarray | None = None) -> np.ndarray:
