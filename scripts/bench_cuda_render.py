@@ -42,7 +42,7 @@ def make_workload(size: tuple[int, int], count: int, features: int) -> tuple[Gau
     camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
     centre = np.array([0.0, 0.0, -1.8])
     scale = int(np.ceil(np.sqrt(count / (width * height))))
-    surface, depth = surface_points(camera.resized(width * scale, height * scale), np.eye(3), centre)
+    surface, depth = surface_points(camera.resize(width * scale, height * scale), np.eye(3), centre)
     random = np.random.default_rng(0)
     chosen = random.choice(len(surface), count, replace=False)
     size_in_metres = 1.5 * depth[chosen] / focal

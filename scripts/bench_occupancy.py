@@ -38,7 +38,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 
 from ggslam.native.loader import NativeContext
-from ggslam.scene.poses import transformed
+from ggslam.scene.poses import transform_points
 from ggslam.sequences.factory import open_sequence
 from ggslam.volumes.agreement import agreement
 from ggslam.volumes.occupancy import OccupancyMap
@@ -66,7 +66,7 @@ def load_scans(recording: Path, frames: int) -> Iterator[Scan]:
         if frame.T_world_camera is None:
             sys.exit(f"{recording}: frame {index} has no true pose")
         points = frame.camera.back_project(frame.depth)[frame.depth > 0]
-        world = transformed(points, frame.T_world_camera).astype(np.float32)
+        world = transform_points(points, frame.T_world_camera).astype(np.float32)
         origin = frame.T_world_camera[:3, 3].astype(np.float32)
         yield Scan(world, origin, world.astype(np.float64), origin.astype(np.float64))
 

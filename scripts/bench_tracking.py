@@ -33,7 +33,7 @@ import torch
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import fit_similarity, inverse, transformed
+from ggslam.scene.poses import fit_similarity, inverse, transform_points
 from ggslam.sequences.factory import open_sequence
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
 from ggslam.tracking.gicp import GicpTarget
@@ -216,7 +216,7 @@ def mean_difference(points: np.ndarray, grey: np.ndarray, reference: Photometric
 def ate_rmse(estimated: np.ndarray, true: np.ndarray) -> float:
     """Root mean square distance of camera centres [n, 4, 4] after the best rigid alignment, metres."""
     x, y = estimated[:, :3, 3], true[:, :3, 3]
-    return float(np.sqrt(((transformed(x, fit_similarity(x, y)[0]) - y) ** 2).sum(1).mean()))
+    return float(np.sqrt(((transform_points(x, fit_similarity(x, y)[0]) - y) ** 2).sum(1).mean()))
 
 
 # --- table -----------------------------------------------------------------------------------------------------------

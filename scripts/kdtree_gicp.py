@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
 from ggslam.localization.surface import load_surface
-from ggslam.scene.poses import inverse, orthonormalized, se3_exp
+from ggslam.scene.poses import inverse, orthonormalize, se3_exp
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import CellArrays
 from ggslam.submaps.cells_around import MapStatus
@@ -137,7 +137,7 @@ def aligned(points: np.ndarray, target: TreeTarget, T: np.ndarray) -> tuple[np.n
         T[:3, :3], T[:3, 3] = turn @ T[:3, :3], T[:3, 3] + step[:3]
         if np.abs(step).max() < _SMALL:
             break
-    return orthonormalized(T), overlap, rmse
+    return orthonormalize(T), overlap, rmse
 
 
 def _cross(v: np.ndarray) -> np.ndarray:

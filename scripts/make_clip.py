@@ -85,7 +85,7 @@ def main() -> None:
     back = np.eye(4)
     back[2, 3] = -0.7  # metres behind the camera
     place = poses[len(poses) // 2] @ back
-    camera = replace(sequence.camera.resized(WIDTH, HEIGHT), fx=0.62 * WIDTH, fy=0.62 * WIDTH)
+    camera = replace(sequence.camera.resize(WIDTH, HEIGHT), fx=0.62 * WIDTH, fy=0.62 * WIDTH)
     film = Film(camera, inverse(place))
     with tempfile.TemporaryDirectory() as name:
         run = Path(name) / "run"

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.scene.poses import is_valid_pose, matrix_to_quaternion, orthonormalized, quaternion_to_matrix
+from ggslam.scene.poses import is_valid_pose, matrix_to_quaternion, orthonormalize, quaternion_to_matrix
 from ggslam.system.atomic import write_text
 
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, metres)\n"
@@ -99,7 +99,7 @@ def read_matrices(path: str | Path, allow_missing: bool = False) -> Trajectory:
         last_row = numbers[12:] if len(numbers) == 16 else T[3]
         if not is_valid_pose(T) or not np.allclose(last_row, T[3], atol=1e-6):
             raise FormatError(f"{where}: not a rigid transform (rotation not orthonormal or last row not 0 0 0 1)")
-        poses.append(orthonormalized(T))
+        poses.append(orthonormalize(T))
     if not poses:
         raise FormatError(f"{path}: no poses in it")
     return Trajectory(np.arange(len(poses), dtype=float), np.stack(poses))

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ggslam.scene.poses import transformed
+from ggslam.scene.poses import transform_points
 
 MOST_QUERIES = 500_000
 """Of larger clouds a random sample of this many points is looked up, always among all points of the other."""
@@ -100,7 +100,7 @@ def nearest_points(
     `distance`."""
     points = source.points[source.queries(seed)]
     if T_target_source is not None:
-        points = transformed(points, T_target_source)
+        points = transform_points(points, T_target_source)
     return target.tree.query(points, distance_upper_bound=distance, workers=-1)
 
 

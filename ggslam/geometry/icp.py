@@ -15,7 +15,7 @@ import numpy as np
 
 from ggslam.geometry.clouds import Cloud, Overlap, Points, as_cloud, check_distance, overlap
 from ggslam.geometry.normals import estimate_normals
-from ggslam.scene.poses import orthonormalized, se3_exp, transformed, turning_angle
+from ggslam.scene.poses import orthonormalize, se3_exp, transform_points, turning_angle
 
 FEWEST_MATCHES = 10
 """Fewer pairs of points than this leave a pose open."""
@@ -72,8 +72,8 @@ def register(
     for distance in distances:
         converged = False
         for _ in range(iterations):
-            step = _step(transformed(chosen, T), target, normals, distance)
-            T = orthonormalized(se3_exp(step) @ T)
+            step = _step(transform_points(chosen, T), target, normals, distance)
+            T = orthonormalize(se3_exp(step) @ T)
             made += 1
             if np.abs(step).max() < SMALL_STEP:
                 converged = True
@@ -82,7 +82,7 @@ def register(
     return CloudRegistration(
         T_target_source=T,
         overlap=overlap(source, target, distances[-1], T, seed),
-        moved_m=float(np.linalg.norm(transformed(middle, T) - transformed(middle, start))),
+        moved_m=float(np.linalg.norm(transform_points(middle, T) - transform_points(middle, start))),
         turned_deg=float(np.degrees(turning_angle(start, T))),
         iterations=made,
         converged=converged,

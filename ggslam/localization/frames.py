@@ -17,7 +17,7 @@ from ggslam.loops.verification import LocalMap, verify
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, transformed
+from ggslam.scene.poses import inverse, transform_points
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
 from ggslam.tracking.gicp_tracker import GicpTracker
@@ -129,7 +129,7 @@ class FrameTracker:
 
         voxels = target.voxels()["means"]
         near = voxels[np.linalg.norm(voxels - T_world_view[:3, 3], axis=1) <= self._look_up.reach]
-        old = LocalMap(known.place.landmarks, transformed(near, T_view_world))
+        old = LocalMap(known.place.landmarks, transform_points(near, T_view_world))
         found = verify(old, new, self.tracker.camera, noise.sigma, align_at, self._look_up.verification)
         return last if found.accepted else None
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ggslam.localization.surface import Surface
 from ggslam.native.loader import NativeContext
-from ggslam.scene.poses import inverse, orthonormalized
+from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
 from ggslam.tracking.scan_points import ScanSettings, scan_points
@@ -218,7 +218,7 @@ class ScanTracker:
             self._velocity = np.eye(4)
             reason = f"{found.overlap:.0%} of {count} points match the map, {self.settings.min_overlap:.0%} needed"
             return FrontEndResult(self._pose.copy(), LocalizationStatus.LOST, found.overlap, found.rmse, reason)
-        T = orthonormalized(found.T_world_camera)
+        T = orthonormalize(found.T_world_camera)
         self._velocity, self._pose = inverse(self._pose) @ T, T
         status = LocalizationStatus.DEGENERATE if found.degenerate else LocalizationStatus.OK
         return FrontEndResult(T.copy(), status, found.overlap, found.rmse)

@@ -22,7 +22,7 @@ from ggslam.loops.places import PlaceIndex
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, separation, transformed
+from ggslam.scene.poses import inverse, separation, transform_points
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import POINTS
 from ggslam.submaps.grid import GridStore
@@ -91,7 +91,7 @@ class FrameSights:
         normals = found.normals @ T_world_sensor[:3, :3].T
         small = item.depth[::_STEP, ::_STEP].copy()
         looked_at = partial(_in_view, small, self.camera, inverse(T_world_sensor))
-        points = transformed(found.points, T_world_sensor)
+        points = transform_points(found.points, T_world_sensor)
         return Sight(points, normals, looked_at, StoredView(place, T_world_sensor))
 
 
@@ -104,7 +104,7 @@ class ScanSights:
     def of(self, item: LaserScan, T_world_sensor: np.ndarray) -> Sight:
         """What a scan adds."""
         seen = item.points[np.isfinite(item.points).all(1)].astype(np.float64)
-        points = transformed(seen, T_world_sensor)
+        points = transform_points(seen, T_world_sensor)
         normals = surface_normals(points)
         away = ((points - T_world_sensor[:3, 3]) * normals).sum(1) > 0
         normals[away] *= -1
@@ -114,7 +114,7 @@ class ScanSights:
 def _in_view(depth: np.ndarray, camera: Camera, T_camera_world: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Whether world points [n, 3] are in view of every `_STEP`-th pixel of a depth image and not behind what is there,
     bool [n]."""
-    x, y, z = transformed(points.astype(np.float64), T_camera_world).T
+    x, y, z = transform_points(points.astype(np.float64), T_camera_world).T
     ahead = np.where(z > 0, z, np.inf)
     column = np.rint((x / ahead * camera.fx + camera.cx) / _STEP).astype(np.int64)
     row = np.rint((y / ahead * camera.fy + camera.cy) / _STEP).astype(np.int64)

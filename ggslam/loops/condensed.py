@@ -16,7 +16,7 @@ from scipy.special import gammaincinv  # scipy.stats takes a second to load
 
 from ggslam.loops.odometry import OdometryTree
 from ggslam.loops.uncertainty import adjoint, covariance_in_frame
-from ggslam.scene.poses import inverse, orthonormalized, se3_exp, se3_log
+from ggslam.scene.poses import inverse, orthonormalize, se3_exp, se3_log
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class CondensedGraph:
         graph, values = self._problem(gtsam, believed)
         before = graph.error(values)
         found = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
-        self.values = {k: orthonormalized(found.atPose3(k).matrix()) for k in self.kept}
+        self.values = {k: orthonormalize(found.atPose3(k).matrix()) for k in self.kept}
         return float(before), float(graph.error(found))
 
     def all_poses(self) -> np.ndarray:

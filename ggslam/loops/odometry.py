@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ggslam.loops.uncertainty import covariance_in_frame
-from ggslam.scene.poses import inverse, orthonormalized
+from ggslam.scene.poses import inverse, orthonormalize
 
 
 @dataclass
@@ -35,7 +35,7 @@ class OdometryTree:
     def add(self, parent: int, T_parent_node: np.ndarray, covariance: np.ndarray) -> None:
         """The next node, with the covariance [6, 6] of the left twist of its motion in its parent's frame."""
         self.parents.append(parent)
-        T = orthonormalized(self.poses[parent] @ T_parent_node)
+        T = orthonormalize(self.poses[parent] @ T_parent_node)
         moved = covariance_in_frame(covariance, self.poses[parent])
         self.poses.append(T)
         self.covariances.append(self.covariances[parent] + moved)

@@ -16,7 +16,7 @@ from ggslam.features.orb import Landmarks
 from ggslam.features.registration import Registration, pixels_of, register
 from ggslam.loops.settings import VerificationSettings
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import transformed
+from ggslam.scene.poses import transform_points
 
 _CELLS = 4
 
@@ -123,7 +123,7 @@ def verify(
     noise = sigma(depth)
     overlap = voxel_overlap(
         old.points,
-        transformed(new.points, refined.T_world_camera),
+        transform_points(new.points, refined.T_world_camera),
         settings.voxel_constant + settings.voxel_sigmas * noise,
     )
     reason = _doubt_about_geometry(refined, registration, agreeing, noise, settings)

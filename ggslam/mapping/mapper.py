@@ -15,6 +15,7 @@ import torch
 
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
+from ggslam.mapping.extra_loss import ExtraLoss, add_extra_loss, uses_features
 from ggslam.mapping.identity import IdentityLearner
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
@@ -112,6 +113,8 @@ class Mapper(ABC):
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
         self.residency: Residency | None = None
         """Who keeps a part of the map on disk; None: all of it is in memory."""
+        self.extra_loss: ExtraLoss | None = None
+        """A loss of the user's own, added to the mapper's; on the CPU only."""
         self._rasterizer: TrainingRasterizer
         self._standard_adam = self._adam(1.0)
         self._sampler = KeyframeSampler(float(np.random.default_rng(seed).random()))
@@ -249,7 +252,7 @@ class Mapper(ABC):
         times, watch, identity = self.times, _Stopwatch(), self.identity
         learns = identity is not None and identity.due(keyframe)
         dense = learns and identity is not None and identity.settings.schedule == "dense"
-        view = self._render(keyframe, features=dense)
+        view = self._render(keyframe, features=dense or uses_features(self.extra_loss))
         times.forward += watch.lap()
         loss = self._evaluate_loss(keyframe, view)
         times.loss += watch.lap()
@@ -257,6 +260,9 @@ class Mapper(ABC):
         if learns and identity is not None:
             grad_features = identity.step(self.map, self._rasterizer, keyframe, view)
         times.identity += watch.lap()
+        if self.extra_loss is not None:
+            grad_features = add_extra_loss(self.extra_loss, view, keyframe, loss, grad_features)
+            times.loss += watch.lap()
         step = self._rasterizer.backward_step(
             self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features,
             optimizer=self._standard_adam if rate_factor == 1 else self._adam(rate_factor),

@@ -96,7 +96,10 @@ class GaussianModel(torch.nn.Module):
             raise RenderError(f"from_points: expected points and colors [N, 3], found {means.shape} and {rgb.shape}")
         if not 0 < opacity < 1 or not 0 <= sh_degree <= 3 or feature_channels < 0:
             raise RenderError("from_points: expected opacity in (0, 1), sh_degree 0 to 3, feature_channels from 0")
-        spread = _spacing(means.numpy()) if scales is None else np.broadcast_to(np.asarray(scales, np.float32), count)
+        if scales is None:
+            spread = _neighbour_distance(means.numpy())
+        else:
+            spread = np.broadcast_to(np.asarray(scales, np.float32), count)
         if not (spread > 0).all():
             raise RenderError("from_points: expected scales above 0 (are there points twice?)")
         sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
@@ -169,7 +172,7 @@ class GaussianModel(torch.nn.Module):
         return [(name, getattr(self, name)) for name in (*PARAMETERS, *_LABELS)]
 
 
-def _spacing(points: np.ndarray) -> np.ndarray:
+def _neighbour_distance(points: np.ndarray) -> np.ndarray:
     """Half the mean distance of each point [N, 3] to the three nearest others, as in 3D Gaussian Splatting."""
     neighbours = min(3, len(points) - 1)
     if not neighbours:

@@ -79,7 +79,7 @@ class PixelTerms:
         terms.gaussians[:, 0], terms.weights[:, 0], terms.counts[:] = rows, 1, 1
         return terms
 
-    def joined(self, other: PixelTerms) -> PixelTerms:
+    def append(self, other: PixelTerms) -> PixelTerms:
         """These pixels followed by those of `other`, which must have the same capacity."""
         return PixelTerms(
             np.concatenate([self.gaussians, other.gaussians]), np.concatenate([self.weights, other.weights]),

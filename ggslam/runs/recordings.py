@@ -82,7 +82,7 @@ def describe(
             values[name] = Path(values[name]).absolute()
     return SequenceRecord.of({
         "open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence),
-        "warnings": sequence.warnings, "skipped": [asdict(skipped) for skipped in sequence.skipped],
+        "warnings": sequence.warnings, "skipped": [asdict(skipped) for skipped in sequence.skipped_frames],
         "mask_problems": sequence.mask_problems, "map": None if earlier is None else earlier.path.absolute(),
         "map_fingerprint": None if earlier is None else fingerprint(earlier),
     })  # fmt: skip
@@ -121,7 +121,7 @@ def open_recording_of(
     if is_live(request.path):
         raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (`record`)")
     sequence = replace(request, scale=request.scale if scale is None else scale).open()
-    found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scaled(request.scale))}
+    found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scale(request.scale))}
     expected = {"frames": record.frames, "camera": asdict(record.camera)}
     if json_ready(found) != expected:
         raise RunFolderError(f"{sequence.path}: not the recording of {folder.path}: expected {expected}, found {found}")

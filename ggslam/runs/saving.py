@@ -26,7 +26,7 @@ class _Frames:
     count: int
     format: str = "python"
     warnings: list[str] = field(default_factory=list)
-    skipped: list[Any] = field(default_factory=list)
+    skipped_frames: list[Any] = field(default_factory=list)
     mask_problems: dict[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:

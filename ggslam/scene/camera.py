@@ -36,16 +36,16 @@ class Camera:
         if self.width < 1 or self.height < 1 or not all(map(math.isfinite, numbers)) or self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"impossible camera: {self}")
 
-    def resized(self, width: int, height: int) -> Camera:
+    def resize(self, width: int, height: int) -> Camera:
         """The camera of the same view with its image resampled to `width` x `height` pixels."""
         sx, sy = width / self.width, height / self.height
         return Camera(
             width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
         )
 
-    def scaled(self, factor: float) -> Camera:
+    def scale(self, factor: float) -> Camera:
         """The camera with its image size multiplied by `factor` (rounded to whole pixels)."""
-        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+        return self.resize(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
     def matrix(self) -> np.ndarray:
         """The 3x3 calibration matrix K, float64."""

@@ -52,7 +52,7 @@ def se3_log(T: np.ndarray) -> np.ndarray:
     return np.concatenate([V_inverse @ T[:3, 3], w])
 
 
-def transformed(points: np.ndarray, T_to_from: np.ndarray) -> np.ndarray:
+def transform_points(points: np.ndarray, T_to_from: np.ndarray) -> np.ndarray:
     """Points [n, 3] in the frame that T_to_from [4, 4] leads to."""
     return points @ T_to_from[:3, :3].T + T_to_from[:3, 3]
 
@@ -77,7 +77,7 @@ def inverse(T: np.ndarray) -> np.ndarray:
     return out
 
 
-def orthonormalized(T: np.ndarray) -> np.ndarray:
+def orthonormalize(T: np.ndarray) -> np.ndarray:
     """The transform with its 3x3 part replaced by the nearest rotation (removes accumulated rounding)."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)

@@ -79,7 +79,7 @@ def open_sequence(
         masks: folder of instance masks to use instead of the recording's own; see `masks.find_masks`.
         depth_scale: depth units per metre, instead of the recording's own.
         on_bad_frame: "error": a damaged frame or mask raises; "skip": `stream` passes over the frame and lists it in
-            `skipped`; a frame whose mask alone is damaged comes without it and is listed in `mask_problems`.
+            `skipped_frames`; a frame whose mask alone is damaged comes without it and is listed in `mask_problems`.
         depth_camera: YAML file with the calibration of a depth camera beside the colour camera (see `calibration`); its
             depth images are registered to the colour images.
         min_confidence: depth less sure than this (0 low, 1 medium, 2 high) is dropped where the recording tells how

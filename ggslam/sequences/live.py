@@ -113,7 +113,7 @@ class LiveSequence:
         self.path = Path(source.name) if record is None else record
         self.record, self._stop = record, stop
         self.warnings: list[str] = []
-        self.skipped: list[SkippedFrame] = []
+        self.skipped_frames: list[SkippedFrame] = []
         self.mask_problems: dict[int, str] = {}
         self.instance_names: dict[int, str] = {}
         self._times: list[float] = []

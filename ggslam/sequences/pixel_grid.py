@@ -64,12 +64,12 @@ class ImageGeometry:
             self.native_camera = self._register(recording, depth_size, files)
         elif recording.depth_calibration is not None:
             self.native_camera = Camera(*depth_size, *recording.depth_calibration)
-            self._align_color(color_camera.resized(*depth_size))
+            self._align_color(color_camera.resize(*depth_size))
         else:
             size = min(color_size, depth_size, key=lambda s: s[0] * s[1])
-            self.native_camera = color_camera.resized(*size)
+            self.native_camera = color_camera.resize(*size)
         self._maps = _undistortion(self.native_camera, recording.distortion, recording.fisheye)
-        self.camera = self.native_camera.scaled(scale)
+        self.camera = self.native_camera.scale(scale)
 
     def _register(self, recording: Recording, depth_size: Size, files: FrameFiles) -> Camera:
         """Prepares registration of depth; returns the colour camera at about the depth image's resolution."""
@@ -80,7 +80,7 @@ class ImageGeometry:
                 f"{files.depth}: depth is {_text(depth_size)}, but the calibration of the depth camera is for "
                 f"{stated.width}x{stated.height}"
             )
-        native = self._common.scaled(min(1.0, stated.resized(*depth_size).fx / self._common.fx))
+        native = self._common.scale(min(1.0, stated.resize(*depth_size).fx / self._common.fx))
         self._registration = DepthRegistration(recording.depth_camera, depth_size, native)
         return native
 
@@ -119,7 +119,7 @@ class ImageGeometry:
         if files.camera is None:
             return image
         size = image_size(image)
-        own, common = files.camera.resized(*size), self._common.resized(*size)
+        own, common = files.camera.resize(*size), self._common.resize(*size)
         ax, ay = own.fx / common.fx, own.fy / common.fy
         warp = np.array([[ax, 0.0, own.cx - ax * common.cx], [0.0, ay, own.cy - ay * common.cy]])
         corner = warp @ (size[0] - 1, size[1] - 1, 1)
@@ -171,7 +171,7 @@ def _color_camera(recording: Recording, color_size: Size, color_file: ImageFile)
         raise SequenceError(
             f"{color_file}: image is {_text(color_size)}, but the intrinsics of the recording are for {_text(stated)}"
         )
-    return recording.camera.resized(*color_size)
+    return recording.camera.resize(*color_size)
 
 
 def _undistortion(

@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, transformed
+from ggslam.scene.poses import inverse, transform_points
 from ggslam.sequences.pose_conventions import CONVENTIONS, OURS, PoseConvention
 from ggslam.sequences.sequence import Sequence
 
@@ -114,7 +114,7 @@ def _differences(frame: Frame, other: Frame, convention: PoseConvention, ratio: 
     points = frame.camera.back_project(frame.depth[::1, ::1])[::step, ::step].reshape(-1, 3) * np.float32(ratio)
     points = points[points[:, 2] > 0]
     T_world_frame, T_world_other = map(convention.convert, (frame.T_world_camera, other.T_world_camera))
-    points = transformed(points, inverse(T_world_other) @ T_world_frame)
+    points = transform_points(points, inverse(T_world_other) @ T_world_frame)
     points = points[points[:, 2] > 0.02 * ratio]
     c = other.camera
     u = np.rint(c.fx * points[:, 0] / points[:, 2] + c.cx).astype(int)

@@ -27,7 +27,7 @@ class DepthRegistration:
     """
 
     def __init__(self, source: DepthCamera, size: tuple[int, int], target: Camera) -> None:
-        camera = source.camera.resized(*size)
+        camera = source.camera.resize(*size)
         rays = undistorted_rays(camera, source.distortion, source.fisheye)
         rotation, self._offset = source.T_color_depth[:3, :3], source.T_color_depth[:3, 3].astype(np.float32)
         # Coordinate by coordinate: arrays of points are several times slower to work on.

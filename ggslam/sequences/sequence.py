@@ -74,7 +74,7 @@ class Sequence:
         pose_source, time_source: what told poses and times, for reports.
         options: arguments of `open_sequence` besides the selection; None if it was made otherwise.
         warnings: what a user should know about this recording.
-        skipped: damaged frames passed over so far (only with on_bad_frame="skip").
+        skipped_frames: damaged frames passed over so far (only with on_bad_frame="skip").
     """
 
     def __init__(
@@ -195,7 +195,7 @@ class Sequence:
     # --- frame by frame ----------------------------------------------------------------------------------------------
 
     @property
-    def skipped(self) -> list[SkippedFrame]:
+    def skipped_frames(self) -> list[SkippedFrame]:
         """Damaged frames passed over by `stream` so far, in order."""
         return [self._skipped[i] for i in sorted(self._skipped)]
 

@@ -21,7 +21,7 @@ from ggslam.loops.verification import LocalMap, Verification, verify
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, separation, transformed
+from ggslam.scene.poses import inverse, separation, transform_points
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
 from ggslam.tracking.points import FramePoints, PointSource
@@ -237,7 +237,7 @@ class LoopCloser:
             information = information_in_frame(last.information, T_old_world)
             return replace(last, T_world_camera=T_old_world @ last.T_world_camera, information=information)
 
-        surface = transformed(self._surface.points(around), T_old_world)
+        surface = transform_points(self._surface.points(around), T_old_world)
         found = verify(
             LocalMap(self.places[old].landmarks, surface), LocalMap(place.landmarks, points.points),
             self._camera, self._noise().sigma, align_at, self.settings.verification,

@@ -22,6 +22,7 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError
+from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
@@ -63,14 +64,17 @@ class Slam:
         has_masks: whether the recording has object masks; None: judged by the first keyframe's frame.
         paging: folder that what does not fit into `memory_limit_mb` moves to; None: a temporary one.
         library: CUDA kernels to compute with; None: as `config.device` says.
+        extra_loss: a loss of one's own in every mapping iteration, extra_loss(view, keyframe) -> scalar tensor, see
+            `mapping.extra_loss.ExtraLoss`; on the CPU only.
 
     Raises:
-        ConfigError: a limit of memory that is less than the program itself takes; no such device.
+        ConfigError: a limit of memory that is less than the program itself takes; no such device; an extra loss on a
+            GPU.
     """
 
     def __init__(
         self, camera: Camera, config: Config | None = None, has_masks: bool | None = None, paging: Path | None = None,
-        library: CudaLibrary | None = None,
+        library: CudaLibrary | None = None, extra_loss: ExtraLoss | None = None,
     ) -> None:  # fmt: skip
         self.camera = camera
         self.config = config or Config()
@@ -92,6 +96,9 @@ class Slam:
             self.loops = LoopCloser(camera, self.config.loops, self.surface, self.tracker, self.context)
         self.policy = KeyframePolicy(self.config.keyframes)
         self.mapper = make_mapper(self.config, self.masks.active, self.context, library)
+        if extra_loss is not None and library is not None:
+            raise ConfigError("`extra_loss` needs device: cpu; on a GPU losses are computed by kernels only")
+        self.mapper.extra_loss = extra_loss
         if self.pager is not None:
             self.pager.serve(self.mapper)
         self.scale = 1.0

@@ -86,7 +86,7 @@ class RayCaster:
         """One view. `T_world_camera` [4, 4]."""
         T_shape_camera = self._T_shape_world @ T_world_camera
         depth, mask = self.measure(camera, T_world_camera)
-        fine = camera.resized(2 * camera.width, 2 * camera.height)
+        fine = camera.resize(2 * camera.width, 2 * camera.height)
         u = ((np.arange(fine.width) - fine.cx) / fine.fx).astype(np.float32)
         v = ((np.arange(fine.height) - fine.cy) / fine.fy).astype(np.float32)
         light = self._shade(u, v, *self._trace(u, v, T_shape_camera), T_shape_camera, 1 / fine.fx)

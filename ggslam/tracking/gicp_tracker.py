@@ -11,7 +11,7 @@ from ggslam.features.orb import FeatureView, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import orthonormalized
+from ggslam.scene.poses import orthonormalize
 from ggslam.tracking.engine import CpuTrackingEngine, TrackingEngine
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
 from ggslam.tracking.noise import estimate_noise
@@ -74,7 +74,7 @@ class GicpTracker(Tracker):
         found, reason = self._locate(view, points, target)
         if not self._is_acceptable(found):
             return self._give_up(points, found)
-        T = orthonormalized(found.T_world_camera)
+        T = orthonormalize(found.T_world_camera)
         motion.follow(view, T)
         motion.remember(view, points, self.settings)
         status = TrackingStatus.DEGENERATE if found.degenerate else TrackingStatus.OK

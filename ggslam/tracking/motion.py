@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ggslam.features.orb import FeatureView
-from ggslam.scene.poses import inverse, orthonormalized, separation
+from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.tracking.photometric import PhotometricReference
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import PhotometricSettings, TrackerSettings
@@ -56,7 +56,7 @@ class CameraMotion:
 
     def move(self, T_new_old: np.ndarray) -> None:
         """The world about the camera was moved by a correction [4, 4]."""
-        self.T_world_camera = orthonormalized(T_new_old @ self.T_world_camera)
+        self.T_world_camera = orthonormalize(T_new_old @ self.T_world_camera)
         for view in {id(v): v for v in (*self.views, self.reference_view) if v is not None}.values():
             view.T_world_camera = T_new_old @ view.T_world_camera
         self.reference = None

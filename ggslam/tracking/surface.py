@@ -16,7 +16,7 @@ import numpy as np
 
 from ggslam.formats.array_archive import ArrayArchive, Arrays
 from ggslam.native.loader import NativeContext
-from ggslam.scene.poses import transformed
+from ggslam.scene.poses import transform_points
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import TargetSettings
@@ -104,7 +104,7 @@ class MeasuredSurface:
     def points(self, numbers: Iterable[int]) -> np.ndarray:
         """World points float32 [n, 3] of these keyframes."""
         parts = [self._parts[number] for number in numbers]
-        placed = (transformed(p.points, p.T_world_camera) for p in parts)
+        placed = (transform_points(p.points, p.T_world_camera) for p in parts)
         return np.concatenate([np.empty((0, 3), np.float32), *placed])
 
     def arrange(self, active: set[int], T_world_camera: np.ndarray | None = None) -> GicpTarget:
@@ -158,7 +158,7 @@ class MeasuredSurface:
         begin = 0
         for part in parts:  # one after the other: there may be far more points than a keyframe has
             rows, own = slice(begin, begin + part.count), part.points
-            points[rows] = transformed(own, part.T_world_camera)
+            points[rows] = transform_points(own, part.T_world_camera)
             quaternions[rows] = quaternions_from_normals(part.normals @ part.T_world_camera[:3, :3].T)
             log_scales[rows] = np.log(SPACING * own[:, 2])[:, None] + np.log([1.0, 1.0, FLATNESS])
             begin += part.count

@@ -13,7 +13,7 @@ from ggslam.features.orb import FeatureView
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import orthonormalized
+from ggslam.scene.poses import orthonormalize
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.points import PointSource
@@ -173,7 +173,7 @@ class Tracker(ABC):
             found: where it is.
             source: how that is known, for `TrackingResult.reason`.
         """
-        motion, T = self.state.motion, orthonormalized(found.T_world_camera)
+        motion, T = self.state.motion, orthonormalize(found.T_world_camera)
         motion.restart(view, T)
         motion.remember(view, points, self.settings)
         return TrackingResult(T.copy(), TrackingStatus.RECOVERED, found.overlap, found.rmse, source, points, found)

@@ -15,7 +15,7 @@ from ggslam.cli.main import app
 from ggslam.errors import ConfigError, FormatError, GgslamError, SequenceError
 from ggslam.jobs.export.meshes import MeshRequest, export_mesh
 from ggslam.runs.folder import RunFolder
-from ggslam.scene.poses import transformed
+from ggslam.scene.poses import transform_points
 from ggslam.sequences import open_sequence
 
 trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed (extra [mesh]; an independent reader)")
@@ -49,7 +49,7 @@ def measured(run: RunFolder, recording: Path) -> np.ndarray:
     clouds = []
     for index, T in poses.items():
         points = sequence.camera.back_project(sequence.frame(index).depth).reshape(-1, 3)
-        clouds.append(transformed(points[points[:, 2] > 0], T))
+        clouds.append(transform_points(points[points[:, 2] > 0], T))
     return np.concatenate(clouds)[::37]
 
 

@@ -71,8 +71,8 @@ def grey(camera: Camera) -> np.ndarray:
 @pytest.mark.parametrize(
     ("camera", "noise", "steps", "bar"),
     [
-        (CAMERA, 0.0, 0.0, 0.95), (CAMERA.scaled(2), 0.0, 0.0, 0.93),
-        (CAMERA, 0.001, 0.0, 0.85), (CAMERA, 0.0005, 0.0028, 0.8), (CAMERA.scaled(2), 0.001, 0.0028, 0.8),
+        (CAMERA, 0.0, 0.0, 0.95), (CAMERA.scale(2), 0.0, 0.0, 0.93),
+        (CAMERA, 0.001, 0.0, 0.85), (CAMERA, 0.0005, 0.0028, 0.8), (CAMERA.scale(2), 0.001, 0.0028, 0.8),
     ],
 )  # fmt: skip
 def test_things_on_a_floor_are_segments(camera: Camera, noise: float, steps: float, bar: float) -> None:
@@ -112,7 +112,7 @@ def test_same_image_same_segments_and_largest_first() -> None:
 
 @pytest.mark.parametrize("size", [(320, 240), (40, 30), (9, 7)])
 def test_images_without_depth_of_one_wall_and_tiny_ones(size: tuple[int, int]) -> None:
-    camera = CAMERA.resized(*size)
+    camera = CAMERA.resize(*size)
     nothing = np.zeros((size[1], size[0]), np.float32)
     assert not GeometricSegmenter().segment(grey(camera), nothing, camera).any()
     segments = GeometricSegmenter().segment(grey(camera), nothing + 1.5, camera)

@@ -150,7 +150,7 @@ def test_buffers_are_reused_and_sizes_may_change() -> None:
     first = rasterizer.forward(make_scene(100), CAMERA, POSE)
     second = rasterizer.forward(make_scene(300, 2), CAMERA, POSE)
     assert first.image.data_ptr() == second.image.data_ptr()
-    other = rasterizer.forward(make_scene(10), CAMERA.resized(100, 70), POSE)
+    other = rasterizer.forward(make_scene(10), CAMERA.resize(100, 70), POSE)
     assert other.image.shape == (3, 70, 100)
 
 

@@ -74,7 +74,7 @@ def test_order_of_threads_does_not_matter(other_order: None) -> None:
 def test_large_gaussians_cover_many_tiles(rasterizer: CudaRasterizer) -> None:
     scene = make_scene(60)
     scene.log_scales[::2] += 2.5
-    camera = CAMERA.resized(150, 110)
+    camera = CAMERA.resize(150, 110)
     check_against_cpu(rasterizer, scene, camera, tolerance=3e-5)
     assert rasterizer.statistics()["pairs"] > 60 * 10
 

@@ -71,7 +71,7 @@ def test_nothing_waits_for_the_device(cuda_library: CudaLibrary, monkeypatch: py
 
     for name in ("item", "cpu", "numpy", "tolist", "nonzero", "__bool__", "__int__", "__float__", "__index__"):
         monkeypatch.setattr(torch.Tensor, name, refuse)
-    terms = both.cuda.pixel_terms(pixels).joined(CudaPixelTerms.of_gaussians(rows, 48, cuda_library))
+    terms = both.cuda.pixel_terms(pixels).append(CudaPixelTerms.of_gaussians(rows, 48, cuda_library))
     terms.features(both.device_map), terms.labels(labels[:200]), terms.opacity(), terms.weight_sums(200)
     terms.step(both.device_map, gradient, RATES)
     terms.vote(both.device_map, labels)

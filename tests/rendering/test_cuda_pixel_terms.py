@@ -141,7 +141,7 @@ def test_votes_are_those_of_the_cpu(cuda_library: CudaLibrary) -> None:
 def test_pixels_joined_to_others_need_no_labels(cuda_library: CudaLibrary) -> None:
     both = Both(cuda_library, make_scene(200, 16))
     expected, terms = both.equal_terms(ALL[::2].copy())
-    joined = terms.joined(CudaPixelTerms.of_gaussians(torch.arange(50, device=both.device), 32, cuda_library))
+    joined = terms.append(CudaPixelTerms.of_gaussians(torch.arange(50, device=both.device), 32, cuda_library))
     labels = (np.arange(len(terms)) % 3).astype(np.int32)
     factors = np.linspace(0, 1, len(terms), dtype=np.float32)
     expected.vote(both.map, labels.astype(np.uint16), factors)
@@ -195,7 +195,7 @@ def test_everything_repeats_bit_for_bit(cuda_library: CudaLibrary) -> None:
         both = Both(cuda_library, crowded_scene(16))
         terms = both.cuda_terms(ALL[::2].copy(), 32, 5e-3)
         pulled = CudaPixelTerms.of_gaussians(torch.arange(7, device=both.device), 32, cuda_library)
-        terms = terms.joined(pulled)
+        terms = terms.append(pulled)
         gradient = np.random.default_rng(1).normal(size=(len(terms), 16)).astype(np.float32)
         terms.step(both.device_map, both.given(gradient), RATES)
         terms.vote(both.device_map, both.given((np.arange(len(terms)) % 9).astype(np.int32)))
@@ -209,10 +209,10 @@ def test_pseudo_pixels_follow_when_joined(cuda_library: CudaLibrary) -> None:
     both = Both(cuda_library, make_scene(50, 3))
     terms = both.cuda_terms(ALL[:40].copy(), 8, 1e-3)
     rows = torch.tensor([4, 4, 49], device=both.device)
-    joined = terms.joined(CudaPixelTerms.of_gaussians(rows, 8, cuda_library))
+    joined = terms.append(CudaPixelTerms.of_gaussians(rows, 8, cuda_library))
     assert len(joined) == 43 and joined.capacity == 8
     assert torch.equal(joined.weights[:40], terms.weights)
     assert torch.equal(joined.features(both.device_map)[40:], both.device_map.features[rows])
     assert torch.equal(joined.opacity()[40:].cpu(), torch.ones(3))
     with pytest.raises(RenderError, match="room for 8 and for 9"):
-        terms.joined(CudaPixelTerms.of_gaussians(rows, 9, cuda_library))
+        terms.append(CudaPixelTerms.of_gaussians(rows, 9, cuda_library))

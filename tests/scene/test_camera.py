@@ -13,24 +13,24 @@ CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 
 def test_halving_keeps_rays_where_they_are() -> None:
     """A pixel of the half image covers four: its centre lies between theirs, and so does its ray."""
-    full, half = CAMERA.rays(), CAMERA.scaled(0.5).rays()
+    full, half = CAMERA.rays(), CAMERA.scale(0.5).rays()
     mean = full.reshape(240, 2, 320, 2, 3).mean((1, 3))
     np.testing.assert_allclose(half, mean, atol=1e-6)
-    assert (CAMERA.scaled(0.5).cx, CAMERA.scaled(0.5).fx) == (159.5, 262.5)
+    assert (CAMERA.scale(0.5).cx, CAMERA.scale(0.5).fx) == (159.5, 262.5)
 
 
 def test_resizing_keeps_the_edges_of_the_view() -> None:
     for size in ((320, 240), (200, 333), (1280, 960)):
-        small = CAMERA.resized(*size)
+        small = CAMERA.resize(*size)
         assert (small.width, small.height) == size
         assert (-0.5 - small.cx) / small.fx == pytest.approx((-0.5 - CAMERA.cx) / CAMERA.fx)
         right = (small.width - 0.5 - small.cx) / small.fx
         assert right == pytest.approx((CAMERA.width - 0.5 - CAMERA.cx) / CAMERA.fx)
-    assert CAMERA.scaled(1.0) == CAMERA and CAMERA.scaled(1e-6).width == 1
+    assert CAMERA.scale(1.0) == CAMERA and CAMERA.scale(1e-6).width == 1
 
 
 def test_back_projected_points_project_to_their_pixels() -> None:
-    camera = CAMERA.scaled(0.1)
+    camera = CAMERA.scale(0.1)
     depth = np.random.default_rng(0).uniform(1, 5, (camera.height, camera.width)).astype(np.float32)
     depth[3, 4] = 0
     points = camera.back_project(depth)

@@ -10,13 +10,13 @@ from ggslam.scene.poses import (
     inverse,
     is_valid_pose,
     matrix_to_quaternion,
-    orthonormalized,
+    orthonormalize,
     quaternion_to_matrix,
     se3_exp,
     se3_log,
     separation,
     so3_log,
-    transformed,
+    transform_points,
 )
 
 ANGLES = (0.0, 1e-12, 1e-8, 9e-7, 1.1e-6, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-7)
@@ -81,7 +81,7 @@ def test_inverse_and_orthonormalized() -> None:
     many = np.stack([se3_exp(twist(a, 2)) for a in ANGLES])
     np.testing.assert_allclose(inverse(many) @ many, np.tile(np.eye(4), (len(many), 1, 1)), atol=1e-12)
     worn = many[7] + np.pad(1e-3 * np.random.default_rng(3).normal(size=(3, 3)), ((0, 1), (0, 1)))
-    repaired = orthonormalized(worn)
+    repaired = orthonormalize(worn)
     np.testing.assert_allclose(repaired[:3, :3] @ repaired[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(repaired, many[7], atol=5e-3)
 
@@ -110,4 +110,4 @@ def test_separation_is_that_of_the_motion_between() -> None:
 def test_transformed_points() -> None:
     T, points = se3_exp(np.array([0.5, 1.0, -2.0, 0.3, -0.2, 0.9])), np.random.default_rng(0).normal(size=(7, 3))
     expected = (T @ np.column_stack([points, np.ones(7)]).T).T[:, :3]
-    np.testing.assert_allclose(transformed(points, T), expected, atol=1e-12)
+    np.testing.assert_allclose(transform_points(points, T), expected, atol=1e-12)

@@ -92,7 +92,7 @@ def test_damaged_frame(make: Make, damage: str) -> None:
     assert "\n" not in str(caught.value)
     sequence = open_sequence(folder, on_bad_frame="skip")
     assert [frame.source_index for frame in sequence.stream()] == [0, 1, 2, 4]
-    (skipped,) = sequence.skipped
+    (skipped,) = sequence.skipped_frames
     assert (skipped.index, skipped.source_index) == (3, 3)
     with pytest.raises(SequenceError, match=message):
         raise SequenceError(skipped.reason)

@@ -58,7 +58,7 @@ def test_intrinsics_are_read_and_scaled(make: Make, name: str) -> None:
     camera = open_sequence(folder).camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 31, 15, 11)
     half = open_sequence(folder, scale=0.5)
-    assert half.camera == camera.scaled(0.5)
+    assert half.camera == camera.scale(0.5)
     frame = half.frame(1)
     assert frame.color.shape == (12, 16, 3) and frame.depth.shape == (12, 16) and frame.mask is not None
     assert frame.mask.shape == (12, 16)

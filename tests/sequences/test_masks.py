@@ -270,7 +270,7 @@ def test_damaged_mask(make: Make, kind: str, lazy: bool) -> None:
     sequence = open_sequence(folder, on_bad_frame="skip")
     frames = list(sequence.stream(masks="lazy" if lazy else True))
     assert [frame.load_mask() is None for frame in frames] == [False, False, False, True, False]
-    assert sequence.skipped == [] and list(sequence.mask_problems) == [3]
+    assert sequence.skipped_frames == [] and list(sequence.mask_problems) == [3]
     with pytest.raises(SequenceError, match=message):
         raise SequenceError(sequence.mask_problems[3])
     assert len(list(open_sequence(folder).stream(masks=False))) == 5

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from ggslam.cli.main import app
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import inverse, transformed
+from ggslam.scene.poses import inverse, transform_points
 from ggslam.sequences import open_sequence
 from ggslam.synthetic import RayCaster, Scene, camera_path, furnished_corridor, lighting
 from ggslam.synthetic import corridor as corridor_module
@@ -49,7 +49,7 @@ def poses(corridor: Scene) -> np.ndarray:
 
 def agreement(depth: np.ndarray, T: np.ndarray, other_depth: np.ndarray, T_other: np.ndarray) -> float:
     """Share of the pixels of one view that lie where the other view measures them, to 3 %, of those in its image."""
-    points = transformed(CAMERA.back_project(depth)[depth > 0], inverse(T_other) @ T)
+    points = transform_points(CAMERA.back_project(depth)[depth > 0], inverse(T_other) @ T)
     front = points[points[:, 2] > 0.05]
     u = np.rint(CAMERA.fx * front[:, 0] / front[:, 2] + CAMERA.cx).astype(int)
     v = np.rint(CAMERA.fy * front[:, 1] / front[:, 2] + CAMERA.cy).astype(int)

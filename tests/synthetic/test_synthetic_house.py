@@ -165,7 +165,7 @@ def test_distortion_is_fixed_smooth_and_in_disparity() -> None:
     offset = disparity_distortion(camera, 0.4, 2)
     assert np.sqrt((offset**2).mean()) == pytest.approx(0.4) and abs(offset.mean()) < 1e-9
     assert np.abs(np.diff(offset, axis=0)).max() < 0.05 and np.abs(np.diff(offset, axis=1)).max() < 0.05
-    small = disparity_distortion(camera.resized(80, 60), 0.4, 2)
+    small = disparity_distortion(camera.resize(80, 60), 0.4, 2)
     np.testing.assert_allclose(cv2.resize(offset, (80, 60), interpolation=cv2.INTER_AREA), small, atol=0.01)
     assert np.abs(disparity_distortion(camera, 0.4, 3) - offset).max() > 0.1
     for z in (1.5, 3.0):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ggslam.errors import ConfigError, SequenceError
-from ggslam.scene.poses import inverse, so3_log, transformed
+from ggslam.scene.poses import inverse, so3_log, transform_points
 from ggslam.synthetic import Scanner, World, cast_rays, cloud_tiles, make_world, walk, world_cloud
 from ggslam.synthetic.world import CELL
 
@@ -95,7 +95,7 @@ def test_scan_lies_on_surfaces_within_noise(world: World, poses: np.ndarray) -> 
         for pose in poses[::400]:
             scan = scanner.scan(world, pose, 4)
             assert len(scan) > 0.9 * 16 * 90
-            away = np.abs(distance(world, transformed(scan.points.astype(float), pose)))
+            away = np.abs(distance(world, transform_points(scan.points.astype(float), pose)))
             assert away.max() < 2e-5 + 5 * noise
             assert noise == 0 or 0.3 * noise < np.sqrt((away**2).mean()) < 1.1 * noise
             direction = scan.points / np.linalg.norm(scan.points, axis=1, keepdims=True)
@@ -108,7 +108,7 @@ def test_scans_see_walls_in_all_directions(world: World, poses: np.ndarray) -> N
     scanner = Scanner(12, 40, noise=0.0)
     axes = np.vstack([np.zeros((1, 3)), 1e-4 * np.eye(3)])
     for pose in poses[::100]:
-        points = transformed(scanner.scan(world, pose, 0).points.astype(float), pose)
+        points = transform_points(scanner.scan(world, pose, 0).points.astype(float), pose)
         away = distance(world, (points[:, None] + axes).reshape(-1, 3)).reshape(-1, 4)
         normal = np.clip((away[:, 1:] - away[:, :1]) / 1e-4, -1, 1)
         assert np.linalg.eigvalsh(normal.T @ normal / len(points))[0] > 0.04
@@ -162,7 +162,7 @@ def test_cloud_covers_what_can_be_seen(world: World, poses: np.ndarray) -> None:
 
     tree = cKDTree(cloud)
     for pose in poses[::250]:
-        seen = transformed(Scanner(16, 180, noise=0.0).scan(world, pose, 0).points, pose)
+        seen = transform_points(Scanner(16, 180, noise=0.0).scan(world, pose, 0).points, pose)
         assert tree.query(seen)[0].max() < 2 * spacing
 
 

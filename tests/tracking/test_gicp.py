@@ -231,7 +231,7 @@ def test_the_number_of_points_depends_neither_on_resolution_nor_on_holes(context
     counts = []
     for scale in (2, 4, 8):
         for known in (1.0, 0.3):  # share of the image with depth
-            camera = CAMERA.scaled(scale)
+            camera = CAMERA.scale(scale)
             depth = np.full((camera.height, camera.width), 2.0, np.float32)
             depth[:, round(known * camera.width) :] = 0
             counts.append(len(extract_points(depth, camera, PointSettings(count=5000), NOISE, context)))

@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import is_valid_pose, se3_exp, transformed
+from ggslam.scene.poses import is_valid_pose, se3_exp, transform_points
 from ggslam.viewer.cameras import (
     HEADROOM_M,
     box_lines,
@@ -36,7 +36,7 @@ def test_a_camera_looks_along_a_ray() -> None:
 def test_a_view_of_a_pose_looks_where_it_looked() -> None:
     T = se3_exp(np.array([0.2, 0.1, -0.4, 0.3, -0.2, 0.5]))
     view = view_of_pose(T, 2.0)
-    assert np.allclose(transformed(view.look_at[None], np.linalg.inv(T)), [[0, 0, 2.0]])
+    assert np.allclose(transform_points(view.look_at[None], np.linalg.inv(T)), [[0, 0, 2.0]])
     assert np.allclose(view.up, -T[:3, 1])
 
 

@@ -71,7 +71,7 @@ def render_frames(
         raise ConfigError(f"`what`: expected some of {','.join(KINDS)}, found {unknown[0]!r}")
     camera = folder.sequence().camera
     if width is not None:
-        camera = camera.resized(width, round(camera.height * width / camera.width))
+        camera = camera.resize(width, round(camera.height * width / camera.width))
     objects = ObjectsInParts.of(folder) if set(what) & set(OBJECT_KINDS) else None
     parts = folder.map_in_parts() if objects is None else objects.map
     make_folder(out)

@@ -21,7 +21,7 @@ from ggslam.runs.recordings import fingerprint
 from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import transformed
+from ggslam.scene.poses import transform_points
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.submaps.cell_keys import partition
 from ggslam.submaps.cell_records import CellWrite
@@ -167,7 +167,7 @@ def _surface(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np
     )  # fmt: skip
     points, normals = [np.zeros((0, 3))], [np.zeros((0, 3), np.int8)]
     for steps, turned, reach, T in parts:
-        points.append(transformed(steps * (float(reach) / 32767), T))
+        points.append(transform_points(steps * (float(reach) / 32767), T))
         normals.append(np.rint(turned @ T[:3, :3].T).astype(np.int8))
     return np.concatenate(points), {NORMAL: np.concatenate(normals)}
 

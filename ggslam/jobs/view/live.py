@@ -146,7 +146,7 @@ class LiveView:
             if self._rasterizer is None:  # kernels of one context take turns; the run must not wait for these
                 self._rasterizer = CpuRasterizer(context=NativeContext(1))
             view = self._rasterizer.forward(
-                snapshot.gaussians, camera.resized(*size), inverse(snapshot.T_world_camera), features=False
+                snapshot.gaussians, camera.resize(*size), inverse(snapshot.T_world_camera), features=False
             )
             depth = np.where(view.alpha.numpy() > 0.5, view.expected_depth.numpy(), 0)
             cells += [("rendered", color_to_uint8(view.image.numpy()))]

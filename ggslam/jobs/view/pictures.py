@@ -55,7 +55,7 @@ class ViewPictures:
     def compare(self, frame: int, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `ViewedMap.frame_picture`."""
         segmented = self._segmented
-        camera = self._camera.resized(CELL_WIDTH, round(self._camera.height * CELL_WIDTH / self._camera.width))
+        camera = self._camera.resize(CELL_WIDTH, round(self._camera.height * CELL_WIDTH / self._camera.width))
         view = self._rasterizer.forward(
             self._gaussians, camera, inverse(T_world_camera), features=segmented is not None
         )

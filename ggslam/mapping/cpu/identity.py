@@ -138,7 +138,7 @@ class CpuIdentityLearner(IdentityLearner):
         gradient[known] = s.weight * of_known
         if self._pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
-            terms = terms.joined(PixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
+            terms = terms.append(PixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
             gradient = np.concatenate([gradient, pull])
         terms.step(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate))
         self.table.step(chosen, s.weight * rows, rate_factor * s.classifier_rate)

@@ -191,7 +191,7 @@ class CudaIdentityLearner(IdentityLearner):
         if self._pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
             others = CudaPixelTerms.of_gaussians(pulled, terms.capacity, terms.library)
-            terms, gradient = terms.joined(others), torch.cat([gradient, pull])
+            terms, gradient = terms.append(others), torch.cat([gradient, pull])
         # Without a known pixel nothing may change; a Gaussian in no term makes no step.
         terms = CudaPixelTerms(terms.gaussians, terms.weights, terms.counts * (known > 0), terms.library)
         terms.vote(gaussians, labels, vote_weights)

@@ -43,7 +43,7 @@ class _TermsByGaussian(ctypes.Structure):
 
 
 @lru_cache(maxsize=8)
-def _declared(library: CudaLibrary) -> CudaLibrary:
+def _declare(library: CudaLibrary) -> CudaLibrary:
     library.check_size("pixel_terms", _Terms)
     library.check_size("terms_by_gaussian", _TermsByGaussian)
     arguments: dict[str, list[type]] = {
@@ -95,7 +95,7 @@ class CudaPixelTerms:
             torch.empty(pixels, capacity, dtype=torch.int32, device=device),
             torch.empty(pixels, capacity, dtype=torch.float32, device=device),
             torch.empty(pixels, dtype=torch.int32, device=device),
-            _declared(library),
+            _declare(library),
         )
 
     @staticmethod
@@ -119,7 +119,7 @@ class CudaPixelTerms:
         terms._call("collect", rendering, pointer(pixels), min_weight)
         return terms
 
-    def joined(self, other: CudaPixelTerms) -> CudaPixelTerms:
+    def append(self, other: CudaPixelTerms) -> CudaPixelTerms:
         """These pixels followed by those of `other`, which must have the same capacity."""
         if self.capacity != other.capacity:
             raise RenderError(f"joined: terms with room for {self.capacity} and for {other.capacity}")

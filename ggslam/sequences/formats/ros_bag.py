@@ -122,7 +122,7 @@ def _place_depth(recording: Recording, bag: Bag, topics: Topics, camera: Camera)
     depth_frame = bag.message(topics.depth, 0).header.frame_id
     color_frame = bag.message(topics.color, 0).header.frame_id
     if depth_frame == color_frame and np.allclose(
-        depth_camera.resized(camera.width, camera.height).matrix(), camera.matrix(), atol=0.5
+        depth_camera.resize(camera.width, camera.height).matrix(), camera.matrix(), atol=0.5
     ):
         return
     T = np.eye(4) if depth_frame == color_frame else static_transform(bag, color_frame, depth_frame)

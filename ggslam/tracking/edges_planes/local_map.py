@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 import torch
 
-from ggslam.scene.poses import inverse, orthonormalized, separation
+from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.tracking.edges_planes.alignment import LAST_STEP, FeatureAligner, FeatureAlignment, FrameClock
 from ggslam.tracking.edges_planes.extraction import ScanFeatures
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
@@ -45,7 +45,7 @@ class LocalFeatureMap:
 
     def move(self, T_new_old: np.ndarray) -> None:
         """Moves the map in the world, [4, 4]."""
-        self._T_world_map = orthonormalized(T_new_old @ self._T_world_map)
+        self._T_world_map = orthonormalize(T_new_old @ self._T_world_map)
 
     def align(self, scan: ScanFeatures, T_world_sensor_guess: np.ndarray) -> FeatureAlignment:
         """The pose in the world at which the scan fits best; what the result says of the map is said of the world."""
@@ -55,7 +55,7 @@ class LocalFeatureMap:
         A = np.zeros((6, 6))
         A[:3, :3] = A[3:, 3:] = self._T_world_map[:3, :3]
         result = dataclasses.replace(
-            found, T_map_sensor=orthonormalized(self._T_world_map @ found.T_map_sensor),
+            found, T_map_sensor=orthonormalize(self._T_world_map @ found.T_map_sensor),
             information=A @ found.information @ A.T, weak_directions=found.weak_directions @ A.T,
         )  # fmt: skip
         self.clock.ended(LAST_STEP)
