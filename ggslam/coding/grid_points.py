@@ -35,7 +35,7 @@ def _library() -> ctypes.CDLL:
         "number_planes": [points, grid, c_int32, c_void_p, c_void_p, c_void_p, c_void_p],
     }
     core.ggslam_gpcc_sample_cubes.restype = c_int64
-    core.ggslam_gpcc_sample_cubes.argtypes = [points, grid, c_int32, c_uint32, c_void_p]
+    core.ggslam_gpcc_sample_cubes.argtypes = [points, grid, c_int32, c_uint32, c_uint32, c_void_p]
     for name, arguments in signatures.items():
         function = getattr(core, f"ggslam_gpcc_{name}")
         function.restype, function.argtypes = None, arguments
@@ -84,9 +84,9 @@ class GridPoints:
     def sample_cubes(self, cube_bits: int, one_in: int) -> np.ndarray:
         """Codes uint64 [M] of 21 bits a coordinate, x first, of the points in one of so many (a power of two) cubes of
         an edge of 2^cube_bits voxels."""
-        codes = np.empty(len(self), np.uint64)
+        codes, slabs = np.empty(len(self), np.uint64), min(one_in, 8)
         count = _library().ggslam_gpcc_sample_cubes(
-            self._chosen(None), self._grid, cube_bits, one_in - 1, codes.ctypes.data
+            self._chosen(None), self._grid, cube_bits, slabs - 1, one_in // slabs - 1, codes.ctypes.data
         )
         return codes[:count].copy()
 

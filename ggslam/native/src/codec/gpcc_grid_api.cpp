@@ -93,18 +93,20 @@ GGSLAM_EXPORT void ggslam_gpcc_number_planes(const Points* points, const Grid* g
 }
 
 // Appends to `codes`, which has room for count of them, the points in cubes of an edge of 2^cube_bits voxels that a hash
-// chooses: one cube in mask + 1 (a power of two). A code has 21 bits a coordinate. Returns how many there are.
+// chooses: one slab across x in slab_mask + 1, and of its cubes one in cube_mask + 1 (powers of two). Most points are
+// passed over by one coordinate. A code has 21 bits a coordinate. Returns how many there are.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_sample_cubes(const Points* points, const Grid* grid, std::int32_t cube_bits,
-                                                    std::uint32_t mask, std::uint64_t* codes) {
+                                                    std::uint32_t slab_mask, std::uint32_t cube_mask,
+                                                    std::uint64_t* codes) {
+  const auto hash = [](std::uint64_t v) { return (v + 1) * 0x9e3779b97f4a7c15ull >> 40; };
   std::uint64_t* end = codes;
   for_each_point(*points, [&](std::size_t, const auto* p) {
-    std::uint64_t cube = 0, code = 0;
-    for (int axis = 0; axis < 3; ++axis) {
-      const auto v = static_cast<std::uint64_t>(coordinate(*grid, axis, p[axis]));
-      cube = cube << 21 | v >> cube_bits;
-      code = code << 21 | v;
-    }
-    if ((cube * 0x9e3779b97f4a7c15ull >> 40 & mask) == 0) *end++ = code;
+    const auto x = static_cast<std::uint64_t>(coordinate(*grid, 0, p[0]));
+    if ((hash(x >> cube_bits) & slab_mask) != 0) return;
+    const auto y = static_cast<std::uint64_t>(coordinate(*grid, 1, p[1]));
+    const auto z = static_cast<std::uint64_t>(coordinate(*grid, 2, p[2]));
+    if ((hash((y >> cube_bits) << 21 | z >> cube_bits) & cube_mask) != 0) return;
+    *end++ = x << 42 | y << 21 | z;
   });
   return end - codes;
 }
