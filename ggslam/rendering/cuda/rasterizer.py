@@ -6,8 +6,8 @@ number of pairs of a Gaussian and an image tile has to be known to have made roo
 before that, with the room that the last rendering needed and some more, and repeated in the rare case that it was not
 enough; so the device does not idle while the host waits.
 
-With `waits=False` the host does not wait at all. The room is made by what earlier renderings needed, and a rendering
-for which it does not suffice is told and counted on the device: what was to be learned from it has to be repeated.
+With `waits=False` the host does not wait at all. Room is made by what earlier renderings needed; a rendering that
+overflows it is flagged and counted on the device, and the training step on it has to be repeated.
 """
 
 from __future__ import annotations
