@@ -11,8 +11,8 @@ can hold the cloud (1.1 million points). Times are the best of the repeats, whic
 to one slice coded by one worker in the same run. Nothing else should run on the machine.
 
 With --golden, streams of the reference encoder are decoded and compared, and its payloads with ours. Sparse clouds are
-coded with and without planes. If GGSLAM_TMC3 names a tmc3 binary of release-v12.9, or one is on PATH, streams are checked
-against it both ways, and both encoders code the same cloud by turns, on one core.
+coded with and without planes. If GGSLAM_TMC3 names a tmc3 binary of release-v12.9, or one is on PATH, streams are
+checked against it both ways, and both encoders code the same cloud by turns, on one core.
 """
 
 from __future__ import annotations

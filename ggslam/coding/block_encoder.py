@@ -105,7 +105,7 @@ class _Spool:
         self.corners = np.stack([together.min(0), together.max(0)])
         for name, values in attributes.items():
             own = AttributeSummary.of(values, self.settings.attribute(name))
-            self.summaries[name] = self.summaries[name].joined(own) if name in self.summaries else own
+            self.summaries[name] = self.summaries[name].join(own) if name in self.summaries else own
 
     def rows(self, file: IO[bytes], start: int, count: int) -> np.ndarray:
         """Rows of a file in this form; may be called by several threads."""

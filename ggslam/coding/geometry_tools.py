@@ -13,8 +13,8 @@ import numpy as np
 
 from ggslam.coding.geometry_syntax import ALL_AXES, GeometryParameters
 from ggslam.coding.grid_points import GridPoints
-from ggslam.coding.native import SliceCoder
 from ggslam.coding.settings import CodecSettings
+from ggslam.coding.slice_coder import SliceCoder
 
 DENSE_POINTS_PER_CUBE = 1.5
 """Occupied voxels per occupied cube of 4 x 4 x 4 above which neighbours give useful contexts."""

@@ -56,7 +56,7 @@ def write_compressed_ply(path: str | Path, gaussians: GaussianMap) -> None:
     gaussforge = check_gaussforge(path)
     order = torch.from_numpy(morton_order(gaussians.means.detach().cpu().numpy()))
     columns = {name: values[order] for name, values in _columns(gaussians).items()}
-    write_bytes(path, _packed(gaussforge, path, columns, gaussians.sh_degree, "compressed.ply"))
+    write_bytes(path, _pack(gaussforge, path, columns, gaussians.sh_degree, "compressed.ply"))
 
 
 def write_spz(path: str | Path, gaussians: GaussianMap) -> None:
@@ -80,7 +80,7 @@ def write_spz(path: str | Path, gaussians: GaussianMap) -> None:
     columns["rotations"][:, 2:] *= -1  # D R D with D = diag(1, -1, -1): the same ellipsoid as D R
     odd = [index - 1 for index in _ODD_IN_Y_AND_Z if index <= columns["sh"].shape[1]]
     columns["sh"][:, odd] *= -1
-    write_bytes(path, _packed(gaussforge, path, columns, gaussians.sh_degree, "spz"))
+    write_bytes(path, _pack(gaussforge, path, columns, gaussians.sh_degree, "spz"))
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
@@ -112,7 +112,7 @@ def _columns(gaussians: GaussianMap) -> dict[str, torch.Tensor]:
     return {name: values.detach().cpu().clone() for name, values in columns.items()}
 
 
-def _packed(
+def _pack(
     gaussforge: ModuleType, path: str | Path, columns: dict[str, torch.Tensor], degree: int, kind: str
 ) -> bytes:  # fmt: skip
     values = {name: np.ascontiguousarray(column.numpy(), np.float32).tobytes() for name, column in columns.items()}

@@ -9,7 +9,7 @@ import pytest
 from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
 from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
 from ggslam.coding.geometry_tools import levels_of, split_axes
-from ggslam.coding.native import SliceCoder
+from ggslam.coding.slice_coder import SliceCoder
 from ggslam.coding.stream import read_stream
 
 
@@ -19,8 +19,8 @@ def scan(count: int = 12_000) -> np.ndarray:
     angle, ring = rng.uniform(0, 2 * np.pi, count), rng.integers(1, 33, count)
     distance = np.minimum(1.8 / np.tan(0.012 * ring), 8 / np.abs(np.sin(angle)))
     height = np.where(distance < 1.8 / np.tan(0.012 * ring), 1.8 - distance * np.tan(0.012 * ring), 0.0)
-    metres = np.stack([distance * np.cos(angle), distance * np.sin(angle), height], 1) + rng.normal(0, 0.004, (count, 3))
-    grid = np.floor(metres / 0.005).astype(np.int64)
+    metres = np.stack([distance * np.cos(angle), distance * np.sin(angle), height], 1)
+    grid = np.floor((metres + rng.normal(0, 0.004, (count, 3))) / 0.005).astype(np.int64)
     return np.unique(grid - grid.min(0), axis=0)
 
 
