@@ -8,7 +8,8 @@ from itertools import chain
 from pathlib import Path
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
-from ggslam.formats.packed_splats import check_gaussforge, write_compressed_ply, write_spz
+from ggslam.formats.compressed_ply import write_compressed_ply
+from ggslam.formats.packed_splats import check_gaussforge, write_spz
 from ggslam.formats.point_cloud import write_point_cloud
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.splat_file import write_splat
@@ -35,7 +36,7 @@ def export_packed(folder: RunFolder, path: Path, kind: str, min_opacity: float =
         RunFolderError: nothing to write, or the file cannot be written.
     """
     _check_ending(path, kind)
-    if kind != "splat":
+    if kind == "spz":
         check_gaussforge(path)
     make_folder(path.parent)
     parts = _some(_parts(folder, min_opacity, whole=kind != "splat"), folder, min_opacity)

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splat files at every degree of spherical harmonics, read back without any of our code: as the formats' descriptions
+say (splat_maps.py), and by PlayCanvas' splat-transform, where there is one: a command in GGSLAM_SPLAT_TRANSFORM, or
+`splat-transform` on the PATH (npm install -g @playcanvas/splat-transform)."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from splat_maps import Splats, from_compressed_ply, from_ply, ply_elements, small_map
+
+from ggslam.errors import FormatError
+from ggslam.formats.compressed_ply import write_compressed_ply
+from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.formats.morton import morton_order
+from ggslam.formats.splat_file import write_splat
+
+DEGREES = [0, 1, 2, 3]
+DIRECTIONS = np.array([[0.3, -0.5, 0.8], [-0.7, 0.2, -0.1], [0.1, 0.9, 0.4]])
+
+
+@pytest.fixture(scope="session")
+def splat_transform() -> list[str]:
+    """The command."""
+    command = os.environ.get("GGSLAM_SPLAT_TRANSFORM") or shutil.which("splat-transform")
+    if not command:
+        pytest.skip("splat-transform is not there (GGSLAM_SPLAT_TRANSFORM, or on the PATH)")
+    return shlex.split(command)
+
+
+def convert(command: list[str], *words: str | Path) -> None:
+    done = subprocess.run([*command, "-w", *map(str, words)], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def check_same(seen: Splats, written: Splats, turn: np.ndarray | None = None, rounding: float = 1e-6) -> None:
+    """Exact but for float32: positions, shapes, opacities, colours from everywhere; `turn`: of the file's axes."""
+    R = np.eye(3) if turn is None else turn
+    np.testing.assert_allclose(seen.means, written.means @ R.T, atol=1e-6)
+    expected = R @ written.covariances() @ R.T
+    difference = np.linalg.norm(seen.covariances() - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
+    assert difference.max() < 1e-5
+    np.testing.assert_allclose(seen.opacities, written.opacities, atol=rounding)
+    assert seen.sh.shape == written.sh.shape
+    for direction in DIRECTIONS:
+        np.testing.assert_allclose(seen.colors(R @ direction), written.colors(direction), atol=1e-5)
+
+
+def check_packed(seen: Splats, written: Splats) -> None:
+    """As near as the bits of a compressed PLY allow, rows in Morton order."""
+    written = written.take(morton_order(written.means))
+    for start in range(0, len(written.means), 256):
+        chunk = slice(start, start + 256)
+        for found, given in ((seen.means, written.means), (seen.log_scales, written.log_scales)):
+            step = np.ptp(given[chunk], axis=0) / np.array([2047, 1023, 2047])
+            assert (np.abs(found[chunk] - given[chunk]) <= 0.51 * step + 2e-6).all()
+        step = np.ptp(written.sh[chunk, 0], axis=0) / 255
+        assert (np.abs(seen.sh[chunk, 0] - written.sh[chunk, 0]) <= 0.51 * step + 2e-6).all()
+    unit = [q / np.linalg.norm(q, axis=1, keepdims=True) for q in (seen.quaternions, written.quaternions)]
+    assert np.abs((unit[0] * unit[1]).sum(1)).min() > 1 - 3e-6  # half a step of sqrt(2)/1023 in each of three
+    np.testing.assert_allclose(seen.opacities, written.opacities, atol=0.51 / 255 + 1e-6)
+    assert seen.sh.shape == written.sh.shape
+    np.testing.assert_allclose(seen.sh[:, 1:], written.sh[:, 1:], atol=1 / 64 + 1e-5)
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_ply(degree: int, tmp_path: Path) -> None:
+    gaussians = small_map(degree)
+    write_gaussian_ply(tmp_path / "map.ply", gaussians, ["object_id"])
+    check_same(from_ply(tmp_path / "map.ply"), Splats.of(gaussians))
+    np.testing.assert_array_equal(ply_elements(tmp_path / "map.ply")["vertex"]["object_id"], gaussians.object_id)
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_ply_by_splat_transform(degree: int, tmp_path: Path, splat_transform: list[str]) -> None:
+    gaussians = small_map(degree)
+    write_gaussian_ply(tmp_path / "map.ply", gaussians, ["object_id"])
+    convert(splat_transform, tmp_path / "map.ply", tmp_path / "seen.ply")
+    check_same(from_ply(tmp_path / "seen.ply"), Splats.of(gaussians))
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_compressed_ply(degree: int, tmp_path: Path) -> None:
+    gaussians = small_map(degree)
+    write_compressed_ply(tmp_path / "map.compressed.ply", gaussians)
+    check_packed(from_compressed_ply(tmp_path / "map.compressed.ply"), Splats.of(gaussians))
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_compressed_ply_by_splat_transform(degree: int, tmp_path: Path, splat_transform: list[str]) -> None:
+    gaussians = small_map(degree)
+    write_compressed_ply(tmp_path / "map.compressed.ply", gaussians)
+    convert(splat_transform, tmp_path / "map.compressed.ply", tmp_path / "seen.ply")
+    check_packed(from_ply(tmp_path / "seen.ply"), Splats.of(gaussians))
+
+
+def test_extremes_in_a_compressed_ply(tmp_path: Path) -> None:
+    """One Gaussian, opaque, as flat as can be, with colours out of reach: readers find finite numbers."""
+    gaussians = small_map(1, 1)
+    gaussians.opacity_logits[:] = 100.0
+    gaussians.log_scales[0, 2] = -60.0
+    gaussians.sh[0, 1:] = 9.0
+    write_compressed_ply(tmp_path / "map.ply", gaussians)
+    seen = from_compressed_ply(tmp_path / "map.ply")
+    np.testing.assert_array_equal(seen.means, gaussians.means)
+    np.testing.assert_allclose(seen.log_scales[0], [*gaussians.log_scales[0, :2], -20.0])
+    assert seen.opacities[0] == 254 / 255 and (seen.sh[0, 1:] == 4.0).all()
+
+
+def test_what_no_compressed_ply_can_hold(tmp_path: Path) -> None:
+    gaussians = small_map(0, 5)
+    gaussians.log_scales[3, 1] = float("inf")
+    with pytest.raises(FormatError, match="size of Gaussian 3"):
+        write_compressed_ply(tmp_path / "map.ply", gaussians)
+    gaussians.keep(gaussians.opacities > 2)
+    with pytest.raises(FormatError, match="at least one"):
+        write_compressed_ply(tmp_path / "map.ply", gaussians)
+    assert not list(tmp_path.iterdir())
+
+
+def test_splat_by_splat_transform(tmp_path: Path, splat_transform: list[str]) -> None:
+    gaussians = small_map(0)
+    write_splat(tmp_path / "map.splat", [gaussians])
+    convert(splat_transform, tmp_path / "map.splat", tmp_path / "seen.ply")
+    seen, written = from_ply(tmp_path / "seen.ply"), Splats.of(gaussians)
+    np.testing.assert_allclose(seen.means, written.means, atol=1e-6)
+    np.testing.assert_allclose(seen.log_scales, written.log_scales, atol=1e-5)
+    np.testing.assert_allclose(seen.opacities, written.opacities, atol=0.51 / 255)
+    np.testing.assert_allclose(seen.colors(DIRECTIONS[0]), written.colors(DIRECTIONS[0]).clip(0, 1), atol=0.51 / 255)
