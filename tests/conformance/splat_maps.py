@@ -42,9 +42,10 @@ class Splats:
 
     def covariances(self) -> np.ndarray:
         w, x, y, z = (self.quaternions / np.linalg.norm(self.quaternions, axis=1, keepdims=True)).T.astype(float)
-        R = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                      [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                      [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]).transpose(2, 0, 1)  # fmt: skip
+        rows = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]  # fmt: skip
+        R = np.array(rows).transpose(2, 0, 1)
         return (R * np.exp(2 * self.log_scales.astype(float))[:, None, :]) @ R.transpose(0, 2, 1)
 
     def colors(self, direction: np.ndarray) -> np.ndarray:
@@ -109,8 +110,11 @@ def from_ply(path: Path) -> Splats:
     base = stack(rows, "f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     higher = stack(rows, *(f"f_rest_{i}" for i in range(rest))) if rest else np.zeros((len(rows), 0))
     sh = np.concatenate([base, higher.reshape(len(rows), 3, -1).transpose(0, 2, 1)], 1)
-    return Splats(stack(rows, "x", "y", "z"), stack(rows, *(f"scale_{i}" for i in range(3))),
-                  stack(rows, *(f"rot_{i}" for i in range(4))), 1 / (1 + np.exp(-rows["opacity"].astype(float))), sh)  # fmt: skip
+    opacities = 1 / (1 + np.exp(-rows["opacity"].astype(float)))
+    quaternions = stack(rows, *(f"rot_{i}" for i in range(4)))
+    return Splats(
+        stack(rows, "x", "y", "z"), stack(rows, *(f"scale_{i}" for i in range(3))), quaternions, opacities, sh
+    )  # fmt: skip
 
 
 def from_compressed_ply(path: Path) -> Splats:

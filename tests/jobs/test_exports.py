@@ -13,8 +13,10 @@ import pytest
 from typer.testing import CliRunner
 
 from ggslam.cli.main import app
-from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
 from ggslam.formats.point_cloud import read_point_cloud
+from ggslam.jobs.export.export_run import export_run
+from ggslam.jobs.export.formats import ExportFormat, choose_format
 from ggslam.jobs.export.splats import export_packed, export_pcd
 from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.runs.folder import RunFolder
@@ -158,6 +160,27 @@ def test_splats_by_the_command_line(run: RunFolder, tmp_path: Path, kind: str) -
     assert f"{opaque} Gaussians" in result.output.replace("\n", " ") and f"{len(run.gaussians())} Gaussians" in faint
     if kind == "splat":
         assert out.stat().st_size == 32 * opaque
+
+
+def test_gltf_by_the_command_line(run: RunFolder, tmp_path: Path) -> None:
+    """A .glb is a mesh unless the format is given; a run without objects writes no ids."""
+    out = tmp_path / "splats.glb"
+    opaque = int((run.gaussians().opacities >= 0.6).sum())
+    result = CliRunner().invoke(
+        app, ["export", str(run.path), "--format", "gltf", "--out", str(out), "--min-opacity", "0.6"]
+    )
+    assert result.exit_code == 0, result.output
+    assert f"{opaque} Gaussians" in result.output.replace("\n", " ")
+    data = out.read_bytes()
+    gltf = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    (primitive,) = gltf["meshes"][0]["primitives"]
+    assert list(primitive["extensions"]) == ["KHR_gaussian_splatting"]
+    assert {accessor["count"] for accessor in gltf["accessors"]} == {opaque}
+    with pytest.raises(FormatError, match=r"ends in \.glb"):
+        export_run(run, tmp_path / "splats.gltf", "gltf")
+    with pytest.raises(RunFolderError, match="no objects"):
+        export_run(run, out, "gltf", objects="mug")
+    assert choose_format(None, out, None) is ExportFormat.mesh
 
 
 def test_a_map_on_disk_is_written_cell_by_cell(

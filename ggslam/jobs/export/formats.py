@@ -19,6 +19,7 @@ class ExportFormat(str, Enum):
     compressed_ply = "compressed-ply"
     spz = "spz"
     splat = "splat"
+    gltf = "gltf"
     pcd = "pcd"
     mesh = "mesh"
     colmap = "colmap"
@@ -27,7 +28,7 @@ class ExportFormat(str, Enum):
 
 SUFFIXES = {
     ".ply": (ExportFormat.ply, ExportFormat.segmented, ExportFormat.compressed_ply, ExportFormat.mesh),
-    ".glb": (ExportFormat.mesh,),
+    ".glb": (ExportFormat.mesh, ExportFormat.gltf),
     ".obj": (ExportFormat.mesh,),
     ".spz": (ExportFormat.spz,),
     ".splat": (ExportFormat.splat,),
