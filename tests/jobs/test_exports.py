@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -162,24 +163,43 @@ def test_splats_by_the_command_line(run: RunFolder, tmp_path: Path, kind: str) -
         assert out.stat().st_size == 32 * opaque
 
 
+def gltf_of(path: Path) -> dict[str, Any]:
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+
+
 def test_gltf_by_the_command_line(run: RunFolder, tmp_path: Path) -> None:
-    """A .glb is a mesh unless the format is given; a run without objects writes no ids."""
-    out = tmp_path / "splats.glb"
-    opaque = int((run.gaussians().opacities >= 0.6).sum())
+    """A .glb is a mesh unless the format is given; object ids are the last column."""
+    out, gaussians = tmp_path / "splats.glb", run.gaussians()
+    opaque = gaussians.opacities >= 0.6
     result = CliRunner().invoke(
         app, ["export", str(run.path), "--format", "gltf", "--out", str(out), "--min-opacity", "0.6"]
     )
     assert result.exit_code == 0, result.output
-    assert f"{opaque} Gaussians" in result.output.replace("\n", " ")
-    data = out.read_bytes()
-    gltf = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    (primitive,) = gltf["meshes"][0]["primitives"]
-    assert list(primitive["extensions"]) == ["KHR_gaussian_splatting"]
-    assert {accessor["count"] for accessor in gltf["accessors"]} == {opaque}
+    count = int(opaque.sum())
+    assert f"{count} Gaussians" in result.output.replace("\n", " ")
+    gltf = gltf_of(out)
+    assert {accessor["count"] for accessor in gltf["accessors"]} == {count}
+    assert run.has_objects()
+    assert list(gltf["meshes"][0]["primitives"][0]["extensions"]) == ["KHR_gaussian_splatting", "EXT_mesh_features"]
+    ids = np.frombuffer(out.read_bytes()[-4 * count :], "<f4")
+    np.testing.assert_array_equal(ids, gaussians.object_id[opaque])
+    assert list(gltf["meshes"][0]["extras"]["objects"]) == [str(i) for i in run.object_table().ids()]
+
+
+def test_gltf_plain_and_of_objects(run: RunFolder, tmp_path: Path) -> None:
+    out = tmp_path / "splats.glb"
+    export_run(run, out, "gltf", plain=True)
+    gltf = gltf_of(out)
+    assert list(gltf["meshes"][0]["primitives"][0]["extensions"]) == ["KHR_gaussian_splatting"]
+    assert "extras" not in gltf["meshes"][0]
+    object_id, gaussians = run.object_table().ids()[0], run.gaussians()
+    export_run(run, out, "gltf", objects=str(object_id))
+    gltf, count = gltf_of(out), int((gaussians.object_id == object_id).sum())
+    assert {accessor["count"] for accessor in gltf["accessors"]} == {count}
+    assert list(gltf["meshes"][0]["extras"]["objects"]) == [str(object_id)]
     with pytest.raises(FormatError, match=r"ends in \.glb"):
         export_run(run, tmp_path / "splats.gltf", "gltf")
-    with pytest.raises(RunFolderError, match="no objects"):
-        export_run(run, out, "gltf", objects="mug")
     assert choose_format(None, out, None) is ExportFormat.mesh
 
 
