@@ -136,7 +136,7 @@ def bench(voxel: float, scans: list[Scan], context: NativeContext, budget: float
 
 
 def print_agreement(voxel: float, recording: Path, frames: int, context: NativeContext) -> None:
-    settings = [OccupancySettings(quantize=False), OccupancySettings(), OccupancySettings.raised()]
+    settings = [OccupancySettings(quantize=False), OccupancySettings(), OccupancySettings.with_raised_odds()]
     reference, *others = (OccupancyMap(voxel, s, context) for s in settings)
     for scan in load_scans(recording, frames):
         for target in (reference, *others):

@@ -125,7 +125,7 @@ def failed_test(copy: Path, tests: list[str]) -> str | None:
     run = subprocess.run(words, cwd=copy, env=environment(copy), capture_output=True, text=True)
     if run.returncode == 0:
         return None
-    found = re.search(r"^(?:FAILED|ERROR) (\S+)", run.stdout, re.M)
+    found = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", run.stdout, re.M)
     if run.returncode == 1 and found:
         return found[1]
     if run.returncode < 0 or run.returncode > 128:  # the broken code ended the process: noticed, too

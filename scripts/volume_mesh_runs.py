@@ -22,7 +22,7 @@ from ggslam.scene.poses import inverse
 from ggslam.volumes.mesh import MIN_WEIGHT, extract_mesh
 from ggslam.volumes.raycast import render_depth
 from ggslam.volumes.settings import TsdfSettings
-from ggslam.volumes.surface_native import SurfaceCells
+from ggslam.volumes.surface_cells import SurfaceCells
 from ggslam.volumes.tsdf import TsdfMap
 
 REPEATS = 5

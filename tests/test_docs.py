@@ -32,6 +32,7 @@ def run_python(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess
     return subprocess.run([sys.executable, *arguments], cwd=cwd, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.long("every example of a page, in order")
 @pytest.mark.parametrize(("page", "least"), [("python.md", 12), ("pytorch.md", 7)])
 def test_examples_run_in_order(tmp_path: Path, page: str, least: int) -> None:
     text = (DOCS / page).read_text()

@@ -58,6 +58,7 @@ def test_run_slam(run: Program, room: Path, tmp_path: Path) -> None:
     assert len(read_gaussian_ply(tmp_path / "out" / "map.ply")) > 1000
 
 
+@pytest.mark.long("a training that has to get somewhere")
 def test_train_gaussians(run: Program, room: Path, tmp_path: Path) -> None:
     said = run("train_gaussians.py", room, "trained.ply", 4, 12)
     before, after = map(float, re.findall(r"PSNR ([\d.]+) dB before, ([\d.]+) dB after", said)[0])

@@ -18,7 +18,7 @@ FLOORS = (
     {"tracking", "mapping", "loops", "objects", "volumes", "submaps", "coding", "evaluation", "viewer", "reporting"},
     {"rendering", "sequences", "formats", "features", "synthetic", "geometry"},
     {"scene", "native", "cuda"},
-    {"system"},
+    {"system", "interface"},
     {"errors"},
 )
 """From the top down. A room imports from floors below its own only."""

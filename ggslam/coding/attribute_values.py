@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from ggslam.coding.attribute_syntax import MAX_PARAMETER_SETS, AttributeParameters
-from ggslam.coding.native import rgb_to_ycbcr, ycbcr_to_rgb
 from ggslam.coding.sequence_parameters import (
     KNOWN_LABELS,
     MATRIX_BT709,
@@ -26,6 +25,7 @@ from ggslam.coding.sequence_parameters import (
     AttributeDescription,
 )
 from ggslam.coding.settings import AttributeSettings, CodecSettings
+from ggslam.coding.slice_coder import rgb_to_ycbcr, ycbcr_to_rgb
 from ggslam.errors import ConfigError, FormatError
 
 _GBR = [1, 2, 0]  # where G, B, R are in R, G, B

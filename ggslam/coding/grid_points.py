@@ -3,43 +3,12 @@
 
 from __future__ import annotations
 
-import ctypes
-from ctypes import POINTER, Structure, c_double, c_int32, c_int64, c_size_t, c_uint32, c_void_p
-from functools import lru_cache
-
 import numpy as np
 
+from ggslam.interface.core.codec import Grid, Points
 from ggslam.native.loader import load_library
 
 _KINDS = {np.dtype(kind): number for number, kind in enumerate((np.int32, np.int64, np.float32, np.float64))}
-
-
-class _Grid(Structure):
-    _fields_ = [
-        ("scale", c_double), ("rounding", c_double), ("first", c_int64 * 3), ("last", c_int64 * 3), ("exact", c_int32),
-    ]  # fmt: skip
-
-
-class _Points(Structure):
-    _fields_ = [("data", c_void_p), ("rows", c_void_p), ("count", c_size_t), ("kind", c_int32)]
-
-
-@lru_cache(maxsize=1)
-def _library() -> ctypes.CDLL:
-    core = load_library()
-    points, grid = POINTER(_Points), POINTER(_Grid)
-    signatures = {
-        "on_grid": [points, grid, c_void_p],
-        "along_axis": [points, grid, c_int32, c_void_p],
-        "plane_counts": [points, grid, c_int32, c_void_p],
-        "number_planes": [points, grid, c_int32, c_void_p, c_void_p, c_void_p, c_void_p],
-    }
-    core.ggslam_gpcc_sample_cubes.restype = c_int64
-    core.ggslam_gpcc_sample_cubes.argtypes = [points, grid, c_uint32, c_void_p]
-    for name, arguments in signatures.items():
-        function = getattr(core, f"ggslam_gpcc_{name}")
-        function.restype, function.argtypes = None, arguments
-    return core
 
 
 class GridPoints:
@@ -61,7 +30,7 @@ class GridPoints:
         if points.dtype not in _KINDS:
             points = points.astype(np.int64 if np.issubdtype(points.dtype, np.integer) else np.float64)
         self._points = np.ascontiguousarray(points)
-        self._grid = _Grid(scale, rounding, origin, tuple(o + s - 1 for o, s in zip(origin, size, strict=True)), exact)
+        self._grid = Grid(scale, rounding, origin, tuple(o + s - 1 for o, s in zip(origin, size, strict=True)), exact)
         self.size = size
 
     def __len__(self) -> int:
@@ -71,27 +40,27 @@ class GridPoints:
         """Grid positions int32 [M, 3]."""
         chosen = self._chosen(rows)
         out = np.empty((chosen.count, 3), np.int32)
-        _library().ggslam_gpcc_on_grid(chosen, self._grid, out.ctypes.data)
+        load_library().ggslam_gpcc_on_grid(chosen, self._grid, out.ctypes.data)
         return out
 
     def coordinates(self, axis: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Grid coordinates int32 [M] along an axis."""
         chosen = self._chosen(rows)
         out = np.empty(chosen.count, np.int32)
-        _library().ggslam_gpcc_along_axis(chosen, self._grid, axis, out.ctypes.data)
+        load_library().ggslam_gpcc_along_axis(chosen, self._grid, axis, out.ctypes.data)
         return out
 
     def sample_cubes(self, one_in: int) -> np.ndarray:
         """Codes uint64 [M] of 21 bits a coordinate, x first, of the points in one of so many (a power of two) cubes of
         4 x 4 x 4 voxels."""
         codes = np.empty(len(self), np.uint64)
-        count = _library().ggslam_gpcc_sample_cubes(self._chosen(None), self._grid, one_in - 1, codes.ctypes.data)
+        count = load_library().ggslam_gpcc_sample_cubes(self._chosen(None), self._grid, one_in - 1, codes.ctypes.data)
         return codes[:count].copy()
 
     def plane_counts(self, axis: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Number of points in each plane across an axis, uint32 [size of the axis]."""
         counts = np.zeros(self.size[axis], np.uint32)
-        _library().ggslam_gpcc_plane_counts(self._chosen(rows), self._grid, axis, counts.ctypes.data)
+        load_library().ggslam_gpcc_plane_counts(self._chosen(rows), self._grid, axis, counts.ctypes.data)
         return counts
 
     def number_planes(
@@ -115,16 +84,16 @@ class GridPoints:
         chosen = self._chosen(rows)
         numbers, inside = np.empty(chosen.count, np.uint16), np.empty(int(counts[cut].sum()), np.int64)
         number_of_plane, cut = np.ascontiguousarray(number_of_plane, np.uint16), np.ascontiguousarray(cut, bool)
-        _library().ggslam_gpcc_number_planes(
+        load_library().ggslam_gpcc_number_planes(
             chosen, self._grid, axis, number_of_plane.ctypes.data, cut.ctypes.data, numbers.ctypes.data,
             inside.ctypes.data,
         )  # fmt: skip
         return numbers, inside
 
-    def _chosen(self, rows: np.ndarray | None) -> _Points:
+    def _chosen(self, rows: np.ndarray | None) -> Points:
         kind, data = _KINDS[self._points.dtype], self._points.ctypes.data
         if rows is None:
-            return _Points(data, None, len(self._points), kind)
+            return Points(data, None, len(self._points), kind)
         if rows.dtype != np.int64 or not rows.flags.c_contiguous:
             raise ValueError(f"expected contiguous int64 rows, found {rows.dtype}")
-        return _Points(data, rows.ctypes.data, len(rows), kind)
+        return Points(data, rows.ctypes.data, len(rows), kind)

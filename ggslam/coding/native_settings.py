@@ -1,68 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Structures of ggslam/native/src/codec/gpcc.hpp, field by field, and how the parameter sets and headers fill them."""
+"""How parameter sets and headers fill the structures that the compiled core takes."""
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from ctypes import Structure, c_float, c_int32, c_uint8
+from ctypes import c_int32, c_uint8
 from dataclasses import dataclass
-from typing import Any
 
 from ggslam.coding.attribute_syntax import LIFTING, AttributeHeader, AttributeParameters
 from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
 from ggslam.coding.sequence_parameters import AttributeDescription
-
-
-def _numbers(*names: str) -> list[tuple[str, Any]]:
-    return [(name, c_int32) for name in names]
-
-
-class OctreeSettings(Structure):
-    _fields_ = _numbers("depth", "neighbour_boundary", "adjacent_child", "intra_prediction", "unique_points")
-
-
-class TreeSettings(Structure):
-    _fields_ = [
-        *_numbers("levels", "neighbour_boundary", "adjacent_child", "intra_prediction", "unique_points"),
-        *_numbers("direct_mode", "direct_pairs", "direct_rate", "planes"),
-        ("plane_thresholds", c_int32 * 3),
-        *_numbers("scaling", "slice_qp", "direct_qp", "qp_shift", "codewords", "separate_bits"),
-        ("axes", c_uint8 * 64),
-    ]
-
-
-class PredictiveSettings(Structure):
-    _fields_ = [
-        *_numbers("unique_points", "scaling", "slice_qp", "qp_shift", "qp_interval"),
-        ("residual_bits", c_int32 * 3),
-        *_numbers("separate_bits"),
-    ]
-
-
-class RahtSettings(Structure):
-    _fields_ = [
-        *_numbers("components", "bit_depth", "qp", "qp_secondary", "prediction", "min_parent_neighbours"),
-        *_numbers("min_neighbours", "layers"),
-        ("layer_qps", c_int32 * 2 * 32),
-        *_numbers("separate_bits", "index", "first_version"),
-        ("rdoq", c_float),
-    ]
-
-
-class DetailSettings(Structure):
-    _fields_ = [
-        *_numbers("components", "bit_depth", "lifting", "neighbours", "search_between"),
-        ("bias", c_int32 * 3),
-        *_numbers("levels", "canonical_order", "decimation"),
-        ("periods", c_int32 * 32),
-        *_numbers("first_distance", "direct_predictors", "direct_threshold", "no_average", "search_within"),
-        *_numbers("skip_layers", "blend", "weighted"),
-        ("component_weights", c_int32 * 2 * 32),
-        *_numbers("layers"),
-        ("layer_qps", c_int32 * 2 * 32),
-        *_numbers("separate_bits", "index"),
-    ]
+from ggslam.interface.core.codec import (
+    DetailSettings,
+    OctreeSettings,
+    PredictiveSettings,
+    RahtSettings,
+    TreeSettings,
+)
 
 
 @dataclass(frozen=True)

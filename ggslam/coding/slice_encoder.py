@@ -15,11 +15,11 @@ from ggslam.coding.attribute_values import CodedAttribute
 from ggslam.coding.cloud import SliceReport
 from ggslam.coding.container import UnitType, unit_bytes
 from ggslam.coding.geometry_syntax import ALL_AXES, GeometryHeader, GeometryParameters
-from ggslam.coding.native import MAX_SLICE_POINTS, SliceCoder
 from ggslam.coding.native_settings import raht_settings
 from ggslam.coding.quantization import Quantization
 from ggslam.coding.sequence_parameters import SequenceParameters
 from ggslam.coding.settings import CodecSettings
+from ggslam.coding.slice_coder import MAX_SLICE_POINTS, SliceCoder
 from ggslam.coding.user_data import write_user_data
 from ggslam.errors import ConfigError
 

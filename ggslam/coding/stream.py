@@ -12,10 +12,10 @@ from ggslam.coding.attribute_syntax import AttributeHeader, AttributeParameters
 from ggslam.coding.attribute_values import CodedAttribute, IdTable
 from ggslam.coding.container import Unit, UnitType, read_units
 from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
-from ggslam.coding.native import MAX_SLICE_POINTS
 from ggslam.coding.native_settings import AttributePayload, CodingContext
 from ggslam.coding.quantization import Quantization
 from ggslam.coding.sequence_parameters import MATRIX_BT709, MATRIX_IDENTITY, MATRIX_YCGCO, SequenceParameters
+from ggslam.coding.slice_coder import MAX_SLICE_POINTS
 from ggslam.coding.user_data import read_user_data, version_of
 from ggslam.errors import FormatError
 

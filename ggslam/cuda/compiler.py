@@ -14,9 +14,12 @@ from functools import lru_cache
 from pathlib import Path
 
 from ggslam.errors import MissingDependency
+from ggslam.interface.binding import cuda_hash
 
 KERNELS = Path(__file__).parent / "kernels"
 """Folder of the CUDA sources."""
+INTERFACE = KERNELS.parents[1] / "interface"
+"""Folder of the headers that say what callers see."""
 
 _FLAGS = ("-O3", "-std=c++17", "-ftz=true", "-shared", "-Xcompiler", "-fPIC,-fvisibility=hidden", "--threads", "0")
 _ERROR_LINES = 12
@@ -69,11 +72,26 @@ def compiler_version(nvcc: Path) -> str:
     return run.stdout.strip()
 
 
+def source_files() -> list[Path]:
+    """All sources and headers."""
+    return [*sorted(KERNELS.rglob("*.cu*")), *sorted(INTERFACE.rglob("*.?pp"))]
+
+
+def translation_units() -> list[Path]:
+    """Those of them that the compiler is given."""
+    return [*sorted(KERNELS.rglob("*.cu")), *sorted((INTERFACE / "cuda").glob("*.cpp"))]
+
+
+def common_arguments() -> list[str]:
+    """What every compiler of these sources is told: where headers are, and the version of the interface."""
+    return ["-I", str(KERNELS), "-I", str(INTERFACE.parent), f"-DGGSLAM_INTERFACE_HASH={cuda_hash()}"]
+
+
 def library_path(nvcc: Path, architecture: str) -> Path:
     """The file in the cache for these sources, this compiler and an architecture such as "90"."""
     digest = hashlib.sha256()
-    for source in sorted(KERNELS.rglob("*.cu*")):
-        digest.update(source.relative_to(KERNELS).as_posix().encode() + b"\0" + source.read_bytes() + b"\0")
+    for source in source_files():
+        digest.update(f"{source.parent.name}/{source.name}".encode() + b"\0" + source.read_bytes() + b"\0")
     digest.update("\0".join([compiler_version(nvcc), *_FLAGS]).encode())
     return cache_folder() / f"kernels_sm{architecture}_{digest.hexdigest()[:20]}.so"
 
@@ -81,8 +99,7 @@ def library_path(nvcc: Path, architecture: str) -> Path:
 def compile_command(nvcc: Path, architecture: str, output: Path) -> list[str]:
     """The command that compiles all sources for one architecture."""
     target = f"-gencode=arch=compute_{architecture},code=sm_{architecture}"
-    sources = [str(path) for path in sorted(KERNELS.rglob("*.cu"))]
-    return [str(nvcc), *_FLAGS, "-I", str(KERNELS), target, *sources, "-o", str(output)]
+    return [str(nvcc), *_FLAGS, *common_arguments(), target, *map(str, translation_units()), "-o", str(output)]
 
 
 def compiled_library(architecture: str) -> Path:

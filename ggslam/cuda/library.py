@@ -1,19 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled CUDA kernels as a loaded library. Who calls a function declares its arguments."""
+"""The compiled CUDA kernels as a loaded library."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
 import torch
 
 from ggslam.cuda.compiler import compiled_library
-from ggslam.errors import DeviceError, MissingDependency, NativeCoreError
-
-VERSION = 3
+from ggslam.errors import DeviceError, MissingDependency
+from ggslam.interface.binding import bind_cuda
 
 
 class CudaLibrary:
@@ -24,34 +22,17 @@ class CudaLibrary:
         device_type: of the tensors it works on: "cuda", or "cpu" for the emulation that the tests compile.
 
     Raises:
-        MissingDependency: it cannot be loaded or is of another version.
+        MissingDependency: it cannot be loaded.
+        NativeCoreError: it was compiled from other headers.
     """
 
     def __init__(self, path: Path, device_type: str = "cuda") -> None:
         self.device_type = device_type
         try:
             self.functions = ctypes.CDLL(str(path))
-            version = self.functions.ggslam_cuda_version()
+            bind_cuda(self.functions)
         except (OSError, AttributeError) as error:
             raise MissingDependency(f"the cuda backend: {path} cannot be loaded: {error}") from error
-        if version != VERSION:
-            raise MissingDependency(f"the cuda backend: {path} has interface version {version}, expected {VERSION}")
-        self.functions.ggslam_cuda_error_text.restype = ctypes.c_char_p
-
-    def declare(self, name: str, arguments: Sequence[type], result: type | None = ctypes.c_int) -> None:
-        """Tells the C types of ggslam_cuda_<name>."""
-        function = getattr(self.functions, f"ggslam_cuda_{name}")
-        function.argtypes, function.restype = list(arguments), result
-
-    def check_size(self, name: str, mirror: type[ctypes.Structure]) -> None:
-        """Compares a structure with what ggslam_cuda_<name>_size() says of the kernels' own.
-
-        Raises:
-            NativeCoreError: they differ.
-        """
-        found, expected = getattr(self.functions, f"ggslam_cuda_{name}_size")(), ctypes.sizeof(mirror)
-        if found != expected:
-            raise NativeCoreError(f"compiled kernels: {name} has {found} bytes, expected {expected}")
 
     def call(self, name: str, *arguments: object) -> None:
         """Calls ggslam_cuda_<name>.

@@ -6,11 +6,6 @@ from __future__ import annotations
 import torch
 
 
-def address(tensor: torch.Tensor | None) -> int | None:
-    """Of a tensor's first element; null for None."""
-    return None if tensor is None else tensor.data_ptr()
-
-
 class GrowingMemory:
     """Bytes on a device that are kept from one rendering to the next and grow by a quarter more than is asked for.
 

@@ -22,7 +22,7 @@ class _Marker:
         if self._event is not None:
             self._event.record(torch.cuda.current_stream(self._device))
 
-    def passed(self) -> bool:
+    def is_passed(self) -> bool:
         """Whether the device has come here; true if the marker was never set."""
         return self._event is None or self._event.query()
 
@@ -33,11 +33,11 @@ class _Marker:
 
     def wait_if_ahead(self) -> None:
         """As `wait`, for a place that the device has mostly passed long ago."""
-        if not self.passed():
+        if not self.is_passed():
             self.wait()
 
 
-def _page_locked(size: int, device: torch.device) -> torch.Tensor:
+def _allocate_page_locked(size: int, device: torch.device) -> torch.Tensor:
     return torch.empty(size, dtype=torch.uint8, pin_memory=device.type == "cuda")
 
 
@@ -50,14 +50,14 @@ class Upload:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._buffer = _page_locked(1, device)
+        self._buffer = _allocate_page_locked(1, device)
         self._sent = _Marker(device)
 
     def begin(self, size: int) -> np.ndarray:
         """uint8 [size] to be filled."""
         self._sent.wait_if_ahead()
         if self._buffer.numel() < size:
-            self._buffer = _page_locked(size + size // 4, self._device)
+            self._buffer = _allocate_page_locked(size + size // 4, self._device)
         return self._buffer.numpy()[:size]
 
     def send(self, out: torch.Tensor) -> None:
@@ -77,7 +77,7 @@ class Download:
     def __init__(self, count: int, device: torch.device) -> None:
         self.source = torch.zeros(count, dtype=torch.float64, device=device)
         """On the device."""
-        self._copy = _page_locked(8 * count, device).view(torch.float64)
+        self._copy = _allocate_page_locked(8 * count, device).view(torch.float64)
         self._done = _Marker(device)
 
     def wait(self) -> np.ndarray:
@@ -143,6 +143,6 @@ class HostMirror:
             return self._newest
 
     def _take(self) -> None:
-        if self._under_way and self._sent.passed():
+        if self._under_way and self._sent.is_passed():
             self._newest = self._arriving.numpy().copy()
             self._under_way = False

@@ -45,14 +45,14 @@ def write_compressed_ply(path: str | Path, gaussians: GaussianMap) -> None:
         raise FormatError(f"{path}: a compressed PLY holds at least one Gaussian, found none")
     columns = SplatColumns.of(path, gaussians)
     order = morton_order(columns.means)
-    chunks, vertices = _packed(columns, order)
+    chunks, vertices = _pack(columns, order)
     elements = {"chunk": chunks, "vertex": vertices}
     if columns.sh.shape[1] > 1:
         elements["sh"] = _harmonics(columns.sh[order, 1:])
     write_ply(path, elements)
 
 
-def _packed(columns: SplatColumns, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _pack(columns: SplatColumns, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The elements `chunk` and `vertex`."""
     log_scales = columns.log_scales[order].clip(-_LOG_SCALE_REACH, _LOG_SCALE_REACH)
     colors = 0.5 + SH_C0 * columns.sh[order, 0]

@@ -121,7 +121,7 @@ def gaussians_of_vertices(
     if vertex is None or missing:
         raise FormatError(f"{path} holds no Gaussians: the properties {missing} of 'vertex' are missing")
     # PlayCanvas' compressed layout and others have the names but pack them into integers: refused by `_floats`.
-    rest, features = _numbered(path, names, "f_rest_"), _numbered(path, names, "identity_")
+    rest, features = _names_in_order(path, names, "f_rest_"), _names_in_order(path, names, "identity_")
     degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(len(rest))
     if degree is None:
         raise FormatError(f"{path}: {len(rest)} properties f_rest_*, expected 0, 9, 24 or 45 (SH degree 0 to 3)")
@@ -146,7 +146,7 @@ def gaussians_of_vertices(
     return out
 
 
-def _numbered(path: str | Path, names: Sequence[str], prefix: str) -> list[str]:
+def _names_in_order(path: str | Path, names: Sequence[str], prefix: str) -> list[str]:
     """The properties prefix0, prefix1, ... in numerical order; there must be no gap."""
     found = [name for name in names if name.startswith(prefix)]
     expected = [f"{prefix}{i}" for i in range(len(found))]

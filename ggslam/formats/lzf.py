@@ -6,10 +6,6 @@ Both directions run in the compiled core (ggslam/native/src/codec/lzf_api.cpp) a
 
 from __future__ import annotations
 
-import ctypes
-from ctypes import c_int64, c_void_p
-from functools import lru_cache
-
 import numpy as np
 
 from ggslam.native.loader import load_library
@@ -22,19 +18,10 @@ _REASONS = {
 }
 
 
-@lru_cache(maxsize=1)
-def _library() -> ctypes.CDLL:
-    core = load_library()
-    for name in ("compress", "decompress"):
-        function = getattr(core, f"ggslam_lzf_{name}")
-        function.restype, function.argtypes = c_int64, [c_void_p, c_int64, c_void_p, c_int64]
-    return core
-
-
 def compress(data: bytes) -> bytes:
     """The LZF code of `data`: at most len(data) / 32 + 1 bytes longer, usually shorter."""
     out = np.empty(len(data) + len(data) // 32 + 1, np.uint8)
-    size = _library().ggslam_lzf_compress(data, len(data), out.ctypes.data, len(out))
+    size = load_library().ggslam_lzf_compress(data, len(data), out.ctypes.data, len(out))
     return out[:size].tobytes()
 
 
@@ -47,7 +34,7 @@ def decompress(data: bytes, size: int) -> bytes:
     if not 0 <= size <= _MOST_GROWTH * len(data):
         raise ValueError(f"{len(data)} compressed bytes cannot hold {size}")
     out = np.empty(size, np.uint8)
-    failure = _library().ggslam_lzf_decompress(data, len(data), out.ctypes.data, size)
+    failure = load_library().ggslam_lzf_decompress(data, len(data), out.ctypes.data, size)
     if failure:
         raise ValueError(_REASONS.get(failure, f"the compressed data are damaged or do not stand for {size} bytes"))
     return out.tobytes()

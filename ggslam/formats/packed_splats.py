@@ -55,10 +55,10 @@ def write_spz(path: str | Path, gaussians: GaussianMap) -> None:
         raise FormatError(f"{path}: SPZ holds positions up to {SPZ_REACH:g} m, found {farthest:g} m; write a PLY")
     columns = SplatColumns.of(path, gaussians)
     columns.turn_upright()
-    write_bytes(path, _packed(gaussforge, path, columns, gaussians.sh_degree))
+    write_bytes(path, _pack(gaussforge, path, columns, gaussians.sh_degree))
 
 
-def _packed(gaussforge: ModuleType, path: str | Path, columns: SplatColumns, degree: int) -> bytes:
+def _pack(gaussforge: ModuleType, path: str | Path, columns: SplatColumns, degree: int) -> bytes:
     named = {
         "positions": columns.means, "scales": columns.log_scales, "alphas": columns.logits,
         "rotations": columns.quaternions, "colors": columns.sh[:, 0], "sh": columns.sh[:, 1:],

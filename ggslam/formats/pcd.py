@@ -15,7 +15,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats import lzf
-from ggslam.formats.text_numbers import fitted, parse_numbers
+from ggslam.formats.text_numbers import fit, parse_numbers
 from ggslam.system.atomic import write_bytes
 
 _MAXIMUM_HEADER_BYTES = 1 << 16
@@ -207,7 +207,7 @@ def _ascii_rows(body: bytes, header: _Header, path: Path) -> np.ndarray:
     column = 0
     for name, width in zip(names, widths, strict=True):
         part = header.stored[name]
-        values = fitted(table[:, column : column + width], part.base.str[1:], name, path)
+        values = fit(table[:, column : column + width], part.base.str[1:], name, path)
         rows[name] = values if part.shape else values[:, 0]
         column += width
     return rows

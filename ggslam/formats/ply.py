@@ -15,7 +15,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.ply_header import FORMATS, PLY_NAMES, SIZED_NAMES, Element, Header, read_header
-from ggslam.formats.text_numbers import fitted, parse_numbers
+from ggslam.formats.text_numbers import fit, parse_numbers
 from ggslam.system.atomic import atomic_write
 
 
@@ -76,7 +76,7 @@ def write_ply(
         kinds = {name: (len(rows), rows.dtype) for name, rows in elements.items()}
         file.write(_header(kinds, comments, sized_names))
         for rows in elements.values():
-            file.write(_packed(rows).tobytes())
+            file.write(_pack(rows).tobytes())
 
 
 def write_ply_parts(
@@ -99,7 +99,7 @@ def write_ply_parts(
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(_header({element: (count, dtype)}, comments, sized_names))
         for rows in parts:
-            file.write(_packed(rows).tobytes())
+            file.write(_pack(rows).tobytes())
             written += len(rows)
         if written != count:
             raise ValueError(f"{path}: {written} rows were given, {count} were announced")
@@ -135,7 +135,7 @@ def _declarations(dtype: np.dtype, names: Mapping[str, str]) -> Iterator[str]:
         yield f"property {listed}{names[code]} {_checked_name(name)}"
 
 
-def _packed(rows: np.ndarray) -> np.ndarray:
+def _pack(rows: np.ndarray) -> np.ndarray:
     """The rows as they lie in the file: little endian, without padding, lists preceded by their length."""
     parts: list[tuple] = []
     for name in rows.dtype.names or ():
@@ -166,7 +166,7 @@ def _read_binary(file: BinaryIO, header: Header, path: Path) -> dict[str, np.nda
             stored = np.dtype([(p.name, order + p.code) for p in element.properties])
             data = file.read(element.count * stored.itemsize)
             if len(data) < element.count * stored.itemsize:
-                raise _truncated(path, element, len(data) // stored.itemsize)
+                raise _truncation_error(path, element, len(data) // stored.itemsize)
             # An element without properties has no rows (the header check sees to that), nor a size to divide by.
             rows = np.frombuffer(data, stored) if element.properties else np.empty(0, stored)
             rows = rows.astype(stored.newbyteorder("="))
@@ -229,7 +229,7 @@ def _binary_rows_one_by_one(data: bytes, element: Element, order: str, path: Pat
                     raise ValueError("negative list length")
                 values = np.frombuffer(data, order + p.code, length, offset) if length else np.empty(0, p.code)
             except ValueError:
-                raise _truncated(path, element, row) from None
+                raise _truncation_error(path, element, row) from None
             offset += length * np.dtype(p.code).itemsize
             out[row][p.name] = values.astype(p.code) if p.count_code else values[0]
     return out, offset
@@ -247,11 +247,11 @@ def _read_ascii(file: BinaryIO, header: Header, path: Path) -> dict[str, np.ndar
         found = words[position : position + element.count * columns]
         position += len(found)
         if len(found) < element.count * columns:
-            raise _truncated(path, element, len(found) // max(columns, 1))
+            raise _truncation_error(path, element, len(found) // max(columns, 1))
         table = parse_numbers(found, f"element '{element.name}'", path).reshape(element.count, columns)
         rows = np.empty(element.count, [(p.name, p.code) for p in element.properties])
         for column, p in enumerate(element.properties):
-            rows[p.name] = fitted(table[:, column], p.code, p.name, path)
+            rows[p.name] = fit(table[:, column], p.code, p.name, path)
         out[element.name] = rows
     return out
 
@@ -267,9 +267,9 @@ def _ascii_rows_with_lists(words: list[bytes], position: int, element: Element, 
                 length = int(found[0]) if len(found) and np.isfinite(found[0]) else -1
                 position += 1
             if length < 0 or position + length > len(words):
-                raise _truncated(path, element, row)
+                raise _truncation_error(path, element, row)
             values = parse_numbers(words[position : position + length], what, path)
-            values = fitted(values, p.code, p.name, path)
+            values = fit(values, p.code, p.name, path)
             position += length
             out[row][p.name] = values if p.count_code else values[0]
     return _with_equal_lists_as_arrays(out, element), position
@@ -288,7 +288,7 @@ def _with_equal_lists_as_arrays(rows: np.ndarray, element: Element) -> np.ndarra
     return out
 
 
-def _truncated(path: Path, element: Element, found: int) -> FormatError:
+def _truncation_error(path: Path, element: Element, found: int) -> FormatError:
     return FormatError(
         f"{path}: truncated or damaged: element '{element.name}' claims {element.count} rows, found {found}"
     )

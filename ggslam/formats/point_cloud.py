@@ -83,7 +83,7 @@ def read_point_cloud(path: str | Path) -> ColoredCloud:
     if path.suffix.lower() != ".pcd" and not start.startswith((b"#", b"VERS")):
         raise FormatError(f"{path}: neither a PLY nor a PCD file (it begins with {start!r})")
     rows = read_pcd(path)
-    x, y, z = _named(path, rows, ("x", "y", "z"), "no positions")
+    x, y, z = _columns_of(path, rows, ("x", "y", "z"), "no positions")
     somewhere = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
     return replace(_cloud(path, rows[somewhere], []), nowhere=int((~somewhere).sum()))
 
@@ -103,16 +103,16 @@ def write_point_cloud(
         FormatError: an attribute holds integers of more than 32 bits.
         RunFolderError: the file cannot be written.
     """
-    columns = {name: _written(path, "position", points[:, axis]) for axis, name in enumerate("xyz")}
+    columns = {name: _to_written_type(path, "position", points[:, axis]) for axis, name in enumerate("xyz")}
     pcd = Path(path).suffix.lower() == ".pcd"
     for name, values in attributes.items():
         if name == "color" and pcd:
             columns["rgb"] = _packed_rgb(values)
         elif values.ndim == 1:
-            columns[name] = _written(path, name, values)
+            columns[name] = _to_written_type(path, name, values)
         else:
             names = COLORS if name == "color" else [f"{name}_{i}" for i in range(values.shape[1])]
-            columns.update({n: _written(path, name, values[:, i]) for i, n in enumerate(names)})
+            columns.update({n: _to_written_type(path, name, values[:, i]) for i, n in enumerate(names)})
     if pcd:
         write_pcd(path, columns)
         return
@@ -122,7 +122,7 @@ def write_point_cloud(
     write_ply(path, {"vertex": rows}, comments, sized_names=True)
 
 
-def _written(path: str | Path, name: str, values: np.ndarray) -> np.ndarray:
+def _to_written_type(path: str | Path, name: str, values: np.ndarray) -> np.ndarray:
     """The values in a type that both formats have."""
     if values.dtype.kind == "f" or values.dtype.str[1:] in _WRITTEN_INTEGERS:
         return values
@@ -142,7 +142,7 @@ def _packed_rgb(colors: np.ndarray) -> np.ndarray:
 def _cloud(path: Path, rows: np.ndarray, comments: list[str]) -> ColoredCloud:
     if not len(rows):
         raise FormatError(f"{path}: no points")
-    position = np.stack(_named(path, rows, ("x", "y", "z"), "no positions"), 1)
+    position = np.stack(_columns_of(path, rows, ("x", "y", "z"), "no positions"), 1)
     points = position.astype(np.float64)
     if not np.isfinite(points).all():
         row = int(np.argmin(np.isfinite(points).all(1)))
@@ -163,7 +163,7 @@ def _cloud(path: Path, rows: np.ndarray, comments: list[str]) -> ColoredCloud:
     return replace(cloud, points=origin + voxel_size * grid, grid=grid, voxel_size=voxel_size, origin=origin)
 
 
-def _named(path: Path, rows: np.ndarray, names: Sequence[str], reason: str) -> list[np.ndarray]:
+def _columns_of(path: Path, rows: np.ndarray, names: Sequence[str], reason: str) -> list[np.ndarray]:
     missing = [n for n in names if n not in (rows.dtype.names or ()) or rows.dtype[n].kind not in "fiu"]
     if missing:
         raise FormatError(f"{path}: {reason}: expected the properties {' '.join(names)}, missing {' '.join(missing)}")

@@ -79,7 +79,7 @@ def sample_points(
     if not voxel_size > 0 or not 0 < minimum_opacity < 1:
         raise ValueError(f"impossible voxel size {voxel_size} or minimum opacity {minimum_opacity}")
     discs = _Discs.of(gaussians, minimum_opacity)
-    merged = _summed(_Sums.empty(), gaussians, discs, voxel_size, with_object_id)
+    merged = _add_samples(_Sums.empty(), gaussians, discs, voxel_size, with_object_id)
     return _cloud(merged, voxel_size, with_object_id)
 
 
@@ -124,13 +124,13 @@ def sample_parts(
     for number in order:
         part = parts[number].load()
         for discs in _Discs.of(part, minimum_opacity).cut(axis):
-            pending.append(_summed(_Sums.empty(), part, discs, voxel_size, with_object_id, _SMALL_CHUNK))
+            pending.append(_add_samples(_Sums.empty(), part, discs, voxel_size, with_object_id, _SMALL_CHUNK))
             blocks.is_done(done)
             done, sampled = done + 1, sampled + len(pending[-1].key)
             if sampled < max(_FEW, len(waiting.key)) and not blocks.all_done:  # joining costs as much as what waits
                 continue
             waiting, pending, sampled = _Sums.of([waiting, *pending]), [], 0
-            finished = blocks.finished(waiting.key)
+            finished = blocks.are_done(waiting.key)
             if finished.any():
                 yield _cloud(waiting.of_rows(finished), voxel_size, with_object_id)
                 waiting = waiting.of_rows(~finished)
@@ -149,10 +149,10 @@ def _cubes(discs: _Discs, voxel_size: float) -> np.ndarray:
     low, high = (np.floor((discs.means + side * reach) / edge).astype(np.int64) for side in (-1, 1))
     few = ((high - low) <= 1).all(1)
     corners = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
-    found = [np.unique(_packed(np.minimum(low[few] + corner, high[few]))) for corner in corners]
+    found = [np.unique(_pack(np.minimum(low[few] + corner, high[few]))) for corner in corners]
     for a, b in zip(low[~few], high[~few], strict=True):
         axes = [np.arange(start, stop + 1) for start, stop in zip(a, b, strict=True)]
-        found.append(_packed(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)))
+        found.append(_pack(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)))
     return np.unique(np.concatenate(found))
 
 
@@ -178,16 +178,16 @@ class _Blocks:
         self._to_come[np.searchsorted(self._keys, self._of_section[section])] -= 1
         self._left -= 1
 
-    def finished(self, voxels: np.ndarray) -> np.ndarray:
+    def are_done(self, voxels: np.ndarray) -> np.ndarray:
         """Whether voxels (packed, [N]) lie in the cubes of no section to come, bool [N]."""
         if not len(voxels) or self.all_done:
             return np.ones(len(voxels), bool)
-        key = _packed(_unpacked(voxels) // self._edge)
+        key = _pack(_unpack(voxels) // self._edge)
         place = np.searchsorted(self._keys, key).clip(max=len(self._keys) - 1)
         return (self._keys[place] != key) | (self._to_come[place] == 0)
 
 
-def _summed(
+def _add_samples(
     merged: _Sums, gaussians: GaussianMap, discs: _Discs, voxel_size: float, with_object_id: bool, chunk: int = _CHUNK,
 ) -> _Sums:  # fmt: skip
     """The sums with those of samples of a map, of which `chunk` are in memory at a time."""
@@ -197,7 +197,7 @@ def _summed(
         if np.abs(lattice).max(initial=0) >= 1 << (_BITS - 1):
             raise ValueError(f"the map spans more than 2^{_BITS} voxels of {voxel_size} m")
         labels = object_id if with_object_id else np.zeros_like(object_id)
-        part = _Sums.of([_Sums(_packed(lattice.astype(np.int64)), labels, weight, weight[:, None] * color)])
+        part = _Sums.of([_Sums(_pack(lattice.astype(np.int64)), labels, weight, weight[:, None] * color)])
         pending.append(part)
         waiting += len(part.key)
         if waiting > len(merged.key):  # rarely, so that all merging together costs about as much as one sort
@@ -205,13 +205,13 @@ def _summed(
     return _Sums.of([merged, *pending])
 
 
-def _packed(lattice: np.ndarray) -> np.ndarray:
+def _pack(lattice: np.ndarray) -> np.ndarray:
     """One int64 per voxel from signed coordinates [N, 3]."""
     x, y, z = (lattice + (1 << (_BITS - 1))).T
     return (x << 2 * _BITS) | (y << _BITS) | z
 
 
-def _unpacked(key: np.ndarray) -> np.ndarray:
+def _unpack(key: np.ndarray) -> np.ndarray:
     limit = (1 << _BITS) - 1
     return np.stack([key >> 2 * _BITS, (key >> _BITS) & limit, key & limit], 1) - (1 << (_BITS - 1))
 
@@ -332,7 +332,7 @@ def _cloud(sums: _Sums, voxel_size: float, with_object_id: bool) -> VoxelCloud:
     key, label = sums.key[order], sums.label[order]
     starts = np.nonzero(_first_of_runs(key))[0]
     color = np.add.reduceat(sums.color[order], starts) / np.add.reduceat(sums.weight[order], starts)[:, None]
-    lattice = _unpacked(key[starts])
+    lattice = _unpack(key[starts])
     corner = lattice.min(0)
     return VoxelCloud(
         grid=(lattice - corner).astype(np.int32),

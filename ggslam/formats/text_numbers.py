@@ -23,7 +23,7 @@ def parse_numbers(words: Sequence[bytes], what: str, path: Path) -> np.ndarray:
         raise FormatError(f"{path}: {what}: {error}") from None
 
 
-def fitted(values: np.ndarray, code: str, name: str, path: Path) -> np.ndarray:
+def fit(values: np.ndarray, code: str, name: str, path: Path) -> np.ndarray:
     """Values in their declared numpy type `code` ("u1", "f4", ...); an integer type must hold integers of its range.
 
     Raises:

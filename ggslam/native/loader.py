@@ -11,21 +11,20 @@ from functools import lru_cache
 from pathlib import Path
 
 from ggslam.errors import NativeCoreError
+from ggslam.interface.binding import bind_core
 
-ABI_VERSION = 1
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 _LIBRARY_NAMES = ("libggslam_core.so", "libggslam_core.dylib")
-
-
 _HERE = Path(__file__).parent
 
 
 @lru_cache(maxsize=1)
 def load_library() -> ctypes.CDLL:
-    """The compiled core. `GGSLAM_CORE` in the environment names another file than the installed one.
+    """The compiled core, its functions declared. `GGSLAM_CORE` in the environment names another file than the installed
+    one.
 
     Raises:
-        NativeCoreError: no library, or one of another version.
+        NativeCoreError: no library, or one of another interface.
     """
     candidates = [Path(os.environ["GGSLAM_CORE"])] if "GGSLAM_CORE" in os.environ else []
     candidates += [_HERE / "_lib" / name for name in _LIBRARY_NAMES]
@@ -36,12 +35,7 @@ def load_library() -> ctypes.CDLL:
             f"the compiled core is missing (looked for {', '.join(map(str, candidates))}, and for an installed package "
             "of these sources): run `pip install .` or, in a checkout, `bash scripts/build_native.sh`"
         )
-    version = library.ggslam_abi_version()
-    if version != ABI_VERSION:
-        raise NativeCoreError(f"{library._name}: compiled core has interface version {version}, expected {ABI_VERSION}")
-    library.ggslam_context_create.restype = ctypes.c_void_p
-    library.ggslam_context_create.argtypes = [ctypes.c_int, ctypes.c_int]
-    library.ggslam_context_destroy.argtypes = [ctypes.c_void_p]
+    bind_core(library)
     return library
 
 
@@ -56,13 +50,15 @@ def _installed_library() -> ctypes.CDLL | None:
                 tell = getattr(library, "ggslam_source_hash", None)
                 if tell is not None:
                     tell.restype = ctypes.c_char_p
-                    return library if tell().decode() == source_hash(_HERE / "src") else None
+                    return library if tell().decode() == source_hash(_HERE.parent) else None
     return None
 
 
-def source_hash(folder: Path) -> str:
-    """SHA-256 of C++ sources as CMakeLists.txt computes it: of lines of path and SHA-256, sorted by path."""
-    paths = {p.relative_to(folder).as_posix(): p for kind in ("*.cpp", "*.hpp") for p in folder.rglob(kind)}
+def source_hash(package: Path) -> str:
+    """SHA-256 of the C++ sources in a package's native/src and interface, as CMakeLists.txt computes it: of lines of
+    path and SHA-256, sorted by path."""
+    files = [p for folder in ("native/src", "interface") for p in (package / folder).rglob("*.?pp")]
+    paths = {p.relative_to(package).as_posix(): p for p in files}
     lines = [f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n" for name, path in sorted(paths.items())]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 

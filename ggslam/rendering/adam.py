@@ -12,8 +12,9 @@ from types import MappingProxyType
 import torch
 
 from ggslam.errors import RenderError
-from ggslam.rendering._native import ADAM_GROUPS
 
+ADAM_GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "features")
+"""Parameter groups with a learning rate of their own, in the order of the columns of an Adam schedule."""
 _MAX_ROWS = 1 << 15
 
 

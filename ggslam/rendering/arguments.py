@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from ggslam.errors import RenderError
-from ggslam.rendering import _native
-from ggslam.rendering._native import pointer
+from ggslam.interface.arrays import address
+from ggslam.interface.core import rendering as structures
 from ggslam.rendering.types import (
     PARAMETERS,
     Gaussians,
@@ -66,11 +66,11 @@ def checked_parameters(gaussians: Gaussians, device: torch.device) -> GaussianTe
 
 def gaussian_arrays(
     parameters: GaussianTensors, features: bool, active_sh_degree: int | None
-) -> _native.GaussianArrays:
+) -> structures.GaussianArrays:
     """Where the parameters lie and what of them is rendered; the tensors must stay alive."""
-    return _native.GaussianArrays(
+    return structures.GaussianArrays(
         count=parameters.means.shape[0],
-        **{name: pointer(getattr(parameters, name)) for name in PARAMETERS},
+        **{name: address(getattr(parameters, name)) for name in PARAMETERS},
         sh_coefficients=parameters.sh.shape[1],
         active_sh_coefficients=active_coefficients(parameters, active_sh_degree),
         feature_channels=parameters.features.shape[1],
@@ -78,16 +78,20 @@ def gaussian_arrays(
     )
 
 
-def native_view(camera: Camera, T_camera_world: np.ndarray, near_plane: float, low_pass: float) -> _native.View:
+def posed_view(
+    camera: Camera, T_camera_world: np.ndarray, near_plane: float, low_pass: float
+) -> structures.CameraView:
     """Camera and pose [4, 4]; raises RenderError as `check_pose`."""
     view = camera_view(camera, near_plane, low_pass)
     view.camera_world[:] = check_pose(T_camera_world)[:3].ravel().tolist()
     return view
 
 
-def camera_view(camera: Camera, near_plane: float, low_pass: float) -> _native.View:
+def camera_view(camera: Camera, near_plane: float, low_pass: float) -> structures.CameraView:
     """The camera without its pose, which stays zero."""
-    return _native.View(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, near_plane, low_pass)
+    return structures.CameraView(
+        camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, near_plane, low_pass
+    )
 
 
 def image_buffers(
@@ -113,7 +117,7 @@ def image_buffers(
 
 def image_gradients(
     buffers: RenderBuffers, grads: tuple[torch.Tensor | None, ...], detach_features: bool, device: torch.device
-) -> _native.ImageGradients:
+) -> structures.ImageGradients:
     """Gradients with respect to `IMAGES`, None for zero; raises RenderError where they do not fit the images."""
     given = dict(zip(IMAGES, grads, strict=True))
     if given["features"] is not None and buffers.features is None:
@@ -121,5 +125,5 @@ def image_gradients(
     for name, gradient in given.items():
         if gradient is not None:
             check_tensor(f"grad_{name}", gradient, device, getattr(buffers, name).shape)
-    addresses = {name: pointer(gradient) for name, gradient in given.items()}
-    return _native.ImageGradients(**addresses, detach_features=int(detach_features))
+    addresses = {name: address(gradient) for name, gradient in given.items()}
+    return structures.ImageGradients(**addresses, detach_features=int(detach_features))

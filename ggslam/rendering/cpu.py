@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from ggslam.errors import RenderError
-from ggslam.native.loader import NativeContext
-from ggslam.rendering import _native
-from ggslam.rendering._native import pointer
+from ggslam.interface.arrays import address
+from ggslam.interface.core import rendering as structures
+from ggslam.native.loader import NativeContext, load_library
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.arguments import (
     check_projection,
@@ -21,9 +21,9 @@ from ggslam.rendering.arguments import (
     gaussian_arrays,
     image_buffers,
     image_gradients,
-    native_view,
+    posed_view,
 )
-from ggslam.rendering.pixel_terms import PixelTerms
+from ggslam.rendering.pixel_terms import CpuPixelTerms
 from ggslam.rendering.types import LOW_PASS, PARAMETERS, Gaussians, GaussianTensors, Gradients, RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -36,7 +36,7 @@ _FAILURES = {
 
 
 @dataclass
-class StepResult:
+class CpuStepResult:
     """What a fused backward and optimizer step leaves besides the updated map.
 
     Attributes:
@@ -53,7 +53,7 @@ class _LastForward:
     """Keeps the arrays of the last forward alive: backward reads them again."""
 
     parameters: GaussianTensors
-    arrays: _native.GaussianArrays
+    arrays: structures.GaussianArrays
     buffers: RenderBuffers
 
 
@@ -80,7 +80,7 @@ class CpuRasterizer:
         low_pass: float = LOW_PASS,
     ) -> None:
         self._handle: ctypes.c_void_p | None = None
-        self._library = _native.rasterizer_library()
+        self._library = load_library()
         self.context = context or NativeContext(threads, instruction_set)
         check_projection(near_plane, low_pass)
         self.near_plane = near_plane
@@ -127,11 +127,11 @@ class CpuRasterizer:
         self.rendering += 1
         parameters = checked_parameters(gaussians, _CPU)
         arrays = gaussian_arrays(parameters, features, active_sh_degree)
-        view = native_view(camera, T_camera_world, self.near_plane, self.low_pass)
+        view = posed_view(camera, T_camera_world, self.near_plane, self.low_pass)
         channels = arrays.feature_channels if arrays.render_features else 0
         buffers = image_buffers(self._images, camera, channels, median_depth, _CPU)
-        targets = _native.RenderTargets(
-            **{field[0]: pointer(getattr(buffers, field[0])) for field in _native.RenderTargets._fields_}
+        targets = structures.RenderTargets(
+            **{field[0]: address(getattr(buffers, field[0])) for field in structures.RenderTargets._fields_}
         )
         status = self._library.ggslam_rasterizer_forward(
             self._handle, ctypes.byref(arrays), ctypes.byref(view), ctypes.byref(targets)
@@ -146,7 +146,7 @@ class CpuRasterizer:
         self._library.ggslam_rasterizer_statistics(self._handle, numbers)
         return {"visible": numbers[0], "pairs": numbers[1]}
 
-    def pixel_terms(self, pixels: np.ndarray, capacity: int = 48, min_weight: float = 1e-3) -> PixelTerms:
+    def pixel_terms(self, pixels: np.ndarray, capacity: int = 48, min_weight: float = 1e-3) -> CpuPixelTerms:
         """Which Gaussians some pixels of the last `forward` are made of, with their weights.
 
         Args:
@@ -162,7 +162,7 @@ class CpuRasterizer:
         size = last.buffers.alpha.numel()
         if len(pixels) and (int(pixels.min()) < 0 or int(pixels.max()) >= size):
             raise RenderError(f"pixel_terms: pixels must be 0 to {size - 1}, found {pixels.min()} to {pixels.max()}")
-        terms = PixelTerms.empty(len(pixels), capacity, self.context)
+        terms = CpuPixelTerms.empty(len(pixels), capacity, self.context)
         self._check(
             self._library.ggslam_rasterizer_pixel_terms(
                 self._handle, pixels.ctypes.data, min_weight, ctypes.byref(terms.native())
@@ -199,10 +199,10 @@ class CpuRasterizer:
         arrays: dict[str, Any] = {name: torch.empty_like(getattr(last.parameters, name)) for name in names}
         twist = np.zeros(6)
         touched = torch.empty(last.arrays.count, dtype=torch.uint8)
-        out = _native.GaussianGradients(
-            **{name: pointer(array) for name, array in arrays.items()},
+        out = structures.GaussianGradients(
+            **{name: address(array) for name, array in arrays.items()},
             twist=twist.ctypes.data,
-            touched=pointer(touched),
+            touched=address(touched),
         )
         self._run_backward(grads, out, None)
         arrays.setdefault("features", None)
@@ -221,7 +221,7 @@ class CpuRasterizer:
         grads = image_gradients(last.buffers, given, False, _CPU)
         twist = np.zeros(6)
         touched = torch.empty(last.arrays.count, dtype=torch.uint8)
-        out = _native.GaussianGradients(twist=twist.ctypes.data, touched=pointer(touched))
+        out = structures.GaussianGradients(twist=twist.ctypes.data, touched=address(touched))
         self._run_backward(grads, out, None)
         return twist
 
@@ -235,7 +235,7 @@ class CpuRasterizer:
         *,
         optimizer: AdamSettings,
         detach_features: bool = False,
-    ) -> StepResult:
+    ) -> CpuStepResult:
         """`backward` and one Adam step in one pass: parameters, moments and update counts of the Gaussians that
         contributed are changed in place; those of the others stay as they are. No gradient array is written.
 
@@ -256,24 +256,24 @@ class CpuRasterizer:
         given = (grad_image, grad_depth, grad_alpha, grad_features)
         grads = image_gradients(last.buffers, given, detach_features, _CPU)
         schedule = optimizer.schedule()
-        adam = _native.AdamArguments(
-            updates=pointer(map.updates), schedule=pointer(schedule), schedule_rows=schedule.shape[0],
+        adam = structures.AdamArguments(
+            updates=address(map.updates), schedule=address(schedule), schedule_rows=schedule.shape[0],
             beta1=optimizer.beta1, beta2=optimizer.beta2, epsilon=optimizer.epsilon,
         )  # fmt: skip
         for name, (first, second) in map.moments.items():
-            setattr(adam, name, _native.AdamArrays(pointer(getattr(map, name)), pointer(first), pointer(second)))
+            setattr(adam, name, structures.AdamArrays(address(getattr(map, name)), address(first), address(second)))
         twist = np.zeros(6)
         touched = torch.empty(last.arrays.count, dtype=torch.uint8)
-        out = _native.GaussianGradients(twist=twist.ctypes.data, touched=pointer(touched))
+        out = structures.GaussianGradients(twist=twist.ctypes.data, touched=address(touched))
         self._last = None  # the parameters change now, so there is nothing left to differentiate
         self._run_backward(grads, out, adam)
-        return StepResult(twist, touched)
+        return CpuStepResult(twist, touched)
 
     def _run_backward(
         self,
-        image_gradients: _native.ImageGradients,
-        out: _native.GaussianGradients,
-        adam: _native.AdamArguments | None,
+        image_gradients: structures.ImageGradients,
+        out: structures.GaussianGradients,
+        adam: structures.AdamArguments | None,
     ) -> None:
         status = self._library.ggslam_rasterizer_backward(
             self._handle,

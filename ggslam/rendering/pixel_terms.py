@@ -16,9 +16,9 @@ from functools import lru_cache
 import numpy as np
 
 from ggslam.errors import RenderError
-from ggslam.native.loader import NativeContext
-from ggslam.rendering import _native
-from ggslam.rendering._native import pointer
+from ggslam.interface.arrays import address
+from ggslam.interface.core import rendering as structures
+from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.gaussian_map import GaussianMap
 
 MAX_CHANNELS = 64
@@ -47,7 +47,7 @@ def _schedule(rate: float, beta1: float, beta2: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class PixelTerms:
+class CpuPixelTerms:
     """The terms of P pixels.
 
     Attributes:
@@ -63,25 +63,25 @@ class PixelTerms:
     context: NativeContext
 
     @staticmethod
-    def empty(pixels: int, capacity: int, context: NativeContext) -> PixelTerms:
+    def empty(pixels: int, capacity: int, context: NativeContext) -> CpuPixelTerms:
         """Room for terms."""
         if capacity < 1:
             raise RenderError(f"capacity must be at least 1, found {capacity}")
-        return PixelTerms(
+        return CpuPixelTerms(
             np.empty((pixels, capacity), np.int32), np.empty((pixels, capacity), np.float32),
             np.zeros(pixels, np.int32), context,
         )  # fmt: skip
 
     @staticmethod
-    def of_gaussians(rows: np.ndarray, capacity: int, context: NativeContext) -> PixelTerms:
+    def of_gaussians(rows: np.ndarray, capacity: int, context: NativeContext) -> CpuPixelTerms:
         """Pseudo-pixels that show one Gaussian each, with weight 1: `rows` [M]."""
-        terms = PixelTerms.empty(len(rows), capacity, context)
+        terms = CpuPixelTerms.empty(len(rows), capacity, context)
         terms.gaussians[:, 0], terms.weights[:, 0], terms.counts[:] = rows, 1, 1
         return terms
 
-    def append(self, other: PixelTerms) -> PixelTerms:
+    def append(self, other: CpuPixelTerms) -> CpuPixelTerms:
         """These pixels followed by those of `other`, which must have the same capacity."""
-        return PixelTerms(
+        return CpuPixelTerms(
             np.concatenate([self.gaussians, other.gaussians]), np.concatenate([self.weights, other.weights]),
             np.concatenate([self.counts, other.counts]), self.context,
         )  # fmt: skip
@@ -89,9 +89,9 @@ class PixelTerms:
     def __len__(self) -> int:
         return len(self.counts)
 
-    def native(self) -> _native.PixelTerms:
+    def native(self) -> structures.PixelTerms:
         """As the compiled core wants it; valid as long as this object lives."""
-        return _native.PixelTerms(
+        return structures.PixelTerms(
             len(self), self.gaussians.shape[1], self.gaussians.ctypes.data, self.weights.ctypes.data,
             self.counts.ctypes.data,
         )  # fmt: skip
@@ -105,8 +105,8 @@ class PixelTerms:
         """Rendered features, float32 [P, F]."""
         channels = _checked_channels(gaussians)
         out = np.empty((len(self), channels), np.float32)
-        _native.rasterizer_library().ggslam_terms_blend(
-            self.context.handle, ctypes.byref(self.native()), pointer(gaussians.features), channels, out.ctypes.data
+        load_library().ggslam_terms_blend(
+            self.context.handle, ctypes.byref(self.native()), address(gaussians.features), channels, out.ctypes.data
         )
         return out
 
@@ -130,13 +130,13 @@ class PixelTerms:
             raise RenderError("step: the map was made without moments")
         gradient, schedule = np.ascontiguousarray(gradient), optimizer.schedule()
         first, second = gaussians.moments["features"]
-        adam = _native.FeatureAdam(
-            len(gaussians), pointer(gaussians.features), pointer(first), pointer(second),
-            pointer(gaussians.feature_updates), schedule.ctypes.data, len(schedule), channels,
+        adam = structures.FeatureAdam(
+            len(gaussians), address(gaussians.features), address(first), address(second),
+            address(gaussians.feature_updates), schedule.ctypes.data, len(schedule), channels,
             optimizer.beta1, optimizer.beta2, optimizer.epsilon,
         )  # fmt: skip
         _check(
-            _native.rasterizer_library().ggslam_terms_step(
+            load_library().ggslam_terms_step(
                 self.context.handle, ctypes.byref(self.native()), gradient.ctypes.data, ctypes.byref(adam)
             )
         )
@@ -154,10 +154,10 @@ class PixelTerms:
             pixel_weights = np.ascontiguousarray(pixel_weights, np.float32)
         ids, weights = gaussians.vote_ids, gaussians.vote_weights
         _check(
-            _native.rasterizer_library().ggslam_terms_vote(
+            load_library().ggslam_terms_vote(
                 self.context.handle, ctypes.byref(self.native()), labels.ctypes.data,
                 None if pixel_weights is None else pixel_weights.ctypes.data, len(gaussians), ids.shape[1],
-                pointer(ids), pointer(weights),
+                address(ids), address(weights),
             )
         )  # fmt: skip
 
@@ -172,7 +172,7 @@ class PixelTerms:
         if self.gaussians.max(initial=-1, where=used) >= len(gaussian_labels):
             raise RenderError(f"gaussian_labels: a label for every Gaussian of the map, found {len(gaussian_labels)}")
         ids, shares = np.empty(len(self), np.uint16), np.empty(len(self), np.float32)
-        _native.rasterizer_library().ggslam_terms_label(
+        load_library().ggslam_terms_label(
             self.context.handle, ctypes.byref(self.native()), gaussian_labels.ctypes.data, ids.ctypes.data,
             shares.ctypes.data,
         )  # fmt: skip

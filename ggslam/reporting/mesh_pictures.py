@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, Structure, c_float, c_int32, c_int64, c_void_p
-from functools import lru_cache
 
 import numpy as np
 
+from ggslam.interface.core.rendering import MeshPictureInput
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.reporting.cloud_pictures import CloudView
 from ggslam.scene.poses import inverse
@@ -16,23 +15,6 @@ from ggslam.scene.poses import inverse
 _BACKGROUND = 255
 _AMBIENT = 0.35
 """Share of its colour that a surface has which the light of the camera touches from the side."""
-
-
-class _Input(Structure):
-    _fields_ = (
-        [(name, c_void_p) for name in ("positions", "colors", "triangles")]
-        + [(name, c_int64) for name in ("vertices", "count")]
-        + [(name, c_float) for name in ("fx", "fy", "cx", "cy", "near")]
-        + [(name, c_int32) for name in ("width", "height", "cull")]
-    )
-
-
-@lru_cache(maxsize=1)
-def _library() -> ctypes.CDLL:
-    core = load_library()
-    core.ggslam_draw_mesh.argtypes = [c_void_p, POINTER(_Input), c_void_p, c_void_p]
-    core.ggslam_draw_mesh.restype = None
-    return core
 
 
 def draw_mesh(
@@ -67,10 +49,10 @@ def draw_mesh(
     camera = view.camera
     picture = np.full((camera.height, camera.width, 3), _BACKGROUND, np.uint8)
     inverse_depth = np.zeros((camera.height, camera.width), np.float32)
-    mesh = _Input(
+    mesh = MeshPictureInput(
         position.ctypes.data, shaded.ctypes.data, corners.ctypes.data, len(position), len(corners),
         camera.fx, camera.fy, camera.cx, camera.cy, near, camera.width, camera.height, int(cull),
     )  # fmt: skip
     context = context or NativeContext()
-    _library().ggslam_draw_mesh(context.handle, ctypes.byref(mesh), inverse_depth.ctypes.data, picture.ctypes.data)
+    load_library().ggslam_draw_mesh(context.handle, ctypes.byref(mesh), inverse_depth.ctypes.data, picture.ctypes.data)
     return picture

@@ -23,8 +23,8 @@ class Frame:
         depth: float32 [H, W], metres along the optical axis, 0 where unknown; registered to `color`.
         camera: intrinsics of both images.
         mask: uint16 [H, W] instance ids, 0 = unlabelled; None when the recording has none, or it was not read.
-        T_world_camera: float64 [4, 4] true pose if the recording tells it. Used for scores only, never for tracking.
-        mask_loader: reads the mask when it is needed; see `load_mask`.
+        T_world_camera: float64 [4, 4] true pose if the recording has it. Used for scores only, never for tracking.
+        mask_loader: reads the mask on demand; see `load_mask`.
     """
 
     index: int
@@ -38,7 +38,7 @@ class Frame:
     mask_loader: Callable[[], np.ndarray | None] | None = field(default=None, repr=False, compare=False)
 
     def load_mask(self) -> np.ndarray | None:
-        """The mask, read now if it was not read before (nothing keeps it: every call reads it again).
+        """The mask; reads it from disk on every call if it did not come with the frame.
 
         Raises:
             SequenceError: it is damaged.

@@ -77,7 +77,7 @@ class GaussianMap:
 
     @property
     def _names(self) -> list[str]:
-        """Of all arrays: parameters, bookkeeping, moments (`means.first`, `means.second`)."""
+        """Names of all arrays: parameters, bookkeeping, moments (`means.first`, `means.second`)."""
         moments = [f"{name}.{which}" for name in _PARAMETERS for which in _MOMENTS] if self.with_moments else []
         return [*_PARAMETERS, *_BOOKKEEPING, *moments]
 
@@ -180,7 +180,7 @@ class GaussianMap:
         return out
 
     def take(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Copies of whole rows, index int64 [M]: everything that is known of these Gaussians, for `append`."""
+        """Copies of whole rows, index int64 [M]: everything about these Gaussians, for `append`."""
         return {name: array[index] for name, array in self._arrays(self.count).items()}
 
     def append(self, rows: Mapping[str, torch.Tensor]) -> slice:

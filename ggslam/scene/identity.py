@@ -49,7 +49,7 @@ class IdentityClassifier:
         return features @ self.weight.T + self.bias
 
     def probabilities(self, features: np.ndarray) -> np.ndarray:
-        """Softmax of the logits and that of nothing, float32 [..., C]; what they lack to 1 is nothing's."""
+        """Probability of each class, float32 [..., C]: softmax over the classes and no object (the rest)."""
         z = self.logits(features)
         highest = z.max(-1, keepdims=True, initial=NOTHING_LOGIT)
         z -= highest

@@ -23,7 +23,7 @@ SCALES = (0.86, 0.9, 0.93, 0.96, 0.98, 1.0, 1.02, 1.04, 1.07, 1.1, 1.14)
 
 
 LEAST_OFF, LEAST_GAIN, LEAST_RATIO = 0.012, 0.4, 0.3
-"""From so much displacement (share of the width) and gain (absolute, and to the strength as it is) on it is told."""
+"""Thresholds of a warning: displacement (share of the width), gain (absolute, and relative to the strength as is)."""
 
 
 @dataclass(frozen=True)

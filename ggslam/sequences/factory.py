@@ -78,7 +78,7 @@ def open_sequence(
         scale: size of the delivered images, in (0, 1].
         masks: folder of instance masks to use instead of the recording's own; see `masks.find_masks`.
         depth_scale: depth units per metre, instead of the recording's own.
-        on_bad_frame: "error": a damaged frame or mask raises; "skip": `stream` passes over the frame and lists it in
+        on_bad_frame: "error": a damaged frame or mask raises; "skip": `stream` skips the frame and lists it in
             `skipped_frames`; a frame whose mask alone is damaged comes without it and is listed in `mask_problems`.
         depth_camera: YAML file with the calibration of a depth camera beside the colour camera (see `calibration`); its
             depth images are registered to the colour images.
@@ -112,7 +112,7 @@ def _read_recording(
     folder: Path, format: str | None, masks: Path | None, depth_scale: float | None, options: ReadOptions,
     pose_convention: str | None,
 ) -> Recording:  # fmt: skip
-    """The description of a recording with what the user says of it; arguments and errors as in `open_sequence`."""
+    """Reads a recording's description and applies the user's options; arguments and errors as in `open_sequence`."""
     if not folder.exists():
         raise SequenceError(f"{folder}: no such folder or file")
     recording = _find_format(folder, format).read(folder, options)

@@ -36,7 +36,7 @@ class SequenceReport:
     Attributes:
         name, format, frames: of the sequence.
         duration_s, rate_hz: by the timestamps; rate is the median one (NaN for a single frame).
-        time_source, pose_source: what told them.
+        time_source, pose_source: where they come from.
         camera, native_camera: delivered and stored intrinsics.
         color_size, depth_size: (width, height) of the stored images.
         lens: what is undone, for people; "" for a pinhole camera.

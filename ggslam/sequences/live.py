@@ -96,7 +96,7 @@ def _call(place: str, module: str, function: str) -> LiveSource:
 
 
 class LiveSequence:
-    """A live source as a run sees it: a sequence that ends when it is told to, with Ctrl-C or after `stop` frames.
+    """A live source as a run sees it: a sequence that ends on request, with Ctrl-C or after `stop` frames.
 
     Args:
         source: the camera.

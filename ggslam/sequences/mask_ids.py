@@ -34,7 +34,7 @@ class InstanceCodes:
 
     Attributes:
         codes: int32 [n], increasing, without 0.
-        source: what told them, for messages.
+        source: where they come from, for messages.
         coded: whether RGB images hold codes, as far as known; false: grey ids in three equal channels.
     """
 

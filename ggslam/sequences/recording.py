@@ -142,8 +142,8 @@ class Recording:
         fisheye: whether `distortion` are the four coefficients of OpenCV's fisheye model instead.
         min_confidence: depth less sure than this is dropped in frames that have a confidence image.
         poses: float64 [n, 4, 4] T_world_camera with rows of NaN where unknown, or None.
-        pose_source: file or folder that told the poses, for reports.
-        time_source: what told the time, for reports.
+        pose_source: file or folder that the poses come from, for reports.
+        time_source: where the timestamps come from, for reports.
         instance_names: names of mask ids.
         problems: frames known to be damaged without reading their images: frame number -> reason.
         warnings: what a user should know about this recording.

@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SkippedFrame:
-    """A damaged frame that `stream` passed over: its numbers (as in `Frame`) and what is wrong with it."""
+    """A damaged frame that `stream` skipped: its numbers (as in `Frame`) and what is wrong with it."""
 
     index: int
     source_index: int
@@ -61,20 +61,20 @@ class Sequence:
         native_camera: the same before `scale`.
         depth_scale: units per metre of the stored depth images.
         color_size, depth_size: (width, height) of the stored images.
-        lens: distortion that is undone and intrinsics that change, for people; "" for a pinhole camera that stays one.
+        lens: distortion that is undone and intrinsics that change, in words; "" for a pinhole camera that stays one.
         min_confidence: depth less sure than this is dropped; None: the recording has no confidence images.
         registered: whether depth images of another camera are registered to the colour images.
         timestamps: float64 [n], seconds.
-        ground_truth: float64 [n, 4, 4] T_world_camera, rows of NaN where the recording tells none; None when it
-            never does.
+        ground_truth: float64 [n, 4, 4] T_world_camera, rows of NaN where the recording has none; None when it
+            has none at all.
         has_masks: whether any selected frame has a mask.
         mask_problems: damaged masks met so far (only with on_bad_frame="skip": their frames are delivered without):
             index of the frame -> reason.
         instance_names: mask id -> name, as far as known.
-        pose_source, time_source: what told poses and times, for reports.
+        pose_source, time_source: where poses and timestamps come from, for reports.
         options: arguments of `open_sequence` besides the selection; None if it was made otherwise.
         warnings: what a user should know about this recording.
-        skipped_frames: damaged frames passed over so far (only with on_bad_frame="skip").
+        skipped_frames: damaged frames skipped so far (only with on_bad_frame="skip").
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class Sequence:
 
     @property
     def skipped_frames(self) -> list[SkippedFrame]:
-        """Damaged frames passed over by `stream` so far, in order."""
+        """Damaged frames that `stream` has skipped so far, in order."""
         return [self._skipped[i] for i in sorted(self._skipped)]
 
     def files(self, index: int) -> FrameFiles:

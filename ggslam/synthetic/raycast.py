@@ -34,7 +34,7 @@ class RayImages:
 
 
 class RayCaster:
-    """Renders views of one scene. Texture pyramids are prepared once, light maps when the first colour is asked for."""
+    """Renders views of one scene. Texture pyramids are prepared once, light maps when colour is first needed."""
 
     def __init__(self, scene: Scene, seed: int = 0) -> None:
         self._scene = scene

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Describing a scene: solid shapes with materials, lights and instance names. Knows nothing about ray casting.
+"""Describes a scene: solid shapes with materials, lights and instance names; independent of ray casting.
 
 World axes: x and y along the floor, z up, metres.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenes that can be recorded, by name, and how each is recorded unless one asks otherwise."""
+"""The scenes that can be recorded, by name, and how each is recorded by default."""
 
 from __future__ import annotations
 

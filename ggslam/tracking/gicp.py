@@ -12,9 +12,10 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from ggslam.native.loader import NativeContext
+from ggslam.interface.arrays import address
+from ggslam.interface.core import tracking as structures
+from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.tracking import native
 from ggslam.tracking.observability import PointSpread, about_point, observability
 from ggslam.tracking.photometric import PhotometricPoints, PhotometricReference
 from ggslam.tracking.points import FramePoints
@@ -25,13 +26,13 @@ class GicpTarget:
     """The map as the tracker sees it: Gaussians gathered in voxels of two sizes. Never changes once built."""
 
     def __init__(self) -> None:
-        self._library = native.library()
+        self._library = load_library()
         self._handle: int | None = self._library.ggslam_gicp_target_create()
         self.voxel = 0.0
         """Edge of a fine voxel, metres."""
         self.composed_with: TargetSettings | None = None
         """Settings of the parts, if it was made by `target_parts.composed_target`."""
-        self._unfinished: tuple[NativeContext, native.TargetSettings] | None = None
+        self._unfinished: tuple[NativeContext, structures.TargetSettings] | None = None
 
     def __del__(self) -> None:
         if getattr(self, "_handle", None) is not None:
@@ -42,18 +43,18 @@ class GicpTarget:
         """Pointer for the core."""
         if self._unfinished is not None:
             context, settings = self._unfinished
-            self._library.ggslam_gicp_target_finish(context.handle, self.gathered, settings)
+            self._library.ggslam_gicp_target_finish(context.handle, self.gathered_handle, settings)
             self._unfinished = None
-        return self.gathered
+        return self.gathered_handle
 
     @property
-    def gathered(self) -> int:
+    def gathered_handle(self) -> int:
         """Pointer for those functions of the core that do not need the voxels' shapes."""
         assert self._handle is not None
         return self._handle
 
     @property
-    def settings_to_finish(self) -> native.TargetSettings | None:
+    def settings_to_finish(self) -> structures.TargetSettings | None:
         """What the voxels' shapes are still to be made with, if they are."""
         unfinished = self._unfinished
         return None if unfinished is None else unfinished[1]
@@ -121,32 +122,32 @@ class GicpTarget:
         if base is not None and base.composed_with is not None:
             raise ValueError("a target that was composed of parts grows by parts")
         arrays = (means, quaternions, log_scales, opacity_logits)
-        given = native.TargetInput(
-            *(native.address(a) for a in arrays), None if birth is None else native.address(birth),
-            native.address(positions), len(means), cameras,
+        given = structures.TargetInput(
+            *(address(a) for a in arrays), None if birth is None else address(birth),
+            address(positions), len(means), cameras,
         )  # fmt: skip
         arguments = native_target_settings(settings, target.voxel)
-        earlier = None if base is None else base.gathered
+        earlier = None if base is None else base.gathered_handle
         build = target._library.ggslam_gicp_target_build if finish else target._library.ggslam_gicp_target_gather
-        build(context.handle, target.gathered, earlier, given, arguments)
+        build(context.handle, target.gathered_handle, earlier, given, arguments)
         target._unfinished = None if finish else (context, arguments)
         return target
 
     def __len__(self) -> int:
         """Number of fine voxels."""
-        return self._library.ggslam_gicp_target_size(self.gathered, 0)
+        return self._library.ggslam_gicp_target_size(self.gathered_handle, 0)
 
     def voxels(self, level: int = 0) -> dict[str, np.ndarray]:
         """Copies of a level's (0 fine, 1 coarse) means [n, 3], normals [n, 3], covariances [n, 6], weights [n]."""
         count = self._library.ggslam_gicp_target_size(self.handle, level)
         rows = np.empty((count, 16), np.float32)
-        self._library.ggslam_gicp_target_voxels(self.handle, level, native.address(rows))
+        self._library.ggslam_gicp_target_voxels(self.handle, level, address(rows))
         return {"means": rows[:, :3], "weights": rows[:, 3], "normals": rows[:, 4:7], "covariances": rows[:, 8:14]}
 
 
-def native_target_settings(settings: TargetSettings, voxel: float) -> native.TargetSettings:
+def native_target_settings(settings: TargetSettings, voxel: float) -> structures.TargetSettings:
     """The core's form of the settings, with `voxel` metres for the edge of a fine voxel."""
-    return native.TargetSettings(
+    return structures.TargetSettings(
         voxel, math.log(settings.min_opacity / (1 - settings.min_opacity)), settings.min_thickness,
         settings.max_thickness, settings.max_elongation, settings.scatter_weight, settings.neighbour_weight,
     )  # fmt: skip
@@ -248,13 +249,13 @@ class PhotometricPart:
 
 def native_align_settings(
     settings: AlignSettings, noise: DepthNoise, photometric: PhotometricSettings | None = None
-) -> native.AlignSettings:
+) -> structures.AlignSettings:
     """The core's form of the settings."""
     p = photometric or PhotometricSettings()
     # The core weighs the geometric part per point of unit weight, which has the noise of 1 m. However good the depth,
     # a match is no better than the map's surface.
     photometric_weight = p.weight * (max(noise.sigma(1.0), p.surface_sigma) / p.sigma) ** 2
-    return native.AlignSettings(
+    return structures.AlignSettings(
         settings.translation_tolerance, settings.rotation_tolerance, settings.coarse_kernel_factor,
         noise.constant, noise.square, settings.kernel_constant, settings.kernel_sigmas, settings.overlap_constant,
         settings.overlap_sigmas, settings.min_normal_dot, PLANE_VARIANCE, settings.coarse_iterations,
@@ -263,10 +264,10 @@ def native_align_settings(
     )  # fmt: skip
 
 
-def native_points(points: FramePoints) -> native.AlignPoints:
+def native_points(points: FramePoints) -> structures.AlignPoints:
     """The core's form of a frame's points, which must stay alive."""
     arrays = (points.points, points.normals, points.covariances, points.weights)
-    return native.AlignPoints(*(native.address(a) for a in arrays), len(points))
+    return structures.AlignPoints(*(address(a) for a in arrays), len(points))
 
 
 def align(
@@ -289,18 +290,18 @@ def align(
     """
     guess = np.ascontiguousarray(T_world_camera_guess, np.float64)
     matches, squared = np.empty(len(source), np.int32), np.empty(len(source), np.float32)
-    result = native.AlignResult()
+    result = structures.AlignResult()
     arguments = native_align_settings(settings, noise, photometric.settings if photometric else None)
-    native.library().ggslam_gicp_align(
+    load_library().ggslam_gicp_align(
         context.handle, target.handle, native_points(source), arguments,
         photometric.points.native() if photometric else None, photometric.reference.native() if photometric else None,
-        native.address(guess), native.address(matches), native.address(squared), ctypes.byref(result),
+        address(guess), address(matches), address(squared), ctypes.byref(result),
     )  # fmt: skip
     return _result(result, source, settings, noise, matches, squared)
 
 
 def _result(
-    found: native.AlignResult,
+    found: structures.AlignResult,
     source: FramePoints,
     settings: AlignSettings,
     noise: DepthNoise,

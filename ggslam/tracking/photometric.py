@@ -13,9 +13,10 @@ from functools import reduce
 import cv2
 import numpy as np
 
+from ggslam.interface.arrays import address
+from ggslam.interface.core import tracking as structures
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
-from ggslam.tracking import native
 from ggslam.tracking.settings import PhotometricSettings
 
 
@@ -78,11 +79,11 @@ class PhotometricReference:
         dv = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
         return cls(np.ascontiguousarray(np.dstack([grey, du, dv, view.depth])), view.camera, T_world_camera.copy())
 
-    def native(self) -> native.PhotometricReferenceView:
+    def native(self) -> structures.PhotometricReferenceView:
         """The core's form; this object must stay alive."""
         T = inverse(self.T_world_camera)
-        view = native.PhotometricReferenceView(
-            native.address(self.pixels), self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy,
+        view = structures.PhotometricReferenceView(
+            address(self.pixels), self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy,
             self.camera.width, self.camera.height,
         )  # fmt: skip
         view.rotation[:] = T[:3, :3].ravel().tolist()
@@ -105,9 +106,9 @@ class PhotometricPoints:
     def __len__(self) -> int:
         return len(self.points)
 
-    def native(self) -> native.PhotometricPoints:
+    def native(self) -> structures.PhotometricPoints:
         """The core's form; this object must stay alive."""
-        return native.PhotometricPoints(native.address(self.points), native.address(self.intensity), len(self))
+        return structures.PhotometricPoints(address(self.points), address(self.intensity), len(self))
 
 
 def textured_points(view: GreyDepth, settings: PhotometricSettings) -> PhotometricPoints:

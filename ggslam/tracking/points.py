@@ -10,9 +10,10 @@ from typing import Protocol
 
 import numpy as np
 
-from ggslam.native.loader import NativeContext
+from ggslam.interface.arrays import address
+from ggslam.interface.core import tracking as structures
+from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
-from ggslam.tracking import native
 from ggslam.tracking.settings import DepthNoise, PointSettings
 
 
@@ -113,9 +114,9 @@ def check_depth(depth: np.ndarray, camera: Camera) -> None:
 
 def native_points_settings(
     camera: Camera, settings: PointSettings, noise: DepthNoise, stride: int
-) -> native.DepthPointsSettings:
+) -> structures.DepthPointsSettings:
     """The core's form of the settings, for points `stride` pixels apart."""
-    return native.DepthPointsSettings(
+    return structures.DepthPointsSettings(
         camera.fx, camera.fy, camera.cx, camera.cy, noise.constant, noise.square, settings.min_depth,
         settings.max_depth, settings.min_thickness, settings.max_elongation, settings.min_neighbours,
         camera.width, camera.height, stride, settings.window, max(1, round(camera.width / 320)),
@@ -147,6 +148,6 @@ def extract_points(
     )  # fmt: skip
     arguments = native_points_settings(camera, settings, noise, stride)
     arrays = (found.points, found.normals, found.covariances, found.pixels, found.weights)
-    out = native.DepthPointsOutput(*(native.address(array) for array in arrays))
-    count = native.library().ggslam_depth_points(context.handle, native.address(depth), arguments, out)
+    out = structures.DepthPointsOutput(*(address(array) for array in arrays))
+    count = load_library().ggslam_depth_points(context.handle, address(depth), arguments, out)
     return FramePoints(*(array[:count] for array in arrays))

@@ -12,8 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ggslam.native.loader import NativeContext
-from ggslam.tracking import native
+from ggslam.interface.arrays import address
+from ggslam.interface.core import tracking as structures
+from ggslam.native.loader import NativeContext, load_library
 from ggslam.tracking.gicp import GicpTarget, native_target_settings
 from ggslam.tracking.settings import TargetSettings
 
@@ -35,10 +36,10 @@ class TargetPart:
         settings: TargetSettings, context: NativeContext, rank: int,
     ) -> None:  # fmt: skip
         self._handle: int | None = None
-        self._library = native.library()
+        self._library = load_library()
         self.settings, self.rank, self.count = settings, rank, len(means)
         arrays = (means, quaternions, log_scales, opacity_logits)
-        given = native.TargetInput(*(native.address(a) for a in arrays), None, None, len(means), 0)
+        given = structures.TargetInput(*(address(a) for a in arrays), None, None, len(means), 0)
         arguments = native_target_settings(settings, settings.voxel)
         self._handle = self._library.ggslam_target_part_create(context.handle, given, arguments, rank)
         self.nbytes: int = self._library.ggslam_target_part_bytes(self._handle)
@@ -79,7 +80,7 @@ def composed_target(
     target = GicpTarget()
     target.voxel, target.composed_with = settings.voxel, settings
     handles = (ctypes.c_void_p * len(parts))(*(part.handle for part in parts))
-    native.library().ggslam_gicp_target_compose(
+    load_library().ggslam_gicp_target_compose(
         context.handle, target.handle, None if before is None else before.handle, handles, len(parts),
         native_target_settings(settings, settings.voxel),
     )  # fmt: skip

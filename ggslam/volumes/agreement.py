@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.volumes import occupancy_native as native
+from ggslam.native.loader import load_library
 from ggslam.volumes.occupancy import OccupancyMap
 
 
@@ -39,7 +39,7 @@ def agreement(reference: OccupancyMap, other: OccupancyMap) -> Agreement:
     if reference.resolution != other.resolution:
         raise ValueError(f"maps of one resolution expected, found {reference.resolution} and {other.resolution} m")
     counts = (ctypes.c_uint64 * 9)()
-    native.library().ggslam_occupancy_compare(
+    load_library().ggslam_occupancy_compare(
         reference.handle, other.handle, reference.settings.threshold, other.settings.threshold, counts
     )
     table = np.array(counts[:], np.int64).reshape(3, 3)

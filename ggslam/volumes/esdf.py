@@ -19,8 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.errors import ConfigError
+from ggslam.interface.core.volumes import FieldStats
+from ggslam.native.loader import load_library
 from ggslam.system.settings import setting, settings_class
-from ggslam.volumes.esdf_native import FieldStats, library
 from ggslam.volumes.tsdf import VOXELS, TsdfMap
 
 _MOST_VOXELS = 2000
@@ -101,7 +102,7 @@ class DistanceField:
                 f"FieldSettings.max_distance: expected at most {most:g} ({_MOST_VOXELS} voxels), found "
                 f"{self.settings.max_distance:g}"
             )
-        self._library = library()
+        self._library = load_library()
         self._handle: int | None = self._library.ggslam_esdf_create(tsdf.handle, self.settings.max_distance)
 
     def __del__(self) -> None:

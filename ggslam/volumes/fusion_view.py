@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ggslam.interface.core.volumes import FusionInput
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
-from ggslam.volumes.tsdf_native import FusionInput
 
 _RIGID = 0.02
 """Largest entry by which R^T R of a pose may differ from the unit matrix."""

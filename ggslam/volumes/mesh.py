@@ -11,7 +11,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ggslam.formats.triangle_mesh import TriangleMesh, majority_labels
-from ggslam.volumes.surface_native import MeshArrays, library, surface_cells
+from ggslam.interface.core.volumes import MeshArrays
+from ggslam.native.loader import load_library
+from ggslam.volumes.surface_cells import surface_cells
 from ggslam.volumes.tsdf import TsdfMap
 
 MIN_WEIGHT = 0.1
@@ -73,7 +75,7 @@ def extract_mesh(tsdf: TsdfMap, min_weight: float = MIN_WEIGHT, min_triangles: i
         min_weight: voxels of less weight (in measurements from 1 m), or never seen, count as unknown.
         min_triangles: connected pieces of fewer triangles are left out.
     """
-    core, cells = library(), surface_cells(tsdf, min_weight)
+    core, cells = load_library(), surface_cells(tsdf, min_weight)
     sizes = (ctypes.c_int64 * 2)()
     mesher = core.ggslam_mesher_create(tsdf.context.handle, cells.handle, sizes)
     try:

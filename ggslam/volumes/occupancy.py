@@ -17,9 +17,11 @@ from typing import Literal
 import numpy as np
 
 from ggslam.errors import ConfigError
-from ggslam.native.loader import NativeContext
+from ggslam.interface.core import volumes
+from ggslam.interface.core.volumes import DepthImage, InsertResult, InsertSettings
+from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
-from ggslam.volumes import occupancy_native as native
+from ggslam.volumes.occupancy_arrays import LEAF, contiguous_points, output_bytes
 from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
 from ggslam.volumes.quantization import KEY_OFFSET, check_resolution
 
@@ -99,7 +101,7 @@ class OccupancyMap:
         self.resolution = float(resolution)
         self.settings = settings or OccupancySettings()
         self.context = context or NativeContext()
-        self._library = native.library()
+        self._library = load_library()
         self._handle = self._library.ggslam_occupancy_create(self.resolution)
 
     def __del__(self) -> None:
@@ -124,9 +126,9 @@ class OccupancyMap:
             ValueError: points of another shape.
             ConfigError: the origin lies outside the grid.
         """
-        points = native.contiguous_points(points)
+        points = contiguous_points(points)
         core = self._library.ggslam_occupancy_insert
-        return self._inserted(
+        return self._insert(
             lambda settings, result: core(
                 self.context.handle, self.handle, points.ctypes.data, len(points), settings, result
             ),
@@ -159,12 +161,12 @@ class OccupancyMap:
         if depth.shape != (camera.height, camera.width):
             raise ValueError(f"depth: expected shape {[camera.height, camera.width]}, found {list(depth.shape)}")
         T = np.asarray(T_world_camera, np.float64)
-        image = native.DepthImage(
+        image = DepthImage(
             depth.ctypes.data, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
             max(min_depth, 1e-6), max_depth, (ctypes.c_float * 12)(*T[:3].ravel()),
         )  # fmt: skip
         core = self._library.ggslam_occupancy_insert_depth
-        return self._inserted(
+        return self._insert(
             lambda settings, result: core(self.context.handle, self.handle, ctypes.byref(image), settings, result),
             T[:3, 3],
             max_range,
@@ -172,14 +174,14 @@ class OccupancyMap:
 
     def states(self, points: np.ndarray) -> np.ndarray:
         """Whether points [N, 3] are `UNKNOWN`, `FREE` or `OCCUPIED`, int8 [N]. Outside the grid all is unknown."""
-        points = native.contiguous_points(points)
+        points = contiguous_points(points)
         states = np.empty(len(points), np.int8)
         self._look_up(points, states.ctypes.data, None)
         return states
 
     def log_odds(self, points: np.ndarray) -> np.ndarray:
         """Log-odds at points [N, 3], float32 [N]; not a number where unknown."""
-        points = native.contiguous_points(points)
+        points = contiguous_points(points)
         values = np.empty(len(points), np.float32)
         self._look_up(points, None, values.ctypes.data)
         return values
@@ -187,7 +189,7 @@ class OccupancyMap:
     def leaves(self, which: Literal["all", "occupied", "free"] = "all") -> OccupancyLeaves:
         """The map's leaves, or the occupied or free ones alone."""
         size = self._library.ggslam_occupancy_leaves(self.handle, self.settings.threshold, _WHICH[which])
-        rows = np.frombuffer(native.output_bytes(self.handle, size), native.LEAF)
+        rows = np.frombuffer(output_bytes(self.handle, size), LEAF)
         return OccupancyLeaves(rows["centre"].copy(), rows["size"].copy(), rows["log_odds"].copy())
 
     def occupied_centers(self) -> tuple[np.ndarray, np.ndarray]:
@@ -197,14 +199,14 @@ class OccupancyMap:
 
     def summary(self) -> OccupancySummary:
         """Counts, memory and extent."""
-        found = native.Summary()
+        found = volumes.OccupancySummary()
         self._library.ggslam_occupancy_summary(self.handle, self.settings.threshold, ctypes.byref(found))
         return OccupancySummary(
             int(found.occupied), int(found.free), int(found.blocks), int(found.nodes), int(found.bytes),
             self._box(found.known_low, found.known_high), self._box(found.occupied_low, found.occupied_high),
         )  # fmt: skip
 
-    def native_settings(self, origin: np.ndarray, max_range: float | None) -> native.InsertSettings:
+    def native_settings(self, origin: np.ndarray, max_range: float | None) -> InsertSettings:
         """The settings of one insertion, for the core.
 
         Raises:
@@ -215,14 +217,14 @@ class OccupancyMap:
         s = self.settings
         limits = (s.probability_hit, s.probability_miss, s.probability_minimum, s.probability_maximum)
         where = (ctypes.c_float * 3)(*np.asarray(origin, np.float32).reshape(3))
-        return native.InsertSettings(
+        return InsertSettings(
             -1.0 if max_range is None else max_range, where, *map(log_odds, limits), int(s.quantize)
         )
 
-    def _inserted(
+    def _insert(
         self, insert: Callable[[object, object], int], origin: np.ndarray, max_range: float | None
     ) -> ScanCounts:
-        settings, result = self.native_settings(origin, max_range), native.InsertResult()
+        settings, result = self.native_settings(origin, max_range), InsertResult()
         if not insert(ctypes.byref(settings), ctypes.byref(result)):
             raise self.origin_error(origin)
         return ScanCounts(int(result.rays), int(result.free), int(result.occupied))

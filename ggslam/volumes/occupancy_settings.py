@@ -41,7 +41,7 @@ class OccupancySettings:
             )
 
     @classmethod
-    def raised(cls) -> OccupancySettings:
+    def with_raised_odds(cls) -> OccupancySettings:
         """Hit 0.85 and miss 0.3, about twice OctoMap's log-odds.
 
         In a map that is updated point by point the many rays of a voxel add up within one scan. Here one ray stands

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.native.loader import NativeContext
+from ggslam.native.loader import NativeContext, load_library
 from ggslam.system.atomic import write_bytes
-from ggslam.volumes import occupancy_native as native
 from ggslam.volumes.occupancy import OccupancyMap
+from ggslam.volumes.occupancy_arrays import output_bytes
 from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
 from ggslam.volumes.quantization import RESOLUTION_RANGE
 
@@ -88,7 +88,7 @@ def decode_octomap(
     tree = np.frombuffer(data, np.uint8, offset=header.size)
     nodes = ctypes.c_uint64()
     limits = (result.settings.probability_minimum, result.settings.probability_maximum)
-    fault = native.library().ggslam_occupancy_read(
+    fault = load_library().ggslam_occupancy_read(
         result.handle, header.format, tree.ctypes.data, len(tree), *map(log_odds, limits),
         max(1, memory_limit // _BLOCK_BYTES), ctypes.byref(nodes),
     )  # fmt: skip
@@ -114,25 +114,25 @@ def write_octomap(occupancy: OccupancyMap, path: str | Path) -> None:
     formats = {".bt": _BINARY, ".ot": _FULL}
     if path.suffix.lower() not in formats:
         raise FormatError(f"{path}: expected the ending .bt (free or occupied) or .ot (log-odds)")
-    write_bytes(path, _encoded(occupancy, formats[path.suffix.lower()]))
+    write_bytes(path, _encode(occupancy, formats[path.suffix.lower()]))
 
 
 def binary_octomap(occupancy: OccupancyMap) -> bytes:
     """The map as the bytes of a `.bt` file."""
-    return _encoded(occupancy, _BINARY)
+    return _encode(occupancy, _BINARY)
 
 
 def full_octomap(occupancy: OccupancyMap) -> bytes:
     """The map as the bytes of an `.ot` file."""
-    return _encoded(occupancy, _FULL)
+    return _encode(occupancy, _FULL)
 
 
-def _encoded(occupancy: OccupancyMap, kind: int) -> bytes:
+def _encode(occupancy: OccupancyMap, kind: int) -> bytes:
     nodes = ctypes.c_uint64()
-    size = native.library().ggslam_occupancy_write(
+    size = load_library().ggslam_occupancy_write(
         occupancy.handle, kind, occupancy.settings.threshold, ctypes.byref(nodes)
     )
-    tree = native.output_bytes(occupancy.handle, size)
+    tree = output_bytes(occupancy.handle, size)
     header = f"{_FIRST_LINES[kind]}\n{_COMMENT}id OcTree\nsize {nodes.value}\nres {occupancy.resolution!r}\ndata\n"
     return header.encode() + tree
 

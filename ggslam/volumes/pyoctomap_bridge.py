@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import FormatError, MissingDependency
-from ggslam.native.loader import NativeContext
-from ggslam.volumes import occupancy_native as native
+from ggslam.interface.core.volumes import InsertResult
+from ggslam.native.loader import NativeContext, load_library
 from ggslam.volumes.occupancy import OccupancyMap, ScanCounts
+from ggslam.volumes.occupancy_arrays import contiguous_points, output_bytes
 from ggslam.volumes.occupancy_settings import OccupancySettings
 from ggslam.volumes.octomap_files import decode_octomap, full_octomap
 from ggslam.volumes.quantization import key_centers
@@ -129,15 +130,15 @@ def scan_keys(
     Raises:
         ValueError, ConfigError: as `OccupancyMap.insert`.
     """
-    points = native.contiguous_points(points)
-    settings, result = occupancy.native_settings(origin, max_range), native.InsertResult()
-    size = native.library().ggslam_occupancy_scan_keys(
+    points = contiguous_points(points)
+    settings, result = occupancy.native_settings(origin, max_range), InsertResult()
+    size = load_library().ggslam_occupancy_scan_keys(
         occupancy.context.handle, occupancy.handle, points.ctypes.data, len(points),
         ctypes.byref(settings), ctypes.byref(result),
     )  # fmt: skip
     if size < 0:
         raise occupancy.origin_error(origin)
-    keys = np.frombuffer(native.output_bytes(occupancy.handle, size), np.uint16).reshape(-1, 3)
+    keys = np.frombuffer(output_bytes(occupancy.handle, size), np.uint16).reshape(-1, 3)
     return keys, ScanCounts(int(result.rays), int(result.free), int(result.occupied))
 
 

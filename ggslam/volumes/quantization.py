@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.errors import ConfigError
-from ggslam.native.loader import NativeContext
-from ggslam.volumes.occupancy_native import contiguous_points, library
+from ggslam.native.loader import NativeContext, load_library
+from ggslam.volumes.occupancy_arrays import contiguous_points
 
 KEY_OFFSET = 32768
 """Key of the voxel whose lower corner is the origin of the world."""
@@ -56,7 +56,7 @@ def quantize(points: np.ndarray, resolution: float, context: NativeContext, coun
     points = contiguous_points(points)
     keys = np.empty((len(points), 3), np.uint16)
     counts = np.empty(len(points), np.int32) if count else None
-    number = library().ggslam_quantize(
+    number = load_library().ggslam_quantize(
         context.handle,
         resolution,
         points.ctypes.data,

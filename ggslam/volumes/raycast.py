@@ -8,9 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.interface.core.volumes import RaycastView, SurfaceImages
+from ggslam.native.loader import load_library
 from ggslam.scene.camera import Camera
 from ggslam.volumes.mesh import MIN_WEIGHT
-from ggslam.volumes.surface_native import RaycastView, SurfaceImages, library, surface_cells
+from ggslam.volumes.surface_cells import surface_cells
 from ggslam.volumes.tsdf import TsdfMap
 
 
@@ -66,5 +68,5 @@ def render_depth(
         (ctypes.c_float * 3)(*pose[:3, 3]), camera.width, camera.height,
     )  # fmt: skip
     pointers = SurfaceImages(*(a.ctypes.data for a in (images.depth, images.normals, images.colors, images.labels)))
-    library().ggslam_raycast(tsdf.context.handle, cells.handle, ctypes.byref(view), ctypes.byref(pointers))
+    load_library().ggslam_raycast(tsdf.context.handle, cells.handle, ctypes.byref(view), ctypes.byref(pointers))
     return images

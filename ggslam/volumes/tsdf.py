@@ -12,11 +12,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ggslam.native.loader import NativeContext
+from ggslam.interface.core.volumes import FusionSettings, FusionStats, VoxelArrays
+from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.volumes.fusion_view import FusionView
 from ggslam.volumes.settings import TsdfSettings
-from ggslam.volumes.tsdf_native import FusionSettings, FusionStats, VoxelArrays, library
 
 SIDE = 8
 VOXELS = SIDE**3
@@ -104,7 +104,7 @@ class TsdfMap:
     def __init__(self, settings: TsdfSettings | None = None, context: NativeContext | None = None) -> None:
         self.settings = settings or TsdfSettings()
         self.context = context or NativeContext()
-        self._library = library()
+        self._library = load_library()
         self._handle: int | None = self._library.ggslam_tsdf_create(
             self.settings.voxel, self.settings.truncation, self.settings.max_weight
         )

@@ -60,13 +60,13 @@ def load_tsdf(path: str | Path, frozen: bool = True, context: NativeContext | No
     """
     arrays = read_all_arrays(path, _CONTENT)
     settings = _settings(path, arrays)
-    dense = _checked(path, arrays, "dense", np.int32, (-1, 3))
-    free = _checked(path, arrays, "free", np.int32, (-1, 3))
+    dense = _check(path, arrays, "dense", np.int32, (-1, 3))
+    free = _check(path, arrays, "free", np.int32, (-1, 3))
     voxels = {
-        name: _checked(path, arrays, name, dtype, (len(dense), VOXELS, *tail))
+        name: _check(path, arrays, name, dtype, (len(dense), VOXELS, *tail))
         for name, (dtype, tail) in _VOXEL_ARRAYS.items()
     }
-    free_weight = _checked(path, arrays, "free_weight", np.uint16, (len(free),))
+    free_weight = _check(path, arrays, "free_weight", np.uint16, (len(free),))
     everything = np.concatenate([dense, free])
     if len(np.unique(everything, axis=0)) != len(everything):
         raise FormatError(f"{path}: not {_CONTENT} written by ggslam: a block is there twice")
@@ -87,7 +87,7 @@ def _settings(path: str | Path, arrays: dict[str, np.ndarray]) -> TsdfSettings:
         raise FormatError(f"{path}: not {_CONTENT} written by ggslam: {error}") from None
 
 
-def _checked(
+def _check(
     path: str | Path, arrays: dict[str, np.ndarray], name: str, dtype: type, shape: tuple[int, ...]
 ) -> np.ndarray:
     array = arrays.get(name)

@@ -53,7 +53,7 @@ class Voxels:
         for name, array in vars(self).items():
             array[rows] = getattr(other, name)
 
-    def joined(self, other: Voxels) -> Voxels:
+    def join(self, other: Voxels) -> Voxels:
         """Both, one after the other."""
         return Voxels(*(torch.cat([a, getattr(other, name)]) for name, a in vars(self).items()))
 
@@ -112,7 +112,7 @@ class TorchTsdf:
         weight = torch.zeros_like(keys)
         known = free_row >= 0
         weight[known] = self._free_weight[free_row[known]]
-        voxels = self._voxels[dense_row[old]].joined(Voxels.free(weight[new]))
+        voxels = self._voxels[dense_row[old]].join(Voxels.free(weight[new]))
         color_image = None if checked.color is None else torch.from_numpy(checked.color).to(self.device)
         label_image = None if checked.labels is None else torch.from_numpy(checked.labels.astype(np.int32))
         at = torch.cat([found.coordinates[old], found.coordinates[new]])
@@ -152,7 +152,7 @@ class TorchTsdf:
             self._dense, self._voxels = self._dense[stays], self._voxels[stays]
         if len(made):
             self._dense = torch.cat([self._dense, new_keys[made]])
-            self._voxels = self._voxels.joined(voxels[made + n])
+            self._voxels = self._voxels.join(voxels[made + n])
 
     def to_native(self, context: NativeContext | None = None) -> TsdfMap:
         """The same map for mesh, distance field and files."""
@@ -192,22 +192,22 @@ def _fuse(
     distance, z, pixel = _distances(at, view, s)
     scale = FULL_WEIGHT / s.max_weight
     drop = ((distance + s.truncation) / (s.truncation - s.voxel)).clamp(max=1)
-    measured = _rounded(scale / z**2 * drop).clamp(max=FULL_WEIGHT)
+    measured = _round(scale / z**2 * drop).clamp(max=FULL_WEIGHT)
     valid = (distance >= -s.truncation) & (measured >= 1)
     value, weight = voxels.value.float(), voxels.weight.float()
     behind = valid & (distance >= s.truncation)
     scaled = FREE_VALUE / s.truncation * distance
     if s.clearing > 0:
         through = behind & (weight > 0) & (value < _FREE_FROM) & (scaled - value > _SURPRISE * FREE_VALUE)
-        through &= _eroded(view.depth).flatten()[pixel] >= z + s.truncation
-        weight = torch.where(through, _rounded(weight * (1 - s.clearing)), weight)
+        through &= _erode(view.depth).flatten()[pixel] >= z + s.truncation
+        weight = torch.where(through, _round(weight * (1 - s.clearing)), weight)
     total = weight + measured
     share = measured / total
     mean = value + share * (scaled.clamp(max=FREE_VALUE) - value)
     mean = torch.where(behind & (mean >= _FREE_FROM), FREE_VALUE, mean)
     most = torch.where(mean >= FREE_VALUE, s.max_free_weight * scale, float(FULL_WEIGHT))
     grown = torch.minimum(total, torch.maximum(most, weight - measured))
-    voxels.value = torch.where(valid, _rounded(mean).int(), voxels.value)
+    voxels.value = torch.where(valid, _round(mean).int(), voxels.value)
     voxels.weight = torch.where(valid, grown.int(), voxels.weight)
     band = valid & ~behind
     if color is not None:
@@ -221,7 +221,7 @@ def _fuse(
     return band.any(1)
 
 
-def _rounded(values: Tensor) -> Tensor:
+def _round(values: Tensor) -> Tensor:
     return (values + 0.5).floor()
 
 
@@ -238,11 +238,11 @@ def _distances(at: Tensor, view: DeviceView, s: TsdfSettings) -> tuple[Tensor, T
     inside = (z > NEAR) & (u >= -0.5) & (u < c.width - 0.5) & (v >= -0.5) & (v < c.height - 0.5)
     pixel = torch.where(inside, (v + 0.5).long() * c.width + (u + 0.5).long(), 0)
     nearest = view.depth.flatten()[pixel]
-    depth = _interpolated(view, inside, u, v, nearest, s)
+    depth = _interpolate(view, inside, u, v, nearest, s)
     return torch.where(inside & (nearest > 0), depth - z, -torch.inf), safe, pixel
 
 
-def _interpolated(view: DeviceView, inside: Tensor, u: Tensor, v: Tensor, nearest: Tensor, s: TsdfSettings) -> Tensor:
+def _interpolate(view: DeviceView, inside: Tensor, u: Tensor, v: Tensor, nearest: Tensor, s: TsdfSettings) -> Tensor:
     """Depth between the four pixels around (u, v), where they are all there and differ little; else the nearest."""
     height, width = view.depth.shape
     inside = inside & (u >= 0) & (u < width - 1) & (v >= 0) & (v < height - 1)
@@ -257,7 +257,7 @@ def _interpolated(view: DeviceView, inside: Tensor, u: Tensor, v: Tensor, neares
     return torch.where(smooth, top + y * (bottom - top), nearest)
 
 
-def _eroded(depth: Tensor) -> Tensor:
+def _erode(depth: Tensor) -> Tensor:
     """Smallest depth around each pixel; infinite where there is none."""
     known = torch.where(depth > 0, depth, torch.inf)
     return -max_pool2d(-known[None, None], 2 * _EROSION + 1, stride=1, padding=_EROSION)[0, 0]

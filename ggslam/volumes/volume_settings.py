@@ -17,7 +17,7 @@ class VolumeSettings:
 
     tsdf: TsdfSettings = field(default_factory=TsdfSettings)
     esdf: FieldSettings = field(default_factory=FieldSettings)
-    occupancy: OccupancySettings = field(default_factory=OccupancySettings.raised)
+    occupancy: OccupancySettings = field(default_factory=OccupancySettings.with_raised_odds)
     esdf_every: int = setting(0, 0, 10**6, "frames")
     """The distance field is updated with every n-th frame; 0: with every one when volumes are made live or their
     latency is to be reported, else once at the end."""

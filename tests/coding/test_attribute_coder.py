@@ -11,8 +11,8 @@ import pytest
 from gpcc_reference import CoefficientDecoder, inverse_transform
 
 from ggslam.coding.attribute_syntax import AttributeParameters
-from ggslam.coding.native import SliceCoder
 from ggslam.coding.native_settings import raht_settings
+from ggslam.coding.slice_coder import SliceCoder
 
 
 def coded(

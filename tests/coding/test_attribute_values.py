@@ -8,7 +8,7 @@ import pytest
 
 from ggslam.coding import AttributeSettings, CodecSettings, decode_cloud, encode_cloud
 from ggslam.coding.attribute_values import IdTable
-from ggslam.coding.native import rgb_to_ycbcr, ycbcr_to_rgb
+from ggslam.coding.slice_coder import rgb_to_ycbcr, ycbcr_to_rgb
 from ggslam.errors import ConfigError
 
 IDS = {"id": AttributeSettings(lossless=True)}

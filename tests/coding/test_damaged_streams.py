@@ -20,9 +20,9 @@ from ggslam.coding.attribute_syntax import (
 )
 from ggslam.coding.container import HEADER, UnitType, read_units, unit_bytes
 from ggslam.coding.geometry_syntax import ALL_AXES, GeometryHeader, GeometryParameters
-from ggslam.coding.native import SliceCoder
 from ggslam.coding.native_settings import AttributePayload, CodingContext, RahtSettings
 from ggslam.coding.sequence_parameters import AttributeDescription
+from ggslam.coding.slice_coder import SliceCoder
 from ggslam.errors import FormatError
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from ggslam.coding import CodecSettings, decode_cloud, decode_slice, encode_cloud, list_slices
 from ggslam.coding.container import UnitType, read_units
-from ggslam.coding.native import SliceCoder
+from ggslam.coding.slice_coder import SliceCoder
 from ggslam.coding.stream import read_stream
 
 NAMES = [

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from kept import one_at_a_time
 
-from ggslam.cuda.compiler import KERNELS
+from ggslam.cuda.compiler import common_arguments, source_files, translation_units
 from ggslam.cuda.library import CudaLibrary
 
 EMULATION = Path(__file__).parent
@@ -36,7 +36,7 @@ def emulated_library() -> CudaLibrary:
     if compiler is None:
         pytest.skip("no g++ to compile the emulation of CUDA with")
     digest = hashlib.sha256(" ".join(FLAGS).encode())
-    for source in [*sorted(KERNELS.rglob("*.cu*")), *sorted(EMULATION.glob("*.?pp"))]:
+    for source in [*source_files(), *sorted(EMULATION.glob("*.?pp"))]:
         digest.update(source.read_bytes())
     library = KEPT / f"{digest.hexdigest()[:16]}.so"
     with one_at_a_time(library):
@@ -47,9 +47,9 @@ def emulated_library() -> CudaLibrary:
 
 
 def _compile(compiler: str, folder: Path) -> Path:
-    sources = [path for path in sorted(KERNELS.rglob("*.cu")) if path.name != "sorting.cu"]
+    sources = [path for path in translation_units() if path.name != "sorting.cu"]
     sources += [EMULATION / "fibers.cpp", EMULATION / "sorting_on_cpu.cpp"]
-    command = [compiler, *FLAGS, "-I", str(EMULATION), "-I", str(KERNELS), "-include", "cuda_on_cpu.hpp"]
+    command = [compiler, *FLAGS, "-I", str(EMULATION), *common_arguments(), "-include", "cuda_on_cpu.hpp"]
     objects = [folder / f"{source.stem}.o" for source in sources]
     running = [
         subprocess.Popen([*command, "-c", "-x", "c++", str(source), "-o", str(made)], stderr=subprocess.PIPE, text=True)

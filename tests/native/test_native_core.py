@@ -27,7 +27,9 @@ def loaded(checkout: Path) -> subprocess.CompletedProcess[str]:
 
 def test_a_checkout_takes_the_installed_core_of_its_own_sources_alone(tmp_path: Path) -> None:
     native = tmp_path / "ggslam" / "native"
-    shutil.copytree(CHECKOUT / "ggslam" / "native", native, ignore=shutil.ignore_patterns("_lib", "__pycache__"))
+    for folder in ("native", "interface"):
+        ignored = shutil.ignore_patterns("_lib", "__pycache__")
+        shutil.copytree(CHECKOUT / "ggslam" / folder, native.with_name(folder), ignore=ignored)
     for name in ("__init__.py", "errors.py"):
         shutil.copy(CHECKOUT / "ggslam" / name, tmp_path / "ggslam" / name)
     found = loaded(tmp_path)

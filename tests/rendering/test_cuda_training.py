@@ -4,7 +4,6 @@ and on a GPU where there is one."""
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +25,6 @@ from ggslam.mapping.settings import LossSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.cuda.adam import AdamStep
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import PARAMETERS, RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
@@ -257,10 +255,6 @@ def test_wrong_steps_are_refused() -> None:
     rasterizer.forward(plain, CAMERA, POSE)
     with pytest.raises(RenderError, match="without moments"):
         rasterizer.backward_step(plain, gradient, optimizer=ADAM)
-
-
-def test_structures_are_of_one_size() -> None:
-    assert emulated_library().functions.ggslam_cuda_adam_step_size() == ctypes.sizeof(AdamStep)
 
 
 # --- both together ----------------------------------------------------------------------------------------------------

@@ -130,7 +130,7 @@ def test_alignments_are_those_of_the_core(
 
 
 @pytest.mark.parametrize(
-    "change", [{"coarse_iterations": 0}, {"fine_iterations": 1}, {"coarse_points": 100}, {"min_normal_dot": -2.0}]
+    "change", [{"coarse_iterations": 0}, {"fine_iterations": 1}, {"coarse_points": 100}, {"min_normal_dot": -1.0}]
 )
 def test_every_setting_means_the_same(
     engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget,

@@ -6,10 +6,11 @@ import ctypes
 import numpy as np
 import pytest
 
-from ggslam.native.loader import NativeContext, available_instruction_sets
+from ggslam.interface.arrays import address
+from ggslam.native.loader import NativeContext, available_instruction_sets, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, se3_exp, se3_log
-from ggslam.tracking import native, reference
+from ggslam.tracking import reference
 from ggslam.tracking.gicp import (
     PLANE_VARIANCE,
     AlignmentStatus,
@@ -74,9 +75,9 @@ def kernel_linearization(
     H, b = np.empty((6, 6)), np.empty(6)
     match, squared = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
     pose = np.ascontiguousarray(T)
-    native.library().ggslam_gicp_linearize(
+    load_library().ggslam_gicp_linearize(
         context.handle, target.handle, native_points(points), ctypes.byref(native_align_settings(SETTINGS, NOISE)), 0,
-        *(native.address(a) for a in (pose, match, squared, H, b)),
+        *(address(a) for a in (pose, match, squared, H, b)),
     )  # fmt: skip
     return H, b, match
 

@@ -106,7 +106,7 @@ def test_blocks_of_one_value_collapse_and_come_back() -> None:
     assert occupancy.log_odds(middle + [0.08, 0, 0])[0] == np.float32(log_odds(0.1192))  # the rest of its block stays
 
 
-@pytest.mark.parametrize("settings", [OccupancySettings(), OccupancySettings.raised()])
+@pytest.mark.parametrize("settings", [OccupancySettings(), OccupancySettings.with_raised_odds()])
 def test_a_removed_obstacle_becomes_free_in_the_computed_number_of_scans(settings: OccupancySettings) -> None:
     occupancy = OccupancyMap(0.05, settings)
     obstacle, wall, origin = panel(1.02, 0.15), panel(2.02, 0.6), np.zeros(3)
@@ -124,7 +124,7 @@ def test_a_removed_obstacle_becomes_free_in_the_computed_number_of_scans(setting
 
 def test_raised_settings_forget_sooner() -> None:
     assert OccupancySettings().scans_until_free() == 9
-    assert OccupancySettings.raised().scans_until_free() == 5
+    assert OccupancySettings.with_raised_odds().scans_until_free() == 5
 
 
 def test_depth_images_are_back_projected() -> None:

@@ -215,7 +215,7 @@ def test_insertion_into_an_octomap_tree(quantize: bool) -> None:
 
 def test_an_octomap_tree_carries_the_settings() -> None:
     pytest.importorskip("pyoctomap")
-    settings = OccupancySettings.raised()
+    settings = OccupancySettings.with_raised_odds()
     again = pyoctomap_bridge.from_octomap(pyoctomap_bridge.to_octomap(OccupancyMap(0.1, settings))).settings
     assert [log_odds(getattr(again, name)) for name in ("probability_hit", "probability_miss")] == [
         log_odds(0.85),

@@ -173,6 +173,7 @@ def _version(distribution: str) -> str | None:
 
 
 def _core() -> Iterator[Finding]:
+    from ggslam.interface.binding import core_hash
     from ggslam.native import loader
 
     advice = "run `pip install .` or, in a checkout, `bash scripts/build_native.sh`; see the message above"
@@ -182,7 +183,7 @@ def _core() -> Iterator[Finding]:
     except (GgslamError, OSError, AttributeError) as error:
         yield Finding("core", "compiled core", "broken", str(error), advice)
         return
-    yield Finding("core", "compiled core", "ok", f"interface {loader.ABI_VERSION}, {library._name}")
+    yield Finding("core", "compiled core", "ok", f"interface {core_hash()[:12]}, {library._name}")
     chosen = " (GGSLAM_ISA)" if "GGSLAM_ISA" in os.environ else ""
     yield Finding("core", "instruction set", "ok", f"{context.instruction_set}{chosen}, of {', '.join(offered)}")
     yield Finding("core", "threads", "ok", str(context.threads))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import NativeCoreError, RenderError
+from ggslam.interface.core.mapping import ImageLossJob
 from ggslam.mapping.losses import LOSS_WEIGHTS, LossGradients, LossTarget, LossValues, RenderedImages
 from ggslam.mapping.settings import LossSettings
 from ggslam.native.loader import NativeContext, load_library
@@ -33,36 +34,19 @@ class CpuLossResult(LossGradients):
         return self.values.psnr
 
 
-class _Job(ctypes.Structure):
-    """Mirror of struct ImageLossJob in native/src/mapping/image_loss.hpp."""
-
-    _fields_ = [
-        *[(name, ctypes.c_void_p) for name in (
-            "image", "depth", "alpha", "target_color", "target_depth", "d_image", "d_depth", "d_alpha")],
-        *[(name, ctypes.c_int32) for name in (
-            "height", "width", "target_depth_is_float", "normalised_depth", "charbonnier")],
-        ("depth_scale", ctypes.c_float),
-        ("exposure", ctypes.c_float * 6),
-        *[(name, ctypes.c_float) for name in LOSS_WEIGHTS],
-        *[(name, ctypes.c_double) for name in (
-            "total", "color", "l1", "ssim", "depth_term", "opacity_term", "depth_l1_m", "psnr", "valid_pixels")],
-        ("exposure_gradient", ctypes.c_double * 6),
-    ]  # fmt: skip
-
-
 class CpuImageLoss:
     """Evaluates the loss; keeps scratch memory and gradient images between calls. One instance serves one thread.
 
     The result is the same, bit for bit, for any number of threads.
 
     Raises:
-        NativeCoreError: the compiled core does not fit this code, or memory ran out.
+        NativeCoreError: memory ran out.
     """
 
     def __init__(self, context: NativeContext) -> None:
         self._workspace: int | None = None
         self._context = context
-        self._library = _declare(load_library())
+        self._library = load_library()
         self._workspace = self._library.ggslam_image_loss_create()
         if not self._workspace:
             raise NativeCoreError("no memory for the image loss")
@@ -81,7 +65,7 @@ class CpuImageLoss:
             RenderError: an array has another shape or type than `RenderedImages` and `LossTarget` say.
         """
         height, width = _target_size(target)
-        job = _Job(height=height, width=width)
+        job = ImageLossJob(height=height, width=width)
         for name, shape in (("image", (3, height, width)), ("depth", (height, width)), ("alpha", (height, width))):
             setattr(job, name, _check_rendered(name, getattr(rendered, name), shape).data_ptr())
         color, depth = np.ascontiguousarray(target.color), np.ascontiguousarray(target.depth)
@@ -110,16 +94,6 @@ class CpuImageLoss:
                 torch.empty(3, height, width), torch.empty(height, width), torch.empty(height, width)
             )  # fmt: skip
         return self._gradients
-
-
-def _declare(library: ctypes.CDLL) -> ctypes.CDLL:
-    library.ggslam_image_loss_create.restype = ctypes.c_void_p
-    library.ggslam_image_loss_destroy.argtypes = [ctypes.c_void_p]
-    library.ggslam_image_loss_evaluate.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.POINTER(_Job)]
-    size = library.ggslam_image_loss_job_size()
-    if size != ctypes.sizeof(_Job):
-        raise NativeCoreError(f"compiled core describes a loss by {size} bytes, expected {ctypes.sizeof(_Job)}")
-    return library
 
 
 def _target_size(target: LossTarget[np.ndarray]) -> tuple[int, int]:

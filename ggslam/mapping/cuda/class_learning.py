@@ -9,40 +9,7 @@ import ctypes
 import torch
 
 from ggslam.cuda.library import CudaLibrary
-
-_pointer, _int32, _float = ctypes.c_void_p, ctypes.c_int32, ctypes.c_float
-
-
-class _PixelClassJob(ctypes.Structure):
-    """Mirror of the struct of this name in cuda/kernels/mapping/class_learning.cuh, as are those below."""
-
-    _fields_ = [
-        *[(name, _pointer) for name in (
-            "mask", "pixels", "alias", "class_of", "labels", "classes", "known", "stream")],
-        ("device", _int32), ("count", _int32),
-    ]  # fmt: skip
-
-
-class _CrossEntropyJob(ctypes.Structure):
-    _fields_ = [
-        *[(name, _pointer) for name in ("logits", "targets", "known", "losses", "stream")],
-        ("weight", _float), ("device", _int32), ("count", _int32), ("classes", _int32),
-    ]  # fmt: skip
-
-
-class _NeighbourLossJob(ctypes.Structure):
-    _fields_ = [
-        *[(name, _pointer) for name in ("logits", "gradients", "stream")],
-        ("weight", _float), *[(name, _int32) for name in ("device", "samples", "neighbours", "classes")],
-    ]  # fmt: skip
-
-
-class _ClassAdamJob(ctypes.Structure):
-    _fields_ = [
-        *[(name, _pointer) for name in (
-            "rows", "first_moments", "second_moments", "gradients", "known", "steps", "stream")],
-        ("rate", _float), ("device", _int32), ("size", ctypes.c_int64),
-    ]  # fmt: skip
+from ggslam.interface.cuda.mapping import ClassAdamJob, CrossEntropyJob, NeighbourLossJob, PixelClassJob
 
 
 class ClassKernels:
@@ -55,18 +22,12 @@ class ClassKernels:
 
     def __init__(self, device: torch.device, library: CudaLibrary) -> None:
         self.device, self.library = device, library
-        library.check_size("pixel_class_job", _PixelClassJob)
-        library.check_size("cross_entropy_job", _CrossEntropyJob)
-        library.check_size("neighbour_loss_job", _NeighbourLossJob)
-        library.check_size("class_adam_job", _ClassAdamJob)
-        for name in ("pixel_labels", "pixel_classes", "cross_entropy", "neighbour_loss", "class_adam"):
-            library.declare(name, [_pointer])
 
     def labels(self, mask: torch.Tensor, pixels: torch.Tensor, alias: torch.Tensor) -> torch.Tensor:
         """Current object ids, int32 [P], of `pixels` (int32 [P]) of a mask (uint16 [H, W]), by `alias` (int32
         [65536])."""
         labels = torch.empty_like(pixels)
-        job = _PixelClassJob(
+        job = PixelClassJob(
             mask=mask.data_ptr(), pixels=pixels.data_ptr(), alias=alias.data_ptr(), labels=labels.data_ptr()
         )
         self._call("pixel_labels", job, count=len(pixels))
@@ -77,7 +38,7 @@ class ClassKernels:
         how many have one, int32 [1]."""
         classes = torch.empty_like(labels)
         known = torch.empty(1, dtype=torch.int32, device=self.device)
-        job = _PixelClassJob(
+        job = PixelClassJob(
             class_of=class_of.data_ptr(), labels=labels.data_ptr(), classes=classes.data_ptr(), known=known.data_ptr()
         )
         self._call("pixel_classes", job, count=len(labels))
@@ -94,7 +55,7 @@ class ClassKernels:
             known: int32 [1].
             losses: float32 [P], are written.
         """
-        job = _CrossEntropyJob(
+        job = CrossEntropyJob(
             logits=logits.data_ptr(), targets=targets.data_ptr(), known=known.data_ptr(), losses=losses.data_ptr(),
             weight=weight, classes=logits.shape[1],
         )  # fmt: skip
@@ -107,7 +68,7 @@ class ClassKernels:
             logits: float32 [samples * (1 + k), C]: the samples', then sample by sample their k neighbours'.
         """
         gradients = torch.empty_like(logits)
-        job = _NeighbourLossJob(
+        job = NeighbourLossJob(
             logits=logits.data_ptr(), gradients=gradients.data_ptr(), weight=weight, samples=samples,
             neighbours=logits.shape[0] // samples - 1, classes=logits.shape[1],
         )  # fmt: skip
@@ -120,7 +81,7 @@ class ClassKernels:
     ) -> None:  # fmt: skip
         """Adam (0.9, 0.999) on float32 rows [C, F + 1]; none if `known` (int32 [1]) is 0. Counts in `steps` (int32
         [1])."""
-        job = _ClassAdamJob(
+        job = ClassAdamJob(
             rows=rows.data_ptr(), first_moments=moments[0].data_ptr(), second_moments=moments[1].data_ptr(),
             gradients=gradients.data_ptr(), known=known.data_ptr(), steps=steps.data_ptr(), rate=rate,
             size=rows.numel(),

@@ -18,31 +18,21 @@ import numpy as np
 import torch
 
 from ggslam.cuda.library import CudaLibrary, library_and_device
-from ggslam.cuda.memory import GrowingMemory, address
+from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
+from ggslam.interface.arrays import address
+from ggslam.interface.cuda.mapping import InsertionJob
 from ggslam.mapping.new_gaussians import NewGaussians
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.rendering.types import check_pose
 from ggslam.scene.camera import Camera
 
-_POINTERS = ("color", "depth", "alpha", "rendered_depth", "total", "means", "quaternions", "log_scales", "rgb",
-             "pixels", "workspace", "stream")  # fmt: skip
 _NUMBERS = ("alpha_threshold", "depth_tolerance_m", "depth_tolerance_relative", "scale_pixels", "flatness",
             "max_slope", "texture_threshold", "max_depth_m")  # fmt: skip
 _MOST_PIXELS = 1 << 29
 """Pixels and points for filling are numbered together in 31 bits."""
 
 
-class _Job(ctypes.Structure):
-    """Mirror of struct InsertionJob in cuda/kernels/mapping/insertion.cuh."""
-
-    _fields_ = [
-        *[(name, ctypes.c_void_p) for name in _POINTERS],
-        *[(name, ctypes.c_int32) for name in ("device", "height", "width", "count", "adaptive_stride", "fill_stride")],
-        *[(name, ctypes.c_float) for name in ("units_per_metre", "fx", "fy", "cx", "cy")],
-        ("rotation", ctypes.c_float * 9), ("translation", ctypes.c_float * 3),
-        *[(name, ctypes.c_float) for name in _NUMBERS],
-    ]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -54,7 +44,7 @@ class Selection:
         total: their number, int32 [1] on the device.
     """
 
-    job: _Job
+    job: InsertionJob
     total: torch.Tensor
 
 
@@ -73,10 +63,6 @@ class CudaInsertion:
 
     def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
         self.library, self.device = library_and_device(device, library)
-        self.library.check_size("insertion_job", _Job)
-        for name in ("insertion_select", "insertion_build"):
-            self.library.declare(name, [ctypes.c_void_p])
-        self.library.declare("insertion_bytes", [ctypes.c_void_p], ctypes.c_int64)
         self._memory = GrowingMemory(self.device)
         self._total = torch.empty(1, dtype=torch.int32, device=self.device)
 
@@ -96,7 +82,7 @@ class CudaInsertion:
         T_world_camera: np.ndarray,
         settings: InsertionSettings,
     ) -> Selection:
-        """Starts to choose what the map lacks: first the pixels of `new_gaussians` that are `unexplained`, then, if
+        """Starts to choose what the map lacks: first the pixels that `find_unexplained` gives `new_gaussians`, then, if
         holes are filled, those of `fill_gaussians`. Valid until the next one; the images have to stay till `build`.
 
         Args:
@@ -134,8 +120,8 @@ class CudaInsertion:
         self.library.call("insertion_build", ctypes.byref(job))
         return new
 
-    def _job(self, camera: Camera, T_world_camera: np.ndarray, settings: InsertionSettings) -> _Job:
-        job = _Job(
+    def _job(self, camera: Camera, T_world_camera: np.ndarray, settings: InsertionSettings) -> InsertionJob:
+        job = InsertionJob(
             device=self.device.index or 0, height=camera.height, width=camera.width, fx=camera.fx, fy=camera.fy,
             cx=camera.cx, cy=camera.cy, adaptive_stride=settings.adaptive_stride, fill_stride=settings.fill_stride,
         )  # fmt: skip

@@ -17,49 +17,13 @@ import torch
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.streams import let_go
 from ggslam.errors import RenderError
+from ggslam.interface.cuda.mapping import KeyframeState, KeyframeStepJob, KeyframeWriteJob
 from ggslam.mapping.losses import LossValues
 from ggslam.mapping.settings import ExposureSettings
 
 _RESULTS = torch.Size([len(LossValues.__dataclass_fields__) + 6])
 _TWIST, _FLAG = torch.Size([6]), torch.Size([1])
 _FIRST_ROOM = 64
-
-
-class _Moments(ctypes.Structure):
-    """Mirror of struct AdamMoments in cuda/kernels/mapping/keyframe_step.cuh, as the others here."""
-
-    _fields_ = [("first", ctypes.c_double * 6), ("second", ctypes.c_double * 6)]
-
-
-class _State(ctypes.Structure):
-    """Mirror of struct KeyframeState."""
-
-    _fields_ = [
-        ("pose", ctypes.c_double * 16), ("exposure", ctypes.c_double * 6),
-        ("pose_moments", _Moments), ("exposure_moments", _Moments),
-        ("pose_steps", ctypes.c_int64), ("exposure_steps", ctypes.c_int64),
-        ("pose_copy", ctypes.c_float * 12), ("exposure_copy", ctypes.c_float * 6),
-    ]  # fmt: skip
-
-
-class _StepJob(ctypes.Structure):
-    """Mirror of struct KeyframeStepJob."""
-
-    _fields_ = [
-        *[(name, ctypes.c_void_p) for name in ("state", "twist", "results", "skipped", "totals", "stream")],
-        *[(name, ctypes.c_double) for name in ("pose_rate", "exposure_rate", "exposure_regularization")],
-        ("step_exposure", ctypes.c_int32), ("device", ctypes.c_int32),
-    ]  # fmt: skip
-
-
-class _WriteJob(ctypes.Structure):
-    """Mirror of struct KeyframeWriteJob."""
-
-    _fields_ = [
-        ("state", ctypes.c_void_p), ("stream", ctypes.c_void_p),
-        ("pose", ctypes.c_double * 16), ("exposure", ctypes.c_double * 6),
-        ("is_new", ctypes.c_int32), ("device", ctypes.c_int32),
-    ]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -96,18 +60,13 @@ class KeyframeStates:
 
     def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
         self.library, self.device = library_and_device(device, library)
-        mirrors = {"keyframe_state": _State, "keyframe_step_job": _StepJob, "keyframe_write_job": _WriteJob}
-        for name, mirror in mirrors.items():
-            self.library.check_size(name, mirror)
-        for name in ("keyframe_step", "keyframe_write"):
-            self.library.declare(name, [ctypes.c_void_p])
         self._count = 0
         self._stream: torch.cuda.Stream | None = None  # that rows were written on last
         self._use(self._new_table(_FIRST_ROOM))
         self.totals = torch.zeros(6, dtype=torch.float64, device=self.device)
         """On the device, float64 [6]: the numbers of `IterationSums` in their order."""
         self.totals[4].fill_(torch.nan)
-        self._step_job = _StepJob(device=self.device.index or 0, totals=self.totals.data_ptr())
+        self._step_job = KeyframeStepJob(device=self.device.index or 0, totals=self.totals.data_ptr())
         self._changes = 0
         self._read_table: tuple[int, np.ndarray] = (-1, np.empty((0, 0), np.uint8))  # after so many changes
         self._read_sums: IterationSums | None = None
@@ -119,7 +78,7 @@ class KeyframeStates:
 
     def append(self, T_camera_world: np.ndarray, exposure: np.ndarray) -> int:
         """Adds a keyframe, for which no step was made yet; returns its number. Views of other keyframes that were
-        handed out before must not be used any more: the table may have moved.
+        handed out before are invalid afterwards: the table may have moved.
 
         Args:
             T_camera_world: [4, 4].
@@ -140,11 +99,11 @@ class KeyframeStates:
     def pose(self, i: int) -> torch.Tensor:
         """First three rows of keyframe i's T_camera_world, as the rasterizer takes them: a view, float32 [12], that
         changes with its steps; valid until the next `append`."""
-        return self._poses[self._checked_index(i)]
+        return self._poses[self._check_index(i)]
 
     def exposure(self, i: int) -> torch.Tensor:
         """Keyframe i's exposure, as the image loss takes it: a view, float32 [3, 2], as `pose`."""
-        return self._exposures[self._checked_index(i)]
+        return self._exposures[self._check_index(i)]
 
     def step(
         self,
@@ -174,9 +133,9 @@ class KeyframeStates:
         """
         job = self._step_job
         job.state = self._address(i)
-        job.twist = self._checked("twist", twist, torch.float64, _TWIST)
-        job.results = self._checked("loss_results", loss_results, torch.float64, _RESULTS)
-        job.skipped = None if skipped is None else self._checked("skipped", skipped, torch.int32, _FLAG)
+        job.twist = self._pointer_of("twist", twist, torch.float64, _TWIST)
+        job.results = self._pointer_of("loss_results", loss_results, torch.float64, _RESULTS)
+        job.skipped = None if skipped is None else self._pointer_of("skipped", skipped, torch.int32, _FLAG)
         job.pose_rate, job.step_exposure = pose_rate, exposure is not None
         if exposure is not None:
             job.exposure_rate, job.exposure_regularization = exposure.rate, exposure.regularization
@@ -192,7 +151,7 @@ class KeyframeStates:
             IndexError: no such keyframe.
             RenderError: another shape.
         """
-        self._write(self._checked_index(i), T_camera_world, None)
+        self._write(self._check_index(i), T_camera_world, None)
 
     def write_poses(self, T_camera_world: np.ndarray) -> None:
         """Sets the poses of all keyframes [K, 4, 4], as `write_pose`."""
@@ -205,11 +164,11 @@ class KeyframeStates:
 
     def read_poses(self) -> np.ndarray:
         """T_camera_world of all keyframes, float64 [K, 4, 4]. Waits for the device, unless nothing changed since."""
-        return self._read_doubles(_State.pose).reshape(-1, 4, 4)
+        return self._read_doubles(KeyframeState.pose).reshape(-1, 4, 4)
 
     def read_exposures(self) -> np.ndarray:
         """Exposures of all keyframes, float64 [K, 3, 2], as `read_poses`."""
-        return self._read_doubles(_State.exposure).reshape(-1, 3, 2)
+        return self._read_doubles(KeyframeState.exposure).reshape(-1, 3, 2)
 
     def read_sums(self) -> IterationSums:
         """The sums so far. Waits for the device, unless nothing was added since."""
@@ -221,26 +180,26 @@ class KeyframeStates:
     # --- the table ---------------------------------------------------------------------------------------------------
 
     def _new_table(self, rows: int) -> torch.Tensor:
-        return torch.empty(rows, ctypes.sizeof(_State), dtype=torch.uint8, device=self.device)
+        return torch.empty(rows, ctypes.sizeof(KeyframeState), dtype=torch.uint8, device=self.device)
 
     def _use(self, table: torch.Tensor) -> None:
         self._table = table
-        for_rasterizer, for_loss = _State.pose_copy.offset // 4, _State.exposure_copy.offset // 4
+        for_rasterizer, for_loss = KeyframeState.pose_copy.offset // 4, KeyframeState.exposure_copy.offset // 4
         numbers = table.view(torch.float32)
         self._poses = numbers[:, for_rasterizer : for_rasterizer + 12]
         self._exposures = numbers[:, for_loss : for_loss + 6].unflatten(1, (3, 2))
 
-    def _checked_index(self, i: int) -> int:
+    def _check_index(self, i: int) -> int:
         if not 0 <= i < self._count:
             raise IndexError(f"keyframe {i} of {self._count}")
         return i
 
     def _address(self, i: int) -> int:
-        return self._table.data_ptr() + self._checked_index(i) * ctypes.sizeof(_State)
+        return self._table.data_ptr() + self._check_index(i) * ctypes.sizeof(KeyframeState)
 
     def _write(self, i: int, T_camera_world: np.ndarray, exposure: np.ndarray | None) -> None:
-        job = _WriteJob(stream=self._current_stream(), device=self.device.index or 0)
-        job.state = self._table.data_ptr() + i * ctypes.sizeof(_State)
+        job = KeyframeWriteJob(stream=self._current_stream(), device=self.device.index or 0)
+        job.state = self._table.data_ptr() + i * ctypes.sizeof(KeyframeState)
         for name, array, shape in (("pose", T_camera_world, (4, 4)), ("exposure", exposure, (3, 2))):
             if array is None:
                 continue
@@ -270,7 +229,7 @@ class KeyframeStates:
             self._stream = torch.cuda.current_stream(self.device)
         return self.library.stream(self.device)
 
-    def _checked(self, name: str, tensor: torch.Tensor, dtype: torch.dtype, shape: torch.Size) -> int:
+    def _pointer_of(self, name: str, tensor: torch.Tensor, dtype: torch.dtype, shape: torch.Size) -> int:
         if tensor.dtype != dtype or tensor.shape != shape or tensor.device != self.device:
             expected, found = f"{dtype} {list(shape)} on {self.device}", f"{tensor.dtype} {list(tensor.shape)}"
             raise RenderError(f"{name}: expected {expected}, found {found} on {tensor.device}")

@@ -2,7 +2,7 @@
 """The loss of `ggslam.mapping.losses` on an NVIDIA GPU: the same values and gradients, by kernels that are only
 started here.
 
-Nothing waits for the device: the values stay there as a tensor until somebody asks for them, and the exposure is read
+Nothing waits for the device: the values stay there as a tensor until they are read, and the exposure is read
 from the device, so that it can be optimised there. Sums have a fixed order: the result repeats bit for bit.
 """
 
@@ -17,12 +17,11 @@ import torch
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
+from ggslam.interface.cuda.mapping import ImageLossJob
 from ggslam.mapping.losses import LOSS_WEIGHTS, LossGradients, LossTarget, LossValues, RenderedImages
 from ggslam.mapping.settings import LossSettings
 
 _VALUES = len(fields(LossValues))
-_POINTERS = ("image", "depth", "alpha", "target_color", "target_depth", "exposure", "d_image", "d_depth", "d_alpha",
-             "results", "workspace", "stream")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -47,17 +46,6 @@ class CudaLossResult(LossGradients):
         return LossValues(**values | {"valid_pixels": int(values["valid_pixels"])})
 
 
-class _Job(ctypes.Structure):
-    """Mirror of struct ImageLossJob in cuda/kernels/image_loss.cuh."""
-
-    _fields_ = [
-        *[(name, ctypes.c_void_p) for name in _POINTERS],
-        *[(name, ctypes.c_int32) for name in (
-            "device", "height", "width", "target_depth_is_float", "normalised_depth", "charbonnier")],
-        *[(name, ctypes.c_float) for name in ("depth_scale", *LOSS_WEIGHTS)],
-    ]  # fmt: skip
-
-
 class CudaImageLoss:
     """Evaluates the loss on torch's current stream; keeps scratch memory and gradient images between calls. One
     instance serves one caller and one stream at a time.
@@ -73,9 +61,6 @@ class CudaImageLoss:
 
     def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
         self.library, self.device = library_and_device(device, library)
-        self.library.check_size("image_loss_job", _Job)
-        self.library.declare("image_loss", [ctypes.c_void_p])
-        self.library.declare("image_loss_bytes", [ctypes.c_void_p], ctypes.c_int64)
         self._memory = GrowingMemory(self.device)
         self._results = torch.empty(_VALUES + 6, dtype=torch.float64, device=self.device)
         self._gradients = self._new_gradients(0, 0)
@@ -89,7 +74,7 @@ class CudaImageLoss:
             RenderError: an array has another shape, type or device than `RenderedImages` and `LossTarget` say.
         """
         height, width = self._target_size(target)
-        job = _Job(height=height, width=width, device=self.device.index or 0, depth_scale=target.depth_scale)
+        job = ImageLossJob(height=height, width=width, device=self.device.index or 0, depth_scale=target.depth_scale)
         for name, shape in (("image", (3, height, width)), ("depth", (height, width)), ("alpha", (height, width))):
             tensor = getattr(rendered, name)
             self._check(f"rendered {name}", tensor, (torch.float32,), shape)

@@ -5,24 +5,15 @@
 from __future__ import annotations
 
 import ctypes
-from functools import lru_cache
 
 import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
+from ggslam.interface.cuda.mapping import MOST_NEIGHBOURS, NeighbourJob
 
 _DISTANCES_AT_ONCE = 1 << 24
 """Distances that the search for many neighbours keeps at a time."""
-
-
-class _Job(ctypes.Structure):
-    """Mirror of struct NeighbourJob in cuda/kernels/mapping/neighbours.cuh."""
-
-    _fields_ = [
-        *[(name, ctypes.c_void_p) for name in ("points", "rows", "neighbours", "workspace", "stream")],
-        *[(name, ctypes.c_int32) for name in ("device", "point_count", "row_count", "k")],
-    ]
 
 
 def cuda_neighbours(points: torch.Tensor, rows: torch.Tensor, k: int, library: CudaLibrary) -> torch.Tensor:
@@ -43,17 +34,15 @@ def cuda_neighbours(points: torch.Tensor, rows: torch.Tensor, k: int, library: C
 
     Raises:
         RenderError: an array has another shape, type or device.
-        NativeCoreError: the compiled kernels do not fit this code.
     """
-    most = _prepare(library)
     _check(points, rows, library)
     k = max(0, min(k, points.shape[0] - 1))
     if k == 0 or rows.shape[0] == 0:
         return torch.empty(rows.shape[0], k, dtype=torch.int64, device=points.device)
     rows = rows.to(torch.int64).contiguous()
-    if k > most:
+    if k > MOST_NEIGHBOURS:
         return _by_sorting(points, rows, k)
-    job = _Job(device=points.device.index or 0, point_count=points.shape[0], row_count=rows.shape[0], k=k)
+    job = NeighbourJob(device=points.device.index or 0, point_count=points.shape[0], row_count=rows.shape[0], k=k)
     found = torch.empty(rows.shape[0], k, dtype=torch.int64, device=points.device)
     size = library.functions.ggslam_cuda_neighbours_bytes(ctypes.byref(job))
     workspace = torch.empty(size, dtype=torch.uint8, device=points.device)
@@ -61,15 +50,6 @@ def cuda_neighbours(points: torch.Tensor, rows: torch.Tensor, k: int, library: C
     job.workspace, job.stream = workspace.data_ptr(), library.stream(points.device)
     library.call("neighbours", ctypes.byref(job))
     return found
-
-
-@lru_cache(maxsize=8)
-def _prepare(library: CudaLibrary) -> int:
-    """Declares the functions; returns the most neighbours that the kernels find."""
-    library.check_size("neighbour_job", _Job)
-    library.declare("neighbours", [ctypes.c_void_p])
-    library.declare("neighbours_bytes", [ctypes.c_void_p], ctypes.c_int64)
-    return library.functions.ggslam_cuda_most_neighbours()
 
 
 def _check(points: torch.Tensor, rows: torch.Tensor, library: CudaLibrary) -> None:

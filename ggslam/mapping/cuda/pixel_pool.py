@@ -10,21 +10,10 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
+from ggslam.interface.cuda.mapping import PixelPoolJob
 from ggslam.mapping.identity import IDS
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
-
-_POINTERS = ("mask", "alias", "counts", "per_pixel", "odds", "sums", "random", "pixels", "vote_weights", "stream")
-
-
-class _Job(ctypes.Structure):
-    """Mirror of struct PixelPoolJob in cuda/kernels/mapping/pixel_pool.cuh."""
-
-    _fields_ = [
-        *[(name, ctypes.c_void_p) for name in _POINTERS],
-        *[(name, ctypes.c_double) for name in ("balance", "boundary")],
-        *[(name, ctypes.c_int32) for name in ("device", "height", "width", "drawn")],
-    ]  # fmt: skip
 
 
 class PixelDrawer:
@@ -39,9 +28,6 @@ class PixelDrawer:
 
     def __init__(self, device: torch.device, library: CudaLibrary, seed: int) -> None:
         self._device, self._library = device, library
-        library.check_size("pixel_pool_job", _Job)
-        for name in ("pixel_odds", "draw_pixels"):
-            library.declare(name, [ctypes.c_void_p])
         self.generator = torch.Generator(device).manual_seed(seed)
         """What random numbers come from."""
         self._counts = torch.empty(2, IDS, dtype=torch.int32, device=device)
@@ -70,7 +56,7 @@ class PixelDrawer:
         pixels = torch.empty(wanted, dtype=torch.int32, device=self._device)
         weights = torch.empty(wanted, dtype=torch.float32, device=self._device)
         random = torch.rand(wanted, generator=self.generator, dtype=torch.float64, device=self._device)
-        job = _Job(
+        job = PixelPoolJob(
             mask=mask.data_ptr(), alias=alias.data_ptr(), counts=self._counts.data_ptr(),
             per_pixel=self._per_pixel.data_ptr(), odds=odds.data_ptr(), random=random.data_ptr(),
             pixels=pixels.data_ptr(), vote_weights=weights.data_ptr(), stream=self._library.stream(self._device),

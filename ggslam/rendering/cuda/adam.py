@@ -3,31 +3,17 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 
 import torch
 
 from ggslam.errors import RenderError
-from ggslam.rendering import _native
-from ggslam.rendering._native import ADAM_GROUPS, pointer
-from ggslam.rendering.adam import AdamSettings
+from ggslam.interface.arrays import address
+from ggslam.interface.core.rendering import AdamArrays
+from ggslam.interface.cuda.rendering import AdamStep
+from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.cuda.finished import MapState
-from ggslam.rendering.types import PARAMETERS
 from ggslam.scene.gaussian_map import GaussianMap
-
-
-class AdamStep(ctypes.Structure):
-    """Mirror of struct AdamStep in kernels/adam.cuh."""
-
-    _fields_ = [
-        *((name, _native.AdamArrays) for name in PARAMETERS),
-        ("updates", ctypes.c_void_p),
-        ("rates", ctypes.c_float * len(ADAM_GROUPS)),
-        ("decayed_groups", ctypes.c_int32),
-        *((name, ctypes.c_float) for name in (
-            "log_decay", "decay_floor", "beta1", "beta2", "log_beta1", "log_beta2", "epsilon")),
-    ]  # fmt: skip
 
 
 class AdamSteps:
@@ -59,9 +45,9 @@ class AdamSteps:
         return self._step
 
     def _point_to(self, gaussians: GaussianMap) -> None:
-        self._step.updates = pointer(gaussians.updates)
+        self._step.updates = address(gaussians.updates)
         for name, (first, second) in gaussians.moments.items():
-            arrays = _native.AdamArrays(pointer(getattr(gaussians, name)), pointer(first), pointer(second))
+            arrays = AdamArrays(address(getattr(gaussians, name)), address(first), address(second))
             setattr(self._step, name, arrays)
 
 

@@ -11,9 +11,9 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.rendering import _native
-from ggslam.rendering._native import pointer
-from ggslam.rendering.cuda.contract import Rendering, Sizes
+from ggslam.interface.arrays import address
+from ggslam.interface.core import rendering as structures
+from ggslam.interface.cuda.rendering import Rendering, Sizes
 from ggslam.rendering.types import GaussianTensors, RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -125,7 +125,7 @@ class FinishedRendering:
     def use(self, name: str, block: torch.Tensor) -> None:
         """Lets the rendering work in this block, one of Rendering's workspaces."""
         self.memory[name] = block
-        setattr(self.native, name, pointer(block))
+        setattr(self.native, name, address(block))
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class MapState:
         return MapState(weakref.ref(gaussians), gaussians.version, gaussians.allocations)
 
 
-def target_pointers(buffers: RenderBuffers) -> _native.RenderTargets:
+def target_pointers(buffers: RenderBuffers) -> structures.RenderTargets:
     """Addresses of the images."""
-    names = [field_[0] for field_ in _native.RenderTargets._fields_]
-    return _native.RenderTargets(**{name: pointer(getattr(buffers, name)) for name in names})
+    names = [field_[0] for field_ in structures.RenderTargets._fields_]
+    return structures.RenderTargets(**{name: address(getattr(buffers, name)) for name in names})

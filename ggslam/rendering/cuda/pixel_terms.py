@@ -10,56 +10,19 @@ from __future__ import annotations
 import ctypes
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.rendering import _native
-from ggslam.rendering._native import pointer
-from ggslam.rendering.cuda.adam import AdamStep
-from ggslam.rendering.cuda.contract import Rendering
+from ggslam.interface.arrays import address
+from ggslam.interface.core.rendering import AdamArrays
+from ggslam.interface.cuda.rendering import AdamStep, PixelTerms, Rendering, TermsByGaussian
+from ggslam.rendering.adam import ADAM_GROUPS
 from ggslam.rendering.pixel_terms import MAX_CHANNELS, FeatureAdamSettings
 from ggslam.scene.gaussian_map import VOTE_SLOTS, GaussianMap
 
 _MAX_PLACES = 2**31 - 1
-_pointer, _int32, _int64, _float = ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float
-
-
-class _Terms(ctypes.Structure):
-    """Mirror of struct PixelTerms in cuda/kernels/rendering/pixel_terms.cuh."""
-
-    _fields_ = [
-        ("pixels", _int64), ("gaussians", _pointer), ("weights", _pointer), ("counts", _pointer), ("stream", _pointer),
-        ("capacity", _int32), ("device", _int32),
-    ]  # fmt: skip
-
-
-class _TermsByGaussian(ctypes.Structure):
-    """Mirror of struct TermsByGaussian there."""
-
-    _fields_ = [("gaussians", _pointer), ("places", _pointer), ("size", _int64), ("count", _int64)]
-
-
-@lru_cache(maxsize=8)
-def _declare(library: CudaLibrary) -> CudaLibrary:
-    library.check_size("pixel_terms", _Terms)
-    library.check_size("terms_by_gaussian", _TermsByGaussian)
-    arguments: dict[str, list[type]] = {
-        "collect": [_pointer] * 3 + [_float],
-        "of_gaussians": [_pointer] * 2,
-        "blend": [_pointer, _pointer, _int64, ctypes.c_int, _pointer],
-        "label": [_pointer, _pointer, _int64, _pointer, _pointer],
-        "sort": [_pointer] * 3,
-        "step": [_pointer, _pointer, _pointer, ctypes.c_int, _pointer],
-        "vote": [_pointer, _pointer, _pointer, _pointer, _int64, _pointer, _pointer],
-        "sum": [_pointer] * 4,
-    }
-    for name, types in arguments.items():
-        library.declare(f"terms_{name}", types)
-    library.declare("terms_sorting_bytes", [_int64], _int64)
-    return library
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +58,7 @@ class CudaPixelTerms:
             torch.empty(pixels, capacity, dtype=torch.int32, device=device),
             torch.empty(pixels, capacity, dtype=torch.float32, device=device),
             torch.empty(pixels, dtype=torch.int32, device=device),
-            _declare(library),
+            library,
         )
 
     @staticmethod
@@ -103,7 +66,7 @@ class CudaPixelTerms:
         """Pseudo-pixels that show one Gaussian each, with weight 1: `rows` [M], integers on the device."""
         terms = CudaPixelTerms.empty(len(rows), capacity, library, rows.device)
         rows = rows.to(torch.int32).contiguous()
-        terms._call("of_gaussians", pointer(rows))
+        terms._call("of_gaussians", address(rows))
         return terms
 
     @staticmethod
@@ -116,7 +79,7 @@ class CudaPixelTerms:
                 f"pixels: expected a contiguous torch.int32 [P], found {pixels.dtype} {list(pixels.shape)}"
             )
         terms = CudaPixelTerms.empty(len(pixels), capacity, library, pixels.device)
-        terms._call("collect", rendering, pointer(pixels), min_weight)
+        terms._call("collect", rendering, address(pixels), min_weight)
         return terms
 
     def append(self, other: CudaPixelTerms) -> CudaPixelTerms:
@@ -151,7 +114,7 @@ class CudaPixelTerms:
         """Rendered features, float32 [P, F]."""
         channels = self._checked_channels(gaussians)
         out = torch.empty(len(self), channels, dtype=torch.float32, device=self.device)
-        self._call("blend", pointer(gaussians.features), len(gaussians), channels, pointer(out))
+        self._call("blend", address(gaussians.features), len(gaussians), channels, address(out))
         return out
 
     def labels(self, gaussian_labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -163,7 +126,7 @@ class CudaPixelTerms:
         self._check("gaussian_labels", gaussian_labels, torch.int32, (len(gaussian_labels),))
         ids = torch.empty(len(self), dtype=torch.int32, device=self.device)
         shares = torch.empty(len(self), dtype=torch.float32, device=self.device)
-        self._call("label", pointer(gaussian_labels), len(gaussian_labels), pointer(ids), pointer(shares))
+        self._call("label", address(gaussian_labels), len(gaussian_labels), address(ids), address(shares))
         return ids, shares
 
     # --- at the Gaussians --------------------------------------------------------------------------------------------
@@ -184,7 +147,7 @@ class CudaPixelTerms:
         if not gaussians.moments:
             raise RenderError("step: the map was made without moments")
         adam = _adam_step(gaussians, optimizer)
-        self._call("step", self._by_gaussian(len(gaussians)), pointer(gradient), channels, adam)
+        self._call("step", self._by_gaussian(len(gaussians)), address(gradient), channels, adam)
 
     def vote(self, gaussians: GaussianMap, labels: torch.Tensor, pixel_weights: torch.Tensor | None = None) -> None:
         """Adds the pixels' weights to the votes of their Gaussians.
@@ -204,8 +167,8 @@ class CudaPixelTerms:
         if pixel_weights is not None:
             self._check("pixel_weights", pixel_weights, torch.float32, (labelled,))
         self._call(
-            "vote", self._by_gaussian(len(gaussians)), pointer(labels), pointer(pixel_weights), labelled,
-            pointer(gaussians.vote_ids), pointer(gaussians.vote_weights),
+            "vote", self._by_gaussian(len(gaussians)), address(labels), address(pixel_weights), labelled,
+            address(gaussians.vote_ids), address(gaussians.vote_weights),
         )  # fmt: skip
 
     def weight_sums(self, count: int, pixel_weights: torch.Tensor | None = None) -> torch.Tensor:
@@ -218,32 +181,32 @@ class CudaPixelTerms:
         if pixel_weights is not None:
             self._check("pixel_weights", pixel_weights, torch.float32, (len(self),))
         sums = torch.zeros(count, dtype=torch.float32, device=self.device)
-        self._call("sum", self._by_gaussian(count), pointer(pixel_weights), pointer(sums))
+        self._call("sum", self._by_gaussian(count), address(pixel_weights), address(sums))
         return sums
 
     # --- the C interface ---------------------------------------------------------------------------------------------
 
     def _call(self, name: str, *arguments: object) -> None:
         """Calls ggslam_cuda_terms_<name> for these terms; structures are passed by their address."""
-        terms = _Terms(
-            len(self), pointer(self.gaussians), pointer(self.weights), pointer(self.counts),
+        terms = PixelTerms(
+            len(self), address(self.gaussians), address(self.weights), address(self.counts),
             self.library.stream(self.device), self.capacity, self.device.index or 0,
         )  # fmt: skip
         given = [ctypes.byref(value) if isinstance(value, ctypes.Structure) else value for value in arguments]
         self.library.call(f"terms_{name}", ctypes.byref(terms), *given)
 
-    def _by_gaussian(self, count: int) -> _TermsByGaussian:
+    def _by_gaussian(self, count: int) -> TermsByGaussian:
         """The terms of a map of `count` Gaussians sorted by Gaussian; sorted once, for all that use them."""
         size = len(self) * self.capacity
         known = count in self._sorted
         if not known:
             self._sorted[count] = [torch.empty(size, dtype=torch.int32, device=self.device) for _ in range(2)]
         rows, places = self._sorted[count]
-        by_gaussian = _TermsByGaussian(pointer(rows), pointer(places), size, count)
+        by_gaussian = TermsByGaussian(address(rows), address(places), size, count)
         if not known:
             room = self.library.functions.ggslam_cuda_terms_sorting_bytes(size)
             workspace = torch.empty(room, dtype=torch.uint8, device=self.device)
-            self._call("sort", by_gaussian, pointer(workspace))
+            self._call("sort", by_gaussian, address(workspace))
         return by_gaussian
 
     def _check(self, name: str, tensor: torch.Tensor, dtype: torch.dtype, shape: tuple[int, ...]) -> None:
@@ -270,10 +233,10 @@ def _adam_step(gaussians: GaussianMap, optimizer: FeatureAdamSettings) -> AdamSt
 
     first, second = gaussians.moments["features"]
     step = AdamStep(
-        features=_native.AdamArrays(pointer(gaussians.features), pointer(first), pointer(second)),
-        updates=pointer(gaussians.feature_updates), decayed_groups=0, log_decay=0.0, decay_floor=1.0,
+        features=AdamArrays(address(gaussians.features), address(first), address(second)),
+        updates=address(gaussians.feature_updates), decayed_groups=0, log_decay=0.0, decay_floor=1.0,
         beta1=optimizer.beta1, beta2=optimizer.beta2, log_beta1=logarithm(optimizer.beta1),
         log_beta2=logarithm(optimizer.beta2), epsilon=optimizer.epsilon,
     )  # fmt: skip
-    step.rates[_native.ADAM_GROUPS.index("features")] = optimizer.rate
+    step.rates[ADAM_GROUPS.index("features")] = optimizer.rate
     return step

@@ -6,8 +6,8 @@ number of pairs of a Gaussian and an image tile has to be known to have made roo
 before that, with the room that the last rendering needed and some more, and repeated in the rare case that it was not
 enough; so the device does not idle while the host waits.
 
-With `waits=False` the host does not wait at all. The room is made by what earlier renderings needed, and a rendering
-for which it does not suffice is told and counted on the device: what was to be learned from it has to be repeated.
+With `waits=False` the host does not wait at all. Room is made by what earlier renderings needed; a rendering that
+overflows it is flagged and counted on the device, and the training step on it has to be repeated.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ import torch
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
-from ggslam.rendering import _native
-from ggslam.rendering._native import pointer
+from ggslam.interface.arrays import address
+from ggslam.interface.core import rendering as structures
+from ggslam.interface.cuda.rendering import AdamStep, Rendering, Sizes
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.arguments import (
     camera_view,
@@ -33,10 +34,9 @@ from ggslam.rendering.arguments import (
     gaussian_arrays,
     image_buffers,
     image_gradients,
-    native_view,
+    posed_view,
 )
-from ggslam.rendering.cuda.adam import AdamStep, AdamSteps
-from ggslam.rendering.cuda.contract import Rendering, Sizes, declare_rasterizer
+from ggslam.rendering.cuda.adam import AdamSteps
 from ggslam.rendering.cuda.finished import Counter, FinishedRendering, MapState, target_pointers
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.types import (
@@ -66,7 +66,7 @@ class CudaGradients(ParameterGradients):
 
 @dataclass
 class CudaStepResult:
-    """`StepResult` on the device.
+    """`CpuStepResult` on the device.
 
     Attributes:
         twist: float64 [6] tensor on the device, the pose gradient, as in `CudaGradients`.
@@ -116,7 +116,6 @@ class CudaRasterizer:
         self.near_plane = near_plane
         self.low_pass = low_pass
         self.library, self.device = library_and_device(device, library)
-        declare_rasterizer(self.library)
         self.waits = waits
         self.last_overflowed = torch.zeros(1, dtype=torch.int32, device=self.device)
         self.overflows = torch.zeros(1, dtype=torch.int64, device=self.device)
@@ -174,11 +173,11 @@ class CudaRasterizer:
             check_tensor("T_camera_world", T_camera_world, self.device, _POSE_SHAPE)
             pose, view = T_camera_world, camera_view(camera, self.near_plane, self.low_pass)
         else:
-            pose, view = None, native_view(camera, T_camera_world, self.near_plane, self.low_pass)
+            pose, view = None, posed_view(camera, T_camera_world, self.near_plane, self.low_pass)
         channels = arrays.feature_channels if arrays.render_features else 0
         buffers = image_buffers(images, camera, channels, median_depth, self.device)
         stream, index = self.library.stream(self.device), self.device.index or 0
-        native = Rendering(arrays, view, pointer(pose), target_pointers(buffers), stream=stream, device=index)
+        native = Rendering(arrays, view, address(pose), target_pointers(buffers), stream=stream, device=index)
         native.overflowed = self.last_overflowed.data_ptr()
         native.overflows = None if self.waits else self.overflows.data_ptr()
         rendering = FinishedRendering(parameters, buffers, native, pose)
@@ -270,7 +269,7 @@ class CudaRasterizer:
         last = self._require_last()
         grads = (grad_image, grad_depth, grad_alpha, grad_features)
         twist, touched = self._twist_and_touched(last)
-        out = _native.GaussianGradients(twist=pointer(twist), touched=pointer(touched))
+        out = structures.GaussianGradients(twist=address(twist), touched=address(touched))
         self._differentiate(last, grads, self._memory, False, out)
         return twist
 
@@ -290,11 +289,11 @@ class CudaRasterizer:
         last = self._require_last()
         if last.source != MapState.of(map):
             for name in PARAMETERS:
-                if (pointer(getattr(map, name)) or None) != getattr(last.native.gaussians, name):
+                if (address(getattr(map, name)) or None) != getattr(last.native.gaussians, name):
                     raise RenderError(f"backward_step: the map's {name} are not those that were rendered last")
         adam = self._adam_steps.make(map, optimizer, self.device)
         twist, touched = self._twist_and_touched(last)
-        out = _native.GaussianGradients(twist=pointer(twist), touched=pointer(touched))
+        out = structures.GaussianGradients(twist=address(twist), touched=address(touched))
         grads = (grad_image, grad_depth, grad_alpha, grad_features)
         self._differentiate(last, grads, self._memory, detach_features, out, adam)
         self._last = None  # the parameters change now, so there is nothing left to differentiate
@@ -317,8 +316,8 @@ class CudaRasterizer:
         names = PARAMETERS if rendering.buffers.features is not None else PARAMETERS[:-1]
         arrays: dict[str, Any] = {name: torch.empty_like(getattr(rendering.parameters, name)) for name in names}
         twist, touched = self._twist_and_touched(rendering)
-        out = _native.GaussianGradients(
-            **{name: pointer(array) for name, array in arrays.items()}, twist=pointer(twist), touched=pointer(touched)
+        out = structures.GaussianGradients(
+            **{name: address(array) for name, array in arrays.items()}, twist=address(twist), touched=address(touched)
         )
         self._differentiate(rendering, grads, memory, detach_features, out)
         arrays.setdefault("features", None)
@@ -335,7 +334,7 @@ class CudaRasterizer:
         grads: tuple[torch.Tensor | None, ...],
         memory: GrowingMemory,
         detach_features: bool,
-        out: _native.GaussianGradients,
+        out: structures.GaussianGradients,
         adam: AdamStep | None = None,
     ) -> None:
         gradients = image_gradients(rendering.buffers, grads, detach_features, self.device)
@@ -343,7 +342,7 @@ class CudaRasterizer:
         rows = memory.block("gradients", rendering.gradient_bytes)
         arguments = [ctypes.byref(value) for value in (rendering.native, gradients, out)]
         step = None if adam is None else ctypes.byref(adam)
-        self.library.call("backward", *arguments, step, pointer(rows))
+        self.library.call("backward", *arguments, step, address(rows))
 
     # --- checks ------------------------------------------------------------------------------------------------------
 

@@ -234,7 +234,7 @@ class RealSenseCamera:
         self.name, self.camera = "realsense", self._geometry.camera
 
     def frames(self) -> Iterator[Frame]:
-        """The newest frame whenever one is asked for; frames that nobody waited for are passed over."""
+        """Yields the newest frame on each request; frames that arrive in between are dropped."""
         for index, (time, color, depth) in enumerate(self._pairs):
             metres = depth.astype(np.float32) / np.float32(self._device.depth_scale)
             yield Frame(

@@ -36,7 +36,7 @@ LARGEST_IMAGE = 64_000_000
 
 
 class Record3DFormat:
-    """Nothing is unpacked to disk."""
+    """Reads images straight from the archive; unpacks nothing to disk."""
 
     name = "record3d"
     layout = "one file .r3d of the app Record3D"

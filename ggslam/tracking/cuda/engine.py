@@ -21,10 +21,9 @@ import torch
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.cuda.transfers import Download, Upload
+from ggslam.interface.core import tracking as structures
+from ggslam.interface.cuda.tracking import AlignJob, AlignResult, DepthPointsJob
 from ggslam.scene.camera import Camera
-from ggslam.tracking import native
-from ggslam.tracking.cuda import contract
-from ggslam.tracking.cuda.contract import AlignJob, DepthPointsJob, declare_tracking
 from ggslam.tracking.cuda.points import CudaPoints
 from ggslam.tracking.cuda.results import cuda_alignment
 from ggslam.tracking.cuda.target import CudaTarget
@@ -51,13 +50,12 @@ class CudaTrackingEngine:
         self, camera: Camera, device: torch.device | str | None = None, library: CudaLibrary | None = None
     ) -> None:
         self.library, self.device = library_and_device(device, library)
-        declare_tracking(self.library)
         self.camera = camera
         self._memory = GrowingMemory(self.device)
         self._target = CudaTarget(self.library, self.device)
         self._depth = torch.empty(4 * camera.width * camera.height, dtype=torch.uint8, device=self.device)
         self._depth_upload, self._grey_upload, self._reference_upload = (Upload(self.device) for _ in range(3))
-        self._results = Download(contract.RESULTS, self.device)
+        self._results = Download(AlignResult.ALIGN_RESULTS, self.device)
         self._workspace = torch.zeros(0, dtype=torch.uint8, device=self.device)
         self._reference: weakref.ref[PhotometricReference] | None = None
 
@@ -117,7 +115,7 @@ class CudaTrackingEngine:
         self.library.call("align", ctypes.byref(job))
         source.send()  # some hundred kilobytes, so that a keyframe has them without another wait
         found = self._results.wait()
-        source.settle(int(found[contract.POINT_COUNT]), float(found[contract.MEDIAN_DEPTH]))
+        source.settle(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
         return cuda_alignment(found, matched, settings)
 
     def _aligning_memory(self, job: AlignJob) -> torch.Tensor:
@@ -134,7 +132,7 @@ class CudaTrackingEngine:
         staged[: 3 * count], staged[3 * count :] = part.points.points.ravel(), part.points.intensity
         points = self._memory.block("grey points", 16 * count)
         self._grey_upload.send(points[: 16 * count])
-        job.photometric_points = native.PhotometricPoints(points.data_ptr(), points.data_ptr() + 12 * count, count)
+        job.photometric_points = structures.PhotometricPoints(points.data_ptr(), points.data_ptr() + 12 * count, count)
         reference = part.reference
         pixels = self._memory.block("reference", reference.pixels.nbytes)
         if self._reference is None or self._reference() is not reference:

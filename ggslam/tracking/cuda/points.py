@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from ctypes import sizeof
 from itertools import accumulate
 
 import numpy as np
 import torch
 
-from ggslam.tracking.cuda.contract import HEADER_BYTES, PointArrays
+from ggslam.interface.cuda.tracking import PointArrays, PointsHeader
 from ggslam.tracking.points import FramePoints
 
 _ROWS = {"points": 3, "normals": 3, "covariances": 6, "pixels": 2, "weights": 1}
@@ -77,7 +78,7 @@ class CudaPoints:
 
     def _known_header(self) -> tuple[int, float]:
         if self._header is None:
-            self.settle(*self._header_of(self._block[: HEADER_BYTES // 4].cpu().numpy()))
+            self.settle(*self._header_of(self._block[: sizeof(PointsHeader) // 4].cpu().numpy()))
         assert self._header is not None
         return self._header
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ggslam.tracking.cuda import contract
+from ggslam.interface.cuda.tracking import AlignResult
 from ggslam.tracking.gicp import AlignmentResult, PointMatches, judge
 from ggslam.tracking.observability import PointSpread, about_point
 from ggslam.tracking.settings import AlignSettings
@@ -41,20 +41,22 @@ def cuda_alignment(found: np.ndarray, matched: torch.Tensor, settings: AlignSett
     """An alignment from what the kernels say.
 
     Args:
-        found: float64 [RESULTS], see `contract`.
+        found: float64 [ALIGN_RESULTS], see `AlignResult`.
         matched: float32 [2, room] on the device, bits of the matches and squared distances.
         settings: that it was made with.
     """
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = found[contract.POSE][:9].reshape(3, 3), found[contract.POSE][9:]
-    information = found[contract.INFORMATION][_PLACES]
-    spread = PointSpread(float(found[contract.SPREAD_TOTAL]), found[contract.CENTROID], float(found[contract.RADIUS]))
-    usable = bool(found[contract.USABLE])
+    T[:3, :3], T[:3, 3] = found[AlignResult.POSE :][:9].reshape(3, 3), found[AlignResult.POSE :][9:12]
+    information = found[AlignResult.INFORMATION :][_PLACES]
+    centroid = found[AlignResult.CENTROID : AlignResult.RADIUS]
+    spread = PointSpread(float(found[AlignResult.SPREAD_TOTAL]), centroid, float(found[AlignResult.RADIUS]))
+    usable = bool(found[AlignResult.USABLE])
     status, visibility, weak = judge(information, T[:3, :3], spread, usable, settings.degenerate_below)
     return AlignmentResult(
-        T, status, bool(found[contract.CONVERGED]),
-        int(found[contract.COARSE_ITERATIONS] + found[contract.FINE_ITERATIONS]), float(found[contract.OVERLAP]),
-        float(found[contract.RMSE]), about_point(information, T[:3, 3]), information, visibility, weak,
-        CudaMatches(matched, int(found[contract.POINT_COUNT])), float(found[contract.COST]),
-        float(found[contract.RESIDUAL]), float(found[contract.SHARE]),
+        T, status, bool(found[AlignResult.CONVERGED]),
+        int(found[AlignResult.COARSE_ITERATIONS] + found[AlignResult.FINE_ITERATIONS]),
+        float(found[AlignResult.OVERLAP]), float(found[AlignResult.RMSE]), about_point(information, T[:3, 3]),
+        information, visibility, weak, CudaMatches(matched, int(found[AlignResult.POINT_COUNT])),
+        float(found[AlignResult.COST]), float(found[AlignResult.PHOTOMETRIC_RESIDUAL]),
+        float(found[AlignResult.PHOTOMETRIC_SHARE]),
     )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ctypes
 import weakref
+from ctypes import sizeof
 
 import numpy as np
 import torch
@@ -12,8 +13,9 @@ import torch
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.cuda.transfers import Upload
-from ggslam.tracking import native
-from ggslam.tracking.cuda.contract import BLOCK_BYTES, MOMENT_BYTES, SLOT_BYTES, VOXEL_BYTES, VoxelLevel, VoxelLevelJob
+from ggslam.interface.arrays import address
+from ggslam.interface.cuda.tracking import Voxel, VoxelBlock, VoxelLevel, VoxelLevelJob, VoxelMoments, VoxelSlot
+from ggslam.native.loader import load_library
 from ggslam.tracking.gicp import GicpTarget
 
 _PLACES_PER_BLOCK = 4
@@ -30,7 +32,7 @@ class CudaTarget:
 
     def __init__(self, library: CudaLibrary, device: torch.device) -> None:
         self._library, self._device = library, device
-        self._core = native.library()
+        self._core = load_library()
         self._memory = GrowingMemory(device)
         self._upload = Upload(device)
         self._target: weakref.ref[GicpTarget] | None = None
@@ -40,20 +42,20 @@ class CudaTarget:
         """Fine and coarse voxels of the target, valid until another one is asked for."""
         if self._levels is None or self._target is None or self._target() is not target:
             self._levels = None
-            self._levels = self._sent(target)
+            self._levels = self._send(target)
             self._target = weakref.ref(target)
         return self._levels
 
-    def _sent(self, target: GicpTarget) -> tuple[VoxelLevel, VoxelLevel]:
+    def _send(self, target: GicpTarget) -> tuple[VoxelLevel, VoxelLevel]:
         """Sends blocks and voxels of both levels; of voxels without shapes the moments, for the device to finish."""
-        core, handle, settings = self._core, target.gathered, target.settings_to_finish
-        copy, size = core.ggslam_gicp_target_voxels, VOXEL_BYTES
+        core, handle, settings = self._core, target.gathered_handle, target.settings_to_finish
+        copy, size = core.ggslam_gicp_target_voxels, sizeof(Voxel)
         if settings is not None:
-            copy, size = core.ggslam_gicp_target_moments, MOMENT_BYTES
+            copy, size = core.ggslam_gicp_target_moments, sizeof(VoxelMoments)
         voxels = [core.ggslam_gicp_target_size(handle, level) for level in (0, 1)]
         blocks = [core.ggslam_gicp_target_blocks(handle, level, None) for level in (0, 1)]
-        begins = np.cumsum([0, *(size * n for n in voxels), *(BLOCK_BYTES * n for n in blocks)]).tolist()
-        host = native.address(self._upload.begin(begins[-1]))
+        begins = np.cumsum([0, *(size * n for n in voxels), *(sizeof(VoxelBlock) * n for n in blocks)]).tolist()
+        host = address(self._upload.begin(begins[-1]))
         for level in (0, 1):
             copy(handle, level, host + begins[level])
             core.ggslam_gicp_target_blocks(handle, level, host + begins[2 + level])
@@ -68,7 +70,7 @@ class CudaTarget:
             )  # fmt: skip
             if settings is not None:
                 job.moments, job.settings = first + begins[level], settings
-                job.voxels = self._memory.block(f"voxels {level}", VOXEL_BYTES * voxels[level]).data_ptr()
+                job.voxels = self._memory.block(f"voxels {level}", sizeof(Voxel) * voxels[level]).data_ptr()
             job.level = self._level(level, job, target.voxel)
             self._library.call("voxel_level", ctypes.byref(job))
             made.append(job.level)
@@ -79,6 +81,6 @@ class CudaTarget:
         places = 64
         while places < _PLACES_PER_BLOCK * job.block_count:
             places *= 2
-        slots = self._memory.block(f"slots {level}", SLOT_BYTES * places)
+        slots = self._memory.block(f"slots {level}", sizeof(VoxelSlot) * places)
         size = np.float32(voxel) * np.float32(4 if level else 1)
         return VoxelLevel(job.voxels, slots.data_ptr(), places - 1, size, np.float32(1) / size)

@@ -3,8 +3,6 @@
 #pragma once
 #include "common/platform.cuh"
 
-#define GGSLAM_EXPORT extern "C" __attribute__((visibility("default")))
-
 namespace ggslam::cuda {
 
 inline std::int64_t blocks_for(std::int64_t count, int threads) { return (count + threads - 1) / threads; }

@@ -19,18 +19,10 @@ int run(const Job& job, Kernel kernel, std::int64_t blocks) {
 
 }  // namespace
 
-// Sizes of the structs, so that a caller can check that its mirrors of them are the same.
-GGSLAM_EXPORT int ggslam_cuda_pixel_class_job_size() { return static_cast<int>(sizeof(PixelClassJob)); }
-GGSLAM_EXPORT int ggslam_cuda_cross_entropy_job_size() { return static_cast<int>(sizeof(CrossEntropyJob)); }
-GGSLAM_EXPORT int ggslam_cuda_neighbour_loss_job_size() { return static_cast<int>(sizeof(NeighbourLossJob)); }
-GGSLAM_EXPORT int ggslam_cuda_class_adam_job_size() { return static_cast<int>(sizeof(ClassAdamJob)); }
-
-// Fills `labels`.
 GGSLAM_EXPORT int ggslam_cuda_pixel_labels(const PixelClassJob* job) {
   return run(*job, pixel_labels_kernel, blocks_for(job->count, kClassThreads));
 }
 
-// Fills `classes` and `known` for `labels`.
 GGSLAM_EXPORT int ggslam_cuda_pixel_classes(const PixelClassJob* job) {
   return on_device(job->device, [&] {
     const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);
@@ -40,17 +32,14 @@ GGSLAM_EXPORT int ggslam_cuda_pixel_classes(const PixelClassJob* job) {
   });
 }
 
-// Turns logits into gradients, and fills `losses`.
 GGSLAM_EXPORT int ggslam_cuda_cross_entropy(const CrossEntropyJob* job) {
   return run(*job, cross_entropy_kernel, blocks_for(job->count, kClassWarps));
 }
 
-// Fills `gradients`.
 GGSLAM_EXPORT int ggslam_cuda_neighbour_loss(const NeighbourLossJob* job) {
   return run(*job, neighbour_loss_kernel, blocks_for(job->samples, kClassWarps));
 }
 
-// One step of the classifier, and of the number of its steps.
 GGSLAM_EXPORT int ggslam_cuda_class_adam(const ClassAdamJob* job) {
   return on_device(job->device, [&] {
     const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);

@@ -3,6 +3,7 @@
 // with the classifier's matrix are left to the caller: what is here turns logits into gradients, a warp for each row.
 #pragma once
 #include "common/platform.cuh"
+#include "interface/cuda/mapping.hpp"
 
 namespace ggslam::cuda {
 
@@ -10,49 +11,6 @@ constexpr int kClassThreads = 256;
 constexpr int kClassWarps = kClassThreads / kWarp;
 constexpr float kNothingLogit = 1.0f;                                     // NOTHING_LOGIT of ggslam/scene/identity.py
 constexpr float kLogBeta1 = -0.1053605157f, kLogBeta2 = -0.001000500334f;  // of 0.9 and 0.999
-
-// Labels of pixels, and their classes. All pointers lead to device memory. ggslam/mapping/cuda/class_learning.py
-// mirrors these structs field by field.
-struct PixelClassJob {
-  const std::uint16_t* mask;     // [H, W]
-  const std::int32_t* pixels;    // [count], flat indices
-  const std::int32_t* alias;     // [65536], what ids have become
-  const std::int32_t* class_of;  // [65536], number of each id's class, -1 = none
-  std::int32_t* labels;          // [count], current ids
-  std::int32_t* classes;         // [count], class numbers
-  std::int32_t* known;           // [1], how many pixels have a class
-  void* stream;
-  std::int32_t device, count;
-};
-
-struct CrossEntropyJob {
-  float* logits;                // [count, classes]; become gradients
-  const std::int32_t* targets;  // [count], true classes; -1 = unknown, which counts nothing
-  const std::int32_t* known;    // [1], number of rows that the loss is the mean of
-  float* losses;                // [count], 0 where unknown
-  void* stream;
-  float weight;                 // of the loss
-  std::int32_t device, count, classes;
-};
-
-struct NeighbourLossJob {
-  const float* logits;  // [samples * (1 + neighbours), classes]: the samples', then sample by sample their neighbours'
-  float* gradients;     // of the same shape
-  void* stream;
-  float weight;
-  std::int32_t device, samples, neighbours, classes;
-};
-
-struct ClassAdamJob {
-  float *rows, *first_moments, *second_moments;  // [classes, width]
-  const float* gradients;                        // [classes, width]
-  const std::int32_t* known;                     // [1]; 0: there is no step
-  std::int32_t* steps;                           // [1], number of steps so far
-  void* stream;
-  float rate;
-  std::int32_t device;
-  std::int64_t size;                             // classes * width
-};
 
 __global__ void __launch_bounds__(kClassThreads) pixel_labels_kernel(PixelClassJob job) {
   const std::int64_t i = static_cast<std::int64_t>(blockIdx.x) * kClassThreads + threadIdx.x;

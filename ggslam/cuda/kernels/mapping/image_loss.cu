@@ -5,15 +5,10 @@
 
 using namespace ggslam::cuda;
 
-// Bytes of memory that the loss works in. Asks for height, width and dssim_weight.
 GGSLAM_EXPORT std::int64_t ggslam_cuda_image_loss_bytes(const ImageLossJob* job) {
   return static_cast<std::int64_t>(loss_workspace(nullptr, *job).bytes);
 }
 
-// Size of the struct, so that a caller can check that its mirror of it is the same.
-GGSLAM_EXPORT int ggslam_cuda_image_loss_job_size() { return static_cast<int>(sizeof(ImageLossJob)); }
-
-// Values and gradients of the loss. The caller has checked sizes and pointers.
 GGSLAM_EXPORT int ggslam_cuda_image_loss(const ImageLossJob* job) {
   return on_device(job->device, [&] {
     const LossWorkspace w = loss_workspace(job->workspace, *job);

@@ -3,32 +3,10 @@
 // native/src/mapping/image_loss.hpp, stated in ggslam/mapping/cpu/losses.py.
 #pragma once
 #include "common/carver.cuh"
+#include "interface/cuda/mapping.hpp"
 
 namespace ggslam::cuda {
 
-// One evaluation, all pointers lead to device memory. ggslam/mapping/cuda/losses.py mirrors it field by field.
-struct ImageLossJob {
-  // Rendered: colour [3, H, W], accumulated depth [H, W] in metres, alpha [H, W].
-  const float *image, *depth, *alpha;
-  // Target: colour [H, W, 3], depth [H, W] (uint16 or float, see target_depth_is_float), 0 = none.
-  const std::uint8_t* target_color;
-  const void* target_depth;
-  const float* exposure;  // [3][2], gain and offset of R, G, B; null: 1 and 0
-  // Gradients of the loss, shaped like the rendered images.
-  float *d_image, *d_depth, *d_alpha;
-  double* results;  // [kLossResults], in the order of LossResult
-  void* workspace;
-  void* stream;
-  std::int32_t device, height, width;
-  std::int32_t target_depth_is_float;
-  std::int32_t normalised_depth;  // compare depth / alpha with the target instead of depth
-  std::int32_t charbonnier;       // sqrt(r^2 + eps^2) - eps instead of |r| for colour
-  float depth_scale;              // metres per unit of target_depth
-  float dssim_weight, depth_weight, opacity_weight, no_depth_weight, minimum_alpha, charbonnier_epsilon;
-};
-
-// NaN where nothing was measured. The gradient of the exposure, [3][2], follows.
-enum LossResult { kTotal, kColor, kL1, kSsim, kDepth, kOpacity, kDepthL1, kPsnr, kValidPixels, kExposureGradient };
 constexpr int kLossResults = kExposureGradient + 6;
 
 // Sums over the pixels of a tile. Those of colour are per channel: row kind * 3 + channel of the partial sums.

@@ -8,15 +8,10 @@
 using namespace ggslam::cuda;
 using namespace ggslam::cuda::insertion;
 
-// Bytes of memory that a keyframe takes. Asks for height, width and fill_stride.
 GGSLAM_EXPORT std::int64_t ggslam_cuda_insertion_bytes(const InsertionJob* job) {
   return static_cast<std::int64_t>(workspace_of(nullptr, *job).bytes);
 }
 
-// Size of the struct, so that a caller can check that its mirror of it is the same.
-GGSLAM_EXPORT int ggslam_cuda_insertion_job_size() { return static_cast<int>(sizeof(InsertionJob)); }
-
-// Chooses the pixels and writes how many they are. The caller has checked sizes and pointers.
 GGSLAM_EXPORT int ggslam_cuda_insertion_select(const InsertionJob* job) {
   return on_device(job->device, [&] {
     const Workspace w = workspace_of(job->workspace, *job);
@@ -35,7 +30,6 @@ GGSLAM_EXPORT int ggslam_cuda_insertion_select(const InsertionJob* job) {
   });
 }
 
-// Writes the `count` Gaussians chosen by the call before it with the same job.
 GGSLAM_EXPORT int ggslam_cuda_insertion_build(const InsertionJob* job) {
   return on_device(job->device, [&] {
     const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);

@@ -4,29 +4,9 @@
 #pragma once
 #include "common/carver.cuh"
 #include "common/sorting.cuh"
+#include "interface/cuda/mapping.hpp"
 
 namespace ggslam::cuda {
-
-// One keyframe, all pointers lead to device memory. ggslam/mapping/cuda/insertion.py mirrors it field by field.
-struct InsertionJob {
-  const std::uint8_t* color;     // [H, W, 3]
-  const std::uint16_t* depth;    // [H, W], 0 = none
-  const float *alpha, *rendered_depth;  // [H, W], rendered: alpha and expected depth in metres; both null: an empty map
-  // Written by ggslam_cuda_insertion_select: how many Gaussians there will be.
-  std::int32_t* total;
-  // Written by ggslam_cuda_insertion_build, of `count` rows: [3], [4] wxyz, [3], [3] and flat pixel indices.
-  float *means, *quaternions, *log_scales, *rgb;
-  std::int64_t* pixels;
-  void* workspace;
-  void* stream;
-  std::int32_t device, height, width, count;
-  std::int32_t adaptive_stride, fill_stride;
-  float units_per_metre;  // of depth
-  float fx, fy, cx, cy;
-  float rotation[9], translation[3];  // of T_world_camera
-  float alpha_threshold, depth_tolerance_m, depth_tolerance_relative, scale_pixels, flatness, max_slope,
-      texture_threshold, max_depth_m;
-};
 
 namespace insertion {
 

@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // What is optimised of a keyframe besides the map, its pose and its exposure, and one step of Adam (Kingma and Ba 2015)
 // on them. The arithmetic is that of PoseAdam (ggslam/mapping/keyframe.py), ExposureAdam (ggslam/mapping/cpu/exposure.py) and
-// se3_exp (ggslam/scene/poses.py). ggslam/mapping/cuda/keyframe_states.py mirrors the structures field by field.
+// se3_exp (ggslam/scene/poses.py).
 #pragma once
 #include "common/platform.cuh"
+#include "interface/cuda/mapping.hpp"
 #include "mapping/image_loss.cuh"
 
 namespace ggslam::cuda {
@@ -11,47 +12,6 @@ namespace ggslam::cuda {
 constexpr double kMomentDecay1 = 0.9, kMomentDecay2 = 0.99;
 constexpr double kPoseEpsilon = 1e-15, kExposureEpsilon = 1e-12;  // beside the root of the second moment
 constexpr double kLargestFinite = 1.7976931348623157e308;
-
-struct AdamMoments {
-  double first[6], second[6];
-};
-
-struct KeyframeState {
-  double pose[16];      // T_camera_world, 4 x 4
-  double exposure[6];   // gain and offset of R, G, B
-  AdamMoments pose_moments, exposure_moments;
-  std::int64_t pose_steps, exposure_steps;
-  float pose_copy[12];  // its first three rows, for the rasterizer
-  float exposure_copy[6];  // for the image loss
-};
-
-// Sums over all iterations, all of them doubles.
-struct LossTotals {
-  double total, color, ssim, depth;
-  double last_psnr;   // of the last iteration, no sum
-  double iterations;  // how many there were
-};
-
-// Pointers lead to device memory.
-struct KeyframeStepJob {
-  KeyframeState* state;
-  const double *twist, *results;  // [6], gradient of the pose; [kLossResults] of the image loss
-  const std::int32_t* skipped;    // [1], not 0: nothing is to be done; null: 0
-  LossTotals* totals;
-  void* stream;
-  double pose_rate;  // 0: the pose stays
-  double exposure_rate, exposure_regularization;
-  std::int32_t step_exposure;  // 0: the exposure stays
-  std::int32_t device;
-};
-
-struct KeyframeWriteJob {
-  KeyframeState* state;
-  void* stream;
-  double pose[16], exposure[6];
-  std::int32_t is_new;  // 0: nothing but the pose is written
-  std::int32_t device;
-};
 
 // Twist (v, w), translation first, to the first three rows of a rigid transform.
 __device__ inline void exponential(const double v[3], const double w[3], double rows[3][4]) {

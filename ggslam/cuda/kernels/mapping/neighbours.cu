@@ -8,18 +8,10 @@
 using namespace ggslam::cuda;
 using namespace ggslam::cuda::neighbours;
 
-// Bytes of memory that a search takes. Asks for point_count, row_count and k.
 GGSLAM_EXPORT std::int64_t ggslam_cuda_neighbours_bytes(const NeighbourJob* job) {
   return static_cast<std::int64_t>(workspace_of(nullptr, *job).bytes);
 }
 
-// Size of the struct, so that a caller can check that its mirror of it is the same.
-GGSLAM_EXPORT int ggslam_cuda_neighbour_job_size() { return static_cast<int>(sizeof(NeighbourJob)); }
-
-// The most neighbours of each row that a search finds.
-GGSLAM_EXPORT int ggslam_cuda_most_neighbours() { return kMostNeighbours; }
-
-// Finds the neighbours. The caller has checked sizes and pointers.
 GGSLAM_EXPORT int ggslam_cuda_neighbours(const NeighbourJob* job) {
   return on_device(job->device, [&] {
     const Workspace w = workspace_of(job->workspace, *job);

@@ -8,23 +8,13 @@
 // those of the lowest numbers are taken, whatever the parts.
 #pragma once
 #include "common/carver.cuh"
+#include "interface/cuda/mapping.hpp"
 
 namespace ggslam::cuda {
 
-// At least one row. All pointers lead to device memory.
-// ggslam/mapping/cuda/neighbours.py mirrors it field by field.
-struct NeighbourJob {
-  const float* points;       // [N, 3]
-  const std::int64_t* rows;  // [M], numbers of points
-  std::int64_t* neighbours;  // [M, k]
-  void* workspace;
-  void* stream;
-  std::int32_t device, point_count, row_count, k;  // 1 <= k <= kMostNeighbours, k < N
-};
-
 namespace neighbours {
 
-constexpr int kMostNeighbours = kWarp;
+static_assert(kMostNeighbours == kWarp, "a list has one entry in each lane");
 constexpr int kRowsPerBlock = 16, kThreads = kRowsPerBlock * kWarp;
 constexpr int kTile = 1024;    // points in shared memory
 constexpr int kPerLane = 4;    // points that a lane measures before the list is looked at

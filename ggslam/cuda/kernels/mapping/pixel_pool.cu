@@ -7,10 +7,6 @@
 
 using namespace ggslam::cuda;
 
-// Size of the struct, so that a caller can check that its mirror of it is the same.
-GGSLAM_EXPORT int ggslam_cuda_pixel_pool_job_size() { return static_cast<int>(sizeof(PixelPoolJob)); }
-
-// Fills `odds`. Asks for mask and alias and works in counts and per_pixel.
 GGSLAM_EXPORT int ggslam_cuda_pixel_odds(const PixelPoolJob* job) {
   return on_device(job->device, [&] {
     const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);
@@ -23,7 +19,6 @@ GGSLAM_EXPORT int ggslam_cuda_pixel_odds(const PixelPoolJob* job) {
   });
 }
 
-// Fills `pixels` and `vote_weights`. Asks for odds, sums and random.
 GGSLAM_EXPORT int ggslam_cuda_draw_pixels(const PixelPoolJob* job) {
   return on_device(job->device, [&] {
     launch(draw_pixels_kernel, blocks_for(job->drawn, kPoolThreads), kPoolThreads,

@@ -7,28 +7,13 @@
 // same in every run, whatever the order of additions.
 #pragma once
 #include "common/platform.cuh"
+#include "interface/cuda/mapping.hpp"
 
 namespace ggslam::cuda {
 
 constexpr int kObjectIds = 65536;
 constexpr int kPoolThreads = 256, kTotalThreads = 1024;
 constexpr double kOddsOfAll = 4503599627370496.0;  // 2^52: even a billion pixels keep six digits of their odds
-
-// All pointers lead to device memory. ggslam/mapping/cuda/pixel_pool.py mirrors it field by field.
-struct PixelPoolJob {
-  const std::uint16_t* mask;   // [H, W], 0 = unlabelled
-  const std::int32_t* alias;   // [kObjectIds], what ids have become
-  std::int32_t* counts;        // [2, kObjectIds], pixels of each object; then only those at boundaries
-  double* per_pixel;           // [2, kObjectIds], odds of one pixel of each object, by either way of drawing
-  std::int64_t* odds;          // [H, W], of each pixel
-  const std::int64_t* sums;    // [H, W], running sum of the odds
-  const double* random;        // [drawn], in [0, 1)
-  std::int32_t* pixels;        // [drawn], flat indices
-  float* vote_weights;         // [drawn], the inverse of their odds; 0 where nothing is labelled
-  void* stream;
-  double balance, boundary;    // see IdentitySettings
-  std::int32_t device, height, width, drawn;
-};
 
 __device__ inline std::int32_t current_id(const PixelPoolJob& job, std::int64_t pixel) {
   return job.alias[job.mask[pixel]];

@@ -4,24 +4,9 @@
 // are computed here rather than looked up, so that other rates need nothing but other arguments.
 #pragma once
 #include "common/platform.cuh"
+#include "interface/cuda/rendering.hpp"
 
 namespace ggslam::cuda {
-
-enum AdamGroup { kMeans, kQuaternions, kLogScales, kOpacityLogits, kShConstant, kShRest, kFeatures, kAdamGroups };
-
-struct AdamArrays {
-  float *parameters, *first_moments, *second_moments;
-};
-
-// ggslam/rendering/cuda/adam.py mirrors it field by field.
-struct AdamStep {
-  AdamArrays means, quaternions, log_scales, opacity_logits, sh, features;
-  std::int32_t* updates;  // [N], of each Gaussian so far
-  float rates[kAdamGroups];
-  std::int32_t decayed_groups;  // bit g: the rate of group g decays
-  float log_decay, decay_floor; // rate * max(decay_floor, decay^(u - 1)) at the u-th update
-  float beta1, beta2, log_beta1, log_beta2, epsilon;
-};
 
 // What all parameters of a Gaussian share at its u-th update.
 struct AdamFactors {

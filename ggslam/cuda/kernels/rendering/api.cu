@@ -24,10 +24,6 @@ struct Counter {
   cudaEvent_t ready = nullptr;  // after the last one's
 };
 
-struct Sizes {
-  std::int64_t gaussian_workspace, pair_workspace, pixel_workspace, gradient_rows;  // bytes
-};
-
 cudaStream_t stream_of(const Rendering& r) { return static_cast<cudaStream_t>(r.stream); }
 
 GaussianWorkspace gaussians_of(const Rendering& r) {
@@ -45,7 +41,7 @@ std::uint32_t float_bits(float x) {
 }
 
 // One more than the key of the farthest depth.
-std::uint32_t hidden_key(const View& view) { return float_bits(kMaxDepth) - float_bits(view.near_plane) + 1; }
+std::uint32_t hidden_key(const CameraView& view) { return float_bits(kMaxDepth) - float_bits(view.near_plane) + 1; }
 
 // Calls run(group, number of channels to compile for) for the groups of feature channels; once, without any, if there
 // are none.
@@ -171,12 +167,8 @@ cudaError_t differentiate_all(const Rendering& r, const ImageGradients& in, cons
 }  // namespace ggslam::cuda
 
 using namespace ggslam::cuda;
-
-GGSLAM_EXPORT int ggslam_cuda_version() { return 3; }
-
-GGSLAM_EXPORT const char* ggslam_cuda_error_text(int status) {
-  return cudaGetErrorString(static_cast<cudaError_t>(status));
-}
+using ggslam::GaussianGradients;
+using ggslam::ImageGradients;
 
 GGSLAM_EXPORT int ggslam_cuda_counter_create(int device, void** counter) {
   auto* c = new Counter;
@@ -200,7 +192,6 @@ GGSLAM_EXPORT void ggslam_cuda_counter_destroy(void* counter) {
   delete c;
 }
 
-// Sets the rendering's sizes of sorting scratch and tells how much memory its blocks need, for its pair_capacity.
 GGSLAM_EXPORT int ggslam_cuda_plan(Rendering* r, Sizes* sizes) {
   return on_device(r->device, [&] {
     r->gaussian_sorting_bytes = static_cast<std::int64_t>(sorting_bytes(r->gaussians.count));
@@ -215,12 +206,10 @@ GGSLAM_EXPORT int ggslam_cuda_plan(Rendering* r, Sizes* sizes) {
   });
 }
 
-// Projects, counts and sorts by depth. The totals will be in the counter; needs the Gaussians' workspace only.
 GGSLAM_EXPORT int ggslam_cuda_project(const Rendering* r, void* counter) {
   return on_device(r->device, [&] { return project_all(*r, *static_cast<Counter*>(counter)); });
 }
 
-// Waits for the counter's last projection; totals: visible Gaussians, pairs of a Gaussian and a tile.
 GGSLAM_EXPORT int ggslam_cuda_wait(const void* counter, std::int64_t* totals) {
   const auto* c = static_cast<const Counter*>(counter);
   const cudaError_t status = cudaEventSynchronize(c->ready);
@@ -230,8 +219,6 @@ GGSLAM_EXPORT int ggslam_cuda_wait(const void* counter, std::int64_t* totals) {
   return status;
 }
 
-// The largest number of pairs of the last kRecent projections. Does not wait: in the place of one that is still to come
-// stands the number of an older one. Each number is written as a whole.
 GGSLAM_EXPORT std::int64_t ggslam_cuda_recent_pairs(const void* counter) {
   const volatile Totals* totals = static_cast<const Counter*>(counter)->totals;
   std::uint64_t most = 0;
@@ -239,19 +226,12 @@ GGSLAM_EXPORT std::int64_t ggslam_cuda_recent_pairs(const void* counter) {
   return static_cast<std::int64_t>(most);
 }
 
-// Lists pairs by tile and composites. May be called again for the same projection, with more room for pairs.
 GGSLAM_EXPORT int ggslam_cuda_composite(const Rendering* r) {
   return on_device(r->device, [&] { return composite_all(*r); });
 }
 
-// Differentiates a rendering, whose arrays and memory must still be there and unchanged. adam: null, or a step to make
-// instead of writing gradients; it changes the arrays. row_memory: gradient_rows bytes.
 GGSLAM_EXPORT int ggslam_cuda_backward(const Rendering* r, const ImageGradients* image_gradients,
                                        const GaussianGradients* gradients, const AdamStep* adam, float* row_memory) {
   return on_device(r->device, [&] { return differentiate_all(*r, *image_gradients, *gradients, adam, row_memory); });
 }
 
-// Sizes of structs, so that a caller can check that its mirrors of them are the same.
-GGSLAM_EXPORT int ggslam_cuda_rendering_size() { return static_cast<int>(sizeof(Rendering)); }
-
-GGSLAM_EXPORT int ggslam_cuda_adam_step_size() { return static_cast<int>(sizeof(AdamStep)); }

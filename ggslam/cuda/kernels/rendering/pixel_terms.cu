@@ -44,12 +44,6 @@ int visit_sorted(const PixelTerms& terms, const TermsByGaussian& sorted, Kernel 
 
 using namespace ggslam::cuda;
 
-// Sizes of the structs, so that a caller can check that its mirrors of them are the same.
-GGSLAM_EXPORT int ggslam_cuda_pixel_terms_size() { return static_cast<int>(sizeof(PixelTerms)); }
-GGSLAM_EXPORT int ggslam_cuda_terms_by_gaussian_size() { return static_cast<int>(sizeof(TermsByGaussian)); }
-
-// Terms of pixels [P] (row * width + column) of a rendering whose memory must still be there, without contributions below
-// min_weight and those for which a row has no room.
 GGSLAM_EXPORT int ggslam_cuda_terms_collect(const PixelTerms* out, const Rendering* r, const std::int32_t* pixels,
                                             float min_weight) {
   return on_device(out->device, [&] {
@@ -63,15 +57,13 @@ GGSLAM_EXPORT int ggslam_cuda_terms_collect(const PixelTerms* out, const Renderi
   });
 }
 
-// Terms of pixels that show one Gaussian each, rows [P].
 GGSLAM_EXPORT int ggslam_cuda_terms_of_gaussians(const PixelTerms* out, const std::int32_t* rows) {
   return on_device(out->device, [&] {
-    launch(single_terms_kernel, blocks_for(out->entries(), kTermThreads), kTermThreads, stream_of(*out), rows, *out);
+    launch(single_terms_kernel, blocks_for(out->pixels * out->capacity, kTermThreads), kTermThreads, stream_of(*out), rows, *out);
     return cudaSuccess;
   });
 }
 
-// out [P, channels] = sum of weight times feature, for features [count, channels].
 GGSLAM_EXPORT int ggslam_cuda_terms_blend(const PixelTerms* terms, const float* features, std::int64_t count,
                                           int channels, float* out) {
   return on_device(terms->device, [&] {
@@ -81,7 +73,6 @@ GGSLAM_EXPORT int ggslam_cuda_terms_blend(const PixelTerms* terms, const float* 
   });
 }
 
-// The label with the largest rendering weight at each pixel, and its share of the pixel's weight, for labels [count].
 GGSLAM_EXPORT int ggslam_cuda_terms_label(const PixelTerms* terms, const std::int32_t* labels, std::int64_t count,
                                           std::int32_t* ids, float* shares) {
   return on_device(terms->device, [&] {
@@ -91,12 +82,10 @@ GGSLAM_EXPORT int ggslam_cuda_terms_label(const PixelTerms* terms, const std::in
   });
 }
 
-// Bytes of memory that sorting so many places works in.
 GGSLAM_EXPORT std::int64_t ggslam_cuda_terms_sorting_bytes(std::int64_t entries) {
   return static_cast<std::int64_t>(term_sorting(nullptr, entries).bytes);
 }
 
-// Writes the arrays of `sorted`, whose size and count are set. workspace: terms_sorting_bytes bytes.
 GGSLAM_EXPORT int ggslam_cuda_terms_sort(const PixelTerms* terms, const TermsByGaussian* sorted, void* workspace) {
   return on_device(terms->device, [&] {
     if (sorted->size == 0) return cudaSuccess;
@@ -108,7 +97,6 @@ GGSLAM_EXPORT int ggslam_cuda_terms_sort(const PixelTerms* terms, const TermsByG
   });
 }
 
-// One step of Adam on the features of the Gaussians in the terms; gradient [P, channels].
 GGSLAM_EXPORT int ggslam_cuda_terms_step(const PixelTerms* terms, const TermsByGaussian* sorted, const float* gradient,
                                          int channels, const AdamStep* adam) {
   int width = 1;
@@ -116,14 +104,12 @@ GGSLAM_EXPORT int ggslam_cuda_terms_step(const PixelTerms* terms, const TermsByG
   return visit_sorted(*terms, *sorted, step_terms_kernel, gradient, channels, width, *adam);
 }
 
-// Adds to the votes [N, 4] of the Gaussians in the terms of the first `labelled` pixels.
 GGSLAM_EXPORT int ggslam_cuda_terms_vote(const PixelTerms* terms, const TermsByGaussian* sorted,
                                          const std::int32_t* labels, const float* pixel_weights,
                                          std::int64_t labelled, std::int32_t* vote_ids, float* vote_weights) {
   return visit_sorted(*terms, *sorted, vote_terms_kernel, labels, pixel_weights, labelled, vote_ids, vote_weights);
 }
 
-// Sets sums [N], zero before, of the Gaussians in the terms.
 GGSLAM_EXPORT int ggslam_cuda_terms_sum(const PixelTerms* terms, const TermsByGaussian* sorted,
                                         const float* pixel_weights, float* sums) {
   return visit_sorted(*terms, *sorted, sum_terms_kernel, pixel_weights, sums);

@@ -3,7 +3,7 @@
 // covariance Sigma = M M^T, M = R(q) diag(exp(log_scale)), under the linearised projection J W is
 // V V^T + low_pass I with V = J W M. Forward and backward share these terms.
 #pragma once
-#include "rendering/contract.cuh"
+#include "rendering/rules.cuh"
 
 namespace ggslam::cuda {
 
@@ -14,7 +14,7 @@ struct ViewConstants {
   float min_u, max_u, min_v, max_v;
 };
 
-inline ViewConstants view_constants(const View& view) {
+inline ViewConstants view_constants(const CameraView& view) {
   ViewConstants c;
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) c.W[i][j] = view.camera_world[4 * i + j];

@@ -2,7 +2,7 @@
 // Real spherical harmonics up to degree 3 of a unit direction (x, y, z), in the order and with the signs of 3D Gaussian
 // Splatting (Kerbl et al. 2023).
 #pragma once
-#include "rendering/contract.cuh"
+#include "rendering/rules.cuh"
 
 namespace ggslam::cuda {
 

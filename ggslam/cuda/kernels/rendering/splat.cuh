@@ -4,7 +4,7 @@
 // Multiplications and additions are fused by hand: the compiler is then not free to round differently from one kernel
 // to the next, so that counting and writing tiles, and forward and backward, always decide alike.
 #pragma once
-#include "rendering/contract.cuh"
+#include "rendering/rules.cuh"
 
 namespace ggslam::cuda {
 

@@ -24,7 +24,7 @@ struct Grid {
   __host__ __device__ int tiles() const { return tiles_x * tiles_y; }
 };
 
-inline Grid make_grid(const View& view) {
+inline Grid make_grid(const CameraView& view) {
   return {view.width, view.height, (view.width + kTileSize - 1) / kTileSize, (view.height + kTileSize - 1) / kTileSize};
 }
 

@@ -5,7 +5,8 @@
 // A first pass notes which grid points are good, one bit each; a second one counts the bits before its own, so that
 // points are written in the order of the image whatever the order of the blocks.
 #pragma once
-#include "tracking/contract.cuh"
+#include "common/platform.cuh"
+#include "interface/cuda/tracking.hpp"
 #include "tracking/symmetric3.cuh"
 
 namespace ggslam::cuda {

@@ -7,19 +7,13 @@
 #include "tracking/voxel_shapes.cuh"
 
 using namespace ggslam::cuda;
+using ggslam::AlignSettings;
 
-// Sizes of the structures, so that a caller can check that its mirrors of them are the same.
-GGSLAM_EXPORT int ggslam_cuda_depth_points_job_size() { return static_cast<int>(sizeof(DepthPointsJob)); }
-GGSLAM_EXPORT int ggslam_cuda_voxel_level_job_size() { return static_cast<int>(sizeof(VoxelLevelJob)); }
-GGSLAM_EXPORT int ggslam_cuda_align_job_size() { return static_cast<int>(sizeof(AlignJob)); }
-
-// Bytes of memory that depth_points works in. Asks for columns and rows.
 GGSLAM_EXPORT std::int64_t ggslam_cuda_depth_points_bytes(const DepthPointsJob* job) {
   const std::int64_t cells = static_cast<std::int64_t>(job->columns) * job->rows;
   return blocks_for(cells + 1, kPointThreads) * (kPointThreads / kWarp) * static_cast<std::int64_t>(sizeof(std::uint32_t));
 }
 
-// Points of a depth image, their number and their median depth.
 GGSLAM_EXPORT int ggslam_cuda_depth_points(const DepthPointsJob* job) {
   return on_device(job->device, [&] {
     const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);
@@ -31,8 +25,6 @@ GGSLAM_EXPORT int ggslam_cuda_depth_points(const DepthPointsJob* job) {
   });
 }
 
-// Empties the hash table of a level, which has more places than there are blocks, and puts the level's blocks in; gives
-// the voxels their shapes if they have none yet.
 GGSLAM_EXPORT int ggslam_cuda_voxel_level(const VoxelLevelJob* job) {
   return on_device(job->device, [&] {
     const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);
@@ -45,17 +37,13 @@ GGSLAM_EXPORT int ggslam_cuda_voxel_level(const VoxelLevelJob* job) {
   });
 }
 
-// Bytes of memory that an alignment works in; the caller sets them to zero before the first one. Asks for room,
-// settings and the number of textured points.
 GGSLAM_EXPORT std::int64_t ggslam_cuda_align_bytes(const AlignJob* job) {
   const AlignBlocks blocks = align_blocks(*job, false);
   return static_cast<std::int64_t>(align_workspace(nullptr, blocks.points + blocks.grey, job->room).bytes);
 }
 
-// Number of results.
 GGSLAM_EXPORT int ggslam_cuda_align_results() { return kAlignResults; }
 
-// Aligns points to a target from a guess.
 GGSLAM_EXPORT int ggslam_cuda_align(const AlignJob* job) {
   return on_device(job->device, [&] {
     const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);

@@ -2,7 +2,8 @@
 // Voxels of a target on the device: their hash table and the search for the nearest one, which visits the same voxels in
 // the same order as native/src/tracking/kernels/voxel_lookup.hpp.
 #pragma once
-#include "tracking/contract.cuh"
+#include "common/platform.cuh"
+#include "interface/cuda/tracking.hpp"
 
 namespace ggslam::cuda {
 

@@ -111,7 +111,6 @@ GGSLAM_EXPORT void* ggslam_gpcc_slice_create() { return new (std::nothrow) Slice
 
 GGSLAM_EXPORT void ggslam_gpcc_slice_destroy(void* slice) { delete static_cast<Slice*>(slice); }
 
-// Builds the octree of points [count, 3] in [0, 2^depth). `order` [count] receives their coding order.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_build(void* context, void* slice, const std::int32_t* points, std::uint32_t count,
                                              std::int32_t depth, std::uint32_t* order) {
   return gpcc::guarded([&]() -> std::int64_t {
@@ -124,18 +123,15 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_build(void* context, void* slice, const s
 
 GGSLAM_EXPORT std::uint32_t ggslam_gpcc_leaves(void* slice) { return static_cast<Slice*>(slice)->tree.leaves; }
 
-// Number of nodes at a level below the tree's depth.
 GGSLAM_EXPORT std::uint32_t ggslam_gpcc_nodes(void* slice, std::int32_t level) {
   return static_cast<Slice*>(slice)->tree.levels[level].size();
 }
 
-// Number of points in each leaf, `counts` [leaves].
 GGSLAM_EXPORT void ggslam_gpcc_leaf_points(void* slice, std::uint32_t* counts) {
   const gpcc::Octree& tree = static_cast<Slice*>(slice)->tree;
   for (std::uint32_t leaf = 1; leaf <= tree.leaves; ++leaf) counts[leaf - 1] = tree.weight_of_leaf(leaf);
 }
 
-// Makes every leaf one point.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_merge(void* slice) {
   return gpcc::guarded([&]() -> std::int64_t {
     gpcc::Octree& tree = static_cast<Slice*>(slice)->tree;
@@ -146,7 +142,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_merge(void* slice) {
   });
 }
 
-// Returns the number of bytes, which ggslam_gpcc_take copies.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slice, const gpcc::OctreeSettings* settings) {
   return gpcc::guarded([&]() -> std::int64_t {
     Slice& s = *static_cast<Slice*>(slice);
@@ -156,8 +151,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slic
   });
 }
 
-// `attributes` [points, components] in coding order; replaced by what a decoder will reconstruct. Returns the number of
-// bytes.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_attribute(void* context, void* slice, const gpcc::RahtSettings* settings,
                                                         std::int32_t* attributes) {
   return gpcc::guarded([&]() -> std::int64_t {
@@ -175,7 +168,6 @@ GGSLAM_EXPORT void ggslam_gpcc_take(void* slice, std::uint8_t* out) {
   bytes.clear();
 }
 
-// Decodes a geometry payload that is said to hold `points` points.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slice, const gpcc::OctreeSettings* settings,
                                                        const std::uint8_t* data, std::size_t size,
                                                        std::uint32_t points) {
@@ -189,8 +181,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slic
   });
 }
 
-// The same where the tree does not split every node along all axes, or has other tools than an octree. Its root lies in
-// [0, 2^depth)^3.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_tree(void* context, void* slice, const gpcc::TreeSettings* settings,
                                                    std::int32_t depth, const std::uint8_t* data, std::size_t size,
                                                    std::uint32_t points) {
@@ -204,7 +194,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_tree(void* context, void* slice, c
   });
 }
 
-// The same by predictive geometry.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_predictive(void* context, void* slice,
                                                          const gpcc::PredictiveSettings* settings, std::int32_t depth,
                                                          const std::uint8_t* data, std::size_t size,
@@ -219,7 +208,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_predictive(void* context, void* sl
   });
 }
 
-// Codes the slice's points by such a tree. Returns the number of bytes.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_tree(void* context, void* slice, const gpcc::TreeSettings* settings) {
   return gpcc::guarded([&]() -> std::int64_t {
     Slice& s = *static_cast<Slice*>(slice);
@@ -234,7 +222,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_tree(void* context, void* slice, c
   });
 }
 
-// Hands on the contexts of the slice before, for slices that go on with them.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_go_on(void* slice, const void* before) {
   return gpcc::guarded([&]() -> std::int64_t {
     const Slice& b = *static_cast<const Slice*>(before);
@@ -244,7 +231,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_go_on(void* slice, const void* before) {
   });
 }
 
-// Positions [points, 3] in coding order.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_positions(void* context, void* slice, std::int32_t* out) {
   return gpcc::guarded([&]() -> std::int64_t {
     GGSLAM_DISPATCH(gpcc::isa_of(context), octree_positions)(static_cast<Slice*>(slice)->tree, out);
@@ -262,7 +248,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_attribute(void* context, void* sli
   });
 }
 
-// The same by the predicting or the lifting transform.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_details(void* context, void* slice, const gpcc::DetailSettings* settings,
                                                       const std::uint8_t* data, std::size_t size,
                                                       std::int32_t* attributes) {
@@ -284,7 +269,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_details(void* context, void* slice
   });
 }
 
-// Brings values [points, components] from the order of the stream, in which raw attributes are, into coding order.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_sort_values(void* slice, std::int32_t components, std::int32_t* values) {
   return gpcc::guarded([&]() -> std::int64_t {
     gpcc::from_stream_order(static_cast<Slice*>(slice)->stream_order, components, values);
@@ -292,7 +276,6 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_sort_values(void* slice, std::int32_t com
   });
 }
 
-// Y, Cb, Cr [count, 3] of the colours rgb[order[i]].
 GGSLAM_EXPORT void ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, const std::uint32_t* order,
                                         std::uint32_t count, std::int32_t* out) {
   GGSLAM_DISPATCH(gpcc::isa_of(context), colours_to_ycbcr)(rgb, order, count, out);

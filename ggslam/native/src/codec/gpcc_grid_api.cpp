@@ -8,23 +8,9 @@
 #include <cstdint>
 
 #include "common/context.hpp"
+#include "interface/core/codec.hpp"
 
 namespace ggslam::gpcc {
-
-// clip(floor(scale p + rounding), first, last) - first. Mirrored in ggslam/coding/native.py.
-struct Grid {
-  double scale, rounding;
-  std::int64_t first[3], last[3];
-  std::int32_t exact;  // coordinates are integers and stand for themselves
-};
-
-// Points [*, 3] of which `rows` [count] are meant; without rows, the first `count`.
-struct Points {
-  const void* data;
-  const std::int64_t* rows;
-  std::size_t count;
-  std::int32_t kind;  // 0: int32, 1: int64, 2: float, 3: double
-};
 
 namespace {
 
@@ -62,26 +48,21 @@ void for_each_point(const Points& points, const Visit& visit) {
 
 using namespace ggslam::gpcc;
 
-// Grid positions [count, 3].
 GGSLAM_EXPORT void ggslam_gpcc_on_grid(const Points* points, const Grid* grid, std::int32_t* out) {
   for_each_point(*points, [&](std::size_t i, const auto* p) {
     for (int axis = 0; axis < 3; ++axis) out[3 * i + axis] = coordinate(*grid, axis, p[axis]);
   });
 }
 
-// Grid coordinates [count] along one axis.
 GGSLAM_EXPORT void ggslam_gpcc_along_axis(const Points* points, const Grid* grid, std::int32_t axis, std::int32_t* out) {
   for_each_point(*points, [&](std::size_t i, const auto* p) { out[i] = coordinate(*grid, axis, p[axis]); });
 }
 
-// Adds to counts [planes] the number of points in each plane across an axis.
 GGSLAM_EXPORT void ggslam_gpcc_plane_counts(const Points* points, const Grid* grid, std::int32_t axis,
                                             std::uint32_t* counts) {
   for_each_point(*points, [&](std::size_t, const auto* p) { ++counts[coordinate(*grid, axis, p[axis])]; });
 }
 
-// numbers [count] become number_of_plane[coordinate]. The indices of points in planes that are marked as cut are appended
-// to `inside`, which has room for them.
 GGSLAM_EXPORT void ggslam_gpcc_number_planes(const Points* points, const Grid* grid, std::int32_t axis,
                                              const std::uint16_t* number_of_plane, const std::uint8_t* cut,
                                              std::uint16_t* numbers, std::int64_t* inside) {
@@ -92,8 +73,6 @@ GGSLAM_EXPORT void ggslam_gpcc_number_planes(const Points* points, const Grid* g
   });
 }
 
-// Appends to `codes`, which has room for count of them, the points in cubes of 4 x 4 x 4 voxels that a hash chooses: one
-// cube in mask + 1 (a power of two). A code has 21 bits a coordinate. Returns how many there are.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_sample_cubes(const Points* points, const Grid* grid, std::uint32_t mask,
                                                     std::uint64_t* codes) {
   std::uint64_t* end = codes;

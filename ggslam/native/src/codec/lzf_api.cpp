@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "common/context.hpp"
+#include "interface/core/codec.hpp"
 
 namespace {
 
@@ -43,7 +44,6 @@ uint8_t* put_match(uint8_t* out, int64_t length, int64_t distance) {
 
 }  // namespace
 
-// Bytes written to `out`, which must hold size + size / 32 + 1, or kNoRoom.
 GGSLAM_EXPORT int64_t ggslam_lzf_compress(const uint8_t* data, int64_t size, uint8_t* out, int64_t capacity) {
   if (capacity < size + size / kMaxLiterals + 1) return kNoRoom;
   std::vector<int64_t> last(size_t{1} << kHashBits, -kMaxDistance - 1);
@@ -67,7 +67,6 @@ GGSLAM_EXPORT int64_t ggslam_lzf_compress(const uint8_t* data, int64_t size, uin
   return put_literals(out, data + literals, data + size) - begin;
 }
 
-// 0 when `data` stand for exactly `size` bytes, which are then in `out`; else one of Failure.
 GGSLAM_EXPORT int64_t ggslam_lzf_decompress(const uint8_t* data, int64_t packed, uint8_t* out, int64_t size) {
   int64_t at = 0, done = 0;
   while (at < packed) {

@@ -1,5 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/context.hpp"
+#include "interface/core/common.hpp"
+
+#define GGSLAM_TEXT(macro) GGSLAM_TEXT_OF(macro)
+#define GGSLAM_TEXT_OF(words) #words
 
 namespace ggslam {
 
@@ -28,11 +32,9 @@ Isa best_isa() {
 
 }  // namespace ggslam
 
-// Version of the C interface: the loader refuses a library whose number differs from its own.
-GGSLAM_EXPORT int ggslam_abi_version() { return 1; }
+GGSLAM_EXPORT const char* ggslam_interface_hash() { return GGSLAM_TEXT(GGSLAM_INTERFACE_HASH); }
 
-// SHA-256 of the sources, see CMakeLists.txt.
-GGSLAM_EXPORT const char* ggslam_source_hash() { return GGSLAM_SOURCE_HASH; }
+GGSLAM_EXPORT const char* ggslam_source_hash() { return GGSLAM_TEXT(GGSLAM_SOURCE_HASH); }
 
 GGSLAM_EXPORT int ggslam_isa_available(int isa) {
   return isa >= 0 && isa <= 2 && ggslam::isa_available(static_cast<ggslam::Isa>(isa)) ? 1 : 0;

@@ -4,8 +4,6 @@
 #include "common/dispatch.hpp"
 #include "common/thread_pool.hpp"
 
-#define GGSLAM_EXPORT extern "C" __attribute__((visibility("default")))
-
 namespace ggslam {
 
 struct Context {

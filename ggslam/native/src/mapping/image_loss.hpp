@@ -5,36 +5,9 @@
 #include <cstdint>
 
 #include "common/dispatch.hpp"
+#include "interface/core/mapping.hpp"
 
 namespace ggslam {
-
-// One evaluation. ggslam/mapping/cpu/losses.py mirrors this struct field by field. H = height, W = width.
-struct ImageLossJob {
-  // Rendered: colour [3, H, W] planar, accumulated depth [H, W] in metres, alpha [H, W].
-  const float* image;
-  const float* depth;
-  const float* alpha;
-  // Target: colour [H, W, 3] interleaved, depth [H, W] (uint16 or float, see target_depth_is_float), 0 = none.
-  const uint8_t* target_color;
-  const void* target_depth;
-  // Gradients of the loss, shaped like the rendered images.
-  float* d_image;
-  float* d_depth;
-  float* d_alpha;
-
-  int32_t height, width;
-  int32_t target_depth_is_float;
-  int32_t normalised_depth;  // compare depth / alpha with the target instead of depth
-  int32_t charbonnier;       // sqrt(r^2 + eps^2) - eps instead of |r| for colour
-  float depth_scale;         // metres per unit of target_depth
-  float exposure[6];         // gain, offset for R, G, B: corrected = gain * rendered + offset
-  float dssim_weight, depth_weight, opacity_weight, no_depth_weight, minimum_alpha, charbonnier_epsilon;
-
-  // Results; NaN where nothing was measured.
-  double total, color, l1, ssim, depth_term, opacity_term, depth_l1_m, psnr;
-  double valid_pixels;
-  double exposure_gradient[6];
-};
 
 constexpr int kImageLossTaps = 11;  // window of SSIM
 constexpr int kImageLossRows = 4;   // rows that are blurred vertically together

@@ -106,10 +106,6 @@ GGSLAM_EXPORT void ggslam_image_loss_destroy(void* workspace) {
   delete static_cast<ggslam::ImageLossWorkspace*>(workspace);
 }
 
-// Size of the struct, so that a caller can check that its mirror of it is the same.
-GGSLAM_EXPORT int ggslam_image_loss_job_size() { return static_cast<int>(sizeof(ggslam::ImageLossJob)); }
-
-// Returns 0, or 1 when memory ran out. The caller has checked sizes and pointers.
 GGSLAM_EXPORT int ggslam_image_loss_evaluate(void* context, void* workspace, ggslam::ImageLossJob* job) {
   try {
     static_cast<ggslam::ImageLossWorkspace*>(workspace)->evaluate(*static_cast<ggslam::Context*>(context), *job);

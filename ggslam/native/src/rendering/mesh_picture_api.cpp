@@ -10,9 +10,9 @@ GGSLAM_DECLARE_KERNEL(void mesh_picture_project(const MeshPictureInput& in, std:
 GGSLAM_DECLARE_KERNEL(void mesh_picture_band(const MeshPictureInput& in, const ProjectedVertex* vertices, int top,
                                              int bottom, float* inverse_z, uint8_t* picture))
 
-// Draws on what stands in `picture` [height, width, 3]; `inverse_z` [height, width] must be 0 at first.
+using namespace ggslam;
+
 GGSLAM_EXPORT void ggslam_draw_mesh(void* context_, const MeshPictureInput* in, float* inverse_z, uint8_t* picture) {
-  using namespace ggslam;
   Context& context = *static_cast<Context*>(context_);
   const auto project = GGSLAM_DISPATCH(context.isa, mesh_picture_project);
   const auto draw = GGSLAM_DISPATCH(context.isa, mesh_picture_band);

@@ -13,16 +13,6 @@
 
 namespace ggslam {
 
-// The terms of P pixels, as laid out by ggslam/rendering/_native.py: the first counts[p] of row p are in use, front to
-// back.
-struct PixelTerms {
-  std::int64_t pixels;
-  std::int32_t capacity;        // terms a row has room for
-  std::int32_t* gaussians;      // [P, capacity]
-  float* weights;               // [P, capacity]
-  std::int32_t* counts;         // [P]
-};
-
 // Pixels sorted by tile and sub-block.
 struct TermPixel {
   std::int32_t x, y, row;       // row in PixelTerms
@@ -35,15 +25,6 @@ struct TermsByGaussian {
   const std::int64_t* starts;
   const std::int32_t* rows;
   const float* weights;
-};
-
-struct FeatureAdam {            // as laid out by ggslam/rendering/_native.py
-  std::int64_t gaussians;
-  float *features, *first_moments, *second_moments;  // [N, channels]
-  std::int32_t* updates;        // [N]
-  const float* schedule;        // [rows][2]: step size over bias correction, 1 / sqrt of the second correction
-  std::int32_t schedule_rows, channels;
-  float beta1, beta2, epsilon;
 };
 
 constexpr int kMaxTermChannels = 64;

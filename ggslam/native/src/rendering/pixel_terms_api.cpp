@@ -128,8 +128,6 @@ int guarded(const Function& function) {
 
 using namespace ggslam;
 
-// Fills `out` for pixels (row * width + column, each within the image) of the last forward, leaving out contributions
-// below min_weight and those for which a row has no room. Returns 0 or 1 (out of memory).
 GGSLAM_EXPORT int ggslam_rasterizer_pixel_terms(void* rasterizer, const std::int32_t* pixels, float min_weight,
                                                 const PixelTerms* out) {
   return guarded([&] {
@@ -143,7 +141,6 @@ GGSLAM_EXPORT int ggslam_rasterizer_pixel_terms(void* rasterizer, const std::int
   });
 }
 
-// out [P, channels] = sum of weight times feature. Returns 0.
 GGSLAM_EXPORT int ggslam_terms_blend(void* context, const PixelTerms* terms, const float* features, int channels,
                                      float* out) {
   Context& c = *static_cast<Context*>(context);
@@ -154,8 +151,6 @@ GGSLAM_EXPORT int ggslam_terms_blend(void* context, const PixelTerms* terms, con
   return kDone;
 }
 
-// Adam on the features of the Gaussians in `terms`, their gradient being the sum of weight times gradient [P, channels].
-// Returns 0 or 1 (out of memory).
 GGSLAM_EXPORT int ggslam_terms_step(void* context, const PixelTerms* terms, const float* gradient,
                                     const FeatureAdam* adam) {
   return guarded([&] {
@@ -169,8 +164,6 @@ GGSLAM_EXPORT int ggslam_terms_step(void* context, const PixelTerms* terms, cons
   });
 }
 
-// Adds each pixel's weights, times those of the pixels [P] (null: 1), to the votes [gaussians, slots] of its Gaussians
-// under labels [P]; label 0 votes for nothing. Returns 0 or 1 (out of memory).
 GGSLAM_EXPORT int ggslam_terms_vote(void* context, const PixelTerms* terms, const std::uint16_t* labels,
                                     const float* pixel_weights, std::int64_t gaussians, int slots, std::int32_t* ids, float* weights) {
   return guarded([&] {
@@ -190,7 +183,6 @@ GGSLAM_EXPORT int ggslam_terms_vote(void* context, const PixelTerms* terms, cons
   });
 }
 
-// The label with the largest rendering weight at each pixel, and its share of the pixel's weight. `labels` [gaussians].
 GGSLAM_EXPORT int ggslam_terms_label(void* context, const PixelTerms* terms, const std::uint16_t* labels,
                                      std::uint16_t* ids, float* shares) {
   Context& c = *static_cast<Context*>(context);

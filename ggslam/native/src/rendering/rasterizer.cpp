@@ -10,7 +10,7 @@ namespace {
 
 enum Status { kDone = 0, kOutOfMemory = 1, kTooManyPairs = 2 };
 
-void prepare(Rasterizer& r, const GaussianArrays& gaussians, const View& view) {
+void prepare(Rasterizer& r, const GaussianArrays& gaussians, const CameraView& view) {
   r.gaussians = gaussians;
   r.view = view;
   r.padded_features = gaussians.render_features ? (gaussians.feature_channels + 3) / 4 * 4 : 0;
@@ -67,7 +67,7 @@ bool allot_pairs(Rasterizer& r) {
   return true;
 }
 
-Status forward(Rasterizer& r, const GaussianArrays& gaussians, const View& view, const RenderTargets& targets) {
+Status forward(Rasterizer& r, const GaussianArrays& gaussians, const CameraView& view, const RenderTargets& targets) {
   prepare(r, gaussians, view);
   const Isa isa = r.context.isa;
   ThreadPool& pool = r.context.pool;
@@ -117,8 +117,7 @@ GGSLAM_EXPORT void* ggslam_rasterizer_create(void* context) { return new Rasteri
 
 GGSLAM_EXPORT void ggslam_rasterizer_destroy(void* rasterizer) { delete static_cast<Rasterizer*>(rasterizer); }
 
-// Renders. Returns 0, 1 (out of memory) or 2 (more than 2^31 pairs of a Gaussian and a tile).
-GGSLAM_EXPORT int ggslam_rasterizer_forward(void* rasterizer, const GaussianArrays* gaussians, const View* view,
+GGSLAM_EXPORT int ggslam_rasterizer_forward(void* rasterizer, const GaussianArrays* gaussians, const CameraView* view,
                                             const RenderTargets* targets) {
   try {
     return forward(*static_cast<Rasterizer*>(rasterizer), *gaussians, *view, *targets);
@@ -127,8 +126,6 @@ GGSLAM_EXPORT int ggslam_rasterizer_forward(void* rasterizer, const GaussianArra
   }
 }
 
-// Differentiates the last forward, whose arrays must still be there and unchanged. With `adam`, updates the Gaussians
-// that were touched instead of writing their gradients.
 GGSLAM_EXPORT int ggslam_rasterizer_backward(void* rasterizer, const ImageGradients* image_gradients,
                                              const GaussianGradients* gradients, const AdamArguments* adam) {
   try {
@@ -138,7 +135,6 @@ GGSLAM_EXPORT int ggslam_rasterizer_backward(void* rasterizer, const ImageGradie
   }
 }
 
-// Numbers of the last forward: visible Gaussians, pairs of a Gaussian and a tile.
 GGSLAM_EXPORT void ggslam_rasterizer_statistics(void* rasterizer, std::int64_t* out) {
   const Rasterizer& r = *static_cast<Rasterizer*>(rasterizer);
   out[0] = 0;

@@ -15,6 +15,7 @@
 
 #include "common/buffer.hpp"
 #include "common/context.hpp"
+#include "interface/core/rendering.hpp"
 
 namespace ggslam {
 
@@ -34,53 +35,9 @@ constexpr int kSlotStride = 16;                 // floats from one gradient slot
 constexpr int kMaxBlocks = 32;
 constexpr int kChunk = 64;                      // splats that a tile composites at a time
 
-// --- arguments, as laid out by ggslam/rendering/_native.py -----------------------------------------------------------
-struct GaussianArrays {
-  std::int64_t count;
-  const float *means, *quaternions, *log_scales, *opacity_logits, *sh, *features;
-  std::int32_t sh_coefficients;         // coefficients stored per Gaussian: 1, 4, 9 or 16
-  std::int32_t active_sh_coefficients;  // how many of them are evaluated
-  std::int32_t feature_channels;        // channels stored per Gaussian
-  std::int32_t render_features;         // 0: leave them out
-};
-
-struct View {
-  std::int32_t width, height;
-  float fx, fy, cx, cy, near_plane;
-  float low_pass;  // pixels^2 added to both diagonal terms of the 2D covariance
-  float camera_world[12];  // first three rows of T_camera_world
-};
-
-struct RenderTargets {  // planes [H, W]; features and median_depth may be null
-  float *image, *features, *depth, *alpha, *median_depth;
-};
-
-struct ImageGradients {  // each may be null, which means zero
-  const float *image, *features, *depth, *alpha;
-  std::int32_t detach_features;  // 1: gradients of the feature channels reach the features only
-};
-
-struct GaussianGradients {  // gradient arrays may all be null; twist and touched are always written
-  float *means, *quaternions, *log_scales, *opacity_logits, *sh, *features;
-  double* twist;
-  std::uint8_t* touched;
-};
-
-struct AdamArrays {
-  float *parameters, *first_moments, *second_moments;
-};
-
 // schedule [rows][8]: for a Gaussian at its u-th update, row min(u, rows) - 1 holds the step sizes (learning rate over
 // 1 - beta1^u) of the seven groups in the order below, then 1 / sqrt(1 - beta2^u).
 enum AdamGroup { kMeans, kQuaternions, kLogScales, kOpacityLogits, kShConstant, kShRest, kFeatures, kCorrection };
-
-struct AdamArguments {
-  AdamArrays means, quaternions, log_scales, opacity_logits, sh, features;
-  std::int32_t* updates;
-  const float* schedule;
-  std::int32_t schedule_rows;
-  float beta1, beta2, epsilon;
-};
 
 // --- what the stages hand to one another -----------------------------------------------------------------------------
 
@@ -127,7 +84,7 @@ struct Rasterizer {
   ThreadScratch* scratch;  // one per thread
 
   GaussianArrays gaussians{};
-  View view{};
+  CameraView view{};
   int padded_features = 0;  // rendered feature channels, rounded up to a multiple of 4
   int tile_height = 0, tiles_x = 0, tiles_y = 0;
 

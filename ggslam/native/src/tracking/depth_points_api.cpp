@@ -26,8 +26,6 @@ void move_rows(const DepthPointsOutput& to, const DepthPointsOutput& from, std::
 }  // namespace
 }  // namespace ggslam
 
-// Points on the grid of pixels `stride` apart, row by row; returns their number. The outputs have room for
-// ceil(width / stride) ceil(height / stride) points.
 GGSLAM_EXPORT int ggslam_depth_points(void* context_, const float* depth, const ggslam::DepthPointsSettings* settings,
                                       const ggslam::DepthPointsOutput* out) {
   using namespace ggslam;

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <cstring>
 
+#include "common/vector.hpp"
 #include "tracking/gicp_target.hpp"
 
 GGSLAM_DECLARE_KERNEL(void linearize_block(const LinearizeArgs& args, std::size_t begin, std::size_t end,
@@ -23,41 +24,41 @@ constexpr std::size_t kBlockPoints = 256;
 constexpr double kAcceptedRise = 1.05;
 
 struct RigidPose {
-  double r[9], t[3];
+  Mat3d rotation;
+  Vec3d translation;
 };
 
-// exp of the twist (v, w) about the camera centre: the centre moves by V v, the axes turn by exp(w).
-RigidPose moved(const RigidPose& pose, const double* twist) {
-  const double* w = twist + 3;
-  const double angle = std::sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
+// The first three rows of a 4 x 4 transform.
+RigidPose pose_of(const double* rows) {
+  RigidPose pose;
+  for (int i = 0; i < 3; ++i) pose.rotation.row[i] = Vec3d::from(rows + 4 * i), pose.translation[i] = rows[4 * i + 3];
+  return pose;
+}
+
+// Moves a pose by a twist (v, w) about the camera centre: the axes turn by exp(w) (Rodrigues' formula), the centre moves
+// by v alone. To first order that is the exponential of the twist, and it keeps its two parts apart.
+RigidPose move(const RigidPose& pose, const double* twist) {
+  const Vec3d w = Vec3d::from(twist + 3);
+  const double angle = length(w);
   const bool small = angle < 1e-6;
   const double a = small ? 1 - angle * angle / 6 : std::sin(angle) / angle;
   const double b = small ? 0.5 - angle * angle / 24 : (1 - std::cos(angle)) / (angle * angle);
-  const double k[9] = {0, -w[2], w[1], w[2], 0, -w[0], -w[1], w[0], 0};
-  double kk[9], turn[9];
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j) kk[3 * i + j] = k[3 * i] * k[j] + k[3 * i + 1] * k[3 + j] + k[3 * i + 2] * k[6 + j];
-  for (int i = 0; i < 9; ++i) turn[i] = (i % 4 == 0) + a * k[i] + b * kk[i];
-  RigidPose out;
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j)
-      out.r[3 * i + j] = turn[3 * i] * pose.r[j] + turn[3 * i + 1] * pose.r[3 + j] + turn[3 * i + 2] * pose.r[6 + j];
-  // The centre moves by v alone: to first order the same as exp, and it keeps the two parts of the twist apart.
-  for (int i = 0; i < 3; ++i) out.t[i] = pose.t[i] + twist[i];
-  return out;
+  const Mat3d k = Mat3d::cross_product(w);
+  const Mat3d turn = Mat3d::identity() + a * k + b * (k * k);
+  return {turn * pose.rotation, pose.translation + Vec3d::from(twist)};
+}
+
+template <typename Args>
+void set_pose(const RigidPose& pose, Args& args) {
+  for (int i = 0; i < 9; ++i) args.rotation[i] = static_cast<float>(pose.rotation(i / 3, i % 3));
+  for (int i = 0; i < 3; ++i) args.translation[i] = static_cast<float>(pose.translation[i]);
 }
 
 // Gram-Schmidt on the rows: rounding of a dozen products is all there is to remove.
-void orthonormalize(double* r) {
-  const auto normalize = [](double* v) {
-    const double f = 1 / std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
-    for (int i = 0; i < 3; ++i) v[i] *= f;
-  };
-  normalize(r);
-  const double dot = r[0] * r[3] + r[1] * r[4] + r[2] * r[5];
-  for (int i = 0; i < 3; ++i) r[3 + i] -= dot * r[i];
-  normalize(r + 3);
-  r[6] = r[1] * r[5] - r[2] * r[4], r[7] = r[2] * r[3] - r[0] * r[5], r[8] = r[0] * r[4] - r[1] * r[3];
+Mat3d orthonormalize(const Mat3d& r) {
+  const Vec3d x = normalize(r.row[0]);
+  const Vec3d y = normalize(r.row[1] - dot(x, r.row[1]) * x);
+  return {{x, y, cross(x, y)}};
 }
 
 // Solves (H + damping diag(H)) x = b for the first n unknowns by Cholesky; false if H is not positive.
@@ -125,7 +126,7 @@ class Aligner {
     choose_level(target_.fine, 1, 1, has_reference_);
     result.fine_iterations = descend(pose, settings_.fine_iterations, 1, &converged);
     result.converged = converged;
-    orthonormalize(pose.r);
+    pose.rotation = orthonormalize(pose.rotation);
     report(pose, result);
   }
 
@@ -154,7 +155,7 @@ class Aligner {
       double x[kUnknowns] = {0};
       const int unknowns = use_photometric_ && current.photometric_count > 50 ? 8 : 6;
       if (current.matches < settings_.min_matches || !solve(current.h, current.b, damping, unknowns, x)) return evaluations;
-      const RigidPose candidate = moved(pose, x);
+      const RigidPose candidate = move(pose, x);
       const double gain = gain_ + x[6], bias = bias_ + x[7];
       *converged = is_small(x, tolerance_factor);
       if (*converged) {
@@ -178,15 +179,8 @@ class Aligner {
   }
 
   bool is_small(const double* x, double factor) const {
-    const double v = std::sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]);
-    const double w = std::sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5]);
-    return v < factor * settings_.translation_tolerance && w < factor * settings_.rotation_tolerance;
-  }
-
-  template <typename Args>
-  static void set_pose(const RigidPose& pose, Args& args) {
-    for (int i = 0; i < 9; ++i) args.rotation[i] = static_cast<float>(pose.r[i]);
-    for (int i = 0; i < 3; ++i) args.translation[i] = static_cast<float>(pose.t[i]);
+    return length(Vec3d::from(x)) < factor * settings_.translation_tolerance &&
+           length(Vec3d::from(x + 3)) < factor * settings_.rotation_tolerance;
   }
 
   // Runs a kernel over the blocks of `count` points; sums[i] belongs to block i.
@@ -293,29 +287,24 @@ class Aligner {
 }  // namespace
 }  // namespace ggslam
 
-// Aligns points to a target from the guess `pose` (T_world_camera, row by row). `photometric_points` and `reference`
-// may be null. `match` and `squared_distance` have room for one entry per point.
 GGSLAM_EXPORT void ggslam_gicp_align(void* context, const void* target, const ggslam::AlignPoints* points,
                                      const ggslam::AlignSettings* settings,
                                      const ggslam::PhotometricPoints* photometric_points,
                                      const ggslam::PhotometricReferenceView* reference, const double* pose_guess,
                                      int32_t* match, float* squared_distance, ggslam::AlignResult* result) {
   using namespace ggslam;
-  RigidPose pose;
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) pose.r[3 * i + j] = pose_guess[4 * i + j];
-    pose.t[i] = pose_guess[4 * i + 3];
-  }
+  RigidPose pose = pose_of(pose_guess);
   *result = AlignResult{};
   Aligner(*static_cast<Context*>(context), *points, *static_cast<const GicpTarget*>(target), *settings,
           photometric_points, reference, match, squared_distance)
       .run(pose, *result);
-  for (int i = 0; i < 4; ++i)
-    for (int j = 0; j < 4; ++j) result->pose[4 * i + j] = i == 3 ? (j == 3) : j == 3 ? pose.t[i] : pose.r[3 * i + j];
+  for (int i = 0; i < 3; ++i) {
+    pose.rotation.row[i].to(result->pose + 4 * i);
+    result->pose[4 * i + 3] = pose.translation[i];
+  }
+  result->pose[15] = 1;
 }
 
-// One linearisation at a pose, for tests: level 0 fine, 1 coarse. h [36], b [6] in sums over points, twist about the
-// camera centre; returns the cost.
 GGSLAM_EXPORT double ggslam_gicp_linearize(void* context_, const void* target_, const ggslam::AlignPoints* points,
                                            const ggslam::AlignSettings* settings, int level, const double* pose,
                                            int32_t* match, float* squared_distance, double* h, double* b) {
@@ -330,10 +319,7 @@ GGSLAM_EXPORT double ggslam_gicp_linearize(void* context_, const void* target_, 
   args.point_step = 1;
   args.match = match;
   args.squared_distance = squared_distance;
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) args.rotation[3 * i + j] = static_cast<float>(pose[4 * i + j]);
-    args.translation[i] = static_cast<float>(pose[4 * i + 3]);
-  }
+  set_pose(pose_of(pose), args);
   AlignSums sums{};
   GGSLAM_DISPATCH(context.isa, linearize_block)(args, 0, points->count, &sums);
   unpack(sums.h, 6, h);

@@ -253,8 +253,6 @@ GGSLAM_EXPORT void ggslam_gicp_target_build(void* context, void* target, const v
                                                   static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
 }
 
-// As ggslam_gicp_target_build, but leaves the voxels without shapes. Until ggslam_gicp_target_finish has been called, the
-// target may be a base, and be asked for its size, its moments and its blocks.
 GGSLAM_EXPORT void ggslam_gicp_target_gather(void* context, void* target, const void* base,
                                              const ggslam::TargetInput* input,
                                              const ggslam::TargetSettings* settings) {
@@ -266,14 +264,12 @@ GGSLAM_EXPORT void ggslam_gicp_target_finish(void* context, void* target, const 
   static_cast<ggslam::GicpTarget*>(target)->finish(*static_cast<ggslam::Context*>(context), *settings);
 }
 
-// Number of voxels of a level (0 fine, 1 coarse).
 GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target_, int level_) {
   const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
   const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;
   return static_cast<int>(std::max(level.voxels.size(), level.moments.size()));
 }
 
-// Copies the moments of a level's voxels, [n, 22] in the order of struct VoxelMoments.
 GGSLAM_EXPORT void ggslam_gicp_target_moments(const void* target_, int level, float* out) {
   const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
   const auto& moments = (level ? target.coarse : target.fine).moments;
@@ -281,14 +277,12 @@ GGSLAM_EXPORT void ggslam_gicp_target_moments(const void* target_, int level, fl
   std::copy_n(reinterpret_cast<const float*>(moments.data()), moments.size() * 22, out);
 }
 
-// Copies a level's voxels: [n, 16] mean(3) weight normal(3) 0 covariance(6) 0 0.
 GGSLAM_EXPORT void ggslam_gicp_target_voxels(const void* target_, int level, float* out) {
   const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
   const auto& voxels = (level ? target.coarse : target.fine).voxels;
   std::copy_n(reinterpret_cast<const float*>(voxels.data()), voxels.size() * 16, out);
 }
 
-// Number of blocks of a level. Copies them unless `out` is null: [n, 3] key, occupied, first.
 GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target_, int level_, uint64_t* out) {
   const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
   const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;

@@ -283,7 +283,6 @@ void GicpTarget::compose(Context& context, const GicpTarget* before, Parts parts
 
 using PartHandle = std::shared_ptr<const ggslam::TargetPart>;
 
-// Uses no thread but the caller's.
 GGSLAM_EXPORT void* ggslam_target_part_create(const void* context, const ggslam::TargetInput* input,
                                               const ggslam::TargetSettings* settings, uint64_t rank) {
   auto part = std::make_shared<ggslam::TargetPart>();
@@ -298,7 +297,6 @@ GGSLAM_EXPORT int64_t ggslam_target_part_bytes(const void* part) {
   return static_cast<int64_t>((*static_cast<const PartHandle*>(part))->bytes());
 }
 
-// `before` may be null; `target` is neither it nor in use.
 GGSLAM_EXPORT void ggslam_gicp_target_compose(void* context, void* target, const void* before, const void* const* parts,
                                               int count, const ggslam::TargetSettings* settings) {
   std::vector<PartHandle> own;

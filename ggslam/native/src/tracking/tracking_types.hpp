@@ -1,53 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-// Plain structures shared by the tracking kernels (compiled per instruction set) and their callers. The structures
-// named *Settings and *Result are mirrored field by field in ggslam/tracking/native.py.
+// Plain structures shared by the tracking kernels (compiled per instruction set) and those that start them.
 #pragma once
 #include <cstddef>
 #include <cstdint>
+
+#include "interface/core/tracking.hpp"
 
 namespace ggslam {
 
 // --- points of a depth image ------------------------------------------------------------------------------------
 
-struct DepthPointsSettings {
-  float fx, fy, cx, cy;                // pixels; the centre of the top-left pixel is (0, 0)
-  float noise_constant, noise_square;  // sigma(z) = constant + square z^2, metres
-  float min_depth, max_depth;          // metres
-  float min_thickness, max_elongation;  // of the regularised covariance, see regularized_axes()
-  float min_neighbours;                // share of the window that must lie on the same surface
-  int32_t width, height;
-  int32_t stride;       // pixels between points
-  int32_t window;       // the window has (2 window + 1)^2 samples
-  int32_t window_step;  // pixels between samples of the window
-};
-
-struct DepthPointsOutput {
-  float* points;       // [n, 3] camera frame, metres
-  float* normals;      // [n, 3] unit, towards the camera
-  float* covariances;  // [n, 6] xx xy xz yy yz zz, median eigenvalue 1
-  int32_t* pixels;     // [n, 2] u, v
-  float* weights;      // [n] (sigma(1 m) / sigma(z))^2
-};
-
 // --- voxel grid the points are aligned to --------------------------------------------------------------------------
-
-struct TargetInput {
-  const float* means;           // [n, 3]
-  const float* quaternions;     // [n, 4] wxyz
-  const float* log_scales;      // [n, 3]
-  const float* opacity_logits;  // [n]
-  const int32_t* birth;         // [n] row of camera_positions, or negative: not known
-  const float* camera_positions;  // [cameras, 3]
-  int32_t count, cameras;
-};
-
-struct TargetSettings {
-  float voxel;              // edge of a fine voxel, metres; coarse voxels are 4 times as wide
-  float min_opacity_logit;
-  float min_thickness, max_thickness, max_elongation;
-  float scatter_weight;     // weight of the scatter of the means against the members' own covariances
-  float neighbour_weight;   // weight of the 26 neighbours in a voxel's scatter
-};
 
 struct VoxelMoments {
   float weight;
@@ -101,28 +64,6 @@ inline uint64_t hash_key(uint64_t key) {
 
 // --- alignment -----------------------------------------------------------------------------------------------------
 
-struct AlignSettings {
-  double translation_tolerance, rotation_tolerance;  // metres, radians
-  double coarse_kernel_factor;   // the robust kernel of the coarse level is this much wider
-  float noise_constant, noise_square;
-  float kernel_constant, kernel_sigmas;    // width of the Geman-McClure kernel: constant + sigmas sigma(z)
-  float overlap_constant, overlap_sigmas;  // a match is an inlier under this point-to-plane distance, likewise
-  float min_normal_dot;          // normals of a match agree to this cosine
-  float plane_variance;          // variance of a match along the normal in units of the regularised covariances
-  int32_t coarse_iterations, fine_iterations, coarse_points, min_matches;
-  float photometric_weight;      // factor of the photometric part
-  float huber;                   // grey levels in [0, 1]
-  float depth_tolerance;         // relative depth difference above which a pixel is occluded
-};
-
-struct AlignPoints {
-  const float* points;
-  const float* normals;
-  const float* covariances;
-  const float* weights;
-  int32_t count;
-};
-
 // Sums over a block of points, in the order of AlignSums::h: upper triangle of the 6x6 matrix row by row.
 struct AlignSums {
   double h[21];
@@ -151,19 +92,6 @@ struct LinearizeArgs {
 
 // --- photometric part ------------------------------------------------------------------------------------------------
 
-struct PhotometricPoints {
-  const float* points;     // [n, 3] frame's camera
-  const float* intensity;  // [n] grey in [0, 1]
-  int32_t count;
-};
-
-struct PhotometricReferenceView {
-  const float* pixels;  // [h, w, 4] grey, d grey / du, d grey / dv, depth
-  float fx, fy, cx, cy;
-  int32_t width, height;
-  float rotation[9], translation[3];  // T_reference_world
-};
-
 struct PhotometricArgs {
   PhotometricPoints points;
   PhotometricReferenceView reference;
@@ -176,16 +104,6 @@ struct PhotometricSums {
   double h[36];  // upper triangle of 8x8: twist, gain, bias
   double b[8];
   double cost, count, absolute;
-};
-
-struct AlignResult {
-  double pose[16];         // T_world_camera, row by row
-  double normal_matrix[36];  // of the last linearisation, twist about the camera centre, world axes
-  double information[36];  // point-to-plane, 1 / sigma^2, twist about the camera centre
-  double cost;             // per unit of weight
-  double overlap, rmse;    // share of all points; metres
-  double photometric_residual, photometric_share, gain, bias;
-  int32_t coarse_iterations, fine_iterations, matches, inliers, converged, usable;
 };
 
 }  // namespace ggslam

@@ -2,7 +2,8 @@
 #include "volumes/edge_vertex.hpp"
 
 #include <algorithm>
-#include <cmath>
+
+#include "common/vector.hpp"
 
 namespace ggslam::volumes {
 namespace {
@@ -46,17 +47,17 @@ bool EdgeVertex::beside(int axis, int step, float& value) const {
 }
 
 void EdgeVertex::normal(float out[3]) const {
+  Vec3f slope;
   for (int a = 0; a < 3; ++a) {
     if (a == axis_) {
-      out[a] = static_cast<float>(ends_[1].value() - ends_[0].value());
+      slope[a] = static_cast<float>(ends_[1].value() - ends_[0].value());
       continue;
     }
     float low = 0, high = 0;  // the vertex itself is at 0
     const int sides = beside(a, -1, low) + beside(a, 1, high);
-    out[a] = sides == 0 ? 0 : (high - low) / sides;
+    slope[a] = sides == 0 ? 0 : (high - low) / sides;
   }
-  const float scale = 1 / std::sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2]);
-  for (int a = 0; a < 3; ++a) out[a] *= scale;
+  normalize(slope).to(out);
 }
 
 void EdgeVertex::color(uint8_t out[3]) const {

@@ -6,6 +6,7 @@
 
 #include "common/buffer.hpp"
 #include "common/context.hpp"
+#include "interface/core/volumes.hpp"
 #include "volumes/esdf_types.hpp"
 #include "volumes/tsdf.hpp"
 
@@ -16,15 +17,6 @@ struct FieldBlock {
   std::unique_ptr<FieldVoxels> voxels;
   uint64_t known[kSide] = {}, negative[kSide] = {};  // voxel (i, j, k): bit i + 8 j of word k
   float required = 0;  // how far from its voxels sites were read last time at most, voxels; 0: never computed
-};
-
-struct FieldStats {
-  int64_t changed_blocks;     // of the TSDF since the last time, those that went counted
-  int64_t changed_sites;      // surface points that came, went or moved
-  int64_t recomputed_blocks;  // of the field
-  int64_t blocks;             // the field has now
-  int64_t transformed;        // voxels through the transform, with those computed again
-  double sites_ms, select_ms, transform_ms;
 };
 
 // Half-open range of blocks or voxels.

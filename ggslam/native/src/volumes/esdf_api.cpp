@@ -16,7 +16,6 @@ Esdf& field(void* handle) { return *static_cast<Esdf*>(handle); }
 
 }  // namespace
 
-// The TSDF must live as long as the field.
 GGSLAM_EXPORT void* ggslam_esdf_create(void* tsdf, float max_distance) {
   return new Esdf(*static_cast<Tsdf*>(tsdf), max_distance);
 }
@@ -30,7 +29,6 @@ GGSLAM_EXPORT void ggslam_esdf_update(void* handle, void* context, FieldStats* s
   *stats = field(handle).update(*static_cast<ggslam::Context*>(context));
 }
 
-// Coordinates [n, 3] of all blocks.
 GGSLAM_EXPORT void ggslam_esdf_list(void* handle, int32_t* at) {
   const BlockTable& table = field(handle).table();
   for (std::size_t row = 0; row < table.size(); ++row) {
@@ -39,7 +37,6 @@ GGSLAM_EXPORT void ggslam_esdf_list(void* handle, int32_t* at) {
   }
 }
 
-// Distances [n, 512] of the blocks at coordinates [n, 3]; NaN: unknown.
 GGSLAM_EXPORT void ggslam_esdf_read(void* handle, int64_t n, const int32_t* at, float* distance) {
   const Esdf& f = field(handle);
   for (int64_t i = 0; i < n; ++i) {
@@ -50,7 +47,6 @@ GGSLAM_EXPORT void ggslam_esdf_read(void* handle, int64_t n, const int32_t* at, 
   }
 }
 
-// Number of surface points of all blocks; their positions [n, 3] (metres) and normals [n, 3], unless null.
 GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* normals) {
   const Esdf& f = field(handle);
   int64_t n = 0;
@@ -71,7 +67,6 @@ GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* norm
   return n;
 }
 
-// At points [n, 3] in metres: distances [n] (metres), gradients [n, 3] and whether they are known [n].
 GGSLAM_EXPORT void ggslam_esdf_query(void* handle, void* context_, int64_t n, const double* points, float* distance,
                                      float* gradient, uint8_t* known) {
   ggslam::Context& context = *static_cast<ggslam::Context*>(context_);

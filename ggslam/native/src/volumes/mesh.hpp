@@ -4,18 +4,10 @@
 #include <cstdint>
 #include <vector>
 
+#include "interface/core/volumes.hpp"
 #include "volumes/surface_cells.hpp"
 
 namespace ggslam::volumes {
-
-// Vertices [n, 3] in metres, unit normals [n, 3], colours [n, 3], labels [n]; triangles [m, 3].
-struct MeshArrays {
-  float* vertices;
-  float* normals;
-  uint8_t* colors;
-  uint16_t* labels;
-  int32_t* triangles;
-};
 
 // Vertices of a block: one for each edge of the voxel grid that the surface cuts, of the lower voxel's block.
 struct BlockVertices {

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/context.hpp"
+#include "interface/core/volumes.hpp"
 #include "volumes/mesh.hpp"
 
 using ggslam::Context;
@@ -8,7 +9,6 @@ using ggslam::volumes::Mesher;
 using ggslam::volumes::SurfaceCells;
 using ggslam::volumes::Tsdf;
 
-// Where the surface runs, of voxels with at least `min_weight` (65535ths of the largest). Good until the map changes.
 GGSLAM_EXPORT void* ggslam_surface_cells_create(void* context_, void* tsdf, uint16_t min_weight) {
   Context& context = *static_cast<Context*>(context_);
   return new SurfaceCells(context.pool, context.isa, *static_cast<Tsdf*>(tsdf), min_weight);
@@ -16,7 +16,6 @@ GGSLAM_EXPORT void* ggslam_surface_cells_create(void* context_, void* tsdf, uint
 
 GGSLAM_EXPORT void ggslam_surface_cells_destroy(void* cells) { delete static_cast<SurfaceCells*>(cells); }
 
-// Counts the mesh's vertices and triangles (`sizes` [2]); `cells` must outlive what is returned.
 GGSLAM_EXPORT void* ggslam_mesher_create(void* context, void* cells, int64_t* sizes) {
   Mesher* mesher = new Mesher(static_cast<Context*>(context)->pool, *static_cast<SurfaceCells*>(cells));
   sizes[0] = mesher->vertices(), sizes[1] = mesher->triangles();

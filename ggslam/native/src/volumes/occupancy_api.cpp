@@ -22,24 +22,6 @@ struct OccupancyMap {
   explicit OccupancyMap(double resolution) : tree(resolution) {}
 };
 
-struct InsertSettings {
-  double max_range;
-  float origin[3];
-  float hit, miss, minimum, maximum;
-  std::int32_t quantize;
-};
-
-struct InsertResult {
-  std::uint64_t rays, free, occupied;  // rays walked; voxels of the scan, those both passed and hit counted as occupied
-};
-
-struct DepthImage {
-  const float* depth;
-  std::int32_t width, height;
-  float fx, fy, cx, cy, low, high;
-  float T_world_camera[12];
-};
-
 OccupancyMap& map_of(void* handle) { return *static_cast<OccupancyMap*>(handle); }
 
 // How many voxels a scan saw free that it did not see occupied.
@@ -76,7 +58,6 @@ using namespace ggslam;
 GGSLAM_EXPORT void* ggslam_occupancy_create(double resolution) { return new OccupancyMap(resolution); }
 GGSLAM_EXPORT void ggslam_occupancy_destroy(void* map) { delete static_cast<OccupancyMap*>(map); }
 
-// 0: the origin is outside the grid, nothing was done.
 GGSLAM_EXPORT int ggslam_occupancy_insert(void* context, void* map, const float* points, std::uint64_t n,
                                           const InsertSettings* settings, InsertResult* result) {
   return insert(*static_cast<Context*>(context), map_of(map), points, n, *settings, *result) ? 1 : 0;
@@ -111,7 +92,6 @@ GGSLAM_EXPORT void ggslam_occupancy_compare(void* one, void* other, float thresh
   count_states(map_of(one).tree, map_of(other).tree, threshold_one, threshold_other, counts);
 }
 
-// The following make an output, kept until the next of them is called, and return its size in bytes.
 GGSLAM_EXPORT const void* ggslam_occupancy_output(void* map) { return map_of(map).output.data(); }
 
 GGSLAM_EXPORT std::uint64_t ggslam_occupancy_leaves(void* map_, float threshold, int which) {
@@ -130,7 +110,6 @@ GGSLAM_EXPORT std::uint64_t ggslam_occupancy_write(void* map_, int format, float
   return map.output.size();
 }
 
-// Returns an OctomapFault.
 GGSLAM_EXPORT int ggslam_occupancy_read(void* map, int format, const std::uint8_t* data, std::uint64_t size, float free,
                                         float occupied, std::uint64_t maximum_blocks, std::uint64_t* nodes) {
   const OctomapReading reading =
@@ -139,7 +118,6 @@ GGSLAM_EXPORT int ggslam_occupancy_read(void* map, int format, const std::uint8_
   return static_cast<int>(reading.fault);
 }
 
-// Keys (uint16 [m, 3]) of the voxels that a scan sees, the free ones first; -1: the origin is outside the grid.
 GGSLAM_EXPORT std::int64_t ggslam_occupancy_scan_keys(void* context, void* map_, const float* points, std::uint64_t n,
                                                       const InsertSettings* s, InsertResult* result) {
   OccupancyMap& map = map_of(map_);
@@ -158,8 +136,6 @@ GGSLAM_EXPORT std::int64_t ggslam_occupancy_scan_keys(void* context, void* map_,
   return static_cast<std::int64_t>(map.output.size());
 }
 
-// Distinct voxels of n points: keys (uint16 [m, 3], room for n) and how many points lie in each (int32 [m]; may be
-// null). Returns m.
 GGSLAM_EXPORT std::uint64_t ggslam_quantize(void* context, double resolution, const float* points, std::uint64_t n,
                                             std::uint16_t* keys, std::int32_t* counts) {
   std::vector<std::int64_t> codes;

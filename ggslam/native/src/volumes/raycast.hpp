@@ -4,26 +4,10 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "interface/core/volumes.hpp"
 #include "volumes/surface_cells.hpp"
 
 namespace ggslam::volumes {
-
-struct RaycastView {
-  float fx, fy, cx, cy;
-  float near, far;       // depth, metres
-  float rotation[9];     // world from camera
-  float position[3];     // of the camera, metres
-  int32_t width, height;
-};
-
-// [height, width]: depth along the optical axis in metres, 0 where no surface is seen; unit normals [.., 3] in the
-// camera's axes; colours [.., 3]; labels.
-struct SurfaceImages {
-  float* depth;
-  float* normals;
-  uint8_t* colors;
-  uint16_t* labels;
-};
 
 // What the rays of a tile of pixels are cast into.
 struct RaycastScene {

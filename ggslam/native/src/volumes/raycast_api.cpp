@@ -5,6 +5,7 @@
 #include <cmath>
 
 #include "common/context.hpp"
+#include "common/vector.hpp"
 
 GGSLAM_DECLARE_KERNEL(void raycast_tile(const volumes::RaycastScene& scene, const volumes::RaycastView& view,
                                         const volumes::RaycastTile& tile, const volumes::SurfaceImages& out))
@@ -51,19 +52,14 @@ class TileRanges {
 
   // The box of kPart^3 cells from a voxel.
   void add_box(int x, int y, int z) {
-    const float low_corner[3] = {voxel_ * (x + 0.5f), voxel_ * (y + 0.5f), voxel_ * (z + 0.5f)};
-    const float* R = view_.rotation;
-    float first[3];
-    for (int a = 0; a < 3; ++a) {
-      first[a] = 0;
-      for (int b = 0; b < 3; ++b) first[a] += R[3 * b + a] * (low_corner[b] - view_.position[b]);
-    }
+    const Vec3f low_corner{{voxel_ * (x + 0.5f), voxel_ * (y + 0.5f), voxel_ * (z + 0.5f)}};
+    const Mat3f to_camera = Mat3f::from(view_.rotation).transpose();
+    const Vec3f first = to_camera * (low_corner - Vec3f::from(view_.position));
     int beyond[4] = {0, 0, 0, 0};  // corners beyond the planes through the camera and the image's sides
     float low[3] = {1e30f, 1e30f, 1e30f}, high[3] = {-1e30f, -1e30f, -1e30f};  // column, row, depth
     for (int c = 0; c < 8; ++c) {
-      float p[3];
-      for (int a = 0; a < 3; ++a)
-        p[a] = first[a] + kPart * voxel_ * ((c & 1) * R[a] + ((c >> 1) & 1) * R[3 + a] + (c >> 2) * R[6 + a]);
+      const Vec3f step{{static_cast<float>(c & 1), static_cast<float>((c >> 1) & 1), static_cast<float>(c >> 2)}};
+      const Vec3f p = first + kPart * voxel_ * (to_camera * step);
       const float u = view_.fx * p[0] + view_.cx * p[2], v = view_.fy * p[1] + view_.cy * p[2];
       beyond[0] += u < -p[2], beyond[1] += u > view_.width * p[2];
       beyond[2] += v < -p[2], beyond[3] += v > view_.height * p[2];

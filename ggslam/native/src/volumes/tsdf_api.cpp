@@ -4,24 +4,17 @@
 #include <cstring>
 
 #include "common/context.hpp"
+#include "interface/core/volumes.hpp"
 #include "volumes/tsdf.hpp"
 
 using ggslam::volumes::Block;
 using ggslam::volumes::BlockCoordinates;
 using ggslam::volumes::kVoxels;
 using ggslam::volumes::Tsdf;
+using ggslam::volumes::VoxelArrays;
 using ggslam::volumes::VoxelBlock;
 
 namespace {
-
-// Voxels of blocks as arrays of [blocks, 512] (colour: [blocks, 512, 3]); any may be null.
-struct VoxelArrays {
-  int16_t* value;
-  uint16_t* weight;
-  uint16_t* label;
-  uint8_t* color;
-  uint8_t* votes;
-};
 
 template <class T>
 void copy_out(T* to, std::size_t row, const T* from) {
@@ -50,8 +43,6 @@ GGSLAM_EXPORT int64_t ggslam_tsdf_dense(void* handle) { return tsdf(handle).dens
 GGSLAM_EXPORT int64_t ggslam_tsdf_bytes(void* handle) { return tsdf(handle).bytes(); }
 GGSLAM_EXPORT uint32_t ggslam_tsdf_revision(void* handle) { return tsdf(handle).revision; }
 
-// All blocks by row: coordinates [n, 3], whether they have voxels [n], weights of those that are free [n], whether
-// they are frozen [n], revisions [n].
 GGSLAM_EXPORT void ggslam_tsdf_list(void* handle, int32_t* at, uint8_t* dense, uint16_t* free_weight, uint8_t* frozen,
                                     uint32_t* revision) {
   const Tsdf& map = tsdf(handle);
@@ -62,8 +53,6 @@ GGSLAM_EXPORT void ggslam_tsdf_list(void* handle, int32_t* at, uint8_t* dense, u
   }
 }
 
-// Voxels of the blocks at coordinates [n, 3]; those that are free throughout are written out, too. Blocks that are not
-// there come out as never seen.
 GGSLAM_EXPORT void ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at, const VoxelArrays* out) {
   const Tsdf& map = tsdf(handle);
   VoxelBlock plain{};
@@ -86,7 +75,6 @@ GGSLAM_EXPORT void ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at, 
   }
 }
 
-// Writes voxels of the blocks at coordinates [n, 3], made where there are none. What `in` lacks stays as it is.
 GGSLAM_EXPORT void ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at, const VoxelArrays* in) {
   Tsdf& map = tsdf(handle);
   ++map.revision;
@@ -105,7 +93,6 @@ GGSLAM_EXPORT void ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at,
   }
 }
 
-// Makes the blocks at coordinates [n, 3] free throughout, with weights [n].
 GGSLAM_EXPORT void ggslam_tsdf_write_free(void* handle, int64_t n, const int32_t* at, const uint16_t* weight) {
   Tsdf& map = tsdf(handle);
   ++map.revision;
@@ -116,7 +103,6 @@ GGSLAM_EXPORT void ggslam_tsdf_write_free(void* handle, int64_t n, const int32_t
   }
 }
 
-// Removes the blocks at coordinates [n, 3], where there are any.
 GGSLAM_EXPORT void ggslam_tsdf_erase(void* handle, int64_t n, const int32_t* at) {
   Tsdf& map = tsdf(handle);
   ++map.revision;
@@ -126,7 +112,6 @@ GGSLAM_EXPORT void ggslam_tsdf_erase(void* handle, int64_t n, const int32_t* at)
   }
 }
 
-// From now on decay leaves all blocks that are there alone (frozen = 1), or no longer (0).
 GGSLAM_EXPORT void ggslam_tsdf_freeze(void* handle, int frozen) {
   Tsdf& map = tsdf(handle);
   for (std::size_t row = 0; row < map.size(); ++row) map.block(row).frozen = frozen != 0;

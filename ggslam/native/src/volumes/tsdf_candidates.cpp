@@ -18,15 +18,13 @@ enum : unsigned { kBehind = 1, kInFront = 2, kAt = 4 };
 
 CandidateSearch::CandidateSearch(const Tsdf& map, const FusionInput& input, const FusionSettings& settings,
                                  const FusionImages& images)
-    : map_(map), in_(input), settings_(settings), images_(images), block_(static_cast<double>(map.voxel) * kSide) {
+    : map_(map), in_(input), settings_(settings), images_(images), block_(static_cast<double>(map.voxel) * kSide),
+      rotation_(Mat3d::from(input.rotation)), translation_(Vec3d::from(input.translation)),
+      position_(-1.0 * (rotation_.transpose() * translation_)) {
   for (int a = 0; a < 3; ++a) {
-    const double* r = in_.rotation + 3 * a;
+    const Vec3d& r = rotation_.row[a];
     extent_[a] = static_cast<float>(0.5 * block_ * (std::fabs(r[0]) + std::fabs(r[1]) + std::fabs(r[2])));
-    position_[a] = 0;
-    for (int b = 0; b < 3; ++b) {
-      axes_[a][b] = static_cast<float>(in_.rotation[3 * b + a]);
-      position_[a] -= in_.rotation[3 * b + a] * in_.translation[b];
-    }
+    for (int b = 0; b < 3; ++b) axes_[a][b] = static_cast<float>(rotation_(b, a));
     spread_[a] = std::fabs(axes_[a][0]) / in_.fx + std::fabs(axes_[a][1]) / in_.fy;
   }
   double low[3], high[3];
@@ -94,14 +92,11 @@ void CandidateSearch::emit_free(BlockCoordinates at, int side, std::vector<Candi
 
 // A cube of side^3 blocks.
 CandidateSearch::Cube CandidateSearch::cube(BlockCoordinates at, int side) const {
-  const double p[3] = {(at.x + 0.5 * side) * block_, (at.y + 0.5 * side) * block_, (at.z + 0.5 * side) * block_};
+  const Vec3d p{{(at.x + 0.5 * side) * block_, (at.y + 0.5 * side) * block_, (at.z + 0.5 * side) * block_}};
   Cube out;
   out.half = static_cast<float>(0.5 * side * block_);
-  for (int a = 0; a < 3; ++a) {
-    const double* r = in_.rotation + 3 * a;
-    out.centre[a] = static_cast<float>(r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + in_.translation[a]);
-    out.offset[a] = static_cast<float>(p[a] - position_[a]);
-  }
+  out.centre = to_float(rotation_ * p + translation_);
+  out.offset = to_float(p - position_);
   out.near = out.centre[2] - side * extent_[2], out.far = out.centre[2] + side * extent_[2];
   return out;
 }

@@ -4,6 +4,8 @@
 #include <cstdint>
 #include <vector>
 
+#include "common/vector.hpp"
+#include "interface/core/volumes.hpp"
 #include "volumes/tsdf.hpp"
 
 namespace ggslam {
@@ -15,26 +17,6 @@ namespace ggslam::volumes {
 constexpr int kTile = 4;        // pixels along an edge of the depth pyramid's smallest tiles
 constexpr int kErosion = 2;     // pixels: what is looked through must be so in this neighbourhood
 constexpr float kNear = 0.02f;  // metres; what is nearer is not projected
-
-// Numbers of the fusion, field by field as in ggslam/volumes/tsdf_native.py. Distances in metres.
-struct FusionSettings {
-  float min_depth, max_depth, free_share, edge, clearing, max_free_weight;
-};
-
-// A view to be fused. `color` [H, W, 3] and `labels` [H, W] may be null.
-struct FusionInput {
-  const float* depth;
-  const uint8_t* color;
-  const uint16_t* labels;
-  int32_t width, height;
-  float fx, fy, cx, cy;
-  double rotation[9], translation[3];  // of T_camera_world, row by row
-};
-
-struct FusionStats {
-  int64_t blocks, updated, made, freed;
-  double prepare_ms, select_ms, update_ms;
-};
 
 // Smallest and largest depth in tiles of kTile x 2^level pixels; (inf, 0) where there is none.
 struct DepthTile {
@@ -92,8 +74,10 @@ class CandidateSearch {
     bool whole;          // nothing is cut off at the image's border or near the camera
   };
   struct Cube {
-    float centre[3], near, far;  // in the camera's frame, with the depth of its nearest and farthest corner
-    float offset[3], half;       // centre from the camera along the map's axes, half of the edge
+    Vec3f centre;     // in the camera's frame
+    float near, far;  // depth of its nearest and farthest corner
+    Vec3f offset;     // centre from the camera along the map's axes
+    float half;       // of the edge
   };
   const Tsdf& map_;
   const FusionInput& in_;
@@ -102,7 +86,9 @@ class CandidateSearch {
   double block_;         // edge, metres
   int cell_ = 4;         // edge of a cell in blocks
   float extent_[3];      // half extents of a block along the camera's axes
-  double position_[3];   // of the camera
+  Mat3d rotation_;       // of T_camera_map
+  Vec3d translation_;
+  Vec3d position_;       // of the camera
   float axes_[3][3];     // of the camera in the map
   float spread_[3];      // along the map's axes at z = 1, of one pixel
   int32_t first_[3], count_[3];

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/context.hpp"
+#include "interface/core/volumes.hpp"
 #include "volumes/tsdf_scratch.hpp"
 
 namespace {
@@ -11,7 +12,6 @@ ggslam::volumes::FusionScratch& scratch(ggslam::volumes::Tsdf& map) {
 
 }  // namespace
 
-// Fuses a view; see FusionInput.
 GGSLAM_EXPORT void ggslam_tsdf_integrate(void* handle, void* context, const ggslam::volumes::FusionInput* input,
                                          const ggslam::volumes::FusionSettings* settings,
                                          ggslam::volumes::FusionStats* stats) {
@@ -19,8 +19,6 @@ GGSLAM_EXPORT void ggslam_tsdf_integrate(void* handle, void* context, const ggsl
   *stats = integrate(map, scratch(map), *static_cast<ggslam::Context*>(context), *input, *settings);
 }
 
-// Multiplies the weights of blocks that are not frozen; voxels whose weight falls below `least` are forgotten. Returns
-// the number of blocks forgotten.
 GGSLAM_EXPORT int64_t ggslam_tsdf_decay(void* handle, void* context, float factor, int least, int spare_in_view) {
   auto& map = *static_cast<ggslam::volumes::Tsdf*>(handle);
   return decay(map, scratch(map), *static_cast<ggslam::Context*>(context), factor, least, spare_in_view != 0);

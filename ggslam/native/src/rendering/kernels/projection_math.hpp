@@ -17,7 +17,7 @@ struct ViewConstants {
   float min_u, max_u, min_v, max_v;
 };
 
-static inline ViewConstants view_constants(const View& view) {
+static inline ViewConstants view_constants(const CameraView& view) {
   ViewConstants c;
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) c.W[i][j] = view.camera_world[4 * i + j];

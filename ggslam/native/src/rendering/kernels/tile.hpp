@@ -121,7 +121,7 @@ static inline void transpose_masks_back(const std::uint64_t* transposed, std::ui
 }
 
 // Writes a sub-block to an image plane [H, W]; pixels outside the image are dropped.
-static inline void store_sub_block(float* plane, const View& view, int x0, int y0, Float values) {
+static inline void store_sub_block(float* plane, const CameraView& view, int x0, int y0, Float values) {
   alignas(64) float pixels[kLanes];
   store(pixels, values);
   const bool whole = x0 + kSubWidth <= view.width && y0 + kSubHeight <= view.height;
@@ -136,7 +136,7 @@ static inline void store_sub_block(float* plane, const View& view, int x0, int y
 }
 
 // Reads a sub-block of an image plane; pixels outside the image are 0.
-static inline Float load_sub_block(const float* plane, const View& view, int x0, int y0) {
+static inline Float load_sub_block(const float* plane, const CameraView& view, int x0, int y0) {
   if (plane == nullptr) return Float{};
   alignas(64) float pixels[kLanes] = {};
   const bool whole = x0 + kSubWidth <= view.width && y0 + kSubHeight <= view.height;
@@ -151,7 +151,7 @@ static inline Float load_sub_block(const float* plane, const View& view, int x0,
   return load(pixels);
 }
 
-static inline bool outside(const View& view, int x0, int y0) { return x0 >= view.width || y0 >= view.height; }
+static inline bool outside(const CameraView& view, int x0, int y0) { return x0 >= view.width || y0 >= view.height; }
 
 // How many entries ahead a splat is asked for, and what its own line leads to: feature rows and gradient slots.
 constexpr int kSplatPrefetch = 32, kRowPrefetch = 16;

@@ -1,25 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-// The arguments of the tracking functions. All pointers lead to device memory. ggslam/tracking/cuda/contract.py mirrors
-// the structures field by field; those named *Settings and PhotometricReferenceView are the compiled core's
-// (native/src/tracking/tracking_types.hpp), so that one mirror serves both.
+// The CUDA kernels' tracking. Pointers lead to device memory. Calls only start work on the caller's stream; those with a
+// status return 0 or a cudaError_t.
 #pragma once
-#include "common/platform.cuh"
+#include <cstddef>
+#include <cstdint>
+
+#include "interface/core/tracking.hpp"
+#include "interface/export.hpp"
 
 namespace ggslam::cuda {
-
-// --- points of a depth image -------------------------------------------------------------------------------------
-
-struct DepthPointsSettings {
-  float fx, fy, cx, cy;                 // pixels; the centre of the top-left pixel is (0, 0)
-  float noise_constant, noise_square;   // sigma(z) = constant + square z^2, metres
-  float min_depth, max_depth;           // metres
-  float min_thickness, max_elongation;  // of the regularised covariance
-  float min_neighbours;                 // share of the window that must lie on the same surface
-  std::int32_t width, height;
-  std::int32_t stride;       // pixels between points
-  std::int32_t window;       // the window has (2 window + 1)^2 samples
-  std::int32_t window_step;  // pixels between samples of the window
-};
 
 // What the device alone knows of a frame's points.
 struct PointsHeader {
@@ -37,6 +26,7 @@ struct PointArrays {
   float* weights;        // [n] (sigma(1 m) / sigma(z))^2
 };
 
+// Points to take from a depth image.
 struct DepthPointsJob {
   const float* depth;  // [height, width]
   PointArrays out;     // room for columns * rows points
@@ -46,8 +36,7 @@ struct DepthPointsJob {
   std::int32_t device, columns, rows;  // of the grid
 };
 
-// --- what points are aligned to ------------------------------------------------------------------------------------
-
+// A voxel of a target.
 struct alignas(16) Voxel {
   float mean[3];
   float weight;
@@ -70,19 +59,12 @@ struct alignas(32) VoxelSlot {
   std::uint64_t reserved;
 };
 
+// The voxels of one size, and how they are found.
 struct VoxelLevel {
   const Voxel* voxels;
   VoxelSlot* slots;
   std::uint64_t slot_mask;  // number of slots, a power of two, minus one
   float size, inverse_size;  // of a voxel, metres
-};
-
-struct TargetSettings {
-  float voxel;  // edge of a fine voxel, metres
-  float min_opacity_logit;
-  float min_thickness, max_thickness, max_elongation;  // of a voxel's regularised covariance
-  float scatter_weight;    // weight of the scatter of the means against the members' own covariances
-  float neighbour_weight;  // weight of the 26 neighbours in a voxel's scatter
 };
 
 // Sums over the members of a voxel, see the core.
@@ -95,6 +77,7 @@ struct VoxelMoments {
   float centre[3];
 };
 
+// A level to set up.
 struct VoxelLevelJob {
   const VoxelBlock* blocks;
   const VoxelMoments* moments;  // null: the voxels are finished
@@ -105,35 +88,7 @@ struct VoxelLevelJob {
   std::int32_t device, block_count, voxel_count;
 };
 
-// --- alignment -------------------------------------------------------------------------------------------------------
-
-struct AlignSettings {
-  double translation_tolerance, rotation_tolerance;  // metres, radians
-  double coarse_kernel_factor;  // the robust kernel of the coarse level is this much wider
-  float noise_constant, noise_square;
-  float kernel_constant, kernel_sigmas;    // width of the Geman-McClure kernel: constant + sigmas sigma(z)
-  float overlap_constant, overlap_sigmas;  // a match is an inlier under this point-to-plane distance, likewise
-  float min_normal_dot;                    // normals of a match agree to this cosine
-  float plane_variance;                    // variance of a match along the normal, units of the regularised covariances
-  std::int32_t coarse_iterations, fine_iterations, coarse_points, min_matches;
-  float photometric_weight;  // factor of the photometric part
-  float huber;               // grey levels in [0, 1]
-  float depth_tolerance;     // relative depth difference above which a pixel is occluded
-};
-
-struct PhotometricPoints {
-  const float* points;     // [n, 3] frame's camera
-  const float* intensity;  // [n] grey in [0, 1]
-  std::int32_t count;
-};
-
-struct PhotometricReferenceView {
-  const float* pixels;  // [h, w, 4] grey, d grey / du, d grey / dv, depth
-  float fx, fy, cx, cy;
-  std::int32_t width, height;
-  float rotation[9], translation[3];  // T_reference_world
-};
-
+// Points to align to a target.
 struct AlignJob {
   PointArrays points;
   VoxelLevel fine, coarse;
@@ -165,3 +120,20 @@ enum AlignResult {
 };
 
 }  // namespace ggslam::cuda
+
+// Bytes of memory that depth_points works in. Asks for columns and rows.
+GGSLAM_EXPORT std::int64_t ggslam_cuda_depth_points_bytes(const ggslam::cuda::DepthPointsJob* job);
+
+// Points of a depth image, their number and their median depth.
+GGSLAM_EXPORT int ggslam_cuda_depth_points(const ggslam::cuda::DepthPointsJob* job);
+
+// Empties the hash table of a level, which has more places than there are blocks, and puts the level's blocks in; gives
+// the voxels their shapes if they have none yet.
+GGSLAM_EXPORT int ggslam_cuda_voxel_level(const ggslam::cuda::VoxelLevelJob* job);
+
+// Bytes of memory that an alignment works in; the caller sets them to zero before the first one. Asks for room,
+// settings and the number of textured points.
+GGSLAM_EXPORT std::int64_t ggslam_cuda_align_bytes(const ggslam::cuda::AlignJob* job);
+
+// Aligns points to a target from a guess.
+GGSLAM_EXPORT int ggslam_cuda_align(const ggslam::cuda::AlignJob* job);

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The codec's functions in the compiled core: structures of ggslam/native/src/codec/gpcc.hpp, field by field, and one
-slice's octree with what is coded over it. The functions release the interpreter's lock, so that slices are coded side
-by side."""
+"""One slice's octree in the compiled core, with what is coded over it. The core's functions release the interpreter's
+lock, so that slices are coded side by side."""
 
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, c_int32, c_int64, c_size_t, c_uint32, c_void_p
 from functools import lru_cache
 
 import numpy as np
@@ -16,11 +14,6 @@ from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
 from ggslam.coding.native_settings import (
     AttributePayload,
     CodingContext,
-    DetailSettings,
-    OctreeSettings,
-    PredictiveSettings,
-    RahtSettings,
-    TreeSettings,
     detail_settings,
     layer_qps,
     octree_settings,
@@ -30,49 +23,15 @@ from ggslam.coding.native_settings import (
 )
 from ggslam.coding.sequence_parameters import AttributeDescription
 from ggslam.errors import FormatError
+from ggslam.interface.core.codec import RahtSettings, Status
 from ggslam.native.loader import NativeContext, load_library
 
-_OUT_OF_MEMORY = 1
 _REASONS = {
-    2: "the payload ends early or is damaged",
-    3: "the payload holds another number of points than its unit says",
-    4: "the octree has more nodes than the decoder is willing to hold",
+    Status.TRUNCATED: "the payload ends early or is damaged",
+    Status.COUNT_MISMATCH: "the payload holds another number of points than its unit says",
+    Status.TOO_LARGE: "the octree has more nodes than the decoder is willing to hold",
 }
 MAX_SLICE_POINTS = 1 << 24
-
-
-@lru_cache(maxsize=1)
-def _library() -> ctypes.CDLL:
-    core = load_library()
-    octree, raht = POINTER(OctreeSettings), POINTER(RahtSettings)
-    tree, predictive = POINTER(TreeSettings), POINTER(PredictiveSettings)
-    signatures = {
-        "slice_create": (c_void_p, []),
-        "slice_destroy": (None, [c_void_p]),
-        "build": (c_int64, [c_void_p, c_void_p, c_void_p, c_uint32, c_int32, c_void_p]),
-        "leaves": (c_uint32, [c_void_p]),
-        "nodes": (c_uint32, [c_void_p, c_int32]),
-        "leaf_points": (None, [c_void_p, c_void_p]),
-        "merge": (c_int64, [c_void_p]),
-        "encode_geometry": (c_int64, [c_void_p, c_void_p, octree]),
-        "encode_attribute": (c_int64, [c_void_p, c_void_p, raht, c_void_p]),
-        "take": (None, [c_void_p, c_void_p]),
-        "decode_geometry": (c_int64, [c_void_p, c_void_p, octree, c_void_p, c_size_t, c_uint32]),
-        "decode_tree": (c_int64, [c_void_p, c_void_p, tree, c_int32, c_void_p, c_size_t, c_uint32]),
-        "decode_predictive": (c_int64, [c_void_p, c_void_p, predictive, c_int32, c_void_p, c_size_t, c_uint32]),
-        "encode_tree": (c_int64, [c_void_p, c_void_p, tree]),
-        "go_on": (c_int64, [c_void_p, c_void_p]),
-        "positions": (c_int64, [c_void_p, c_void_p, c_void_p]),
-        "decode_attribute": (c_int64, [c_void_p, c_void_p, raht, c_void_p, c_size_t, c_void_p]),
-        "decode_details": (c_int64, [c_void_p, c_void_p, POINTER(DetailSettings), c_void_p, c_size_t, c_void_p]),
-        "sort_values": (c_int64, [c_void_p, c_int32, c_void_p]),
-        "to_ycbcr": (None, [c_void_p, c_void_p, c_void_p, c_uint32, c_void_p]),
-        "from_ycbcr": (None, [c_void_p, c_void_p, c_uint32, c_void_p]),
-    }
-    for name, (result, arguments) in signatures.items():
-        function = getattr(core, f"ggslam_gpcc_{name}")
-        function.restype, function.argtypes = result, arguments
-    return core
 
 
 @lru_cache(maxsize=1)
@@ -85,9 +44,9 @@ def _check(status: int) -> int:
     """Sizes pass; negative values are errors."""
     if status >= 0:
         return status
-    if -status == _OUT_OF_MEMORY:
+    if -status == Status.OUT_OF_MEMORY:
         raise MemoryError("the codec ran out of memory")
-    raise FormatError(_REASONS[-status])
+    raise FormatError(_REASONS[Status(-status)])
 
 
 def _bytes_view(data: bytes | memoryview) -> np.ndarray:
@@ -102,7 +61,7 @@ class SliceCoder:
     """
 
     def __init__(self) -> None:
-        self._core = _library()
+        self._core = load_library()
         self._context = _context()
         self._handle = self._core.ggslam_gpcc_slice_create()
         if not self._handle:
@@ -251,7 +210,7 @@ class SliceCoder:
         else:
             bits = np.unpackbits(_bytes_view(coded.payload), count=count * description.bit_depth)
             if len(coded.payload) * 8 < count * description.bit_depth:
-                raise FormatError(_REASONS[2])
+                raise FormatError(_REASONS[Status.TRUNCATED])
             weights = 1 << np.arange(description.bit_depth - 1, -1, -1)
             values = bits.reshape(count, -1) @ weights
         values = np.ascontiguousarray(values.reshape(self.points, -1), np.int32)
@@ -268,14 +227,16 @@ def rgb_to_ycbcr(rgb: np.ndarray, order: np.ndarray) -> np.ndarray:
     """BT.709 full-range Y, Cb, Cr int32 [M, 3] of the colours uint8 [N, 3] picked by `order` uint32 [M]."""
     rgb = np.ascontiguousarray(rgb, np.uint8)
     out = np.empty((len(order), 3), np.int32)
-    _library().ggslam_gpcc_to_ycbcr(_context().handle, rgb.ctypes.data, order.ctypes.data, len(order), out.ctypes.data)
+    load_library().ggslam_gpcc_to_ycbcr(
+        _context().handle, rgb.ctypes.data, order.ctypes.data, len(order), out.ctypes.data
+    )
     return out
 
 
 def ycbcr_to_rgb(components: np.ndarray) -> np.ndarray:
     """The inverse: uint8 [N, 3] of int32 [N, 3] in [0, 255]."""
     rgb = np.empty(components.shape, np.uint8)
-    _library().ggslam_gpcc_from_ycbcr(_context().handle, components.ctypes.data, len(components), rgb.ctypes.data)
+    load_library().ggslam_gpcc_from_ycbcr(_context().handle, components.ctypes.data, len(components), rgb.ctypes.data)
     return rgb
 
 
@@ -286,7 +247,7 @@ def _variable_values(data: bytes, count: int) -> np.ndarray:
     for i in range(count):
         length = data[at] if at < len(data) else 255
         if length > 2 or at + 1 + length > len(data):
-            raise FormatError(_REASONS[2])
+            raise FormatError(_REASONS[Status.TRUNCATED])
         out[i] = int.from_bytes(data[at + 1 : at + 1 + length], "big")
         at += 1 + length
     return out

@@ -1,0 +1,45 @@
+// SPDX-License-Identifier: Apache-2.0
+// The compiled core's image loss.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+#include "interface/export.hpp"
+
+namespace ggslam {
+
+// One evaluation of the loss; H = height, W = width.
+struct ImageLossJob {
+  // Rendered: colour [3, H, W] planar, accumulated depth [H, W] in metres, alpha [H, W].
+  const float* image;
+  const float* depth;
+  const float* alpha;
+  // Target: colour [H, W, 3] interleaved, depth [H, W] (uint16 or float, see target_depth_is_float), 0 = none.
+  const uint8_t* target_color;
+  const void* target_depth;
+  // Gradients of the loss, shaped like the rendered images.
+  float* d_image;
+  float* d_depth;
+  float* d_alpha;
+
+  int32_t height, width;
+  int32_t target_depth_is_float;
+  int32_t normalised_depth;  // compare depth / alpha with the target instead of depth
+  int32_t charbonnier;       // sqrt(r^2 + eps^2) - eps instead of |r| for colour
+  float depth_scale;         // metres per unit of target_depth
+  float exposure[6];         // gain, offset for R, G, B: corrected = gain * rendered + offset
+  float dssim_weight, depth_weight, opacity_weight, no_depth_weight, minimum_alpha, charbonnier_epsilon;
+
+  // Results; NaN where nothing was measured.
+  double total, color, l1, ssim, depth_term, opacity_term, depth_l1_m, psnr;
+  double valid_pixels;
+  double exposure_gradient[6];
+};
+
+}  // namespace ggslam
+
+GGSLAM_EXPORT void* ggslam_image_loss_create();
+GGSLAM_EXPORT void ggslam_image_loss_destroy(void* workspace);
+
+// Returns 0, or 1 when memory ran out. The caller has checked sizes and pointers.
+GGSLAM_EXPORT int ggslam_image_loss_evaluate(void* context, void* workspace, ggslam::ImageLossJob* job);

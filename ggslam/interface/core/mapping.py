@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+# Written by scripts/make_native_mirrors.py from mapping.hpp; changes are lost.
+"""The compiled core's image loss."""
+
+from __future__ import annotations
+
+from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_void_p
+from typing import Any
+
+HEADER = "core/mapping.hpp"
+HEADER_SHA256 = "0971d33ed5fceab9852673affbce81876812af71b3b3f6ebaeb5896912b03210"
+
+
+class ImageLossJob(Structure):
+    """One evaluation of the loss; H = height, W = width."""
+
+    _fields_ = [
+        ("image", c_void_p), ("depth", c_void_p), ("alpha", c_void_p), ("target_color", c_void_p),
+        ("target_depth", c_void_p), ("d_image", c_void_p), ("d_depth", c_void_p), ("d_alpha", c_void_p),
+        ("height", c_int32), ("width", c_int32), ("target_depth_is_float", c_int32), ("normalised_depth", c_int32),
+        ("charbonnier", c_int32), ("depth_scale", c_float), ("exposure", c_float * 6), ("dssim_weight", c_float),
+        ("depth_weight", c_float), ("opacity_weight", c_float), ("no_depth_weight", c_float),
+        ("minimum_alpha", c_float), ("charbonnier_epsilon", c_float), ("total", c_double), ("color", c_double),
+        ("l1", c_double), ("ssim", c_double), ("depth_term", c_double), ("opacity_term", c_double),
+        ("depth_l1_m", c_double), ("psnr", c_double), ("valid_pixels", c_double), ("exposure_gradient", c_double * 6),
+    ]
+
+
+STRUCTURES: tuple[type[Structure], ...] = (ImageLossJob,)
+FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
+    "ggslam_image_loss_create": (c_void_p, []),
+    "ggslam_image_loss_destroy": (None, [c_void_p]),
+    "ggslam_image_loss_evaluate": (c_int, [c_void_p, c_void_p, POINTER(ImageLossJob)]),
+}
+"""Result and arguments of each."""
