@@ -126,14 +126,14 @@ def run_recording(path: Path, arguments: argparse.Namespace) -> None:
 
 def map_agreement(run: Run, reference: Run) -> str:
     """How the map of one run lies upon that of another, after the best rigid motion."""
-    found = register(thinned(np.concatenate(run.cloud)), thinned(np.concatenate(reference.cloud)))
+    found = register(thin(np.concatenate(run.cloud)), thin(np.concatenate(reference.cloud)))
     return (
         f"fitness {found.overlap.fitness:.3f}, inlier RMSE {1e3 * found.overlap.inlier_rmse_m:.1f} mm, "
         f"moved {1e3 * found.moved_m:.1f} mm and {found.turned_deg:.2f} degrees"
     )
 
 
-def thinned(points: np.ndarray) -> np.ndarray:
+def thin(points: np.ndarray) -> np.ndarray:
     """One point per voxel."""
     _, first = np.unique(np.floor(points / MAP_SPACING).astype(np.int64), axis=0, return_index=True)
     return points[first]

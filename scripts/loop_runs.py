@@ -6,6 +6,7 @@ from __future__ import annotations
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from ggslam.sequences import open_sequence
 from ggslam.sequences.sequence import Sequence
 from ggslam.slam.config import Config, load_config
 from ggslam.slam.loop_closing import Correction, LoopCloser
+from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.slam import Slam
 
 FIRST_FRAMES = 40
@@ -34,15 +36,25 @@ CUT_FRAMES = (100, 160)
 class WatchedSlam(Slam):
     """Looks at the first views before and after each closure."""
 
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self._corrections = _WatchedCorrections(self)
+
     def first_views(self) -> float:
         """Mean PSNR of the keyframes of the first frames, dB, each from its own pose."""
         chosen = [k for k in self.mapper.keyframes if k.frame_index < FIRST_FRAMES]
         return float(np.mean([psnr(self, k) for k in chosen]))
 
-    def _correct(self, loops: LoopCloser, correction: Correction) -> None:
-        before = self.first_views()
-        super()._correct(loops, correction)
-        print(f"  closed: first views {before:.2f} dB before, {self.first_views():.2f} dB after", flush=True)
+
+class _WatchedCorrections(MapCorrections):
+    def __init__(self, slam: WatchedSlam) -> None:
+        super().__init__(slam.surface, slam.mapper, slam.pager)
+        self._slam = slam
+
+    def apply(self, correction: Correction, loops: LoopCloser) -> None:
+        before = self._slam.first_views()
+        super().apply(correction, loops)
+        print(f"  closed: first views {before:.2f} dB before, {self._slam.first_views():.2f} dB after", flush=True)
 
 
 def rendered(slam: Slam, keyframe: Keyframe) -> np.ndarray:

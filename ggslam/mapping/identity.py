@@ -207,7 +207,7 @@ class IdentityLearner(ABC):
             gradient = self._dense(gaussians, rasterizer, keyframe, view)
         pixels, vote_weights = self._draw(keyframe)
         if len(pixels):
-            self._sampled(gaussians, rasterizer, keyframe, pixels, vote_weights, rate_factor)
+            self._learn_at_pixels(gaussians, rasterizer, keyframe, pixels, vote_weights, rate_factor)
         self.times.steps += time.perf_counter() - start
         self.times.count += 1
         return gradient
@@ -259,7 +259,7 @@ class IdentityLearner(ABC):
         """So many labelled pixels of a keyframe that has a mask."""
 
     @abstractmethod
-    def _sampled(
+    def _learn_at_pixels(
         self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, pixels: Any, vote_weights: Any,
         rate_factor: float,
     ) -> None:  # fmt: skip

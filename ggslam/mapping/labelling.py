@@ -30,10 +30,10 @@ class MapLabels:
         """From ids and their shares on every `stride`-th pixel and row, [h, w]; depth [H, W]."""
         height, width = depth.shape
 
-        def enlarged(image: np.ndarray) -> np.ndarray:
+        def enlarge(image: np.ndarray) -> np.ndarray:
             return image.repeat(stride, 0).repeat(stride, 1)[:height, :width]
 
-        return MapLabels(enlarged(np.where(share > 0, ids, 0).astype(np.uint16)), enlarged(share), depth)
+        return MapLabels(enlarge(np.where(share > 0, ids, 0).astype(np.uint16)), enlarge(share), depth)
 
 
 @dataclass(frozen=True)

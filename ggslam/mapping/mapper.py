@@ -98,7 +98,7 @@ class Mapper(ABC):
         gaussians: the map; empty or loaded.
         settings: see `MapperSettings`.
         seed: of the draw of keyframes.
-        identity: learns objects from the keyframes' masks; None: nobody does. The map needs feature channels for it.
+        identity: learns objects from the keyframes' masks, into the map's feature channels; None: no objects.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class Mapper(ABC):
         self.depth_sigma = 0.004
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
         self.residency: Residency | None = None
-        """Who keeps a part of the map on disk; None: all of it is in memory."""
+        """Keeps a part of the map on disk; None: all of it is in memory."""
         self.extra_loss: ExtraLoss | None = None
         """A loss of the user's own, added to the mapper's; on the CPU only."""
         self._rasterizer: TrainingRasterizer
@@ -134,13 +134,13 @@ class Mapper(ABC):
         return vote_labels(self.map).cpu().numpy().astype(np.uint16)
 
     def beside_others(self) -> AbstractContextManager[object]:
-        """Within, which may be entered again and again, a thread works on the device beside the mapper, which is in
-        another thread, and goes first. Nothing of the mapper may be used there."""
+        """Context for a thread that works on the device while the mapper works in another one: its work goes first. May
+        be entered repeatedly. Do not use the mapper inside."""
         return nullcontext()
 
     def in_turn(self) -> AbstractContextManager[object]:
-        """Within, this thread's work on the device takes turns with that of the mapper: what it reads of the map is
-        whole, also while the mapper works in another thread."""
+        """Context in which this thread's work on the device takes turns with the mapper's: it reads a consistent map
+        even while the mapper works in another thread."""
         return nullcontext()
 
     # --- growth ------------------------------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the mapper asks whoever keeps a part of the map on disk."""
+"""What the mapper needs to know when a part of the map is on disk."""
 
 from __future__ import annotations
 

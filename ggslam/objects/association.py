@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ggslam.objects.consistency import ConsistencyJudge
-from ggslam.objects.evidence import PairEvidence, touching
+from ggslam.objects.evidence import PairEvidence, find_touching_pairs
 from ggslam.objects.fragments import Fragment, FragmentMemory
-from ggslam.objects.overlap import MapView, SegmentOverlap, numbered, overlap_of
+from ggslam.objects.overlap import MapView, SegmentOverlap, number_ids, overlap_of
 from ggslam.objects.settings import AssociationSettings
 from ggslam.scene.camera import Camera
 
@@ -110,8 +110,8 @@ class Associator:
         if self.uses_own_ids:
             result = self._own_ids(segments, overlap)
         else:
-            result = self._matched(view, overlap, *self._choose(overlap, depth, camera, T_world_camera))
-        for i in numbered(result.ids)[0].tolist():
+            result = self._match(view, overlap, *self._choose(overlap, depth, camera, T_world_camera))
+        for i in number_ids(result.ids)[0].tolist():
             self.sightings[i] = self.sightings.get(i, 0) + 1
         for kept, dropped in result.merges:
             self.sightings[kept] = max(self.sightings.get(kept, 0), self.sightings.pop(dropped, 0))
@@ -134,10 +134,10 @@ class Associator:
         self._current = np.arange(_IDS).astype(np.uint16)
         return Association(segments.copy(), [], new)
 
-    def _matched(
+    def _match(
         self, view: MapView, overlap: SegmentOverlap, best: np.ndarray, parts: dict[int, Fragment]
     ) -> Association:
-        covered = self._covered(overlap)
+        covered = self._find_covered(overlap)
         created: list[int] = []
         ids = np.zeros(len(overlap.segments) + 1, np.uint16)  # the last one: no segment
         for k in range(len(overlap.segments)):
@@ -154,7 +154,7 @@ class Associator:
         image = ids[overlap.row]
         self._keep_known(image, overlap, covered, best, parts)
         shown = np.where(overlap.column >= 0, view.ids, np.uint16(0))
-        self._evidence.observe(overlap, touching(shown))
+        self._evidence.observe(overlap, find_touching_pairs(shown))
         merges = self._evidence.merges()
         for kept, dropped in merges:
             self._current[self._current == dropped] = kept
@@ -162,7 +162,7 @@ class Associator:
         splits = [(part.parent, part.object_id) for part in parts.values() if part.object_id]
         return Association(self._current[image] if merges else image, merges, created, splits)
 
-    def _covered(self, overlap: SegmentOverlap) -> np.ndarray:
+    def _find_covered(self, overlap: SegmentOverlap) -> np.ndarray:
         """bool [S, O]: objects that a segment has as a whole, or with a large share of both."""
         within, covers, visible = overlap.within, overlap.covers, overlap.shared.sum(0)
         seen = visible >= self._settings.min_visible * overlap.row.size

@@ -32,7 +32,7 @@ class OrientedBox:
 
 def middle_of(points: np.ndarray, weights: np.ndarray) -> Vector:
     """Weighted mean of points [M, 3] without the farthest (`TRIMMED`)."""
-    kept = _kept(points)
+    kept = _inlier_mask(points)
     return _vector(np.average(points[kept].astype(np.float64), axis=0, weights=weights[kept].astype(np.float64)))
 
 
@@ -41,7 +41,7 @@ def oriented_box(points: np.ndarray) -> OrientedBox:
     leave axes undetermined: these are chosen along the coordinates."""
     from sklearn.decomposition import PCA  # slow to import
 
-    inner = points[_kept(points)].astype(np.float64)
+    inner = points[_inlier_mask(points)].astype(np.float64)
     axes = np.eye(3)
     if len(inner) >= 3:
         with np.errstate(invalid="ignore"):  # points that are all one have no variance to share out
@@ -57,7 +57,7 @@ def oriented_box(points: np.ndarray) -> OrientedBox:
     return OrientedBox(_vector((low + high) / 2 @ axes), (first, second, third), _vector(high - low))
 
 
-def _kept(points: np.ndarray) -> np.ndarray:
+def _inlier_mask(points: np.ndarray) -> np.ndarray:
     """bool [M]: all but the share `TRIMMED` of points that are farthest from the median."""
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     return distance <= np.quantile(distance, 1 - TRIMMED, method="higher")

@@ -37,7 +37,7 @@ class ConsistencyJudge:
             segments: uint16 [H, W], the mask as stored.
             overlap: of this mask with the map.
         """
-        changed = self._changed(segments)
+        changed = self._has_changed(segments)
         if self.consistent is False or not changed:
             return self.consistent
         agreement = agreement_of(overlap)
@@ -46,7 +46,7 @@ class ConsistencyJudge:
             self._settle()
         return self.consistent
 
-    def _changed(self, segments: np.ndarray) -> bool:
+    def _has_changed(self, segments: np.ndarray) -> bool:
         previous, self._previous = self._previous, segments
         if previous is None or previous.shape != segments.shape:
             return True

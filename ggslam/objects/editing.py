@@ -19,7 +19,14 @@ from ggslam.objects.encoding import assign, code_of, with_class
 from ggslam.objects.membership import MembershipSettings, members
 from ggslam.objects.recoloring import recolor
 from ggslam.objects.segmented_map import SegmentedMap
-from ggslam.objects.segmented_rows import append_copies, copies_of, joined, keep_rows, merged_votes, votes_without
+from ggslam.objects.segmented_rows import (
+    append_copies,
+    copies_of,
+    join_gaussians,
+    keep_rows,
+    merged_votes,
+    votes_without,
+)
 from ggslam.objects.table import ObjectTable, Observation
 from ggslam.rendering.types import GaussianTensors
 from ggslam.scene.poses import quaternion_to_matrix
@@ -61,7 +68,7 @@ def remove_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
     keep_rows(scene, ~gone)
     _forget(scene, ids)
     rebuild_table(scene)
-    return Change(f"removed {what}: {int(gone.sum())} Gaussians", before, _nothing(scene), left)
+    return Change(f"removed {what}: {int(gone.sum())} Gaussians", before, _no_gaussians(scene), left)
 
 
 def keep_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
@@ -74,7 +81,8 @@ def keep_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
     keep_rows(scene, kept)
     _forget(scene, [i for i in scene.table.ids() if i not in ids])
     rebuild_table(scene)
-    return Change(f"kept {what}: {int(kept.sum())} Gaussians, {len(before.means)} removed", before, _nothing(scene))
+    text = f"kept {what}: {int(kept.sum())} Gaussians, {len(before.means)} removed"
+    return Change(text, before, _no_gaussians(scene))
 
 
 def move_objects(
@@ -142,7 +150,8 @@ def duplicate_objects(scene: SegmentedMap, ids: Sequence[int], shift: Vector | N
     rebuild_table(scene, names)
     after = copies_of(scene.gaussians, np.arange(len(scene.gaussians)) >= first)
     copies_are = ", ".join(scene.table.record(i).label() for i in made)
-    return Change(f"duplicated {what} by {_numbers(shift)} m: {copies_are}", joined(before), after, made=tuple(made))
+    text = f"duplicated {what} by {_numbers(shift)} m: {copies_are}"
+    return Change(text, join_gaussians(before), after, made=tuple(made))
 
 
 def recolor_objects(scene: SegmentedMap, ids: Sequence[int], color: tuple[int, int, int]) -> Change:
@@ -179,7 +188,7 @@ def merge_objects(scene: SegmentedMap, kept: int, merged: int) -> Change:
     if scene.votes is not None:
         scene.votes = merged_votes(scene.votes, merged, kept)
     rebuild_table(scene, names, seen)
-    nothing = _nothing(scene)
+    nothing = _no_gaussians(scene)
     return Change(f"merged {what}: {int(rows.sum())} Gaussians", nothing, nothing, merged=(kept, merged))
 
 
@@ -197,7 +206,7 @@ def rename_object(scene: SegmentedMap, object_id: int, name: str) -> Change:
         raise ConfigError(f"name {name!r}: object {taken[0]} has it already")
     records = [replace(r, name=name) if r.id == object_id else r for r in scene.table.objects]
     scene.table = replace(scene.table, objects=records)
-    return Change(f"renamed {what} to {name}", _nothing(scene), _nothing(scene))
+    return Change(f"renamed {what} to {name}", _no_gaussians(scene), _no_gaussians(scene))
 
 
 def rigid_motion(centre: np.ndarray, shift: Vector, rotate_degrees: Vector = (0.0, 0.0, 0.0)) -> np.ndarray:
@@ -288,7 +297,7 @@ def _enrol(scene: SegmentedMap, rows: np.ndarray, object_id: int) -> None:
 # --- small things ---------------------------------------------------------------------------------------------------
 
 
-def _nothing(scene: SegmentedMap) -> GaussianTensors:
+def _no_gaussians(scene: SegmentedMap) -> GaussianTensors:
     return copies_of(scene.gaussians, np.zeros(len(scene.gaussians), bool))
 
 

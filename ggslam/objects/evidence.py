@@ -98,7 +98,7 @@ class PairEvidence:
             into.observations += pair.observations
 
 
-def touching(ids: np.ndarray) -> set[tuple[int, int]]:
+def find_touching_pairs(ids: np.ndarray) -> set[tuple[int, int]]:
     """Pairs of different ids (smaller first, 0 left out) on neighbouring pixels of a uint16 image."""
     pairs = []
     for a, b in ((ids[:, :-1], ids[:, 1:]), (ids[:-1], ids[1:])):

@@ -54,7 +54,7 @@ class GeometricSegmenter:
             unit = -planes / np.linalg.norm(planes, axis=1, keepdims=True)
             normals[on_plane] = unit[plane_of[on_plane] - 1]
         regions = self._regions(surface, plane_of)
-        regions = self._joined(regions, len(planes), surface, normals)
+        regions = self._join_regions(regions, len(planes), surface, normals)
         return _by_size(regions, surface.valid, self._settings.min_area)
 
     def _regions(self, surface: DepthSurface, plane_of: np.ndarray) -> np.ndarray:
@@ -72,7 +72,7 @@ class GeometricSegmenter:
         number = np.zeros(len(area), np.int32)
         number[kept] = int(plane_of.max()) + 1 + np.arange(len(kept))
         regions = np.where(rest, number[pieces], plane_of)
-        return _grown(regions, surface, gap_tolerance(surface, self._settings), _GROWTH * surface.step)
+        return _grow(regions, surface, gap_tolerance(surface, self._settings), _GROWTH * surface.step)
 
     def _smooth_links(self, surface: DepthSurface, rest: np.ndarray, axis: int) -> np.ndarray:
         """bool [H, W-1] (axis 1) or [H-1, W] (axis 0): neighbours of the rest without a gap or a concave edge."""
@@ -95,7 +95,7 @@ class GeometricSegmenter:
         connected[middle][rows[concave], columns[concave]] = False
         return connected
 
-    def _joined(self, regions: np.ndarray, planes: int, surface: DepthSurface, normals: np.ndarray) -> np.ndarray:
+    def _join_regions(self, regions: np.ndarray, planes: int, surface: DepthSurface, normals: np.ndarray) -> np.ndarray:
         """Regions with convex and smooth neighbours joined."""
         borders = find_borders(regions, surface, normals, surface.step + 1, self._settings)
         groups = Groups(int(regions.max()) + 1)
@@ -152,7 +152,7 @@ def _middle(axis: int, margin: int) -> tuple[slice, ...]:
     return np.s_[:, margin:-margin] if axis else np.s_[margin:-margin, :]
 
 
-def _grown(regions: np.ndarray, surface: DepthSurface, tolerance: np.ndarray, passes: int) -> np.ndarray:
+def _grow(regions: np.ndarray, surface: DepthSurface, tolerance: np.ndarray, passes: int) -> np.ndarray:
     """Regions grown over valid pixels without region, one pixel a pass, where no gap is in between."""
     width = regions.shape[1] + 2
     label, depth = np.pad(regions, 1).ravel(), np.pad(surface.depth, 1).ravel()

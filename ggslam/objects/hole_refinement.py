@@ -45,7 +45,7 @@ def refine(
     """
     known = [view for view in views if view.view.frame is not None]
     targets = [_Target.of(view, recorded(view.view.frame)) for view in known if view.view.frame is not None]
-    new = {name: _trained(gaussians, name)[first:] for name in _RATES}
+    new = {name: _trained_values(gaussians, name)[first:] for name in _RATES}
     parameters = {name: values.clone().requires_grad_() for name, values in new.items()}
     groups = [{"params": [parameters[name]], "lr": rate} for name, rate in _RATES.items()]
     optimizer = torch.optim.Adam(groups, eps=_FEW_PIXELS)
@@ -57,14 +57,14 @@ def refine(
         d_depth = _DEPTH_WEIGHT * torch.sign(view.depth - target.depth) * target.measured
         gradients = rasterizer.backward(d_color, d_depth)
         for name, values in parameters.items():
-            values.grad = _trained(gradients, name)[first:]
+            values.grad = _trained_values(gradients, name)[first:]
         optimizer.step()
         with torch.no_grad():
             for name, values in new.items():
                 values.copy_(parameters[name])
 
 
-def _trained(holder: GaussianMap | Gradients, name: str) -> torch.Tensor:
+def _trained_values(holder: GaussianMap | Gradients, name: str) -> torch.Tensor:
     """A parameter or its gradient; of colour the part that does not depend on the viewing direction."""
     values: torch.Tensor = getattr(holder, name)
     return values[:, :1] if name == "sh" else values

@@ -20,7 +20,7 @@ SOLID = 0.8
 
 
 @dataclass(frozen=True)
-class MapView:
+class CameraView:
     """A place from which the map is looked at.
 
     Attributes:
@@ -66,7 +66,7 @@ class HoleView:
         picture: colours float32 [H, W, 3] without it, in [0, 1].
     """
 
-    view: MapView
+    view: CameraView
     covered: np.ndarray
     before: np.ndarray
     now: np.ndarray
@@ -78,10 +78,10 @@ def depth_tolerance(depth: np.ndarray) -> np.ndarray:
     return 0.015 + 0.01 * depth
 
 
-def look(kept: Gaussians, removed: Gaussians, views: Sequence[MapView], count: int) -> list[HoleView]:
+def look(kept: Gaussians, removed: Gaussians, views: Sequence[CameraView], count: int) -> list[HoleView]:
     """The views in which the removed object covered most, at most `count`, less those that show little of it."""
-    rasterizer, both = CpuRasterizer(), marked(kept, removed)
-    seen = [_hole_view(kept, both, view, rasterizer) for view in facing(removed, views)]
+    rasterizer, both = CpuRasterizer(), mark_removed(kept, removed)
+    seen = [_hole_view(kept, both, view, rasterizer) for view in find_facing_views(removed, views)]
     areas = np.array([v.covered.sum() for v in seen], int)
     order = np.argsort(-areas, kind="stable")[:count]
     return [seen[i] for i in order if areas[i] > max(8, 0.05 * areas[order[0]])]
@@ -96,7 +96,7 @@ def looked_again(kept: Gaussians, views: Sequence[HoleView]) -> list[HoleView]:
     return out
 
 
-def marked(kept: Gaussians, removed: Gaussians) -> GaussianTensors:
+def mark_removed(kept: Gaussians, removed: Gaussians) -> GaussianTensors:
     """Both sets together with two features: the first is 1 for the removed, the second is 0."""
     tensors = {name: torch.cat([getattr(kept, name), getattr(removed, name)]) for name in PARAMETERS[:-1]}
     mark = torch.zeros(len(tensors["means"]), 2)
@@ -104,13 +104,13 @@ def marked(kept: Gaussians, removed: Gaussians) -> GaussianTensors:
     return GaussianTensors(**tensors, features=mark)
 
 
-def facing(gaussians: Gaussians, views: Sequence[MapView], most: int = 48) -> list[MapView]:
+def find_facing_views(gaussians: Gaussians, views: Sequence[CameraView], most: int = 48) -> list[CameraView]:
     """Views that have a good part of some Gaussians in the image, spread evenly if they are more than `most`."""
     means = gaussians.means.numpy()
     return pick_views([view for view in views if view.project(means)[2].mean() > 0.3], most)
 
 
-def _hole_view(kept: Gaussians, both: GaussianTensors, view: MapView, rasterizer: CpuRasterizer) -> HoleView:
+def _hole_view(kept: Gaussians, both: GaussianTensors, view: CameraView, rasterizer: CpuRasterizer) -> HoleView:
     out = rasterizer.forward(both, view.camera, view.T_camera_world)
     covered = out.features[0].numpy() > COVERED if out.features is not None else np.zeros(out.depth.shape, bool)
     before = solid_depth(out.alpha, out.expected_depth)
@@ -128,7 +128,7 @@ def solid_depth(alpha: torch.Tensor, depth: torch.Tensor) -> np.ndarray:
     return np.where(alpha.numpy() > SOLID, depth.numpy(), 0).astype(np.float32)
 
 
-def pick_views(views: Sequence[MapView], most: int) -> list[MapView]:
+def pick_views(views: Sequence[CameraView], most: int) -> list[CameraView]:
     """At most so many of the views, evenly."""
     pick = np.unique(np.linspace(0, max(0, len(views) - 1), min(most, len(views))).round().astype(int))
     return [views[i] for i in pick]

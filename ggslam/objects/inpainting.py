@@ -19,8 +19,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from ggslam.objects.hole_refinement import Recorded, refine
-from ggslam.objects.hole_views import HoleView, MapView, look, looked_again
-from ggslam.objects.plane_filling import as_seen, cover, find_hole, make_chart, overlapped, paint
+from ggslam.objects.hole_views import CameraView, HoleView, look, looked_again
+from ggslam.objects.plane_filling import as_seen, cover, find_hole, make_chart, paint, widen_hole
 from ggslam.objects.rim_planes import RimPlane, find_rim_planes, rim_points
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.segmented_rows import copies_of
@@ -70,7 +70,7 @@ class Filling:
 def inpaint(
     scene: SegmentedMap,
     removed: GaussianTensors,
-    views: Sequence[MapView],
+    views: Sequence[CameraView],
     ignored: Sequence[int] = (),
     recorded: Callable[[int], Recorded] | None = None,
     settings: InpaintSettings | None = None,
@@ -95,7 +95,7 @@ class _Hole:
     """One hole while it is closed. New Gaussians are the last rows of the map."""
 
     def __init__(
-        self, scene: SegmentedMap, removed: GaussianTensors, views: Sequence[MapView], ignored: Sequence[int],
+        self, scene: SegmentedMap, removed: GaussianTensors, views: Sequence[CameraView], ignored: Sequence[int],
         settings: InpaintSettings,
     ) -> None:  # fmt: skip
         self.scene, self.removed, self.views, self.settings = scene, removed, views, settings
@@ -117,13 +117,13 @@ class _Hole:
         views = looked_again(copies_of(self.scene.gaussians, self.surroundings()), views)
         planes = self._continue_planes(views)
         self._close_views(views)
-        if recorded is not None and self.added:
+        if recorded is not None and self.added_count:
             refine(self.scene.gaussians, self.old, views, recorded, self.settings.refine_iterations)
         left = [open_pixels(copies_of(self.scene.gaussians, self.surroundings()), view).sum() for view in views]
-        return Filling(self.added, dropped, planes, int(max(left)))
+        return Filling(self.added_count, dropped, planes, int(max(left)))
 
     @property
-    def added(self) -> int:
+    def added_count(self) -> int:
         """New Gaussians so far."""
         return len(self.scene.gaussians) - self.old
 
@@ -138,7 +138,7 @@ class _Hole:
             chart = make_chart(plane, kept, float(np.median(distance)) / focal)
             hole = None if chart is None else find_hole(chart, views, [p for p in planes if p is not plane])
             if chart is not None and hole is not None and hole.any():
-                hole = overlapped(hole)
+                hole = widen_hole(hole)
                 patches.append((cover(chart, hole, paint(as_seen(chart, views), hole), plane), plane))
         for patch, plane in patches:
             self._insert(patch, plane)

@@ -88,7 +88,7 @@ def members(
     surroundings = _Surroundings(gaussians.means.numpy())
     claimed = (evidence.stored[:, None] == ids) | (evidence.own >= settings.threshold)
     for own, object_id in zip(claimed.T, ids, strict=True):
-        chosen |= _repaired(own, object_id, evidence, surroundings, settings)
+        chosen |= _repair(own, object_id, evidence, surroundings, settings)
     common = union & ~claimed.any(1)  # claimed by the sum alone: on the border of two of the objects
     return chosen | (common & surroundings.near(chosen, settings)) if common.any() else chosen
 
@@ -153,20 +153,20 @@ class _Surroundings:
         """Gaussians no farther from a chosen one than chosen ones are joined over, bool [N]."""
         out = chosen.copy()
         if 1 < chosen.sum() < len(chosen):
-            reach = _spacing(self.means[chosen]) * settings.link_spacings
+            reach = _median_spacing(self.means[chosen]) * settings.link_spacings
             distance, _ = cKDTree(self.means[chosen]).query(self.means, distance_upper_bound=reach)
             out |= np.isfinite(distance)
         return out
 
 
-def _spacing(points: np.ndarray) -> float:
+def _median_spacing(points: np.ndarray) -> float:
     """Median distance to the second nearest of the others: the first is often a twin."""
     count = min(3, len(points))
     distance, _ = cKDTree(points).query(points, k=[count])
     return float(np.median(distance)) + 1e-9
 
 
-def _repaired(
+def _repair(
     claimed: np.ndarray, object_id: int, evidence: _Evidence, surroundings: _Surroundings, s: MembershipSettings
 ) -> np.ndarray:
     rows = np.flatnonzero(claimed)
@@ -177,7 +177,7 @@ def _repaired(
     out[rows[_strangers(rows, object_id, label, surroundings, s)]] = False
     if not s.floaters:
         out &= _large_components(out, surroundings.means, s)
-    out |= _enclosed(out, object_id, evidence, surroundings, s)
+    out |= _find_enclosed(out, object_id, evidence, surroundings, s)
     return out
 
 
@@ -199,7 +199,7 @@ def _strangers(
 
 def _components(points: np.ndarray, s: MembershipSettings) -> np.ndarray:
     """Number of the connected component of each point [M]."""
-    reach = _spacing(points) * s.link_spacings
+    reach = _median_spacing(points) * s.link_spacings
     count = min(9, len(points))
     distance, index = cKDTree(points).query(points, k=range(1, count + 1), distance_upper_bound=reach)
     row, column = np.nonzero(np.isfinite(distance[:, 1:]))
@@ -226,7 +226,7 @@ def _large_components(chosen: np.ndarray, means: np.ndarray, s: MembershipSettin
     return out
 
 
-def _enclosed(
+def _find_enclosed(
     chosen: np.ndarray, object_id: int, evidence: _Evidence, surroundings: _Surroundings, s: MembershipSettings
 ) -> np.ndarray:
     """Others that lie among the chosen or in their hull (rule 4), bool [N]."""

@@ -56,7 +56,7 @@ class SegmentOverlap:
         return self.shared / np.maximum(self.shared.sum(0), 1)
 
 
-def numbered(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def number_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The distinct ids of a uint16 image but 0, ascending, and the number of each pixel's among them (-1 for 0)."""
     present = np.bincount(ids.ravel(), minlength=1) > 0
     present[0] = False
@@ -75,8 +75,8 @@ def same_surface(view: MapView, depth: np.ndarray, settings: AssociationSettings
 def overlap_of(segments: np.ndarray, view: MapView, depth: np.ndarray, settings: AssociationSettings) -> SegmentOverlap:
     """Counts the pixels that `segments` (uint16 [H, W]) and the objects of `view` share."""
     known = same_surface(view, depth, settings) & (view.confidence >= settings.min_confidence)
-    segment_ids, row = numbered(segments)
-    object_ids, column = numbered(np.where(known, view.ids, np.uint16(0)))
+    segment_ids, row = number_ids(segments)
+    object_ids, column = number_ids(np.where(known, view.ids, np.uint16(0)))
     both = (row >= 0) & (column >= 0)
     shape = len(segment_ids), len(object_ids)
     pairs = row[both].astype(np.int64) * shape[1] + column[both]

@@ -189,7 +189,7 @@ def as_seen(chart: Chart, views: Sequence[HoleView]) -> Chart:
     return replace(chart, color=color.reshape(chart.color.shape), clean=seen if seen.any() else chart.clean)
 
 
-def overlapped(hole: np.ndarray) -> np.ndarray:
+def widen_hole(hole: np.ndarray) -> np.ndarray:
     """The hole and one cell around it, so that no gap stays along its rim. bool [H, W]."""
     return cv2.dilate(hole.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 

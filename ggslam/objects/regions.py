@@ -55,7 +55,7 @@ def find_borders(
     found = []
     for axis in (1, 0):
         a, b = _link_ends(regions, axis)
-        p, q = _shifted(a, regions.shape, axis, -reach), _shifted(b, regions.shape, axis, reach)
+        p, q = _shift(a, regions.shape, axis, -reach), _shift(b, regions.shape, axis, reach)
         flat, points, normal = regions.ravel(), surface.points.reshape(-1, 3), normals.reshape(-1, 3)
         judged = (flat[p] == flat[a]) & (flat[q] == flat[b])
         p, q = np.where(judged, p, a), np.where(judged, q, b)
@@ -86,7 +86,7 @@ def _link_ends(regions: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     return a, a + (1 if axis else regions.shape[1])
 
 
-def _shifted(index: np.ndarray, shape: tuple[int, ...], axis: int, by: int) -> np.ndarray:
+def _shift(index: np.ndarray, shape: tuple[int, ...], axis: int, by: int) -> np.ndarray:
     rows, columns = np.divmod(index, shape[1])
     if axis:
         columns = (columns + by).clip(0, shape[1] - 1)

@@ -108,11 +108,11 @@ def _best_plane(points: np.ndarray, normals: np.ndarray, tolerance: float, rng: 
         inliers = points[_on(plane, points, normals, tolerance)]
         if len(inliers) < 3:
             break
-        plane = _fitted(inliers)
+        plane = _fit_plane(inliers)
     return plane
 
 
-def _fitted(points: np.ndarray) -> np.ndarray:
+def _fit_plane(points: np.ndarray) -> np.ndarray:
     """(nx, ny, nz, offset) of the plane through points with the least squared distances."""
     centre = points.mean(0)
     normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]

@@ -53,17 +53,17 @@ class ObjectVotes:
             FormatError: missing, damaged, or arrays that do not fit together.
         """
         ids, weights = read_arrays(path, "votes", "ids", "weights")
-        return ObjectVotes._checked(path, ids, weights)
+        return ObjectVotes._check_votes(path, ids, weights)
 
     @staticmethod
     def labels_in_file(path: str | Path) -> np.ndarray:
         """`labels` of the votes in a file, which are never all in memory; errors as of `from_file`."""
         blocks = array_blocks(path, "votes", "ids", "weights", rows=_ROWS_AT_ONCE)
-        labels = [ObjectVotes._checked(path, *block).labels() for block in blocks]
+        labels = [ObjectVotes._check_votes(path, *block).labels() for block in blocks]
         return np.concatenate(labels) if labels else np.empty(0, np.uint16)
 
     @staticmethod
-    def _checked(path: str | Path, ids: np.ndarray, weights: np.ndarray) -> ObjectVotes:
+    def _check_votes(path: str | Path, ids: np.ndarray, weights: np.ndarray) -> ObjectVotes:
         if ids.ndim != 2 or ids.shape != weights.shape or not ids.shape[1] or not np.isfinite(weights).all():
             raise FormatError(f"{path}: shapes do not fit or weights are not finite: {ids.shape}, {weights.shape}")
         return ObjectVotes(ids.astype(np.uint16), weights.astype(np.float32))

@@ -42,7 +42,7 @@ def copies_of(gaussians: Gaussians, rows: np.ndarray) -> GaussianTensors:
     return GaussianTensors(**{name: getattr(gaussians, name)[index] for name in PARAMETERS})
 
 
-def joined(parts: Sequence[GaussianTensors]) -> GaussianTensors:
+def join_gaussians(parts: Sequence[GaussianTensors]) -> GaussianTensors:
     """Several sets as one."""
     return GaussianTensors(**{name: torch.cat([getattr(part, name) for part in parts]) for name in PARAMETERS})
 

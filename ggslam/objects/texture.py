@@ -34,7 +34,7 @@ def fill_gap(picture: np.ndarray, known: np.ndarray, gap: np.ndarray) -> np.ndar
         return _filled_coarsely(picture, known, gap, float(np.sqrt(gap.sum() / (_MOST * size * size / 3))))
     pixels = (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
     smooth = cv2.inpaint(pixels, (~known).astype(np.uint8), 5, cv2.INPAINT_TELEA).astype(np.float32) / 255
-    textured = _copied(picture.astype(np.float32), known & ~gap, gap, smooth)
+    textured = _copy_patches(picture.astype(np.float32), known & ~gap, gap, smooth)
     if textured is None:
         return smooth[gap]
     light = cv2.GaussianBlur(smooth.mean(2) - textured.mean(2), (0, 0), size).clip(-_LIGHT, _LIGHT)
@@ -54,7 +54,7 @@ def _filled_coarsely(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, fa
     return np.asarray(cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR))[gap]
 
 
-def _copied(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, smooth: np.ndarray) -> np.ndarray | None:
+def _copy_patches(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, smooth: np.ndarray) -> np.ndarray | None:
     """The picture with the gap filled by known patches; what is neither known nor gap is `smooth`. None if no whole
     patch is known."""
     size = 2 * _HALF + 1

@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ggslam.objects.hole_views import COVERED, MapView, depth_tolerance, marked, pick_views
+from ggslam.objects.hole_views import COVERED, CameraView, depth_tolerance, mark_removed, pick_views
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import copies_of, keep_rows
 from ggslam.rendering.cpu import CpuRasterizer
@@ -48,7 +48,7 @@ def places(removed: GaussianTensors, touching: float = 0.05) -> list[GaussianTen
 
 
 def drop_traces(
-    scene: SegmentedMap, removed: GaussianTensors, views: Sequence[MapView], ignored: Sequence[int] = ()
+    scene: SegmentedMap, removed: GaussianTensors, views: Sequence[CameraView], ignored: Sequence[int] = ()
 ) -> int:
     """Drops the traces of what was removed; returns how many Gaussians.
 
@@ -65,7 +65,7 @@ def drop_traces(
     return int(dropped.sum())
 
 
-def traces(kept: Gaussians, removed: Gaussians, views: Sequence[MapView]) -> np.ndarray:
+def traces(kept: Gaussians, removed: Gaussians, views: Sequence[CameraView]) -> np.ndarray:
     """Which of the kept Gaussians are no observation of what is there without the object, bool [N].
 
     What such a Gaussian adds to the views goes mostly to pixels that the object covers, or nowhere: it was trained to
@@ -76,7 +76,7 @@ def traces(kept: Gaussians, removed: Gaussians, views: Sequence[MapView]) -> np.
     own, means = removed.means.numpy(), kept.means.numpy()
     reach = float(np.linalg.norm(np.ptp(own, axis=0)))
     near = np.isfinite(cKDTree(own).query(means, distance_upper_bound=reach)[0])
-    both, rasterizer = marked(kept, removed), CpuRasterizer()
+    both, rasterizer = mark_removed(kept, removed), CpuRasterizer()
     alone = GaussianTensors(**{name: getattr(both, name)[: len(near)] for name in PARAMETERS})
     weights = torch.zeros(len(near), 3)
     for view in pick_views([view for view in views if view.project(means[near])[2].any()], _VIEWS):
@@ -95,7 +95,7 @@ def traces(kept: Gaussians, removed: Gaussians, views: Sequence[MapView]) -> np.
     return near & ((clear <= _CLEAR * (clear + through)) | (clear <= _SELDOM * now))
 
 
-def _before(points: np.ndarray, removed: Gaussians, view: MapView) -> np.ndarray:
+def _before(points: np.ndarray, removed: Gaussians, view: CameraView) -> np.ndarray:
     """Which points [N, 3] stand clearly before an object, bool [N]: what they hide of it is no trace of it."""
     out = CpuRasterizer().forward(removed, view.camera, view.T_camera_world, features=False)
     depth = np.where(out.alpha.numpy() > COVERED, out.expected_depth.numpy(), np.inf).astype(np.float32)

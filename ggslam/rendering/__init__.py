@@ -4,7 +4,7 @@
 
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.api import backends, choose_backend, register_backend, render
-from ggslam.rendering.cpu import CpuRasterizer, StepResult
+from ggslam.rendering.cpu import CpuRasterizer, CpuStepResult
 from ggslam.rendering.cuda import CudaGradients, CudaRasterizer
 from ggslam.rendering.losses import color_loss, depth_loss, identity_loss, neighbour_loss, ssim_map
 from ggslam.rendering.model import GaussianModel
@@ -13,6 +13,7 @@ from ggslam.rendering.types import Gaussians, GaussianTensors, Gradients, Render
 __all__ = [
     "AdamSettings",
     "CpuRasterizer",
+    "CpuStepResult",
     "CudaGradients",
     "CudaRasterizer",
     "GaussianModel",
@@ -20,7 +21,6 @@ __all__ = [
     "Gaussians",
     "Gradients",
     "RenderBuffers",
-    "StepResult",
     "backends",
     "choose_backend",
     "color_loss",

@@ -23,7 +23,7 @@ from ggslam.rendering.arguments import (
     image_gradients,
     posed_view,
 )
-from ggslam.rendering.pixel_terms import PixelTerms
+from ggslam.rendering.pixel_terms import CpuPixelTerms
 from ggslam.rendering.types import LOW_PASS, PARAMETERS, Gaussians, GaussianTensors, Gradients, RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -36,7 +36,7 @@ _FAILURES = {
 
 
 @dataclass
-class StepResult:
+class CpuStepResult:
     """What a fused backward and optimizer step leaves besides the updated map.
 
     Attributes:
@@ -146,7 +146,7 @@ class CpuRasterizer:
         self._library.ggslam_rasterizer_statistics(self._handle, numbers)
         return {"visible": numbers[0], "pairs": numbers[1]}
 
-    def pixel_terms(self, pixels: np.ndarray, capacity: int = 48, min_weight: float = 1e-3) -> PixelTerms:
+    def pixel_terms(self, pixels: np.ndarray, capacity: int = 48, min_weight: float = 1e-3) -> CpuPixelTerms:
         """Which Gaussians some pixels of the last `forward` are made of, with their weights.
 
         Args:
@@ -162,7 +162,7 @@ class CpuRasterizer:
         size = last.buffers.alpha.numel()
         if len(pixels) and (int(pixels.min()) < 0 or int(pixels.max()) >= size):
             raise RenderError(f"pixel_terms: pixels must be 0 to {size - 1}, found {pixels.min()} to {pixels.max()}")
-        terms = PixelTerms.empty(len(pixels), capacity, self.context)
+        terms = CpuPixelTerms.empty(len(pixels), capacity, self.context)
         self._check(
             self._library.ggslam_rasterizer_pixel_terms(
                 self._handle, pixels.ctypes.data, min_weight, ctypes.byref(terms.native())
@@ -235,7 +235,7 @@ class CpuRasterizer:
         *,
         optimizer: AdamSettings,
         detach_features: bool = False,
-    ) -> StepResult:
+    ) -> CpuStepResult:
         """`backward` and one Adam step in one pass: parameters, moments and update counts of the Gaussians that
         contributed are changed in place; those of the others stay as they are. No gradient array is written.
 
@@ -267,7 +267,7 @@ class CpuRasterizer:
         out = structures.GaussianGradients(twist=twist.ctypes.data, touched=address(touched))
         self._last = None  # the parameters change now, so there is nothing left to differentiate
         self._run_backward(grads, out, adam)
-        return StepResult(twist, touched)
+        return CpuStepResult(twist, touched)
 
     def _run_backward(
         self,

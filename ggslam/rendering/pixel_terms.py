@@ -47,7 +47,7 @@ def _schedule(rate: float, beta1: float, beta2: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class PixelTerms:
+class CpuPixelTerms:
     """The terms of P pixels.
 
     Attributes:
@@ -63,25 +63,25 @@ class PixelTerms:
     context: NativeContext
 
     @staticmethod
-    def empty(pixels: int, capacity: int, context: NativeContext) -> PixelTerms:
+    def empty(pixels: int, capacity: int, context: NativeContext) -> CpuPixelTerms:
         """Room for terms."""
         if capacity < 1:
             raise RenderError(f"capacity must be at least 1, found {capacity}")
-        return PixelTerms(
+        return CpuPixelTerms(
             np.empty((pixels, capacity), np.int32), np.empty((pixels, capacity), np.float32),
             np.zeros(pixels, np.int32), context,
         )  # fmt: skip
 
     @staticmethod
-    def of_gaussians(rows: np.ndarray, capacity: int, context: NativeContext) -> PixelTerms:
+    def of_gaussians(rows: np.ndarray, capacity: int, context: NativeContext) -> CpuPixelTerms:
         """Pseudo-pixels that show one Gaussian each, with weight 1: `rows` [M]."""
-        terms = PixelTerms.empty(len(rows), capacity, context)
+        terms = CpuPixelTerms.empty(len(rows), capacity, context)
         terms.gaussians[:, 0], terms.weights[:, 0], terms.counts[:] = rows, 1, 1
         return terms
 
-    def append(self, other: PixelTerms) -> PixelTerms:
+    def append(self, other: CpuPixelTerms) -> CpuPixelTerms:
         """These pixels followed by those of `other`, which must have the same capacity."""
-        return PixelTerms(
+        return CpuPixelTerms(
             np.concatenate([self.gaussians, other.gaussians]), np.concatenate([self.weights, other.weights]),
             np.concatenate([self.counts, other.counts]), self.context,
         )  # fmt: skip

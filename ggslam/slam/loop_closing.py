@@ -152,7 +152,7 @@ class LoopCloser:
         view = FeatureView(frame.color, frame.depth, np.eye(4))
         self._begun = frame.index, self._helper.submit(self.places.describe, view)
 
-    def _described(self, frame: Frame, T_world_camera: np.ndarray) -> Place:
+    def _describe(self, frame: Frame, T_world_camera: np.ndarray) -> Place:
         begun, self._begun = self._begun, None
         if begun is not None and begun[0] == frame.index:
             return begun[1].result()
@@ -167,7 +167,7 @@ class LoopCloser:
         start = time.perf_counter()
         with self._lock:
             T = tracking.T_world_camera
-            place = self._described(frame, T)
+            place = self._describe(frame, T)
             # In real time, keyframes from before the camera was lost may still come after it was found.
             belated = self._found_at is not None and frame.index < self._found_at[0]
             self._connect(tracking, belated)
@@ -219,7 +219,7 @@ class LoopCloser:
             loop = self.graph.add_loop(match.number, number, found.T_old_new, found.information)
             correction = self.poses[match.number] @ found.T_old_new @ inverse(self.poses[number])
             self._verified.append(_Found(number, correction, self.poses[number]))
-            return self._close(frame, match.number, loop) if self._confirmed() else None
+            return self._close(frame, match.number, loop) if self._is_confirmed() else None
         return None
 
     def _verify(
@@ -244,7 +244,7 @@ class LoopCloser:
         )  # fmt: skip
         return found, last
 
-    def _confirmed(self) -> bool:
+    def _is_confirmed(self) -> bool:
         """Whether the last loops found agree on the correction."""
         s, newest, count = self.settings, self._verified[-1], 0
         here = newest.T_world_camera

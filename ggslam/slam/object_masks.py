@@ -129,7 +129,7 @@ class ObjectMasks:
                 self._source = "geometry" if mask is None else "recording"
                 self._associator = self._make_associator()
             if self._source == "recording":
-                return mask if mask is None else _checked(mask, frame)
+                return mask if mask is None else _check_mask(mask, frame)
         if self._segment is None:
             segmenter = GeometricSegmenter(self.settings.geometry)
             self._segment = lambda frame: segmenter.segment(frame.color, frame.depth, frame.camera)
@@ -160,7 +160,7 @@ def _choose(settings: MaskSettings, has_masks: bool | None) -> Source | None:
     return settings.source
 
 
-def _checked(mask: np.ndarray, frame: Frame) -> np.ndarray:
+def _check_mask(mask: np.ndarray, frame: Frame) -> np.ndarray:
     if mask.shape != frame.depth.shape or mask.dtype != np.uint16:
         raise SequenceError(
             f"frame {frame.source_index}: mask is {mask.dtype} {list(mask.shape)}, expected uint16 "

@@ -6,6 +6,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import weakref
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -22,12 +23,62 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.slam.config import Config
+from ggslam.slam.loop_closing import LoopCloser
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.memory_budget import MB, MemoryBudget
+from ggslam.slam.object_masks import ObjectMasks
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
 from ggslam.tracking.gicp_tracker import GicpTracker
+from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker
+
+
+@dataclass
+class RunParts:
+    """The parts of a run.
+
+    Attributes:
+        context: threads of the CPU.
+        masks: of objects.
+        tracker: locates frames.
+        mapper: builds the map.
+        surface: what frames are aligned to.
+        pager: keeps the run within its limit of memory; None without one.
+        loops: finds loops and lost frames; None if the settings do not want it.
+        on_device: whether the map is on a GPU.
+        notes: what the user should know of the choice.
+    """
+
+    context: NativeContext
+    masks: ObjectMasks
+    tracker: Tracker
+    mapper: Mapper
+    surface: MeasuredSurface
+    pager: MapPager | None
+    loops: LoopCloser | None
+    on_device: bool
+    notes: list[str]
+
+
+def make_parts(
+    camera: Camera, config: Config, has_masks: bool | None, paging: Path | None, library: CudaLibrary | None
+) -> RunParts:
+    """The parts that the settings name; arguments and errors as of `Slam`."""
+    context, masks, notes = NativeContext(config.threads or None), ObjectMasks(config.masks, has_masks), []
+    if library is None:
+        library, reason = run_library(config)
+        notes += [reason] if reason else []
+    tracker = make_tracker(camera, config, context, library)
+    pager = make_pager(camera, config, paging)
+    surface = MeasuredSurface(config.tracking.target, context, None if pager is None else pager.archive)
+    # A device makes the voxels' shapes itself; features are tracked on the CPU, which has them made here.
+    surface.finish = library is None or config.tracker != "gicp"
+    loops = LoopCloser(camera, config.loops, surface, tracker, context) if config.loops.enabled else None
+    mapper = make_mapper(config, masks.active, context, library)
+    if pager is not None:
+        pager.serve(mapper)
+    return RunParts(context, masks, tracker, mapper, surface, pager, loops, library is not None, notes)
 
 
 def run_library(config: Config) -> tuple[CudaLibrary | None, str | None]:
@@ -91,7 +142,7 @@ def make_tracker(camera: Camera, config: Config, context: NativeContext, library
 
 
 def make_pager(camera: Camera, config: Config, folder: Path | None) -> MapPager | None:
-    """Who keeps a run within its limit of memory, if it has one."""
+    """Keeps the run within its limit of memory; None if it has none."""
     if not config.memory_limit_mb:
         return None
     budget = MemoryBudget(int(config.memory_limit_mb * MB), int(config.paging.budget_mb * MB))

@@ -87,9 +87,9 @@ class RealtimeSlam:
             tracking = slam.track(frame)
         is_keyframe = self._jobs.qsize() < MAX_WAITING and slam.wants_keyframe(frame, tracking)
         if is_keyframe:
-            slam.anchor_to(tracking.T_world_camera)
+            slam.poses.add_keyframe(tracking.T_world_camera)
             self._jobs.put((frame, tracking, slam.moves_followed))
-        slam.remember(frame, tracking)
+        slam.poses.add(frame, tracking)
         slam.times.stop()
         seconds = time.perf_counter() - start
         return slam.note_step(is_keyframe, seconds)

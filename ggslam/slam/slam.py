@@ -10,10 +10,8 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -24,34 +22,24 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
-from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.frame_checks import check_frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
-from ggslam.scene.poses import inverse
 from ggslam.slam.config import Config
-from ggslam.slam.loop_closing import Correction, LoopCloser
-from ggslam.slam.object_masks import ObjectMasks, observations
-from ggslam.slam.parts import device_name, make_mapper, make_pager, make_tracker, run_library
+from ggslam.slam.frame_poses import FramePoses
+from ggslam.slam.map_corrections import MapCorrections
+from ggslam.slam.parts import device_name, make_parts
 from ggslam.slam.result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
+from ggslam.slam.run_objects import RunObjects
 from ggslam.slam.saved_places import saved_places_to_bytes
 from ggslam.slam.step_log import StepLog
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.tracking.keyframes import KeyframePolicy
-from ggslam.tracking.scale import scaled, scene_scale
+from ggslam.tracking.scale import scale_settings, scene_scale
 from ggslam.tracking.settings import DepthNoise
-from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """The keyframe that poses are remembered relative to, and its pose as tracked."""
-
-    keyframe: int
-    T_world_camera: np.ndarray
 
 
 class Slam:
@@ -78,45 +66,26 @@ class Slam:
     ) -> None:  # fmt: skip
         self.camera = camera
         self.config = config or Config()
-        self.context = NativeContext(self.config.threads or None)
-        self.masks = ObjectMasks(self.config.masks, has_masks)
-        self._notes: list[str] = []
-        if library is None:
-            library, reason = run_library(self.config)
-            self._notes += [reason] if reason else []
-        self._on_device = library is not None
-        self.tracker = make_tracker(camera, self.config, self.context, library)
-        self.pager = make_pager(camera, self.config, paging)
-        archive = None if self.pager is None else self.pager.archive
-        self.surface = MeasuredSurface(self.config.tracking.target, self.context, archive)
-        # A device makes the voxels' shapes itself; features are tracked on the CPU, which has them made here.
-        self.surface.finish = library is None or self.config.tracker != "gicp"
-        self.loops: LoopCloser | None = None
-        if self.config.loops.enabled:
-            self.loops = LoopCloser(camera, self.config.loops, self.surface, self.tracker, self.context)
-        self.policy = KeyframePolicy(self.config.keyframes)
-        self.mapper = make_mapper(self.config, self.masks.active, self.context, library)
-        if extra_loss is not None and library is not None:
+        parts = make_parts(camera, self.config, has_masks, paging, library)
+        self.context, self.masks, self.tracker, self.surface = parts.context, parts.masks, parts.tracker, parts.surface
+        self.mapper, self.pager, self.loops = parts.mapper, parts.pager, parts.loops
+        self._notes, self._on_device = parts.notes, parts.on_device
+        if extra_loss is not None and self._on_device:
             raise ConfigError("`extra_loss` needs device: cpu; on a GPU losses are computed by kernels only")
         self.mapper.extra_loss = extra_loss
-        if self.pager is not None:
-            self.pager.serve(self.mapper)
+        self.policy = KeyframePolicy(self.config.keyframes)
         self.scale = 1.0
         """Size of the scene against a room's, see `tracking.scale`."""
-        self.frames: list[TrackedFrame] = []
+        self.poses = FramePoses()
         self.dropped_frames: list[int] = []
         self.refine_iterations = 0
         self.times = SlamTimes()
         self.steps = StepLog()
-        self._anchor = Anchor(-1, np.eye(4))
-        self._keyframes_made = 0
         self.growing = True
         """Whether keyframes are made and the map is trained; off: frames are located in the map as it is."""
-        self._moves: list[np.ndarray] = []
+        self._corrections = MapCorrections(self.surface, self.mapper, self.pager)
         self._moves_followed = 0
-        self._publishing = threading.Lock()
-        self._settled = False
-        self._objects: LearnedObjects | None = None
+        self._objects = RunObjects(self.masks)
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
         """Starts in a map made before; `surface` and `loops` hold its keyframes already. The camera counts as lost
@@ -132,7 +101,7 @@ class Slam:
         """
         if self.pager is not None:
             raise ConfigError("memory_limit_mb: a run that starts in the map of another (`map`) has no limit of memory")
-        self._objects, self._keyframes_made = objects, len(keyframes)
+        self._objects.learned, self.poses.keyframes_made = objects, len(keyframes)
         self.mapper.adopt(gaussians, keyframes)
         if objects is None or gaussians.feature_channels != IDENTITY_CHANNELS:
             self.mapper.identity = None
@@ -158,8 +127,8 @@ class Slam:
             if self.loops is not None and self._on_device:
                 self.loops.begin(frame)  # beside what the host waits for
             self.insert(frame, tracking, self.moves_followed)
-            self.anchor_to(tracking.T_world_camera)
-        self.remember(frame, tracking)
+            self.poses.add_keyframe(tracking.T_world_camera)
+        self.poses.add(frame, tracking)
         if self.mapper.keyframes and self.growing:
             first = is_keyframe and len(self.mapper.keyframes) == 1
             settings = self.config.mapping
@@ -167,6 +136,11 @@ class Slam:
         self.times.stop()
         seconds = time.perf_counter() - start
         return self.note_step(is_keyframe, seconds)
+
+    @property
+    def frames(self) -> list[TrackedFrame]:
+        """How each frame so far was tracked."""
+        return self.poses.frames
 
     @property
     def map(self) -> GaussianMap:
@@ -179,7 +153,7 @@ class Slam:
         frame = self.frames[-1]
         report = self.steps.add(frame, is_keyframe, seconds, self.times, loops_s, self.mapper, self.gaussian_count)
         if frame.status != TrackingStatus.LOST.value:
-            report.T_world_camera = self._anchor.T_world_camera @ frame.T_keyframe_camera
+            report.T_world_camera = self.poses.newest()
         return report
 
     @property
@@ -201,7 +175,7 @@ class Slam:
     def result(self) -> SlamResult:
         """What there is so far. The first call settles the objects: it is for the end."""
         self.times.loops = self.loops.seconds if self.loops is not None else 0.0
-        objects = self._learned_objects()
+        objects = self._objects.settle(self.mapper, self.pager) if self.growing else self._objects.learned
         cells = None if self.pager is None else self.pager.settle()
         gaussians = self.map.to(torch.device("cpu"))
         return SlamResult(
@@ -227,24 +201,6 @@ class Slam:
         if self.pager is not None:
             self.pager.close()
 
-    def _learned_objects(self) -> LearnedObjects | None:
-        """The last identity steps, and every Gaussian's object; once."""
-        identity = self.mapper.identity
-        if self._settled or identity is None or not identity.table.count or not self.growing:
-            return self._objects
-        self._settled = True  # if it fails below, the map can still be had by another call
-        earlier = None if self._objects is None else self._objects.observations
-        seen = observations(self.mapper.keyframes, identity.current, earlier)
-        sizes = np.bincount(self.mapper.vote_labels(), minlength=65536)
-        if self.pager is not None:
-            sizes += self.pager.vote_sizes()
-        noise = self.masks.noise(identity.classifier.class_ids, seen, len(self.mapper.keyframes), sizes)
-        identity.forget(self.map, noise)
-        self.mapper.finish_identity()
-        kept = {i: observation for i, observation in seen.items() if i not in noise}
-        self._objects = LearnedObjects(identity.classifier, self.masks.supervision, kept)
-        return self._objects
-
     # --- its parts, also used by the real-time loop ------------------------------------------------------------------
 
     def track(self, frame: Frame) -> TrackingResult:
@@ -263,7 +219,7 @@ class Slam:
             found = self.loops.find(frame, result)
             if found is not None:
                 result, keyframe = found
-                self._anchor = Anchor(keyframe, self.loops.poses[keyframe].copy())
+                self.poses.anchor_to(keyframe, self.loops.poses[keyframe])
         if not self.mapper.keyframes and self.tracker.noise is not None:
             self.mapper.depth_sigma = self.tracker.noise.sigma(result.median_depth_m)
         self.times.tracking_by_frame.append(time.perf_counter() - start)
@@ -272,18 +228,17 @@ class Slam:
 
     def use_scale(self, scale: float) -> None:
         """Fits the tracker to a scene of this size; before the first keyframe."""
-        self.scale, self.tracker.settings = scale, scaled(self.config.tracking, scale)
+        self.scale, self.tracker.settings = scale, scale_settings(self.config.tracking, scale)
         self.surface.settings = self.tracker.settings.target
 
     def _follow_moves(self) -> None:
         """The tracker goes along with corrections of the map made since the last frame."""
-        with self._publishing:
-            target, moves = self.surface.target, self._moves[self._moves_followed :]
-            self._moves_followed = len(self._moves)
+        target, moves = self._corrections.news(self._moves_followed)
+        self._moves_followed += len(moves)
         for T_new_old in moves:
             self.tracker.move(T_new_old)
             self.policy.move(T_new_old)
-            self._anchor = Anchor(self._anchor.keyframe, T_new_old @ self._anchor.T_world_camera)
+            self.poses.move(T_new_old)
         if target is not None:
             self.tracker.set_target(target)
 
@@ -295,13 +250,11 @@ class Slam:
     @property
     def corrections(self) -> int:
         """How many times a closed loop has moved the map."""
-        return len(self._moves)
+        return len(self._corrections)
 
     def pose_of(self, frame: TrackedFrame) -> np.ndarray:
         """T_world_camera [4, 4] of a frame that was not lost, as far as is known by now."""
-        if frame.keyframe < len(self.mapper.keyframes):
-            return self.mapper.keyframes[frame.keyframe].T_world_camera @ frame.T_keyframe_camera
-        return self._anchor.T_world_camera @ frame.T_keyframe_camera  # its keyframe still waits for the mapper
+        return self.poses.pose_of(frame, self.mapper.keyframes)
 
     def wants_keyframe(self, frame: Frame, tracking: TrackingResult) -> bool:
         """Whether the frame becomes a keyframe: never when lost, and never when held out for scoring (but something
@@ -319,45 +272,16 @@ class Slam:
             tracking: where it is.
             moves_followed: the corrections that this knows of.
         """
-        for T_new_old in self._moves[moves_followed:]:
-            tracking = replace(tracking, T_world_camera=T_new_old @ tracking.T_world_camera)
+        tracking = self._corrections.follow(tracking, moves_followed)
         if self.pager is not None:
             self.pager.prepare(tracking.T_world_camera, frame.depth)
         before = self.map.count
         keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
         added = self.map.count - before
-        with self._publishing:
-            self.surface.add(tracking.points, tracking.T_world_camera)
-        correction = None if self.loops is None else self.loops.add(frame, tracking)
-        if self.loops is not None and correction is not None:
-            self._correct(self.loops, correction)
+        self._corrections.add_points(tracking)
+        if self.loops is not None:
+            correction = self.loops.add(frame, tracking)
+            if correction is not None:
+                self._corrections.apply(correction, self.loops)
         if self.pager is not None:
-            self.pager.inserted(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
-
-    def _correct(self, loops: LoopCloser, correction: Correction) -> None:
-        """Moves the map after its keyframes, takes out what is double now, and trains both ends of the loop."""
-        self.mapper.move_keyframes(correction.T_new_old)
-        if self.pager is not None:
-            self.pager.move_keyframes(correction.T_new_old)
-            self.pager.bring_ends(correction.kept & correction.active)
-        with self._publishing:
-            loops.settle(correction)
-            self._moves.append(correction.T_new_old[-1])
-        self.mapper.mend(
-            sorted(correction.kept & correction.active), sorted(correction.doubted), self.config.loops.repair_iterations
-        )
-
-    def anchor_to(self, T_world_camera: np.ndarray) -> None:
-        """From now on poses are remembered relative to this keyframe, the newest."""
-        self._anchor = Anchor(self._keyframes_made, T_world_camera.copy())
-        self._keyframes_made += 1
-
-    def remember(self, frame: Frame, tracking: TrackingResult) -> None:
-        """Notes the pose of a frame relative to the newest keyframe."""
-        T_keyframe_camera = inverse(self._anchor.T_world_camera) @ tracking.T_world_camera
-        self.frames.append(
-            TrackedFrame(
-                frame.index, frame.source_index, frame.timestamp, max(0, self._anchor.keyframe), T_keyframe_camera,
-                tracking.overlap, tracking.rmse_m, tracking.status.value, tracking.reason,
-            )
-        )  # fmt: skip
+            self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)

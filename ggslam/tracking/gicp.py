@@ -43,12 +43,12 @@ class GicpTarget:
         """Pointer for the core."""
         if self._unfinished is not None:
             context, settings = self._unfinished
-            self._library.ggslam_gicp_target_finish(context.handle, self.gathered, settings)
+            self._library.ggslam_gicp_target_finish(context.handle, self.gathered_handle, settings)
             self._unfinished = None
-        return self.gathered
+        return self.gathered_handle
 
     @property
-    def gathered(self) -> int:
+    def gathered_handle(self) -> int:
         """Pointer for those functions of the core that do not need the voxels' shapes."""
         assert self._handle is not None
         return self._handle
@@ -127,15 +127,15 @@ class GicpTarget:
             address(positions), len(means), cameras,
         )  # fmt: skip
         arguments = native_target_settings(settings, target.voxel)
-        earlier = None if base is None else base.gathered
+        earlier = None if base is None else base.gathered_handle
         build = target._library.ggslam_gicp_target_build if finish else target._library.ggslam_gicp_target_gather
-        build(context.handle, target.gathered, earlier, given, arguments)
+        build(context.handle, target.gathered_handle, earlier, given, arguments)
         target._unfinished = None if finish else (context, arguments)
         return target
 
     def __len__(self) -> int:
         """Number of fine voxels."""
-        return self._library.ggslam_gicp_target_size(self.gathered, 0)
+        return self._library.ggslam_gicp_target_size(self.gathered_handle, 0)
 
     def voxels(self, level: int = 0) -> dict[str, np.ndarray]:
         """Copies of a level's (0 fine, 1 coarse) means [n, 3], normals [n, 3], covariances [n, 6], weights [n]."""

@@ -49,7 +49,7 @@ class GicpTracker(Tracker):
         self._median_depth: float | None = None
 
     @classmethod
-    def sharing(cls, state: TrackerState) -> GicpTracker:
+    def with_state(cls, state: TrackerState) -> GicpTracker:
         """A tracker that works with the state of another."""
         tracker = cls(state.camera, state.settings, state.context)
         tracker.state = state

@@ -12,7 +12,7 @@ from ggslam.scene.poses import separation
 from ggslam.system.settings import setting, settings_class
 
 
-class Tracked(Protocol):
+class LocatedFrame(Protocol):
     """What the policy wants to know of a tracked frame (`tracker.TrackingResult` has it)."""
 
     @property
@@ -69,7 +69,7 @@ class KeyframePolicy:
         self._frame_index = 0
         self._T_world_camera = np.eye(4)
 
-    def decide(self, frame_index: int, tracked: Tracked) -> bool:
+    def decide(self, frame_index: int, tracked: LocatedFrame) -> bool:
         """Whether the frame becomes a keyframe; if so it is remembered as the last one and `kind` says why.
 
         Frames that must not become keyframes (held out, lost) are not to be asked about.
@@ -84,7 +84,7 @@ class KeyframePolicy:
         """The world about the last keyframe was moved by a correction [4, 4]."""
         self._T_world_camera = T_new_old @ self._T_world_camera
 
-    def _kind(self, frame_index: int, tracked: Tracked) -> KeyframeKind | None:
+    def _kind(self, frame_index: int, tracked: LocatedFrame) -> KeyframeKind | None:
         s = self.settings
         if self.kind is None:
             return KeyframeKind.FIRST

@@ -20,7 +20,7 @@ def unpack(packed: np.ndarray) -> np.ndarray:
     return packed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
-def regularized(
+def regularize(
     covariances: np.ndarray, min_thickness: float, max_thickness: float, max_elongation: float
 ) -> np.ndarray:
     """Equation 1 of GS-ICP, S' = S / median(S), with bounds on thickness and elongation; [n, 3, 3] to [n, 3, 3]."""
@@ -53,7 +53,7 @@ def point_shape(
     normal = axes[:, 0] * (-1 if axes[:, 0] @ points[v, u] > 0 else 1)
     along = (normal @ points[v, u]) ** 2 / (points[v, u] @ points[v, u])
     values[0] = max(values[0] - 2 * noise.sigma(z) ** 2 * along, 0.0)
-    shape = regularized((axes * values @ axes.T)[None], settings.min_thickness, 1.0, settings.max_elongation)[0]
+    shape = regularize((axes * values @ axes.T)[None], settings.min_thickness, 1.0, settings.max_elongation)[0]
     return normal, shape
 
 
@@ -65,7 +65,7 @@ def gaussian_shapes(
     variances = np.exp(2 * log_scales.astype(float))
     covariances = np.einsum("nij,nj,nkj->nik", R, variances, R)
     normals = np.take_along_axis(R, variances.argmin(1)[:, None, None], 2)[:, :, 0]
-    return normals, regularized(covariances, settings.min_thickness, 1.0, settings.max_elongation)
+    return normals, regularize(covariances, settings.min_thickness, 1.0, settings.max_elongation)
 
 
 def voxel_means(

@@ -31,7 +31,7 @@ def scene_scale(depth: np.ndarray) -> float:
     return median / min(max(median, NEAR_M), FAR_M)
 
 
-def scaled(settings: TrackerSettings, scale: float) -> TrackerSettings:
+def scale_settings(settings: TrackerSettings, scale: float) -> TrackerSettings:
     """The settings with the target's voxels and, in scenes larger than rooms, the depth range times `scale`. Lengths
     that follow the depth noise are left alone."""
     points = replace(settings.points, max_depth=settings.points.max_depth * max(1.0, scale))

@@ -114,7 +114,7 @@ class MeasuredSurface:
             for part, T in zip(self._parts, T_world_camera, strict=True):
                 part.T_world_camera = np.array(T, float)
         self.active = set(active)
-        self.target = None  # unless somebody aligns to it, there is never more than one in memory
+        self.target = None  # frees it before the next one is made
         self.target = self.of(sorted(self.active))
         return self.target
 

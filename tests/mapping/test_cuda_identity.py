@@ -21,7 +21,7 @@ from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
-from ggslam.rendering.pixel_terms import PixelTerms
+from ggslam.rendering.pixel_terms import CpuPixelTerms
 from ggslam.rendering.types import RenderBuffers
 
 ALONE = NeighbourSettings(weight=0)
@@ -44,12 +44,12 @@ class View:
         self.weights = random.uniform(0.01, 0.16, (len(pixel), 6)).astype(np.float32)
         self.counts = random.integers(0, 7, len(pixel)).astype(np.int32)
 
-    def arrays(self, pixels: np.ndarray, capacity: int) -> PixelTerms:
+    def arrays(self, pixels: np.ndarray, capacity: int) -> CpuPixelTerms:
         rows, weights = np.zeros((2, len(pixels), capacity))
         counts = self.counts[pixels]
         used = np.arange(6) < counts[:, None]
         rows[:, :6], weights[:, :6] = self.gaussians[pixels] * used, self.weights[pixels] * used
-        return PixelTerms(rows.astype(np.int32), weights.astype(np.float32), counts, self.context)
+        return CpuPixelTerms(rows.astype(np.int32), weights.astype(np.float32), counts, self.context)
 
     def pixel_terms(self, pixels, capacity: int = 48, min_weight: float = 0.0):  # type: ignore[no-untyped-def]
         if isinstance(pixels, np.ndarray):

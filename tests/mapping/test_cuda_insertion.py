@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.mapping.cpu.insertion import fill_gaussians, new_gaussians, unexplained
+from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
 from ggslam.mapping.cuda.insertion import CudaInsertion
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE
 from ggslam.mapping.new_gaussians import NewGaussians
@@ -69,7 +69,7 @@ def on_device(library: CudaLibrary, images: Images, s: InsertionSettings, empty:
 
 def on_host(images: Images, s: InsertionSettings, empty: bool = False) -> list[NewGaussians]:
     depth, alpha = images.depth_m, np.zeros_like(images.alpha) if empty else images.alpha
-    where = np.ones(depth.shape, bool) if empty else unexplained(depth, alpha, images.rendered, s)
+    where = np.ones(depth.shape, bool) if empty else find_unexplained(depth, alpha, images.rendered, s)
     parts = [new_gaussians(images.color, depth, images.camera, POSE, where, s)]
     if s.fill_stride:
         parts.append(fill_gaussians(images.color, depth, alpha, images.camera, POSE, s))

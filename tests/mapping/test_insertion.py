@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ggslam.mapping.cpu.insertion import grid_selection, new_gaussians, surface_normals, unexplained
+from ggslam.mapping.cpu.insertion import find_unexplained, grid_selection, new_gaussians, surface_normals
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import quaternion_to_matrix, se3_exp
@@ -65,7 +65,7 @@ def test_unexplained_is_alpha_or_something_in_front() -> None:
     depth = np.array([[1.0, 1.0, 1.0, 1.0]], np.float32)
     alpha = np.array([[0.2, 1.0, 1.0, 1.0]], np.float32)
     rendered = np.array([[1.0, 1.0, 1.2, 0.5]], np.float32)
-    assert unexplained(depth, alpha, rendered, s).tolist() == [[True, False, True, False]]
+    assert find_unexplained(depth, alpha, rendered, s).tolist() == [[True, False, True, False]]
 
 
 def test_adaptive_stride_thins_flat_regions_only() -> None:

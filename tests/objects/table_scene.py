@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ggslam.mapping.cpu.insertion import new_gaussians, unexplained
+from ggslam.mapping.cpu.insertion import find_unexplained, new_gaussians
 from ggslam.mapping.settings import InsertionSettings
-from ggslam.objects.hole_views import MapView
+from ggslam.objects.hole_views import CameraView
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.rendering.cpu import CpuRasterizer
@@ -31,7 +31,7 @@ class TableScene:
     """The map, its views, and the images with and without the cylinder, in the order of the views."""
 
     scene: SegmentedMap
-    views: list[MapView]
+    views: list[CameraView]
     images: list[RayImages]
     truth: list[RayImages]
 
@@ -81,7 +81,7 @@ def build_table_scene() -> TableScene:
         where = np.ones(view.depth.shape, bool)
         if len(gaussians):
             out = rasterizer.forward(gaussians, CAMERA, inverse(pose), features=False)
-            where = unexplained(view.depth, out.alpha.numpy(), out.expected_depth.numpy(), settings)
+            where = find_unexplained(view.depth, out.alpha.numpy(), out.expected_depth.numpy(), settings)
         new = new_gaussians(view.color, view.depth, CAMERA, pose, where, settings)
         labels = view.mask.reshape(-1)[new.pixels].astype(np.int64)
         gaussians.insert(
@@ -94,5 +94,5 @@ def build_table_scene() -> TableScene:
     voted[:, 0] = gaussians.object_id.numpy()
     votes = ObjectVotes(voted, (voted > 0).astype(np.float32))
     table = ObjectTable.build(gaussians, classifier, "masks", names)
-    views = [MapView(CAMERA, inverse(pose), number) for number, pose in enumerate(poses)]
+    views = [CameraView(CAMERA, inverse(pose), number) for number, pose in enumerate(poses)]
     return TableScene(SegmentedMap(gaussians, classifier, table, votes), views, images, truth)

@@ -16,10 +16,10 @@ from ggslam.errors import ConfigError
 from ggslam.objects import texture
 from ggslam.objects.editing import move_objects, remove_objects
 from ggslam.objects.hole_refinement import Recorded
-from ggslam.objects.hole_views import HoleView, MapView
+from ggslam.objects.hole_views import CameraView, HoleView
 from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
 from ggslam.objects.plane_filling import Chart, as_seen, paint
-from ggslam.objects.segmented_rows import copies_of, joined
+from ggslam.objects.segmented_rows import copies_of, join_gaussians
 from ggslam.objects.traces import drop_traces, places
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import RenderBuffers
@@ -160,7 +160,7 @@ def test_things_apart_leave_holes_of_their_own(table: TableScene) -> None:
     other.means += torch.tensor([1.0, 0, 0])
     floater = copies_of(cylinder, np.arange(len(cylinder.means)) < 1)
     floater.means -= torch.tensor([1.0, 0, 0])
-    sizes = sorted(len(part.means) for part in places(joined([cylinder, other, floater])))
+    sizes = sorted(len(part.means) for part in places(join_gaussians([cylinder, other, floater])))
     assert sizes == [len(other.means), len(cylinder.means)]
 
 
@@ -197,7 +197,7 @@ def test_colours_come_from_views_off_the_object_s_outline() -> None:
     now, picture = np.ones((90, 120), np.float32), np.full((90, 120, 3), 0.5, np.float32)
     outline = cv2.dilate(hole.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     picture[outline] = 0.0
-    view = HoleView(MapView(camera, np.eye(4)), hole, now, now, picture)
+    view = HoleView(CameraView(camera, np.eye(4)), hole, now, now, picture)
     seen = as_seen(replace(chart, clean=np.zeros_like(hole)), [view])
     assert seen.clean.sum() > 0.6 * seen.clean.size and not (seen.clean & outline).any()
     assert (seen.color[seen.clean] == 0.5).all()

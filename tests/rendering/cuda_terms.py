@@ -13,7 +13,7 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
-from ggslam.rendering.pixel_terms import FeatureAdamSettings, PixelTerms
+from ggslam.rendering.pixel_terms import CpuPixelTerms, FeatureAdamSettings
 from ggslam.rendering.types import GaussianTensors
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -50,7 +50,7 @@ class Both:
     def cuda_terms(self, pixels: np.ndarray, capacity: int, min_weight: float) -> CudaPixelTerms:
         return self.cuda.pixel_terms(torch.from_numpy(pixels).to(self.device), capacity, min_weight)
 
-    def equal_terms(self, pixels: np.ndarray, capacity: int = 32) -> tuple[PixelTerms, CudaPixelTerms]:
+    def equal_terms(self, pixels: np.ndarray, capacity: int = 32) -> tuple[CpuPixelTerms, CudaPixelTerms]:
         """Terms of the CUDA kernels, and the same for the CPU."""
         terms = self.cuda_terms(pixels, capacity, 1e-3)
         return on_cpu(terms, self.cpu), terms
@@ -59,6 +59,6 @@ class Both:
         return torch.from_numpy(values).to(self.device)
 
 
-def on_cpu(terms: CudaPixelTerms, rasterizer: CpuRasterizer) -> PixelTerms:
+def on_cpu(terms: CudaPixelTerms, rasterizer: CpuRasterizer) -> CpuPixelTerms:
     arrays = [array.cpu().numpy().copy() for array in (terms.gaussians, terms.weights, terms.counts)]
-    return PixelTerms(*arrays, rasterizer.context)
+    return CpuPixelTerms(*arrays, rasterizer.context)

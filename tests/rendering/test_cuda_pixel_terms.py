@@ -14,10 +14,10 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
-from ggslam.rendering.pixel_terms import PixelTerms
+from ggslam.rendering.pixel_terms import CpuPixelTerms
 
 
-def assert_terms_agree(found: PixelTerms, expected: PixelTerms) -> None:
+def assert_terms_agree(found: CpuPixelTerms, expected: CpuPixelTerms) -> None:
     """The same Gaussians in the same order with the same weights; but rounding decides about contributions of just
     1/255 and of just the least weight, so that one pixel in a hundred may differ."""
     capacity = found.gaussians.shape[1]
@@ -103,7 +103,7 @@ def test_a_gaussian_seen_by_many_pixels_sums_them_all(cuda_library: CudaLibrary)
     rows = np.repeat(np.array([2, 0, 2], np.int32), [70, 1, 45])
     gradient = np.random.default_rng(2).normal(size=(len(rows), 5)).astype(np.float32)
     terms = CudaPixelTerms.of_gaussians(torch.from_numpy(rows).to(device), 4, cuda_library)
-    PixelTerms.of_gaussians(rows, 4, context).step(gaussians, gradient, RATES)
+    CpuPixelTerms.of_gaussians(rows, 4, context).step(gaussians, gradient, RATES)
     terms.step(found, torch.from_numpy(gradient).to(device), RATES)
     assert torch.equal(found.feature_updates.cpu(), torch.tensor([1, 0, 1], dtype=torch.int32))
     assert torch.allclose(found.moments["features"][0].cpu(), gaussians.moments["features"][0], rtol=1e-5, atol=1e-6)

@@ -11,7 +11,7 @@ from rendering_scenes import CAMERA, POSE, make_scene
 from ggslam.errors import RenderError
 from ggslam.native.loader import available_instruction_sets
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.pixel_terms import FeatureAdamSettings, PixelTerms
+from ggslam.rendering.pixel_terms import CpuPixelTerms, FeatureAdamSettings
 from ggslam.scene.gaussian_map import GaussianMap
 
 ALL = np.arange(CAMERA.width * CAMERA.height)
@@ -104,7 +104,7 @@ def test_a_label_with_most_of_the_weight_survives_any_number_of_others() -> None
     gaussians, rasterizer = make_map(), CpuRasterizer()
     rows = np.zeros(400, np.int64)
     labels = np.where(np.arange(400) % 2 == 0, 5, np.arange(400) + 100).astype(np.uint16)
-    PixelTerms.of_gaussians(rows, 4, rasterizer.context).vote(gaussians, labels)
+    CpuPixelTerms.of_gaussians(rows, 4, rasterizer.context).vote(gaussians, labels)
     heaviest = gaussians.vote_ids.numpy()[0, gaussians.vote_weights.numpy()[0].argmax()]
     assert heaviest == 5 and gaussians.vote_weights.numpy()[0].sum() == 400
 

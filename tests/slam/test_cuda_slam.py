@@ -21,6 +21,7 @@ from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
+from ggslam.runs.records.sequence import OpenRecord, SequenceRecord
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import open_sequence
@@ -139,7 +140,7 @@ def test_a_keyframe_looks_again_if_its_rendering_found_no_room(
     def run_three(short: bool) -> Slam:
         slam = Slam(frames[0].camera, config("keyframes.max_gap=1"), has_masks=True, library=cuda_library)
         mapper: Any = slam.mapper
-        rendered = mapper.rendered
+        rendered = mapper.render_keyframe
 
         def rendered_short(keyframe: Keyframe, with_room: bool) -> Any:
             view = rendered(keyframe, with_room)
@@ -148,7 +149,7 @@ def test_a_keyframe_looks_again_if_its_rendering_found_no_room(
             return view
 
         if short:
-            monkeypatch.setattr(mapper, "rendered", rendered_short)
+            monkeypatch.setattr(mapper, "render_keyframe", rendered_short)
         for frame in frames[:3]:
             slam.step(frame)
         return slam
@@ -238,5 +239,6 @@ def test_a_run_that_may_choose_tells_where_it_was(
     settings = config("device=auto", "identity.enabled=false")
     _, result = run(frames[:1], settings, None)
     assert len(result.notes) == 1 and "NVIDIA GPU" in result.notes[0]
-    RunFolder.create(tmp_path / "run").save(settings, {}, result)
+    record = SequenceRecord(open=OpenRecord(path="room"), camera=frames[0].camera)
+    RunFolder.create(tmp_path / "run").save(settings, record, result)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["environment"]["device"] == "cpu"

@@ -111,7 +111,7 @@ def test_the_clock_lets_begin_what_is_likely_to_end(monkeypatch: pytest.MonkeyPa
     clock = FrameClock(10)
     assert clock.allows("step")
     now[0] = 0.004
-    clock.ended("step")
+    clock.end_step("step")
     assert clock.allows("step")  # 4 ms used, 4 ms more
     now[0] = 0.007
     assert not clock.allows("step")

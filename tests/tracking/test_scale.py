@@ -13,7 +13,7 @@ from ggslam.scene.poses import inverse
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam
-from ggslam.tracking.scale import scaled, scene_scale
+from ggslam.tracking.scale import scale_settings, scene_scale
 from ggslam.tracking.settings import TrackerSettings
 
 
@@ -24,9 +24,9 @@ def test_rooms_are_the_measure() -> None:
         assert scene_scale(image) == pytest.approx(scale)
     assert scene_scale(np.zeros((6, 8), np.float32)) == 1.0
     usual = TrackerSettings()
-    assert scaled(usual, 1.0) == usual
-    assert scaled(usual, 4.0).target.voxel == 4 * usual.target.voxel
-    assert (scaled(usual, 4.0).points.max_depth, scaled(usual, 0.5).points.max_depth) == (32.0, 8.0)
+    assert scale_settings(usual, 1.0) == usual
+    assert scale_settings(usual, 4.0).target.voxel == 4 * usual.target.voxel
+    assert (scale_settings(usual, 4.0).points.max_depth, scale_settings(usual, 0.5).points.max_depth) == (32.0, 8.0)
 
 
 @pytest.mark.parametrize("size", [0.2, 1.0, 4.0])

@@ -28,11 +28,11 @@ from ggslam.objects.editing import (
     rename_object,
 )
 from ggslam.objects.hole_refinement import Recorded
-from ggslam.objects.hole_views import MapView
+from ggslam.objects.hole_views import CameraView
 from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
 from ggslam.objects.recoloring import parse_color
 from ggslam.objects.segmented_map import SegmentedMap
-from ggslam.objects.segmented_rows import joined
+from ggslam.objects.segmented_rows import join_gaussians
 from ggslam.objects.table import ObjectTable
 from ggslam.objects.traces import drop_traces, places
 from ggslam.runs.folder import RunFolder
@@ -168,7 +168,7 @@ class _Source:
 
     camera: Camera
     keyframes: KeyframesRecord
-    views: list[MapView]
+    views: list[CameraView]
     displacement: Displacement
 
     @staticmethod
@@ -185,7 +185,7 @@ class _Source:
             raise RunFolderError(f"{folder.path / record.FILE}: it lists no keyframes or no tracked frames")
         # Keyframes of the map that the run began with have no images here.
         views = [
-            MapView(camera, inverse(k.T_world_camera), None if k.frame == ELSEWHERE else k.frame)
+            CameraView(camera, inverse(k.T_world_camera), None if k.frame == ELSEWHERE else k.frame)
             for k in record.keyframes
         ]  # fmt: skip
         return _Source(camera, record, views, displacement)
@@ -269,7 +269,7 @@ def _mend(
         if settings is not None:
             notes.append("nothing to inpaint: no object left its place")
         return None
-    removed = joined(left)
+    removed = join_gaussians(left)
     if settings is not None:
         filling = inpaint(scene, removed, source.views, displaced, recording, settings)
     else:

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ggslam.objects.editing import Change
-from ggslam.objects.hole_views import COVERED, MapView, marked
-from ggslam.objects.segmented_rows import joined
+from ggslam.objects.hole_views import COVERED, CameraView, mark_removed
+from ggslam.objects.segmented_rows import join_gaussians
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import Gaussians
 from ggslam.reporting.pictures import color_to_uint8, compare_pictures
@@ -44,8 +44,8 @@ def before_and_after(
     poses = record.poses()
     numbers = np.array(sorted(poses))
     looked_at = numbers[np.unique(np.linspace(0, len(numbers) - 1, _LOOKED_AT).round().astype(int))]
-    views = [MapView(camera, inverse(poses[frame]), frame) for frame in looked_at.tolist()]
-    before, after = (joined([getattr(c, name) for c in visible]) for name in ("before", "after"))
+    views = [CameraView(camera, inverse(poses[frame]), frame) for frame in looked_at.tolist()]
+    before, after = (join_gaussians([getattr(c, name) for c in visible]) for name in ("before", "after"))
     areas = _areas(original, before, views) + _areas(edited, after, views)
     pictures, rasterizer = {}, CpuRasterizer()
     for number in _best(areas, PICTURES):
@@ -59,11 +59,11 @@ def before_and_after(
     return pictures
 
 
-def _areas(gaussians: Gaussians, part: Gaussians, views: Sequence[MapView]) -> np.ndarray:
+def _areas(gaussians: Gaussians, part: Gaussians, views: Sequence[CameraView]) -> np.ndarray:
     """Pixels of each view in which `part` of a map is seen."""
     if not len(part.means):
         return np.zeros(len(views), int)
-    rasterizer, both, out = CpuRasterizer(), marked(gaussians, part), []
+    rasterizer, both, out = CpuRasterizer(), mark_removed(gaussians, part), []
     for view in views:
         image = rasterizer.forward(both, view.camera, view.T_camera_world).features
         out.append(0 if image is None else int((image[0].numpy() > COVERED / 2).sum()))

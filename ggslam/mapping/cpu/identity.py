@@ -15,7 +15,7 @@ from ggslam.mapping.identity import BIRTH_VOTE, MIN_WEIGHT, TERMS, IdentityLearn
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.votes import merge_votes, vote_labels
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.pixel_terms import FeatureAdamSettings, PixelTerms
+from ggslam.rendering.pixel_terms import CpuPixelTerms, FeatureAdamSettings
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
@@ -72,7 +72,7 @@ class CpuIdentityLearner(IdentityLearner):
         if self.settings.initialisation == "votes" and len(rows):
             gaussians.features.numpy()[rows] = self.table.codes(vote_labels(gaussians).numpy()[rows])
 
-    def _as_mapped(self, gaussians: GaussianMap, terms: PixelTerms, labels: np.ndarray) -> np.ndarray:
+    def _as_mapped(self, gaussians: GaussianMap, terms: CpuPixelTerms, labels: np.ndarray) -> np.ndarray:
         """Labels of pixels, those of a whole replaced by its part's where the map shows the part."""
         if not self._whole_of.any():
             return labels
@@ -91,7 +91,7 @@ class CpuIdentityLearner(IdentityLearner):
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
-    def _sampled(
+    def _learn_at_pixels(
         self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: MaskedKeyframe, pixels: np.ndarray,
         vote_weights: np.ndarray, rate_factor: float,
     ) -> None:  # fmt: skip
@@ -123,11 +123,11 @@ class CpuIdentityLearner(IdentityLearner):
         out[:, pixels] = s.weight * gradient.T
         if self._pulls(gaussians):
             rows_pulled, pull = self._pull_together(gaussians)
-            terms = PixelTerms.of_gaussians(rows_pulled, 1, rasterizer.context)
+            terms = CpuPixelTerms.of_gaussians(rows_pulled, 1, rasterizer.context)
             terms.step(gaussians, pull, FeatureAdamSettings(rate=s.rate))
         return torch.from_numpy(out.reshape(view.features.shape))
 
-    def _train(self, gaussians: GaussianMap, terms: PixelTerms, classes: np.ndarray, rate_factor: float) -> None:
+    def _train(self, gaussians: GaussianMap, terms: CpuPixelTerms, classes: np.ndarray, rate_factor: float) -> None:
         s, known = self.settings, classes >= 0  # an object may have been taken back since its pixels were drawn
         if not known.any():
             return
@@ -138,7 +138,7 @@ class CpuIdentityLearner(IdentityLearner):
         gradient[known] = s.weight * of_known
         if self._pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
-            terms = terms.append(PixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
+            terms = terms.append(CpuPixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
             gradient = np.concatenate([gradient, pull])
         terms.step(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate))
         self.table.step(chosen, s.weight * rows, rate_factor * s.classifier_rate)

@@ -12,7 +12,9 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
 
 
-def unexplained(depth: np.ndarray, alpha: np.ndarray, rendered_depth: np.ndarray, s: InsertionSettings) -> np.ndarray:
+def find_unexplained(
+    depth: np.ndarray, alpha: np.ndarray, rendered_depth: np.ndarray, s: InsertionSettings
+) -> np.ndarray:
     """Pixels to insert at, bool [H, W]: nothing is rendered there, or something behind what is measured.
 
     Args:

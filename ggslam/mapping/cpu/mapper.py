@@ -11,7 +11,7 @@ import torch
 
 from ggslam.mapping.cpu.exposure import ExposureAdam
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
-from ggslam.mapping.cpu.insertion import fill_gaussians, new_gaussians, unexplained
+from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
@@ -78,7 +78,7 @@ class CpuMapper(Mapper):
         if self.map.count:
             view = self._render(keyframe, features=False)
             alpha, rendered = view.alpha.numpy(), view.expected_depth.numpy()
-            where = unexplained(depth, alpha, rendered, s)
+            where = find_unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
         if self.identity is not None and labeller is not None:
             self._take_labels(keyframe, labeller(keyframe, show))

@@ -164,7 +164,7 @@ class CudaIdentityLearner(IdentityLearner):
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
-    def _sampled(
+    def _learn_at_pixels(
         self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: CudaMaskedKeyframe, pixels: torch.Tensor,
         vote_weights: torch.Tensor, rate_factor: float,
     ) -> None:  # fmt: skip

@@ -82,7 +82,7 @@ class CudaInsertion:
         T_world_camera: np.ndarray,
         settings: InsertionSettings,
     ) -> Selection:
-        """Starts to choose what the map lacks: first the pixels of `new_gaussians` that are `unexplained`, then, if
+        """Starts to choose what the map lacks: first the pixels that `find_unexplained` gives `new_gaussians`, then, if
         holes are filled, those of `fill_gaussians`. Valid until the next one; the images have to stay till `build`.
 
         Args:

@@ -78,7 +78,7 @@ class KeyframeStates:
 
     def append(self, T_camera_world: np.ndarray, exposure: np.ndarray) -> int:
         """Adds a keyframe, for which no step was made yet; returns its number. Views of other keyframes that were
-        handed out before must not be used any more: the table may have moved.
+        handed out before are invalid afterwards: the table may have moved.
 
         Args:
             T_camera_world: [4, 4].
@@ -99,11 +99,11 @@ class KeyframeStates:
     def pose(self, i: int) -> torch.Tensor:
         """First three rows of keyframe i's T_camera_world, as the rasterizer takes them: a view, float32 [12], that
         changes with its steps; valid until the next `append`."""
-        return self._poses[self._checked_index(i)]
+        return self._poses[self._check_index(i)]
 
     def exposure(self, i: int) -> torch.Tensor:
         """Keyframe i's exposure, as the image loss takes it: a view, float32 [3, 2], as `pose`."""
-        return self._exposures[self._checked_index(i)]
+        return self._exposures[self._check_index(i)]
 
     def step(
         self,
@@ -133,9 +133,9 @@ class KeyframeStates:
         """
         job = self._step_job
         job.state = self._address(i)
-        job.twist = self._checked("twist", twist, torch.float64, _TWIST)
-        job.results = self._checked("loss_results", loss_results, torch.float64, _RESULTS)
-        job.skipped = None if skipped is None else self._checked("skipped", skipped, torch.int32, _FLAG)
+        job.twist = self._pointer_of("twist", twist, torch.float64, _TWIST)
+        job.results = self._pointer_of("loss_results", loss_results, torch.float64, _RESULTS)
+        job.skipped = None if skipped is None else self._pointer_of("skipped", skipped, torch.int32, _FLAG)
         job.pose_rate, job.step_exposure = pose_rate, exposure is not None
         if exposure is not None:
             job.exposure_rate, job.exposure_regularization = exposure.rate, exposure.regularization
@@ -151,7 +151,7 @@ class KeyframeStates:
             IndexError: no such keyframe.
             RenderError: another shape.
         """
-        self._write(self._checked_index(i), T_camera_world, None)
+        self._write(self._check_index(i), T_camera_world, None)
 
     def write_poses(self, T_camera_world: np.ndarray) -> None:
         """Sets the poses of all keyframes [K, 4, 4], as `write_pose`."""
@@ -189,13 +189,13 @@ class KeyframeStates:
         self._poses = numbers[:, for_rasterizer : for_rasterizer + 12]
         self._exposures = numbers[:, for_loss : for_loss + 6].unflatten(1, (3, 2))
 
-    def _checked_index(self, i: int) -> int:
+    def _check_index(self, i: int) -> int:
         if not 0 <= i < self._count:
             raise IndexError(f"keyframe {i} of {self._count}")
         return i
 
     def _address(self, i: int) -> int:
-        return self._table.data_ptr() + self._checked_index(i) * ctypes.sizeof(KeyframeState)
+        return self._table.data_ptr() + self._check_index(i) * ctypes.sizeof(KeyframeState)
 
     def _write(self, i: int, T_camera_world: np.ndarray, exposure: np.ndarray | None) -> None:
         job = KeyframeWriteJob(stream=self._current_stream(), device=self.device.index or 0)
@@ -229,7 +229,7 @@ class KeyframeStates:
             self._stream = torch.cuda.current_stream(self.device)
         return self.library.stream(self.device)
 
-    def _checked(self, name: str, tensor: torch.Tensor, dtype: torch.dtype, shape: torch.Size) -> int:
+    def _pointer_of(self, name: str, tensor: torch.Tensor, dtype: torch.dtype, shape: torch.Size) -> int:
         if tensor.dtype != dtype or tensor.shape != shape or tensor.device != self.device:
             expected, found = f"{dtype} {list(shape)} on {self.device}", f"{tensor.dtype} {list(tensor.shape)}"
             raise RenderError(f"{name}: expected {expected}, found {found} on {tensor.device}")

@@ -2,7 +2,7 @@
 """The loss of `ggslam.mapping.losses` on an NVIDIA GPU: the same values and gradients, by kernels that are only
 started here.
 
-Nothing waits for the device: the values stay there as a tensor until somebody asks for them, and the exposure is read
+Nothing waits for the device: the values stay there as a tensor until they are read, and the exposure is read
 from the device, so that it can be optimised there. Sums have a fixed order: the result repeats bit for bit.
 """
 

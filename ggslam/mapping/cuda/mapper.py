@@ -3,7 +3,7 @@
 starts work.
 
 It waits at a new keyframe (once, for the number of Gaussians to insert and for what the map shows of objects), and when
-somebody asks for poses. What it tells of losses is what has arrived of them without waiting.
+poses are read. The losses it reports are those that have arrived without waiting.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class CudaMapper(Mapper):
         move_with_keyframes(self.map, T_new_old)
 
     def run(self, iterations: int) -> None:
-        super().run(iterations + self._missed())
+        super().run(iterations + self._count_missed())
         self._totals.send()
         self._overflows.send()
         self._pace.piece_ends()
@@ -103,11 +103,11 @@ class CudaMapper(Mapper):
         self._repeated = int(download(self._rasterizer.overflows)[0][0])
         super().refine(iterations, progress)
         numbers = self._trainable()
-        for _ in range(self._missed(int(download(self._rasterizer.overflows)[0][0]))):
+        for _ in range(self._count_missed(int(download(self._rasterizer.overflows)[0][0]))):
             self.iterate(self._draw(numbers), self.settings.refine_decay)
         self._totals.send()
 
-    def _missed(self, overflows: int | None = None) -> int:
+    def _count_missed(self, overflows: int | None = None) -> int:
         """Iterations that did nothing, as far as is known, because their rendering found no room: to be made again."""
         overflows = int(self._overflows.newest()[0]) if overflows is None else overflows
         missed = max(0, overflows - self._repeated)
@@ -134,7 +134,7 @@ class CudaMapper(Mapper):
         if self.identity is not None:
             self.identity.begin(self.map, rows, self.identity.labels_at(keyframe, new.pixels))
 
-    def rendered(self, keyframe: CudaKeyframe, with_room: bool) -> RenderBuffers:
+    def render_keyframe(self, keyframe: CudaKeyframe, with_room: bool) -> RenderBuffers:
         """The map as a keyframe sees it, without identities; `with_room`: waits for room for all that is in view."""
         self._rasterizer.waits = with_room
         try:
@@ -206,7 +206,7 @@ class _Look:
         mapper, keyframe, self._with_room = self._mapper, self._keyframe, with_room
         self._alpha = self._depth = None
         if mapper.map.count:
-            view = mapper.rendered(keyframe, with_room)
+            view = mapper.render_keyframe(keyframe, with_room)
             self._alpha, self._depth = view.alpha, view.expected_depth
         images = keyframe.device_images
         self.selection = mapper.selection(images, keyframe, self._alpha, self._depth, self._T)
@@ -215,7 +215,7 @@ class _Look:
         """What the map shows of the objects, looked at on every `stride`-th pixel and row; on the host."""
         assert self._alpha is not None and self._depth is not None
         ids, share = self._mapper.labels_on_grid(self._alpha, stride)
-        found = self._arrived(ids, share, self._depth)
+        found = self._fetch(ids, share, self._depth)
         if found is None:
             return self.labels(stride)
         return MapLabels.from_grid(found[0], found[1], found[2], stride)
@@ -223,10 +223,10 @@ class _Look:
     def count(self) -> int:
         """Of the Gaussians to insert."""
         while self._count is None:
-            self._arrived()
+            self._fetch()
         return self._count
 
-    def _arrived(self, *tensors: torch.Tensor) -> list[np.ndarray] | None:
+    def _fetch(self, *tensors: torch.Tensor) -> list[np.ndarray] | None:
         """These on the host, and the count known; None if all has to be done again, and was started."""
         *found, total, short = download(*tensors, self.selection.total, self._mapper.room_was_short)
         if short[0] and self._alpha is not None and not self._with_room:

@@ -66,7 +66,7 @@ class CudaGradients(ParameterGradients):
 
 @dataclass
 class CudaStepResult:
-    """`StepResult` on the device.
+    """`CpuStepResult` on the device.
 
     Attributes:
         twist: float64 [6] tensor on the device, the pose gradient, as in `CudaGradients`.

@@ -42,13 +42,13 @@ class CudaTarget:
         """Fine and coarse voxels of the target, valid until another one is asked for."""
         if self._levels is None or self._target is None or self._target() is not target:
             self._levels = None
-            self._levels = self._sent(target)
+            self._levels = self._send(target)
             self._target = weakref.ref(target)
         return self._levels
 
-    def _sent(self, target: GicpTarget) -> tuple[VoxelLevel, VoxelLevel]:
+    def _send(self, target: GicpTarget) -> tuple[VoxelLevel, VoxelLevel]:
         """Sends blocks and voxels of both levels; of voxels without shapes the moments, for the device to finish."""
-        core, handle, settings = self._core, target.gathered, target.settings_to_finish
+        core, handle, settings = self._core, target.gathered_handle, target.settings_to_finish
         copy, size = core.ggslam_gicp_target_voxels, sizeof(Voxel)
         if settings is not None:
             copy, size = core.ggslam_gicp_target_moments, sizeof(VoxelMoments)

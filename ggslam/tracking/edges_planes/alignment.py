@@ -66,7 +66,7 @@ class FrameClock:
         """The step is timed from now until `ended`."""
         self._began[step] = time.perf_counter()
 
-    def ended(self, step: str) -> None:
+    def end_step(self, step: str) -> None:
         """The step has ended."""
         took = time.perf_counter() - self._began[step]
         usual = self._usual.get(step, took)
@@ -188,7 +188,7 @@ class FeatureAligner:
                 break
             fit, made = self._minimise(residuals, T)
             steps += made
-            self._clock.ended("matching")
+            self._clock.end_step("matching")
             settled = self._is_settled(T, fit.T, scan)
             T = fit.T
         self._clock.begins(LAST_STEP)
@@ -214,7 +214,7 @@ class FeatureAligner:
         generously."""
         s, P, kept = self._settings, scan.planes, matched.found.copy()
         gate = (s.gate_constant + s.gate_sigmas * scan.sigmas[:P]) * (1.0 if is_last else 3.0)
-        kept[:P] &= matched.distances(_moved(T, scan.points[:P])) < gate
+        kept[:P] &= matched.distances(_transform(T, scan.points[:P])) < gate
         if s.edge_weight == 0:
             kept[P:] = False
         planes, lines = int(np.count_nonzero(kept[:P])), int(np.count_nonzero(kept[P:]))
@@ -236,7 +236,7 @@ class FeatureAligner:
     def _minimise(self, residuals: _Residuals, T: np.ndarray) -> tuple[_Fit, int]:
         """Levenberg-Marquardt with fixed matches, and the number of steps made: at least one."""
         s = self._settings
-        fit = self._linearised(residuals, T)
+        fit = self._linearise(residuals, T)
         damping, steps = 1e-6, 0
         while steps < s.inner_iterations and (steps == 0 or self._clock.allows("step")):
             damped = fit.H.copy()
@@ -246,10 +246,10 @@ class FeatureAligner:
             T_next = fit.T.copy()
             T_next[:3, :3] = cv2.Rodrigues(step[3:])[0] @ T_next[:3, :3]
             T_next[:3, 3] += step[:3]
-            next_fit = self._linearised(residuals, T_next)
+            next_fit = self._linearise(residuals, T_next)
             steps += 1
             if steps > 1:
-                self._clock.ended("step")
+                self._clock.end_step("step")
             if next_fit.cost <= fit.cost:
                 fit, damping = next_fit, 0.1 * damping
             else:
@@ -258,7 +258,7 @@ class FeatureAligner:
                 break
         return fit, steps
 
-    def _linearised(self, residuals: _Residuals, T: np.ndarray) -> _Fit:
+    def _linearise(self, residuals: _Residuals, T: np.ndarray) -> _Fit:
         """Normal equations of a twist from the left about the sensor's centre, and the Huber cost."""
         lines, k = residuals.lines, self._settings.huber_sigmas
         rows = residuals.rows @ _pose_matrix(T)
@@ -279,7 +279,7 @@ class FeatureAligner:
     ) -> FeatureAlignment:
         s, rows, P = self._settings, len(residuals.rows), scan.planes
         found = matched.found[:P]
-        distance = np.where(found, matched.distances(_moved(fit.T, scan.points[:P])), np.inf).astype(np.float32)
+        distance = np.where(found, matched.distances(_transform(fit.T, scan.points[:P])), np.inf).astype(np.float32)
         inlier = distance < s.overlap_constant + s.overlap_sigmas * scan.sigmas[:P]
         count = int(np.count_nonzero(inlier))
         visibility, weak = _observability(fit, residuals, s.degenerate_below)
@@ -319,7 +319,7 @@ def _observability(fit: _Fit, residuals: _Residuals, limit: float) -> tuple[np.n
     return values, vectors[:, values < limit].T
 
 
-def _moved(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _transform(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points float32 [n, 3] in the frame that T [4, 4] leads to."""
     M = T.astype(np.float32)
     return points @ M[:3, :3].T + M[:3, 3]

@@ -69,7 +69,7 @@ class ScanFeatures:
         """Of `points`, float32 [P + E, 3]; zero for edges."""
         return torch.cat([self.normals, torch.zeros_like(self.edges)])
 
-    def thinned(self, planes: int, edges: int) -> ScanFeatures:
+    def thin(self, planes: int, edges: int) -> ScanFeatures:
         """At most so many of each kind, evenly taken from the order they are in."""
         if len(self.planes) <= planes and len(self.edges) <= edges:
             return self
@@ -166,7 +166,7 @@ class LineScanner:
         planes = continuous[:n] & (curvature[:n] < s.plane_sigmas**2)
         # Among points that are flat as far as noise lets one see, chance decides: the least would line up in columns.
         flatness = self._dither[:n] / curvature[:n].clamp(min=1.0)
-        return self._turning(at_edges), self._pick(planes, flatness, s.planes_per_segment)
+        return self._find_turns(at_edges), self._pick(planes, flatness, s.planes_per_segment)
 
     def curvature(self, lines: ScanLines) -> Tensor:
         """c_j = |sum_{k=-5..5, k != 0} p_{j+k} - 10 p_j|^2 (equation 1) over what noise makes of it on a straight
@@ -189,7 +189,7 @@ class LineScanner:
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
-    def _turning(self, positions: Tensor) -> Tensor:
+    def _find_turns(self, positions: Tensor) -> Tensor:
         """Those positions where the line turns enough (equation 2): the angle between the mean directions from the
         five neighbours before and to the five after. After `curvature`."""
         columns = self._shape[1]

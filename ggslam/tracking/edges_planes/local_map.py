@@ -50,7 +50,7 @@ class LocalFeatureMap:
     def align(self, scan: ScanFeatures, T_world_sensor_guess: np.ndarray) -> FeatureAlignment:
         """The pose in the world at which the scan fits best; what the result says of the map is said of the world."""
         s = self.settings.align
-        scan = scan.thinned(s.planes, s.edges)
+        scan = scan.thin(s.planes, s.edges)
         found = self._aligner.align(scan, inverse(self._T_world_map) @ T_world_sensor_guess)
         A = np.zeros((6, 6))
         A[:3, :3] = A[3:, 3:] = self._T_world_map[:3, :3]
@@ -58,7 +58,7 @@ class LocalFeatureMap:
             found, T_map_sensor=orthonormalize(self._T_world_map @ found.T_map_sensor),
             information=A @ found.information @ A.T, weak_directions=found.weak_directions @ A.T,
         )  # fmt: skip
-        self.clock.ended(LAST_STEP)
+        self.clock.end_step(LAST_STEP)
         return result
 
     def is_convincing(self, found: FeatureAlignment) -> bool:
@@ -74,7 +74,7 @@ class LocalFeatureMap:
             return False
         self.clock.begins("update")
         self.add(scan, T_world_sensor)
-        self.clock.ended("update")
+        self.clock.end_step("update")
         return True
 
     def _wants(self, scan: ScanFeatures, T_world_sensor: np.ndarray, overlap: float) -> bool:

@@ -144,7 +144,7 @@ class FeatureTrackerSettings:
     """Everything the edge/plane front-end needs to know."""
 
     gicp_fallback: bool = True
-    """Where edges and planes do not convince, or leave a direction of motion open, G-ICP (`tracker.Tracker`) locates
+    """Where edges and planes do not convince, or leave a direction of motion open, G-ICP (`GicpTracker`) locates
     the frame if it has a target. That takes its own time, beyond the budget."""
 
     device: str = "cpu"

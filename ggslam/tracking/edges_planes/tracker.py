@@ -65,7 +65,7 @@ class FeatureTracker(Tracker):
         T_world_camera: np.ndarray | None = None,
     ) -> None:
         super().__init__(TrackerState.begin(camera, settings, context, T_world_camera))
-        self._gicp = GicpTracker.sharing(self.state)
+        self._gicp = GicpTracker.with_state(self.state)
         self.features = features or FeatureTrackerSettings()
         self.local_map = LocalFeatureMap(self.features)
         self.counts = FeatureCounts()

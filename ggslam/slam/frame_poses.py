@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses of all frames, remembered relative to keyframes: they move when loops are closed and poses are refined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse
+from ggslam.slam.result import TrackedFrame
+from ggslam.tracking.tracker import TrackingResult
+
+
+class FramePoses:
+    """Where the frames so far were located."""
+
+    def __init__(self) -> None:
+        self.frames: list[TrackedFrame] = []
+        self.keyframes_made = 0
+        """Keyframes so far, those included that still wait for the mapper."""
+        self._anchor, self._T_world_anchor = -1, np.eye(4)  # number of a keyframe, its pose as tracked
+
+    def add_keyframe(self, T_world_camera: np.ndarray) -> None:
+        """From now on poses are remembered relative to this keyframe, the newest."""
+        self.anchor_to(self.keyframes_made, T_world_camera)
+        self.keyframes_made += 1
+
+    def anchor_to(self, keyframe: int, T_world_camera: np.ndarray) -> None:
+        """From now on poses are remembered relative to a keyframe with the pose [4, 4]."""
+        self._anchor, self._T_world_anchor = keyframe, T_world_camera.copy()
+
+    def move(self, T_new_old: np.ndarray) -> None:
+        """The world about the camera was moved by a correction [4, 4]."""
+        self._T_world_anchor = T_new_old @ self._T_world_anchor
+
+    def add(self, frame: Frame, tracking: TrackingResult) -> None:
+        """Notes the pose of a frame."""
+        T_keyframe_camera = inverse(self._T_world_anchor) @ tracking.T_world_camera
+        self.frames.append(
+            TrackedFrame(
+                frame.index, frame.source_index, frame.timestamp, max(0, self._anchor), T_keyframe_camera,
+                tracking.overlap, tracking.rmse_m, tracking.status.value, tracking.reason,
+            )
+        )  # fmt: skip
+
+    def newest(self) -> np.ndarray:
+        """T_world_camera [4, 4] of the newest frame as tracked."""
+        return self._T_world_anchor @ self.frames[-1].T_keyframe_camera
+
+    def pose_of(self, frame: TrackedFrame, keyframes: Sequence[Keyframe]) -> np.ndarray:
+        """T_world_camera [4, 4] of a frame that was not lost, as far as is known by now.
+
+        Args:
+            frame: one of `frames`.
+            keyframes: that the mapper has taken in.
+        """
+        if frame.keyframe < len(keyframes):
+            return keyframes[frame.keyframe].T_world_camera @ frame.T_keyframe_camera
+        return self._T_world_anchor @ frame.T_keyframe_camera

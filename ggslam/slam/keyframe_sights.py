@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the keyframes of a map see: how deep, which Gaussians' cells, and when they saw them last."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.geometry.frustums import Frustums, depth_reach
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse
+from ggslam.submaps.paging_settings import PagingSettings
+
+_AT_ONCE = 64
+"""Keyframes that are asked together what they see."""
+_TILES = (6, 8)
+"""Rows and columns of parts of a view: each is as deep as what was measured in it, cells behind that are hidden."""
+
+
+@dataclass(frozen=True)
+class SightedPose:
+    """A pose T_world_camera [4, 4], and how deep each tile of the image sees from there, metres [rows, columns]."""
+
+    T_world_camera: np.ndarray
+    reach: np.ndarray
+
+
+class KeyframeSights:
+    """What keyframes see.
+
+    Args:
+        camera: of all keyframes.
+        settings: see there.
+    """
+
+    def __init__(self, camera: Camera, settings: PagingSettings) -> None:
+        self._camera, self._settings = camera, settings
+        self.keyframes: Sequence[Keyframe] = ()
+        """Those of the map; the mapper's own list."""
+        self._reach: list[np.ndarray] = []
+
+    def add(self, T_world_camera: np.ndarray, depth: np.ndarray) -> SightedPose:
+        """The next keyframe is about to be inserted at a pose [4, 4].
+
+        Args:
+            T_world_camera: where it is.
+            depth: what it measured, metres [H, W].
+        """
+        s = self._settings
+        deep = s.view_margin * depth_reach(depth, *_TILES) + s.view_spare
+        self._reach.append(np.minimum(deep, s.view_range))
+        return SightedPose(T_world_camera, self._reach[-1])
+
+    def of(self, numbers: Iterable[int]) -> list[SightedPose]:
+        """What these keyframes see from where they are now."""
+        return [SightedPose(self.keyframes[number].T_world_camera, self._reach[number]) for number in numbers]
+
+    def newest(self) -> SightedPose:
+        """Of the newest keyframe."""
+        return self.of([len(self._reach) - 1])[0]
+
+    def frustums(self, sights: Sequence[SightedPose]) -> Frustums:
+        """The visible spaces."""
+        poses = np.stack([inverse(sight.T_world_camera) for sight in sights])
+        return Frustums.of(self._camera, poses, np.stack([sight.reach for sight in sights]))
+
+    def batches(self, numbers: Sequence[int]) -> Iterable[tuple[Sequence[int], Frustums]]:
+        """So many keyframes at a time as may be asked together, and their visible spaces."""
+        for begin in range(0, len(numbers), _AT_ONCE):
+            asked = numbers[begin : begin + _AT_ONCE]
+            yield asked, self.frustums(self.of(asked))
+
+    def last_seen(self, boxes: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Number of the last keyframe that sees each box (lower and upper corners [M, 3]), int64 [M], -1 for none."""
+        last, unseen = np.full(len(boxes[0]), -1), np.arange(len(boxes[0]))
+        for end in range(len(self.keyframes), 0, -_AT_ONCE):
+            numbers = np.arange(max(0, end - _AT_ONCE), end)
+            seen = self.frustums(self.of(numbers.tolist())).touch(boxes[0][unseen], boxes[1][unseen])
+            last[unseen] = np.where(seen, numbers[:, None], -1).max(0)
+            unseen = unseen[last[unseen] < 0]
+            if not len(unseen):
+                break
+        return last

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Corrections of the map after a loop was closed: keyframes move, Gaussians with them, and the tracker follows."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+
+from ggslam.mapping.mapper import Mapper
+from ggslam.slam.loop_closing import Correction, LoopCloser
+from ggslam.slam.map_paging import MapPager
+from ggslam.tracking.gicp import GicpTarget
+from ggslam.tracking.surface import MeasuredSurface
+from ggslam.tracking.tracker import TrackingResult
+
+
+class MapCorrections:
+    """Keeps the surface, which the tracker's thread reads, in step with the corrections that the mapper's makes.
+
+    Args:
+        surface: that frames are aligned to.
+        mapper: whose map is corrected.
+        pager: of the map; None: all of it is in memory.
+    """
+
+    def __init__(self, surface: MeasuredSurface, mapper: Mapper, pager: MapPager | None) -> None:
+        self._surface, self._mapper, self._pager = surface, mapper, pager
+        self._moves: list[np.ndarray] = []
+        self._publishing = threading.Lock()
+
+    def __len__(self) -> int:
+        """How many times a closed loop has moved the map."""
+        return len(self._moves)
+
+    def news(self, known: int) -> tuple[GicpTarget | None, list[np.ndarray]]:
+        """What the tracker aligns to now, and what moved the world about the camera, [4, 4] each, since so many
+        corrections."""
+        with self._publishing:
+            return self._surface.target, self._moves[known:]
+
+    def follow(self, tracking: TrackingResult, known: int) -> TrackingResult:
+        """A tracked frame moved along with the corrections after the first `known` ones."""
+        for T_new_old in self._moves[known:]:
+            tracking = replace(tracking, T_world_camera=T_new_old @ tracking.T_world_camera)
+        return tracking
+
+    def add_points(self, tracking: TrackingResult) -> None:
+        """The points of a new keyframe join the surface."""
+        with self._publishing:
+            self._surface.add(tracking.points, tracking.T_world_camera)
+
+    def apply(self, correction: Correction, loops: LoopCloser) -> None:
+        """Moves the map after its keyframes, takes out what is double now, and trains both ends of the loop."""
+        ends = correction.kept & correction.active
+        self._mapper.move_keyframes(correction.T_new_old)
+        if self._pager is not None:
+            self._pager.move_keyframes(correction.T_new_old)
+            self._pager.bring_ends(ends)
+        with self._publishing:
+            loops.settle(correction)
+            self._moves.append(correction.T_new_old[-1])
+        self._mapper.mend(sorted(ends), sorted(correction.doubted), loops.settings.repair_iterations)

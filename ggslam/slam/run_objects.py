@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The objects that a run has learned, settled once at its end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.mapping.mapper import Mapper
+from ggslam.slam.map_paging import MapPager
+from ggslam.slam.object_masks import ObjectMasks, observations
+from ggslam.slam.result import LearnedObjects
+
+
+class RunObjects:
+    """Objects of a run.
+
+    Args:
+        masks: of its keyframes.
+    """
+
+    def __init__(self, masks: ObjectMasks) -> None:
+        self._masks = masks
+        self.learned: LearnedObjects | None = None
+        """Of the map that the run began with; after `settle` of the run."""
+        self._settled = False
+
+    def settle(self, mapper: Mapper, pager: MapPager | None) -> LearnedObjects | None:
+        """The last identity steps, and every Gaussian's object; only the first call does anything. None if nothing was
+        learned.
+
+        Args:
+            mapper: of the run.
+            pager: of its map; None: all of it is in memory.
+        """
+        identity = mapper.identity
+        if self._settled or identity is None or not identity.table.count:
+            return self.learned
+        self._settled = True  # if it fails below, the map can still be had by another call
+        earlier = None if self.learned is None else self.learned.observations
+        seen = observations(mapper.keyframes, identity.current, earlier)
+        sizes = np.bincount(mapper.vote_labels(), minlength=65536)
+        if pager is not None:
+            sizes += pager.vote_sizes()
+        noise = self._masks.noise(identity.classifier.class_ids, seen, len(mapper.keyframes), sizes)
+        identity.forget(mapper.map, noise)
+        mapper.finish_identity()
+        kept = {i: observation for i, observation in seen.items() if i not in noise}
+        self.learned = LearnedObjects(identity.classifier, self._masks.supervision, kept)
+        return self.learned
