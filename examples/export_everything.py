@@ -15,7 +15,8 @@ import ggslam
 FORMS: list[tuple[str, str, dict[str, Any]]] = [
     ("map.ply", "ply", {}),
     ("map.splat", "splat", {}),
-    ("map.compressed.ply", "compressed-ply", {}),  # extra [splats]
+    ("map.compressed.ply", "compressed-ply", {}),
+    ("map.glb", "gltf", {}),
     ("map.spz", "spz", {}),  # extra [splats]
     ("points", "points", {"voxel": 0.02}),
     ("map.pcd", "pcd", {"voxel": 0.02}),

@@ -19,6 +19,8 @@ EPILOG = """
 
   ggslam export runs/kitchen --out kitchen.glb
 
+  ggslam export runs/kitchen --format gltf --out kitchen_splats.glb
+
   ggslam export runs/kitchen --objects mug,7 --out objects/
 
   ggslam export runs/kitchen --format segmented --out kitchen_objects.ply
@@ -41,8 +43,9 @@ FormatName = Annotated[
     typer.Option(
         "--format",
         help="ply: Gaussians as 3DGS stores them; segmented: the same in the colours of their objects; compressed-ply, "
-        "spz, splat: the same in fewer bytes; points, pcd: coloured points; mesh: .glb, .obj or .ply; trajectory: "
-        "TUM; colmap, nerfstudio: images, poses and points for other trainers. Default: what the name of --out says.",
+        "spz, spz4 (.spz, versions 3 and 4), splat: the same in fewer bytes; gltf: the same as .glb (without this "
+        "option a .glb is a mesh); points, pcd: coloured points; mesh: .glb, .obj or .ply; trajectory: TUM; colmap, "
+        "nerfstudio: images, poses and points for other trainers. Default: what the name of --out says.",
     ),
 ]
 Voxel = Annotated[
@@ -53,8 +56,9 @@ Voxel = Annotated[
 MinOpacity = Annotated[float, typer.Option(help="Leave out fainter Gaussians (not for trajectory, mesh).")]
 Objects = Annotated[
     str | None,
-    typer.Option(help="Objects by name or id (mug,7), or all. ply: a file for each; segmented, mesh: only these."),
-]
+    typer.Option(help="Objects by name or id (mug,7), or all. ply: a file for each; segmented, mesh, gltf: only "
+                 "these."),
+]  # fmt: skip
 Plain = Annotated[bool, typer.Option("--plain", help="Write only the fields of 3DGS: no object ids, no identities.")]
 Keyframes = Annotated[
     bool, typer.Option("--keyframes", help="colmap, nerfstudio: write only keyframes and held-out frames.")

@@ -65,6 +65,7 @@ def test_the_name_says_the_format(name: str, kind: str) -> None:
 def test_formats_that_share_a_suffix_and_folders() -> None:
     for kind in (ExportFormat.segmented, ExportFormat.compressed_ply, ExportFormat.mesh):
         assert choose_format(kind, Path("x.ply"), None) is kind
+    assert choose_format(ExportFormat.gltf, Path("x.glb"), None) is ExportFormat.gltf
     assert choose_format(ExportFormat.colmap, Path("folder"), None) is ExportFormat.colmap
     assert choose_format(None, Path("folder"), "mug,7") is ExportFormat.ply
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,9 +14,11 @@ import pytest
 from typer.testing import CliRunner
 
 from ggslam.cli.main import app
-from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
 from ggslam.formats.point_cloud import read_point_cloud
-from ggslam.jobs.export.splats import export_packed, export_pcd
+from ggslam.jobs.export.export_run import export_run
+from ggslam.jobs.export.formats import ExportFormat, choose_format
+from ggslam.jobs.export.splats import ENDINGS, export_packed, export_pcd
 from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe
@@ -144,11 +147,12 @@ def test_trajectory_in_numpy(run: RunFolder, tmp_path: Path) -> None:
         np.testing.assert_allclose(quaternion_to_matrix(row[[7, 4, 5, 6]]), T[:3, :3], atol=1e-7)
 
 
-@pytest.mark.parametrize("kind", ["compressed-ply", "spz", "splat"])
+@pytest.mark.parametrize("kind", ["compressed-ply", "spz", "spz4", "splat"])
 def test_splats_by_the_command_line(run: RunFolder, tmp_path: Path, kind: str) -> None:
-    if kind != "splat":
+    if kind in ("spz", "spz4"):
         pytest.importorskip("gaussforge", reason="gaussforge is not installed (extra [splats])")
-    out = tmp_path / f"map.{kind.removeprefix('compressed-')}"
+        pytest.importorskip("zstandard", reason="zstandard is not installed (extra [splats])")
+    out = tmp_path / f"map{ENDINGS[kind]}"
     faint = export_packed(run, out, kind)
     result = CliRunner().invoke(
         app, ["export", str(run.path), "--format", kind, "--out", str(out), "--min-opacity", "0.6"]
@@ -158,6 +162,46 @@ def test_splats_by_the_command_line(run: RunFolder, tmp_path: Path, kind: str) -
     assert f"{opaque} Gaussians" in result.output.replace("\n", " ") and f"{len(run.gaussians())} Gaussians" in faint
     if kind == "splat":
         assert out.stat().st_size == 32 * opaque
+
+
+def gltf_of(path: Path) -> dict[str, Any]:
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+
+
+def test_gltf_by_the_command_line(run: RunFolder, tmp_path: Path) -> None:
+    """A .glb is a mesh unless the format is given; object ids are the last column."""
+    out, gaussians = tmp_path / "splats.glb", run.gaussians()
+    opaque = gaussians.opacities >= 0.6
+    result = CliRunner().invoke(
+        app, ["export", str(run.path), "--format", "gltf", "--out", str(out), "--min-opacity", "0.6"]
+    )
+    assert result.exit_code == 0, result.output
+    count = int(opaque.sum())
+    assert f"{count} Gaussians" in result.output.replace("\n", " ")
+    gltf = gltf_of(out)
+    assert {accessor["count"] for accessor in gltf["accessors"]} == {count}
+    assert run.has_objects()
+    assert list(gltf["meshes"][0]["primitives"][0]["extensions"]) == ["KHR_gaussian_splatting", "EXT_mesh_features"]
+    ids = np.frombuffer(out.read_bytes()[-4 * count :], "<f4")
+    np.testing.assert_array_equal(ids, gaussians.object_id[opaque])
+    assert list(gltf["meshes"][0]["extras"]["objects"]) == [str(i) for i in run.object_table().ids()]
+
+
+def test_gltf_plain_and_of_objects(run: RunFolder, tmp_path: Path) -> None:
+    out = tmp_path / "splats.glb"
+    export_run(run, out, "gltf", plain=True)
+    gltf = gltf_of(out)
+    assert list(gltf["meshes"][0]["primitives"][0]["extensions"]) == ["KHR_gaussian_splatting"]
+    assert "extras" not in gltf["meshes"][0]
+    object_id, gaussians = run.object_table().ids()[0], run.gaussians()
+    export_run(run, out, "gltf", objects=str(object_id))
+    gltf, count = gltf_of(out), int((gaussians.object_id == object_id).sum())
+    assert {accessor["count"] for accessor in gltf["accessors"]} == {count}
+    assert list(gltf["meshes"][0]["extras"]["objects"]) == [str(object_id)]
+    with pytest.raises(FormatError, match=r"ends in \.glb"):
+        export_run(run, tmp_path / "splats.gltf", "gltf")
+    assert choose_format(None, out, None) is ExportFormat.mesh
 
 
 def test_a_map_on_disk_is_written_cell_by_cell(

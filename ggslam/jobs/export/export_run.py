@@ -8,6 +8,7 @@ from pathlib import Path
 from ggslam.errors import ConfigError
 from ggslam.jobs.export.formats import ExportFormat, choose_format
 from ggslam.jobs.export.map_files import (
+    export_gltf,
     export_objects,
     export_points,
     export_segmented,
@@ -20,7 +21,7 @@ from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.jobs.progress import Observer
 from ggslam.runs.folder import RunFolder
 
-_WITH_OBJECTS = (ExportFormat.ply, ExportFormat.segmented, ExportFormat.mesh)
+_WITH_OBJECTS = (ExportFormat.ply, ExportFormat.segmented, ExportFormat.mesh, ExportFormat.gltf)
 _WITH_VIEWS = (ExportFormat.colmap, ExportFormat.nerfstudio)
 
 
@@ -44,14 +45,15 @@ def export_run(
     Args:
         run: the run, or its folder.
         out: file or, for points, colmap, nerfstudio and for objects one by one, folder to write.
-        format: ply: 3DGS Gaussians; segmented: the same in the colours of their objects; compressed-ply, spz, splat:
-            the same in fewer bytes; points, pcd: coloured clouds; mesh: .glb, .obj or .ply; trajectory: TUM; colmap,
-            nerfstudio: images with poses and points. None: what the name of `out` says.
+        format: ply: 3DGS Gaussians; segmented: the same in the colours of their objects; compressed-ply, spz, spz4,
+            splat: the same in fewer bytes; gltf: the same as .glb (a .glb without `format` is a mesh); points, pcd:
+            coloured clouds; mesh: .glb, .obj or .ply; trajectory: TUM; colmap, nerfstudio: images with poses and
+            points. None: what the name of `out` says.
         voxel: metres: distance of points (default 0.01), or the edge of a mesh's voxels (default: as the run's
             settings say).
-        objects: names or ids, "mug,7", or "all", for ply, segmented and mesh: only these.
+        objects: names or ids, "mug,7", or "all", for ply, segmented, mesh and gltf: only these.
         min_opacity: leave out fainter Gaussians (not of trajectory, mesh, colmap, nerfstudio).
-        plain: ply, segmented: only the fields of 3DGS.
+        plain: ply, segmented, gltf: only the fields of 3DGS.
         keyframes: colmap, nerfstudio: only keyframes and held-out frames.
         recording: where the recording is now, if it was moved (colmap, nerfstudio, mesh).
         rendered: mesh: from depth rendered from the map, even if the recording is there.
@@ -74,6 +76,8 @@ def export_run(
         return write(folder, place, points, keyframes, images)
     if kind is ExportFormat.segmented:
         return export_segmented(folder, place, objects, min_opacity, plain)
+    if kind is ExportFormat.gltf:
+        return export_gltf(folder, place, objects, min_opacity, plain)
     if kind is ExportFormat.ply and objects is not None:
         return export_objects(folder, place, objects, min_opacity, plain)
     if kind is ExportFormat.ply:
@@ -100,7 +104,7 @@ def _refuse_ignored(
 ) -> None:
     """Raises ConfigError for an argument that this format leaves without effect."""
     if objects is not None and kind not in _WITH_OBJECTS:
-        raise ConfigError(f"`objects` goes with `format` ply, segmented or mesh, not {kind.value}")
+        raise ConfigError(f"`objects` goes with `format` ply, segmented, mesh or gltf, not {kind.value}")
     if keyframes and kind not in _WITH_VIEWS:
         raise ConfigError(f"`keyframes` goes with `format` colmap or nerfstudio, not {kind.value}")
     if recording is not None and kind not in (*_WITH_VIEWS, ExportFormat.mesh):

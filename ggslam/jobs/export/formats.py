@@ -18,7 +18,9 @@ class ExportFormat(str, Enum):
     trajectory = "trajectory"
     compressed_ply = "compressed-ply"
     spz = "spz"
+    spz4 = "spz4"
     splat = "splat"
+    gltf = "gltf"
     pcd = "pcd"
     mesh = "mesh"
     colmap = "colmap"
@@ -27,9 +29,9 @@ class ExportFormat(str, Enum):
 
 SUFFIXES = {
     ".ply": (ExportFormat.ply, ExportFormat.segmented, ExportFormat.compressed_ply, ExportFormat.mesh),
-    ".glb": (ExportFormat.mesh,),
+    ".glb": (ExportFormat.mesh, ExportFormat.gltf),
     ".obj": (ExportFormat.mesh,),
-    ".spz": (ExportFormat.spz,),
+    ".spz": (ExportFormat.spz, ExportFormat.spz4),
     ".splat": (ExportFormat.splat,),
     ".pcd": (ExportFormat.pcd,),
     ".txt": (ExportFormat.trajectory,),

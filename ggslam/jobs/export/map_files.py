@@ -12,7 +12,8 @@ from pathlib import Path
 
 import torch
 
-from ggslam.errors import ConfigError, RunFolderError
+from ggslam.errors import ConfigError, FormatError, RunFolderError
+from ggslam.formats.gaussian_gltf import write_gaussian_gltf
 from ggslam.formats.gaussian_ply import write_gaussian_parts
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_ply import write_points_in_parts
@@ -108,6 +109,35 @@ def _color_by_object(gaussians: GaussianMap, palette: torch.Tensor) -> None:
     gaussians.sh[:, 0] = rgb_to_sh(palette[gaussians.object_id.long()].float() / 255)
 
 
+def export_gltf(
+    folder: RunFolder, path: Path, objects: str | None = None, min_opacity: float = 0.0, plain: bool = False
+) -> str:
+    """Writes the Gaussians as binary glTF with KHR_gaussian_splatting; returns a line that says so.
+
+    Args:
+        folder: of the run.
+        path: file to write; ends in .glb.
+        objects: only these, as in `export_objects`; None: the whole map.
+        min_opacity: leave out fainter Gaussians.
+        plain: leave out object ids and names, which are written of runs with objects.
+
+    Raises:
+        ConfigError, RunFolderError: as in `export_objects`.
+        FormatError: another ending, or what glTF cannot hold.
+    """
+    if path.suffix.lower() != ".glb":
+        raise FormatError(f"{path}: a file of the format gltf ends in .glb")
+    table = folder.object_table() if objects is not None or folder.has_objects() else None
+    ids = None if table is None or objects is None else table.select(objects)
+    rows = folder.map_in_parts().rows
+    chosen = _Chosen.of(folder, rows, min_opacity, ids)
+    names = None if table is None or plain else {i: table.record(i).name or "" for i in ids or table.ids()}
+    make_folder(path.parent)
+    write_gaussian_gltf(path, chosen.count, chosen.parts(), rows.like.sh_degree, names)
+    found = "" if names is None else f" with the ids of {len(names)} object{'s' * (len(names) != 1)}"
+    return f"wrote {path}: {chosen.count} Gaussians{found}, {path.stat().st_size / 1e6:.1f} MB"
+
+
 def object_file_name(record: ObjectRecord) -> str:
     """`7_mug.ply`, in characters that every file system takes."""
     name = re.sub(r"[^A-Za-z0-9-]+", "_", record.name or "").strip("_")[:64]
@@ -186,10 +216,11 @@ class _Chosen:
         self, path: Path, extra: Collection[str], change: Callable[[GaussianMap], None] = lambda part: None
     ) -> int:
         """Writes a 3DGS PLY of them, changed; returns how many there are."""
-        write_gaussian_parts(path, self.count, self._parts(change), self.rows.like, extra)
+        write_gaussian_parts(path, self.count, self.parts(change), self.rows.like, extra)
         return self.count
 
-    def _parts(self, change: Callable[[GaussianMap], None]) -> Iterator[GaussianMap]:
+    def parts(self, change: Callable[[GaussianMap], None] = lambda part: None) -> Iterator[GaussianMap]:
+        """They themselves, block by block, changed."""
         for number, found in enumerate(self.found):
             if not self._count(found):
                 continue

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussian maps as the compressed PLY of PlayCanvas, which SuperSplat and web viewers open.
+
+Axes as in the map. Three elements. `chunk`: the least and the most of positions (metres), logarithms of standard
+deviations and base colours of 256 Gaussians. `vertex`: four words a Gaussian, the first number in the highest bits:
+position and size in 11, 10 and 11 bits between the corners of the chunk, base colour likewise and opacity in 8 bits
+each, and a quaternion: which of w x y z is the largest (2 bits), and the others in 10 bits between -sqrt(1/2) and
+sqrt(1/2). `sh`: the higher spherical harmonics, a byte each, all of red, then green, then blue.
+
+Neither object ids nor identities have a place.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import FormatError
+from ggslam.formats.morton import morton_order
+from ggslam.formats.ply import write_ply
+from ggslam.formats.splat_columns import SplatColumns
+from ggslam.scene.gaussian_map import SH_C0, GaussianMap
+
+CHUNK = 256
+"""Gaussians that share their corners."""
+SH_REACH = 4.0
+"""Spherical harmonics are bytes, steps of 1/32 between minus and plus this."""
+_LOG_SCALE_REACH = 20.0
+_CORNERS = (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+
+
+def write_compressed_ply(path: str | Path, gaussians: GaussianMap) -> None:
+    """Writes a compressed PLY, whole or not at all. Rows are put into Morton order, so that chunks are small.
+
+    Args:
+        path: the file to write.
+        gaussians: at least one.
+
+    Raises:
+        FormatError: there is no Gaussian, or a number is not finite.
+        RunFolderError: the file cannot be written.
+    """
+    if not len(gaussians):
+        raise FormatError(f"{path}: a compressed PLY holds at least one Gaussian, found none")
+    columns = SplatColumns.of(path, gaussians)
+    order = morton_order(columns.means)
+    chunks, vertices = _pack(columns, order)
+    elements = {"chunk": chunks, "vertex": vertices}
+    if columns.sh.shape[1] > 1:
+        elements["sh"] = _harmonics(columns.sh[order, 1:])
+    write_ply(path, elements)
+
+
+def _pack(columns: SplatColumns, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The elements `chunk` and `vertex`."""
+    log_scales = columns.log_scales[order].clip(-_LOG_SCALE_REACH, _LOG_SCALE_REACH)
+    colors = 0.5 + SH_C0 * columns.sh[order, 0]
+    opacity = 0.5 + 0.5 * np.tanh(0.5 * columns.logits[order].astype(np.float64))
+    starts = np.arange(0, len(order), CHUNK)
+    corners: dict[str, np.ndarray] = {}
+    shares = []
+    for names, values in zip(_CORNERS, (columns.means[order], log_scales, colors), strict=True):
+        low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+        corners |= dict(zip([f"min_{name}" for name in names], low.T, strict=True))
+        corners |= dict(zip([f"max_{name}" for name in names], high.T, strict=True))
+        shares.append(_shares(values, low, high))
+    color = np.column_stack([shares[2], opacity.clip(1 / 255, 254 / 255)])  # 0 and 1 are infinite as logits
+    words = {
+        "packed_position": _word(shares[0], (11, 10, 11)), "packed_rotation": _rotation(columns.quaternions[order]),
+        "packed_scale": _word(shares[1], (11, 10, 11)), "packed_color": _word(color, (8, 8, 8, 8)),
+    }  # fmt: skip
+    return _rows(corners, "<f4"), _rows(words, "<u4")
+
+
+def _shares(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Where numbers [N, 3] lie between the corners [chunks, 3] of their chunks, 0 to 1, float64."""
+    low, high = low.repeat(CHUNK, 0)[: len(values)], high.repeat(CHUNK, 0)[: len(values)]
+    extent = high.astype(np.float64) - low
+    return (values.astype(np.float64) - low) / np.where(extent > 0, extent, 1.0)
+
+
+def _rotation(unit: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz [N, 4] of unit length as words [N]."""
+    largest = np.abs(unit).argmax(1)
+    others = unit * np.where(np.take_along_axis(unit, largest[:, None], 1) < 0, -1, 1)  # q and -q turn alike
+    others = others[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    return largest.astype(np.uint32) << np.uint32(30) | _word(others * np.sqrt(0.5) + 0.5, (10, 10, 10))
+
+
+def _word(shares: np.ndarray, widths: tuple[int, ...]) -> np.ndarray:
+    """Numbers from 0 to 1, [N, k], as words uint32 [N]: rounded to so many bits each, the first in the highest."""
+    word = np.zeros(len(shares), np.uint32)
+    for column, width in zip(shares.T, widths, strict=True):
+        most = 2**width - 1
+        word = word << np.uint32(width) | np.floor(column * most + 0.5).clip(0, most).astype(np.uint32)
+    return word
+
+
+def _harmonics(higher: np.ndarray) -> np.ndarray:
+    """The element `sh` of coefficients [N, K, 3]: a byte is the interval that a number lies in."""
+    steps = np.floor((higher / (2 * SH_REACH) + 0.5) * 256).clip(0, 255)
+    channel_major = steps.transpose(0, 2, 1).reshape(len(higher), -1)
+    return _rows({f"f_rest_{i}": column for i, column in enumerate(channel_major.T)}, "u1")
+
+
+def _rows(columns: dict[str, np.ndarray], kind: str) -> np.ndarray:
+    rows = np.empty(len(next(iter(columns.values()))), [(name, kind) for name in columns])
+    for name, column in columns.items():
+        rows[name] = column
+    return rows

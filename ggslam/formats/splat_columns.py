@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers of a map as splat formats want them: checked, quaternions of unit length, turned where y is upwards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ggslam.errors import FormatError
+from ggslam.scene.gaussian_map import GaussianMap
+
+_ODD_IN_Y_AND_Z = (1, 2, 4, 7, 9, 11, 12, 14)
+"""Spherical harmonics, in the order of 3DGS, that change sign when y and z do."""
+
+
+@dataclass(frozen=True)
+class SplatColumns:
+    """Copies of what a map consists of, float32, in the order of the map.
+
+    Attributes:
+        means: [N, 3] metres.
+        log_scales: [N, 3] natural logarithm of standard deviations in metres.
+        quaternions: [N, 4] wxyz, of unit length.
+        logits: [N] of opacities.
+        sh: [N, K, 3] spherical harmonics, the base colour first.
+    """
+
+    means: np.ndarray
+    log_scales: np.ndarray
+    quaternions: np.ndarray
+    logits: np.ndarray
+    sh: np.ndarray
+
+    @staticmethod
+    def of(path: str | Path, gaussians: GaussianMap) -> SplatColumns:
+        """Those of a map that is to be written to `path`; raises FormatError for a number that is not finite."""
+        unit = torch.nn.functional.normalize(gaussians.quaternions, dim=1)
+        tensors = (gaussians.means, gaussians.log_scales, unit, gaussians.opacity_logits, gaussians.sh)
+        names = ("position", "size", "quaternion", "opacity", "colour")
+        arrays = [values.detach().cpu().numpy().astype(np.float32) for values in tensors]
+        for name, values in zip(names, arrays, strict=True):
+            bad = ~np.isfinite(values).reshape(len(values), -1).all(1)
+            if bad.any():
+                raise FormatError(f"{path}: the {name} of Gaussian {int(bad.argmax())} is not a finite number")
+        return SplatColumns(*arrays)
+
+    def turn_upright(self) -> None:
+        """Turns everything by 180 degrees about x: from x right, y down, z forward to y up, z backwards."""
+        self.means[:, 1:] *= -1
+        self.quaternions[:, 2:] *= -1  # D R D with D = diag(1, -1, -1): the same ellipsoid as D R
+        self.sh[:, [index for index in _ODD_IN_Y_AND_Z if index < self.sh.shape[1]]] *= -1
