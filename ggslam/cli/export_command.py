@@ -43,9 +43,9 @@ FormatName = Annotated[
     typer.Option(
         "--format",
         help="ply: Gaussians as 3DGS stores them; segmented: the same in the colours of their objects; compressed-ply, "
-        "spz, splat: the same in fewer bytes; gltf: the same as .glb (without this option a .glb is a mesh); points, "
-        "pcd: coloured points; mesh: .glb, .obj or .ply; trajectory: TUM; colmap, nerfstudio: images, poses and points "
-        "for other trainers. Default: what the name of --out says.",
+        "spz, spz4 (.spz, versions 3 and 4), splat: the same in fewer bytes; gltf: the same as .glb (without this "
+        "option a .glb is a mesh); points, pcd: coloured points; mesh: .glb, .obj or .ply; trajectory: TUM; colmap, "
+        "nerfstudio: images, poses and points for other trainers. Default: what the name of --out says.",
     ),
 ]
 Voxel = Annotated[

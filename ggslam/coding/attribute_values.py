@@ -71,7 +71,7 @@ class CodedAttribute:
         picked = values[rows].reshape(len(rows), -1)
         if self.table is not None:
             return self.table.components(picked)
-        if self.description.scaled:
+        if self.description.has_scale:
             scale = self.description.scale
             picked = (picked.astype(np.int64) - self.description.offset + scale // 2) // scale
         if self.description.matrix == MATRIX_IDENTITY:
@@ -96,11 +96,11 @@ class CodedAttribute:
         description = self.description
         if self.table is not None:
             return self._ids(components[:, 0], corrections)
-        if description.scaled:
+        if description.has_scale:
             components = (components.astype(np.int64) * description.scale >> description.fraction_bits)
             components += description.offset
         if description.matrix == MATRIX_BT709:
-            return ycbcr_to_rgb(components.clip(0, 255).astype(np.int32) if description.scaled else components)
+            return ycbcr_to_rgb(components.clip(0, 255).astype(np.int32) if description.has_scale else components)
         if description.matrix == MATRIX_YCGCO and description.components == 3:
             return _rgb_of_ycgco(components, description.bit_depth - 1)
         values = components.astype(self.dtype)
@@ -180,7 +180,7 @@ class AttributeSummary:
         ids = np.unique(values) if own.lossless else np.empty(0, values.dtype)
         return AttributeSummary(values.dtype, components, int(values.min()), int(values.max()), ids)
 
-    def joined(self, other: AttributeSummary) -> AttributeSummary:
+    def join(self, other: AttributeSummary) -> AttributeSummary:
         """That of the values of both."""
         ids = np.union1d(self.ids, other.ids)
         return replace(self, low=min(self.low, other.low), high=max(self.high, other.high), ids=ids)

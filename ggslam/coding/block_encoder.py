@@ -23,7 +23,7 @@ from ggslam.coding.attribute_values import AttributeSummary, plan_summaries
 from ggslam.coding.cloud import CodingReport
 from ggslam.coding.encoder import checked_points, encode_cloud, parameter_units, sequence_parameters
 from ggslam.coding.geometry_syntax import GeometryParameters
-from ggslam.coding.geometry_tools import DensitySample, geometry_parameters
+from ggslam.coding.geometry_tools import GeometrySample, geometry_parameters
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.settings import CodecSettings
 from ggslam.coding.side_by_side import in_order
@@ -105,7 +105,7 @@ class _Spool:
         self.corners = np.stack([together.min(0), together.max(0)])
         for name, values in attributes.items():
             own = AttributeSummary.of(values, self.settings.attribute(name))
-            self.summaries[name] = self.summaries[name].joined(own) if name in self.summaries else own
+            self.summaries[name] = self.summaries[name].join(own) if name in self.summaries else own
 
     def rows(self, file: IO[bytes], start: int, count: int) -> np.ndarray:
         """Rows of a file in this form; may be called by several threads."""
@@ -132,7 +132,8 @@ class _Spool:
 
     def geometry(self, grid: Quantization) -> GeometryParameters:
         """The parameter set of all slices."""
-        sample = DensitySample(self.count)
+        assert grid.size is not None
+        sample = GeometrySample(self.count, grid.size)
         for rows in self.blocks():
             sample.add(grid.of(np.ascontiguousarray(rows[_POINTS])))
         return geometry_parameters(self.settings, sample)

@@ -12,7 +12,7 @@ import numpy as np
 from ggslam.coding.attribute_values import CodedAttribute, plan_attributes
 from ggslam.coding.cloud import CodingReport, EncodedCloud, PointCloud
 from ggslam.coding.container import UnitType, unit_bytes
-from ggslam.coding.geometry_tools import DensitySample, geometry_parameters
+from ggslam.coding.geometry_tools import GeometrySample, geometry_parameters
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.sequence_parameters import SequenceParameters
 from ggslam.coding.settings import CodecSettings
@@ -51,7 +51,8 @@ def encode_cloud(
         points, settings.voxel_size, settings.geometry_bits, settings.geometry_scale, settings.box, settings.unit,
         settings.shift,
     )  # fmt: skip
-    sample = DensitySample(len(points))
+    assert quantization.size is not None
+    sample = GeometrySample(len(points), quantization.size)
     sample.add(quantization.of(points))
     numbers = assign_slices(points, quantization, settings)
     sequence = sequence_parameters(quantization, [plan for plan, _ in plans])

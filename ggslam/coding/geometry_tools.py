@@ -6,48 +6,105 @@ The reference decoder takes the first set of a stream for all slices, so there i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cached_property
+
 import numpy as np
 
-from ggslam.coding.geometry_syntax import GeometryParameters
+from ggslam.coding.geometry_syntax import ALL_AXES, GeometryParameters
 from ggslam.coding.grid_points import GridPoints
 from ggslam.coding.settings import CodecSettings
+from ggslam.coding.slice_coder import SliceCoder
 
 DENSE_POINTS_PER_CUBE = 1.5
 """Occupied voxels per occupied cube of 4 x 4 x 4 above which neighbours give useful contexts."""
-_SMALL = 1 << 16
-_ONE_CUBE_IN = 64
-_CUBE_MASK = np.uint64(sum((((1 << 21) - 1) & ~3) << (21 * axis) for axis in range(3)))
+PLANES_POINTS_PER_CUBE = 4.0
+"""Up to so many it is worth trying whether planes make the geometry smaller..."""
+PLANES_GAIN = 0.03
+"""...by this part at least."""
+PLANE_THRESHOLDS = (77, 99, 113)  # of the common test conditions
+_SAMPLE = 1 << 14
+_MOST_CUBES = 6  # of the longest side, as a logarithm
+_MASK = (1 << 21) - 1
 
 
-class DensitySample:
-    """Counts occupied voxels and cubes of a cloud that may come in blocks.
+class GeometrySample:
+    """Some of the points of a cloud that may come in blocks: those in cubes that a hash chooses.
 
     Args:
         count: points of the whole cloud.
+        size: of its grid, voxels.
     """
 
-    def __init__(self, count: int) -> None:
-        self._one_in = 1 if count <= _SMALL else _ONE_CUBE_IN
+    def __init__(self, count: int, size: Sequence[int]) -> None:
+        self._one_in = 1 << max(0, (count // _SAMPLE).bit_length() - 1)
+        self._cube_bits = max(2, (max(size) - 1).bit_length() - _MOST_CUBES)
         self._codes: list[np.ndarray] = []
 
     def add(self, block: GridPoints) -> None:
-        """Notes some of the points of a block."""
-        self._codes.append(block.sample_cubes(self._one_in))
+        """Notes the points of a block that belong to the sample."""
+        self._codes.append(block.sample_cubes(self._cube_bits, self._one_in))
 
-    @property
+    @cached_property
+    def voxels(self) -> np.ndarray:
+        """Occupied voxels of the sample, int32 [N, 3]."""
+        codes = np.unique(np.concatenate(self._codes)).astype(np.int64)
+        return np.stack([codes >> 42, codes >> 21 & _MASK, codes & _MASK], 1).astype(np.int32)
+
+    @cached_property
     def voxels_per_cube(self) -> float:
-        """Occupied voxels per occupied cube of 4 x 4 x 4, about; 1 for a cloud without points in the sample."""
-        voxels = np.unique(np.concatenate(self._codes))
-        return len(voxels) / max(1, len(np.unique(voxels & _CUBE_MASK)))
+        """Occupied voxels per occupied cube of 4 x 4 x 4, about; 0 for a sample without points."""
+        cubes = self.voxels.astype(np.int64) >> 2
+        keys = cubes[:, 0] << 42 | cubes[:, 1] << 21 | cubes[:, 2]
+        return len(keys) / max(1, len(np.unique(keys)))
+
+    def planes_pay(self, without: GeometryParameters, with_planes: GeometryParameters) -> bool:
+        """Whether coding the sample takes less with planes."""
+        voxels = self.voxels
+        if len(voxels) < 100:
+            return False
+        voxels = voxels - voxels.min(0)
+        bits = [int(value).bit_length() for value in voxels.max(0)]
+        coder = SliceCoder()
+        coder.build(voxels, max(1, *bits))
+        sizes = [len(coder.encode_geometry(tools, split_axes(bits))) for tools in (without, with_planes)]
+        return sizes[1] < (1 - PLANES_GAIN) * sizes[0]
 
 
-def geometry_parameters(settings: CodecSettings, sample: DensitySample) -> GeometryParameters:
+def split_axes(bits: Sequence[int]) -> tuple[int, ...]:
+    """By level of a tree over sides of 2^bits, the axes that it splits: always the longest, at last all of them."""
+    left, levels = list(bits), []
+    if not any(left):
+        left[0] = 1
+    while any(left):
+        longest = max(left)
+        levels.append(sum(4 >> axis for axis in range(3) if left[axis] == longest))
+        left = [side - (side == longest) for side in left]
+    return tuple(levels)
+
+
+def geometry_parameters(settings: CodecSettings, sample: GeometrySample) -> GeometryParameters:
     """The parameter set of a stream."""
     boundary = settings.neighbour_boundary
     if boundary is None:
         boundary = 8 if sample.voxels_per_cube > DENSE_POINTS_PER_CUBE else 0
+    without = _parameters(settings, boundary, False)
+    if settings.planes is False or (settings.planes is None and sample.voxels_per_cube > PLANES_POINTS_PER_CUBE):
+        return without
+    near = 8 if settings.neighbour_boundary is None else boundary
+    with_planes = _parameters(settings, near, True)
+    return with_planes if settings.planes or sample.planes_pay(without, with_planes) else without
+
+
+def _parameters(settings: CodecSettings, boundary: int, planes: bool) -> GeometryParameters:
     near = boundary > 0
     return GeometryParameters(
         settings.duplicates == "merge", boundary, near and settings.adjacent_child,
-        settings.intra_prediction_size if near else 0,
+        settings.intra_prediction_size if near else 0, partial_splits=planes, planes=planes,
+        plane_thresholds=PLANE_THRESHOLDS if planes else (0, 0, 0),
     )  # fmt: skip
+
+
+def levels_of(parameters: GeometryParameters, bits: Sequence[int]) -> tuple[int, ...]:
+    """The axes that the levels of a slice with sides of 2^bits split."""
+    return split_axes(bits) if parameters.partial_splits else (ALL_AXES,) * max(1, *bits)

@@ -38,29 +38,31 @@ class GridPoints:
 
     def positions(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Grid positions int32 [M, 3]."""
-        chosen = self._chosen(rows)
+        chosen = self._select(rows)
         out = np.empty((chosen.count, 3), np.int32)
         load_library().ggslam_gpcc_on_grid(chosen, self._grid, out.ctypes.data)
         return out
 
     def coordinates(self, axis: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Grid coordinates int32 [M] along an axis."""
-        chosen = self._chosen(rows)
+        chosen = self._select(rows)
         out = np.empty(chosen.count, np.int32)
         load_library().ggslam_gpcc_along_axis(chosen, self._grid, axis, out.ctypes.data)
         return out
 
-    def sample_cubes(self, one_in: int) -> np.ndarray:
+    def sample_cubes(self, cube_bits: int, one_in: int) -> np.ndarray:
         """Codes uint64 [M] of 21 bits a coordinate, x first, of the points in one of so many (a power of two) cubes of
-        4 x 4 x 4 voxels."""
-        codes = np.empty(len(self), np.uint64)
-        count = load_library().ggslam_gpcc_sample_cubes(self._chosen(None), self._grid, one_in - 1, codes.ctypes.data)
+        an edge of 2^cube_bits voxels."""
+        codes, slabs = np.empty(len(self), np.uint64), min(one_in, 8)
+        count = load_library().ggslam_gpcc_sample_cubes(
+            self._select(None), self._grid, cube_bits, slabs - 1, one_in // slabs - 1, codes.ctypes.data
+        )
         return codes[:count].copy()
 
     def plane_counts(self, axis: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Number of points in each plane across an axis, uint32 [size of the axis]."""
         counts = np.zeros(self.size[axis], np.uint32)
-        load_library().ggslam_gpcc_plane_counts(self._chosen(rows), self._grid, axis, counts.ctypes.data)
+        load_library().ggslam_gpcc_plane_counts(self._select(rows), self._grid, axis, counts.ctypes.data)
         return counts
 
     def number_planes(
@@ -81,7 +83,7 @@ class GridPoints:
         Returns:
             Numbers uint16 [M], and the indices int64 among the M of points in the planes `cut`.
         """
-        chosen = self._chosen(rows)
+        chosen = self._select(rows)
         numbers, inside = np.empty(chosen.count, np.uint16), np.empty(int(counts[cut].sum()), np.int64)
         number_of_plane, cut = np.ascontiguousarray(number_of_plane, np.uint16), np.ascontiguousarray(cut, bool)
         load_library().ggslam_gpcc_number_planes(
@@ -90,7 +92,7 @@ class GridPoints:
         )  # fmt: skip
         return numbers, inside
 
-    def _chosen(self, rows: np.ndarray | None) -> Points:
+    def _select(self, rows: np.ndarray | None) -> Points:
         kind, data = _KINDS[self._points.dtype], self._points.ctypes.data
         if rows is None:
             return Points(data, None, len(self._points), kind)

@@ -9,19 +9,21 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
-from ggslam.coding.attribute_syntax import AttributeHeader, AttributeParameters
+from ggslam.coding.attribute_syntax import LIFTING, PREDICTING, RAHT, RAW, AttributeHeader, AttributeParameters
 from ggslam.coding.container import HEADER, Unit, UnitType, read_units
 from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
 from ggslam.coding.sequence_parameters import (
     MATRIX_BT709,
     MATRIX_IDENTITY,
+    MATRIX_YCGCO,
     AttributeDescription,
     SequenceParameters,
 )
 from ggslam.coding.user_data import read_user_data
 from ggslam.errors import FormatError
 
-_MATRICES = {MATRIX_IDENTITY: " as G, B, R", MATRIX_BT709: " as Y, Cb, Cr (BT.709)"}
+_MATRICES = {MATRIX_IDENTITY: " as G, B, R", MATRIX_BT709: " as Y, Cb, Cr (BT.709)", MATRIX_YCGCO: " as Y, Cg, Co"}
+_ENCODINGS = {RAHT: "RAHT", PREDICTING: "predicting transform", LIFTING: "lifting transform", RAW: "raw values"}
 _PROFILES = ("simple", "dense", "predictive", "main")
 
 
@@ -143,8 +145,8 @@ class _Lister:
         self.listing.points += header.points
         self.listing.slices += 1
         corner = " ".join(str(v) for v in header.grid_origin)
-        text = f"slice {header.slice_id}: {header.points} points in a cube of 2^{header.depth} voxels at {corner}"
-        return text, header.points
+        where = "" if not header.axes else f" in a cube of 2^{header.depth} voxels"
+        return f"slice {header.slice_id}: {header.points} points{where} at {corner}", header.points
 
     def _attribute_unit(self, unit: Unit) -> tuple[str, str]:
         if self._sequence is None:
@@ -152,9 +154,11 @@ class _Lister:
         identity = AttributeHeader.parameter_set_of(unit.payload)
         if identity not in self._attributes:
             raise FormatError(f"there is no attribute parameter set {identity} before it")
-        header, _ = AttributeHeader.read(unit.payload, self._attributes[identity])
-        if header.attribute >= len(self._names):
-            raise FormatError(f"it is of attribute {header.attribute}, the stream has {len(self._names)}")
+        index = AttributeHeader.attribute_of(unit.payload)
+        if index >= len(self._names):
+            raise FormatError(f"it is of attribute {index}, the stream has {len(self._names)}")
+        components = self._sequence.attributes[index].components
+        header, _ = AttributeHeader.read(unit.payload, self._attributes[identity], components)
         depth = self._sequence.attributes[header.attribute].bit_depth
         first, others = self._attributes[identity].qps(depth, header.qp_deltas)
         name = self._names[header.attribute]
@@ -180,18 +184,30 @@ def _sequence_text(s: SequenceParameters) -> str:
 
 
 def _geometry_text(g: GeometryParameters) -> str:
-    parts = ["octree", "no duplicate points" if g.unique_points else "duplicate points"]
-    if not g.neighbour_boundary:
-        return ", ".join([*parts, "contexts from siblings"])
-    parts.append(f"contexts from neighbours in cubes of 2^{g.neighbour_boundary}")
-    if g.adjacent_child:
-        parts.append("and from adjacent children")
-    if g.intra_prediction:
-        parts.append(f"prediction of nodes below 2^{g.intra_prediction}")
+    duplicates = "no duplicate points" if g.unique_points else "duplicate points"
+    if g.predictive:
+        return f"predictive geometry, {duplicates}"
+    parts = ["octree", duplicates]
+    if g.neighbour_boundary:
+        parts.append(f"contexts from neighbours in cubes of 2^{g.neighbour_boundary}")
+        parts += ["and from adjacent children"] if g.adjacent_child else []
+        parts += [f"prediction of nodes below 2^{g.intra_prediction}"] if g.intra_prediction else []
+    else:
+        parts.append("contexts from siblings")
+    parts += ["planes"] if g.planes else []
+    parts += ["levels split some axes only"] if g.partial_splits else []
+    parts += [f"direct points (mode {g.direct_mode})"] if g.direct_mode else []
+    parts += [f"positions scaled with QP {g.base_qp}"] if g.scaling else []
     return ", ".join(parts)
 
 
 def _attribute_text(a: AttributeParameters) -> str:
-    parts = [f"set {a.attribute_id}: RAHT, QP {a.qp}", f"chroma offset {a.chroma_offset}"]
-    parts.append(f"prediction with thresholds {a.thresholds[0]} {a.thresholds[1]}" if a.prediction else "no prediction")
+    parts = [f"set {a.attribute_id}: {_ENCODINGS[a.encoding]}"]
+    if a.encoding != RAW:
+        parts += [f"QP {a.qp}", f"chroma offset {a.chroma_offset}"]
+    if a.encoding == RAHT:
+        thresholds = f"prediction with thresholds {a.thresholds[0]} {a.thresholds[1]}"
+        parts.append(thresholds if a.prediction else "no prediction")
+    elif a.encoding != RAW:
+        parts.append(f"levels of detail: {a.details.levels}")
     return ", ".join(parts)

@@ -39,7 +39,7 @@ class AttributeDescription:
     fraction_bits: int = 0
 
     @property
-    def scaled(self) -> bool:
+    def has_scale(self) -> bool:
         """Whether values differ from what is coded."""
         return (self.offset, self.scale, self.fraction_bits) != (0, 1, 0)
 
@@ -182,7 +182,7 @@ def _write_attribute(w: BitWriter, attribute: AttributeDescription) -> None:
     w.ue(attribute.bit_depth - 1)
     w.flag(True)
     w.ue(KNOWN_LABELS.index(attribute.label))
-    w.ue((attribute.matrix is not None) + attribute.scaled)
+    w.ue((attribute.matrix is not None) + attribute.has_scale)
     w.align()
     if attribute.matrix is not None:
         body = BitWriter()
@@ -191,7 +191,7 @@ def _write_attribute(w: BitWriter, attribute: AttributeDescription) -> None:
         body.ue(attribute.matrix)
         body.flag(attribute.full_range)
         _write_parameter(w, CICP_PARAMETER, body)
-    if attribute.scaled:
+    if attribute.has_scale:
         body = BitWriter()
         for value, sign in ((attribute.offset, True), (attribute.scale - 1, False)):
             bits = abs(value).bit_length()

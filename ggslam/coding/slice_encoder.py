@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from ggslam.coding.attribute_syntax import AttributeHeader, AttributeParameters
 from ggslam.coding.attribute_values import CodedAttribute
 from ggslam.coding.cloud import SliceReport
 from ggslam.coding.container import UnitType, unit_bytes
-from ggslam.coding.geometry_syntax import ALL_AXES, GeometryHeader, GeometryParameters
+from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
+from ggslam.coding.geometry_tools import levels_of
 from ggslam.coding.native_settings import raht_settings
 from ggslam.coding.quantization import Quantization
 from ggslam.coding.sequence_parameters import SequenceParameters
@@ -58,7 +59,10 @@ def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
     origin = np.array([grid[:, axis].min() for axis in range(3)], np.int32)
     for axis in range(3):
         grid[:, axis] -= origin[axis]
-    depth = max(1, int(grid.max()).bit_length())
+    geometry = cloud.geometry
+    axes = levels_of(geometry, [int(grid[:, axis].max()).bit_length() for axis in range(3)])
+    header = GeometryHeader(number, (int(origin[0]), int(origin[1]), int(origin[2])), axes, len(grid))
+    depth = header.depth
     coder = SliceCoder()
     order = coder.build(grid, depth)
     counts = None
@@ -67,9 +71,8 @@ def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
         coder.merge()
     if coder.points > MAX_SLICE_POINTS:
         raise ConfigError(f"{coder.points} points lie in one voxel: merge duplicates or choose smaller voxels")
-    geometry = cloud.geometry
-    header = GeometryHeader(number, (int(origin[0]), int(origin[1]), int(origin[2])), (ALL_AXES,) * depth, coder.points)
-    payload = header.write(cloud.sequence, geometry) + coder.encode_geometry(geometry) + header.footer()
+    header = replace(header, points=coder.points)
+    payload = header.write(cloud.sequence, geometry) + coder.encode_geometry(geometry, axes) + header.footer()
     units = [unit_bytes(UnitType.GEOMETRY, payload)]
     if rows is not None:
         order = np.take(rows.astype(np.uint32), order)

@@ -136,8 +136,8 @@ def run_sweep(
     for step in steps:
         with meter.measure() as energy:
             encode = partial(encode_cloud, cloud.grid, {"color": cloud.colors}, _settings(settings, step))
-            encoded, encode_s = _timed(encode)
-        decoded, decode_s = _timed(partial(decode_cloud, encoded.data, settings.workers))
+            encoded, encode_s = _measure(encode)
+        decoded, decode_s = _measure(partial(decode_cloud, encoded.data, settings.workers))
         joules = None if energy.joules is None else energy.joules / REPEATS
         color, d1, d2 = quality.of(decoded, step)
         report = encoded.report
@@ -147,7 +147,7 @@ def run_sweep(
         ), decoded  # fmt: skip
 
 
-def _timed(call: Callable[[], Result]) -> tuple[Result, float]:
+def _measure(call: Callable[[], Result]) -> tuple[Result, float]:
     """What the call returns, and its shortest time of `REPEATS`, seconds."""
     times = []
     for _ in range(REPEATS):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussian maps as SPZ (Niantic, version 3, gzip), written by the package gaussforge (extra `[splats]`).
+"""Gaussian maps as SPZ (Niantic), version 3 (gzip) or 4 (zstd), by the packages gaussforge and zstandard.
 
 Positions in steps of 1/4096 m, everything else in bytes. The specification puts y upwards and z backwards, so the map
 (y down, z forward at the first camera) is turned by 180 degrees about x on the way. There are neither object ids nor
@@ -8,6 +8,8 @@ identities.
 
 from __future__ import annotations
 
+import gzip
+import struct
 from pathlib import Path
 from types import ModuleType
 
@@ -37,25 +39,56 @@ def check_gaussforge(path: str | Path) -> ModuleType:
     return gaussforge
 
 
-def write_spz(path: str | Path, gaussians: GaussianMap) -> None:
+def check_zstandard(path: str | Path) -> ModuleType:
+    """The package zstandard.
+
+    Raises:
+        MissingDependency: it is not installed; says how to get it.
+    """
+    try:
+        import zstandard
+    except ImportError as error:
+        raise MissingDependency(
+            f"to write {path} as version 4 the package zstandard is needed: `pip install 'ggslam[splats]'` ({error})"
+        ) from None
+    return zstandard
+
+
+def write_spz(path: str | Path, gaussians: GaussianMap, version: int = 3) -> None:
     """Writes an SPZ file, whole or not at all.
 
     Args:
         path: the file to write; ends in .spz.
         gaussians: at least one, within `SPZ_REACH` of the origin.
+        version: 3 or 4.
 
     Raises:
-        MissingDependency: gaussforge is not installed.
+        MissingDependency: gaussforge or, for version 4, zstandard is not installed.
         FormatError: a Gaussian is too far away for the format, or a number is not finite.
         RunFolderError: the file cannot be written.
     """
-    gaussforge = check_gaussforge(path)
+    gaussforge, zstandard = check_gaussforge(path), check_zstandard(path) if version == 4 else None
     farthest = float(gaussians.means.abs().max())
     if not farthest < SPZ_REACH:
         raise FormatError(f"{path}: SPZ holds positions up to {SPZ_REACH:g} m, found {farthest:g} m; write a PLY")
     columns = SplatColumns.of(path, gaussians)
     columns.turn_upright()
-    write_bytes(path, _pack(gaussforge, path, columns, gaussians.sh_degree))
+    data = _pack(gaussforge, path, columns, gaussians.sh_degree)
+    write_bytes(path, data if zstandard is None else _version_4(zstandard, data))
+
+
+def _version_4(zstandard: ModuleType, version_3: bytes) -> bytes:
+    """The same numbers as version 4: each attribute is a zstd frame of its own behind a table of their sizes."""
+    payload = gzip.decompress(version_3)
+    count, degree, fraction, flags = struct.unpack_from("<8xIBBB", payload)
+    widths = [9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)]  # bytes a Gaussian: positions, opacities, colours, ...
+    frames, table, start = [], b"", 16
+    for width in filter(None, widths):
+        frames.append(zstandard.ZstdCompressor(level=12).compress(payload[start : start + width * count]))
+        table += struct.pack("<QQ", len(frames[-1]), width * count)
+        start += width * count
+    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, fraction, flags, len(frames), 32)
+    return b"".join([header, table, *frames])
 
 
 def _pack(gaussforge: ModuleType, path: str | Path, columns: SplatColumns, degree: int) -> bytes:

@@ -48,7 +48,7 @@ def write_points_in_parts(folder: str | Path, clouds: Iterable[VoxelCloud]) -> i
     """
     folder = Path(folder)
     with _temporary_file(folder) as raw:  # until all parts are there, the corner is not known
-        whole, count, dtype = _gathered(raw, clouds)
+        whole, count, dtype = _gather_rows(raw, clouds)
         for name, meaning, in_cells in ((METRIC_FILE, _METRIC, False), (GRID_FILE, _GRID, True)):
             clouds_again = _read_back(raw, whole, dtype)
             rows = (_vertices(c.grid if in_cells else c.points, "f4", c) for c in clouds_again)
@@ -66,7 +66,7 @@ def _temporary_file(folder: Path) -> Iterator[IO[bytes]]:
         raise write_failure(folder, error) from error
 
 
-def _gathered(raw: IO[bytes], clouds: Iterable[VoxelCloud]) -> tuple[VoxelCloud, int, np.dtype]:
+def _gather_rows(raw: IO[bytes], clouds: Iterable[VoxelCloud]) -> tuple[VoxelCloud, int, np.dtype]:
     """Writes the rows of clouds, grid coordinates counted from the world's origin; gives an empty cloud with scale,
     lowest corner and whether there are objects, the number of rows and their type."""
     count, size, corner, dtype = 0, 1.0, np.full(3, np.iinfo(np.int64).max), np.dtype("u1")

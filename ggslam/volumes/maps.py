@@ -110,7 +110,7 @@ class VolumeMaps:
         self.times = VolumeTimes()
 
     @property
-    def _fusing(self) -> TsdfMap | TorchTsdf:
+    def _receiver(self) -> TsdfMap | TorchTsdf:
         return self.tsdf if self._on_device is None else self._on_device
 
     def _occupancy(self, resolution: float) -> OccupancyMap:
@@ -144,14 +144,14 @@ class VolumeMaps:
             start = time.perf_counter()
             self._insert(frame.depth, frame.camera, T_world_camera)
             row["occupancy"] = time.perf_counter() - start
-        self.times.blocks.append(len(self._fusing))
+        self.times.blocks.append(len(self._receiver))
         self.times.rows.append(row)
 
     def _fuse(
         self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, color: np.ndarray,
         labels: np.ndarray | None,
     ) -> None:  # fmt: skip
-        self._fusing.integrate(depth, camera, T_world_camera, color, labels)
+        self._receiver.integrate(depth, camera, T_world_camera, color, labels)
 
     def _insert(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> None:
         assert self.occupancy is not None

@@ -162,7 +162,7 @@ def _look(
         within = pair - (ends[b] - counts[b])
         u, v = area[b, 0] + within % columns[b], area[b, 1] + within // columns[b]
         tile = v * tiles.widths[0] + u
-        met, z0, z1 = _meeting(view, u, v, offset[b], near[b], far[b], half)
+        met, z0, z1 = _intersect_rays(view, u, v, offset[b], near[b], far[b], half)
         low, high = z0 - truncation, z1 + truncation
         least, most = tiles.low[tile], tiles.high[tile]
         met &= most > 0
@@ -177,7 +177,7 @@ def _look(
     return found[0], found[1], found[2]
 
 
-def _meeting(
+def _intersect_rays(
     view: DeviceView, u: Tensor, v: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Whether rays through tiles (u, v) meet cubes, and the stretch of depth in which they do."""

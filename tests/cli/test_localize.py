@@ -34,7 +34,7 @@ def ggslam(*arguments: object) -> Result:
 def done(*arguments: object) -> str:
     result = ggslam(*arguments)
     assert result.exit_code == 0 and result.exception is None, (result.output, result.exception)
-    return result.output
+    return " ".join(result.output.split())  # lines may break anywhere
 
 
 def summary(out: Path) -> dict[str, Any]:

@@ -62,7 +62,7 @@ codec_settings = st.fixed_dictionaries(
         "adjacent_child": st.booleans(),
         "intra_prediction_size": st.integers(0, 8),
         "raht_prediction": st.booleans(),
-        "rdoq": st.sampled_from([0.0, 0.05]),
+        "rdoq": st.sampled_from([0.0, 1.0]), "planes": st.sampled_from([None, False, True]),
     }
 )
 

@@ -5,9 +5,11 @@ say (splat_maps.py), and by PlayCanvas' splat-transform, where there is one: a c
 
 from __future__ import annotations
 
+import gzip
 import os
 import shlex
 import shutil
+import struct
 import subprocess
 from pathlib import Path
 
@@ -30,6 +32,7 @@ from ggslam.formats.compressed_ply import write_compressed_ply
 from ggslam.formats.gaussian_gltf import write_gaussian_gltf
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.morton import morton_order
+from ggslam.formats.packed_splats import write_spz
 from ggslam.formats.splat_file import write_splat
 
 DEGREES = [0, 1, 2, 3]
@@ -225,3 +228,57 @@ def test_gltf_by_trimesh(tmp_path: Path) -> None:
     write_gaussian_gltf(tmp_path / "map.glb", 600, [gaussians], 1, {1: "mug"})
     (cloud,) = trimesh.load_scene(tmp_path / "map.glb").geometry.values()
     np.testing.assert_allclose(cloud.vertices, gaussians.means.numpy() @ UPRIGHT, atol=1e-6)
+
+
+def spz_streams(path: Path) -> list[bytes]:
+    """The attributes of an SPZ file of version 3 or 4."""
+    data = path.read_bytes()
+    if data[:4] != b"NGSP":
+        data = gzip.decompress(data)
+        assert struct.unpack_from("<4sI", data) == (b"NGSP", 3)
+        count, degree = struct.unpack_from("<IB", data, 8)
+        ends = np.cumsum([16, *(count * width for width in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)) if width)])
+        assert ends[-1] == len(data)
+        return [data[one:other] for one, other in zip(ends[:-1], ends[1:], strict=True)]
+    zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed (extra [splats])")
+    version, streams, start = *struct.unpack_from("<4xI", data), data[15], *struct.unpack_from("<I", data, 16)
+    assert version == 4
+    out, place = [], start + 16 * streams
+    for number in range(streams):
+        packed, size = struct.unpack_from("<QQ", data, start + 16 * number)
+        out.append(zstandard.ZstdDecompressor().decompress(data[place : place + packed]))
+        assert len(out[-1]) == size
+        place += packed
+    assert place == len(data)
+    return out
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("degree", DEGREES)
+def test_spz_by_splat_transform(degree: int, version: int, tmp_path: Path, splat_transform: list[str]) -> None:
+    """It copies what stands in SPZ to PLY, where the map is upside down then."""
+    pytest.importorskip("gaussforge", reason="gaussforge is not installed (extra [splats])")
+    pytest.importorskip("zstandard", reason="zstandard is not installed (extra [splats])")
+    gaussians = small_map(degree)
+    write_spz(tmp_path / "map.spz", gaussians, version)
+    convert(splat_transform, tmp_path / "map.spz", tmp_path / "seen.ply")
+    seen, written = from_ply(tmp_path / "seen.ply"), Splats.of(gaussians)
+    np.testing.assert_allclose(seen.means, written.means @ UPRIGHT, atol=0.51 / 4096)
+    expected = UPRIGHT @ written.covariances() @ UPRIGHT
+    difference = np.linalg.norm(seen.covariances() - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
+    assert difference.max() < 0.08
+    np.testing.assert_allclose(seen.opacities, written.opacities, atol=1.01 / 255)
+    for direction in DIRECTIONS:
+        error = np.abs(seen.colors(UPRIGHT @ direction) - written.colors(direction))
+        assert error.mean() < 0.06 and error.max() < 0.01 + 3 * np.sqrt((degree + 1) ** 2 - 1) / 16
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_both_versions_of_spz_hold_the_same(degree: int, tmp_path: Path) -> None:
+    pytest.importorskip("gaussforge", reason="gaussforge is not installed (extra [splats])")
+    pytest.importorskip("zstandard", reason="zstandard is not installed (extra [splats])")
+    gaussians = small_map(degree)
+    for version in (3, 4):
+        write_spz(tmp_path / f"{version}.spz", gaussians, version)
+    streams = spz_streams(tmp_path / "4.spz")
+    assert streams == spz_streams(tmp_path / "3.spz") and len(streams) == (6 if degree else 5)

@@ -18,7 +18,7 @@ from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.jobs.export.export_run import export_run
 from ggslam.jobs.export.formats import ExportFormat, choose_format
-from ggslam.jobs.export.splats import export_packed, export_pcd
+from ggslam.jobs.export.splats import ENDINGS, export_packed, export_pcd
 from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe
@@ -147,11 +147,12 @@ def test_trajectory_in_numpy(run: RunFolder, tmp_path: Path) -> None:
         np.testing.assert_allclose(quaternion_to_matrix(row[[7, 4, 5, 6]]), T[:3, :3], atol=1e-7)
 
 
-@pytest.mark.parametrize("kind", ["compressed-ply", "spz", "splat"])
+@pytest.mark.parametrize("kind", ["compressed-ply", "spz", "spz4", "splat"])
 def test_splats_by_the_command_line(run: RunFolder, tmp_path: Path, kind: str) -> None:
-    if kind == "spz":
+    if kind in ("spz", "spz4"):
         pytest.importorskip("gaussforge", reason="gaussforge is not installed (extra [splats])")
-    out = tmp_path / f"map.{kind.removeprefix('compressed-')}"
+        pytest.importorskip("zstandard", reason="zstandard is not installed (extra [splats])")
+    out = tmp_path / f"map{ENDINGS[kind]}"
     faint = export_packed(run, out, kind)
     result = CliRunner().invoke(
         app, ["export", str(run.path), "--format", kind, "--out", str(out), "--min-opacity", "0.6"]

@@ -189,10 +189,12 @@ GGSLAM_EXPORT void ggslam_gpcc_number_planes(const ggslam::gpcc::Points* points,
                                              std::int32_t axis, const std::uint16_t* number_of_plane,
                                              const std::uint8_t* cut, std::uint16_t* numbers, std::int64_t* inside);
 
-// Appends to `codes`, which has room for count of them, the points in cubes of 4 x 4 x 4 voxels that a hash chooses: one
-// cube in mask + 1 (a power of two). A code has 21 bits a coordinate. Returns how many there are.
+// Appends to `codes`, which has room for count of them, the points in cubes of an edge of 2^cube_bits voxels that a hash
+// chooses: one slab across x in slab_mask + 1, and of its cubes one in cube_mask + 1 (powers of two). Most points are
+// passed over by one coordinate. A code has 21 bits a coordinate. Returns how many there are.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_sample_cubes(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
-                                                    std::uint32_t mask, std::uint64_t* codes);
+                                                    std::int32_t cube_bits, std::uint32_t slab_mask,
+                                                    std::uint32_t cube_mask, std::uint64_t* codes);
 
 // Bytes written to `out`, which must hold size + size / 32 + 1, or kNoRoom.
 GGSLAM_EXPORT int64_t ggslam_lzf_compress(const uint8_t* data, int64_t size, uint8_t* out, int64_t capacity);

@@ -9,7 +9,7 @@ from enum import IntEnum
 from typing import Any
 
 HEADER = "core/codec.hpp"
-HEADER_SHA256 = "d4fa058b2c8a7680cad801ddb33713842087747327b8b5f7f536184fb2c86c24"
+HEADER_SHA256 = "750cfeb207e090467f341f8c7a1d2a3822f6303bbf717aa8a134611b7308b247"
 
 
 class Status(IntEnum):
@@ -132,7 +132,7 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_gpcc_number_planes": (None, [
         POINTER(Points), POINTER(Grid), c_int32, c_void_p, c_void_p, c_void_p, c_void_p,
     ]),
-    "ggslam_gpcc_sample_cubes": (c_int64, [POINTER(Points), POINTER(Grid), c_uint32, c_void_p]),
+    "ggslam_gpcc_sample_cubes": (c_int64, [POINTER(Points), POINTER(Grid), c_int32, c_uint32, c_uint32, c_void_p]),
     "ggslam_lzf_compress": (c_int64, [c_void_p, c_int64, c_void_p, c_int64]),
     "ggslam_lzf_decompress": (c_int64, [c_void_p, c_int64, c_void_p, c_int64]),
 }

@@ -168,7 +168,7 @@ def decode_file(
     try:
         if slice_id is None and box is None and (splats := _splats_in_parts(data, workers)) is not None:
             return _write_splats(splats, out)
-        cloud = _decoded(data, slice_id, box, workers)
+        cloud = _decode_part(data, slice_id, box, workers)
         if is_splat_cloud(cloud):
             if not len(cloud):
                 raise FormatError("no Gaussians in the box")
@@ -179,7 +179,7 @@ def decode_file(
     except FormatError as error:
         raise FormatError(f"{source}: {error}") from None
     make_folder(out.parent)
-    points, comments = _placed(cloud)
+    points, comments = _place(cloud)
     write_point_cloud(out, points, attributes, comments if out.suffix.lower() != ".pcd" else ())
     return Decoded(out, len(cloud), "points")
 
@@ -256,7 +256,7 @@ def _corner(origin: np.ndarray, voxel_size: float) -> tuple[np.ndarray, tuple[fl
     return corner.astype(np.int32), (float(left[0]), float(left[1]), float(left[2]))
 
 
-def _decoded(data: bytes, slice_id: int | None, box: Box | None, workers: int | None) -> PointCloud:
+def _decode_part(data: bytes, slice_id: int | None, box: Box | None, workers: int | None) -> PointCloud:
     if slice_id is not None:
         return decode_slice(data, slice_id)
     if box is None:
@@ -264,17 +264,17 @@ def _decoded(data: bytes, slice_id: int | None, box: Box | None, workers: int | 
     return decode_box(data, *box)
 
 
-def _placed(cloud: PointCloud) -> tuple[np.ndarray, list[str]]:
+def _place(cloud: PointCloud) -> tuple[np.ndarray, list[str]]:
     """Positions to write, and the header comments of a cloud that is on its grid still."""
     quantization = cloud.quantization
     points, voxel_size = cloud.points, quantization.voxel_size
     if not quantization.metres or quantization.centre != 0:
-        return _narrowed(points, voxel_size), []
+        return _narrow(points, voxel_size), []
     place = " ".join(repr(float(value)) for value in quantization.first)
-    return _narrowed(points, voxel_size), ["x y z are metres", f"voxel_size {voxel_size!r}", f"origin {place}"]
+    return _narrow(points, voxel_size), ["x y z are metres", f"voxel_size {voxel_size!r}", f"origin {place}"]
 
 
-def _narrowed(points: np.ndarray, voxel_size: float) -> np.ndarray:
+def _narrow(points: np.ndarray, voxel_size: float) -> np.ndarray:
     """float32 unless that moves a point by more than a hundredth of a voxel."""
     narrow = points.astype(np.float32)
     return narrow if np.abs(points - narrow).max(initial=0) < 0.01 * voxel_size else points

@@ -102,20 +102,20 @@ class _Pictures:
 
     def __init__(self, cloud: GridCloud, folder: Path) -> None:
         self._folder, self._cloud = folder, cloud
-        points = self._placed(cloud.grid)
+        points = self._place(cloud.grid)
         self._view: CloudView = view_of(points)
         original = draw_cloud(points, cloud.colors, self._view, 1 / cloud.quantization.scale)
         self._original = (original, f"original, {len(cloud.grid)} points")
         self._drawn: dict[str, list[tuple[np.ndarray, str]]] = {}
 
-    def _placed(self, voxels: np.ndarray) -> np.ndarray:
+    def _place(self, voxels: np.ndarray) -> np.ndarray:
         return self._cloud.quantization.restore(voxels)
 
     def draw(self, row: StudyRow, decoded: PointCloud) -> None:
         """Draws and writes one picture."""
         step = row.step
         size = 1 / (self._cloud.quantization.scale * step.geometry_scale)
-        picture = draw_cloud(self._placed(decoded.points), decoded.attributes["color"], self._view, size)
+        picture = draw_cloud(self._place(decoded.points), decoded.attributes["color"], self._view, size)
         write_picture(self._folder / f"cloud_{step_name(step)}.png", picture)
         setting = f"QP {step.qp}" if step.sweep == "qp" else f"scale {step.geometry_scale:g}"
         quality = f"Y {row.color.y:.1f} dB" if step.sweep == "qp" else f"D1 {row.d1:.1f} dB"

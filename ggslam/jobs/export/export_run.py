@@ -45,10 +45,10 @@ def export_run(
     Args:
         run: the run, or its folder.
         out: file or, for points, colmap, nerfstudio and for objects one by one, folder to write.
-        format: ply: 3DGS Gaussians; segmented: the same in the colours of their objects; compressed-ply, spz, splat:
-            the same in fewer bytes; gltf: the same as .glb (a .glb without `format` is a mesh); points, pcd: coloured
-            clouds; mesh: .glb, .obj or .ply; trajectory: TUM; colmap, nerfstudio: images with poses and points. None:
-            what the name of `out` says.
+        format: ply: 3DGS Gaussians; segmented: the same in the colours of their objects; compressed-ply, spz, spz4,
+            splat: the same in fewer bytes; gltf: the same as .glb (a .glb without `format` is a mesh); points, pcd:
+            coloured clouds; mesh: .glb, .obj or .ply; trajectory: TUM; colmap, nerfstudio: images with poses and
+            points. None: what the name of `out` says.
         voxel: metres: distance of points (default 0.01), or the edge of a mesh's voxels (default: as the run's
             settings say).
         objects: names or ids, "mug,7", or "all", for ply, segmented, mesh and gltf: only these.

@@ -18,6 +18,7 @@ class ExportFormat(str, Enum):
     trajectory = "trajectory"
     compressed_ply = "compressed-ply"
     spz = "spz"
+    spz4 = "spz4"
     splat = "splat"
     gltf = "gltf"
     pcd = "pcd"
@@ -30,7 +31,7 @@ SUFFIXES = {
     ".ply": (ExportFormat.ply, ExportFormat.segmented, ExportFormat.compressed_ply, ExportFormat.mesh),
     ".glb": (ExportFormat.mesh, ExportFormat.gltf),
     ".obj": (ExportFormat.mesh,),
-    ".spz": (ExportFormat.spz,),
+    ".spz": (ExportFormat.spz, ExportFormat.spz4),
     ".splat": (ExportFormat.splat,),
     ".pcd": (ExportFormat.pcd,),
     ".txt": (ExportFormat.trajectory,),

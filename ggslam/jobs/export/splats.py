@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.compressed_ply import write_compressed_ply
-from ggslam.formats.packed_splats import check_gaussforge, write_spz
+from ggslam.formats.packed_splats import check_gaussforge, check_zstandard, write_spz
 from ggslam.formats.point_cloud import write_point_cloud
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.splat_file import write_splat
@@ -17,7 +17,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import make_folder
 
-ENDINGS = {"compressed-ply": ".ply", "spz": ".spz", "splat": ".splat", "pcd": ".pcd"}
+ENDINGS = {"compressed-ply": ".ply", "spz": ".spz", "spz4": ".spz", "splat": ".splat", "pcd": ".pcd"}
 """How a file of each kind is named, so that other programs know it."""
 
 
@@ -27,7 +27,7 @@ def export_packed(folder: RunFolder, path: Path, kind: str, min_opacity: float =
     Args:
         folder: of the run.
         path: file to write; its ending must be that of the kind.
-        kind: "compressed-ply", "spz" or "splat".
+        kind: "compressed-ply", "spz" (version 3), "spz4" (version 4) or "splat".
         min_opacity: leave out fainter Gaussians.
 
     Raises:
@@ -36,8 +36,10 @@ def export_packed(folder: RunFolder, path: Path, kind: str, min_opacity: float =
         RunFolderError: nothing to write, or the file cannot be written.
     """
     _check_ending(path, kind)
-    if kind == "spz":
+    if kind in ("spz", "spz4"):
         check_gaussforge(path)
+    if kind == "spz4":
+        check_zstandard(path)
     make_folder(path.parent)
     parts = _some(_parts(folder, min_opacity, whole=kind != "splat"), folder, min_opacity)
     if kind == "splat":
@@ -45,7 +47,10 @@ def export_packed(folder: RunFolder, path: Path, kind: str, min_opacity: float =
     else:
         gaussians = next(parts)
         count = len(gaussians)
-        (write_spz if kind == "spz" else write_compressed_ply)(path, gaussians)
+        if kind == "compressed-ply":
+            write_compressed_ply(path, gaussians)
+        else:
+            write_spz(path, gaussians, 4 if kind == "spz4" else 3)
     return f"wrote {path}: {count} Gaussians, {path.stat().st_size / 1e6:.1f} MB"
 
 

@@ -73,17 +73,18 @@ GGSLAM_EXPORT void ggslam_gpcc_number_planes(const Points* points, const Grid* g
   });
 }
 
-GGSLAM_EXPORT std::int64_t ggslam_gpcc_sample_cubes(const Points* points, const Grid* grid, std::uint32_t mask,
+GGSLAM_EXPORT std::int64_t ggslam_gpcc_sample_cubes(const Points* points, const Grid* grid, std::int32_t cube_bits,
+                                                    std::uint32_t slab_mask, std::uint32_t cube_mask,
                                                     std::uint64_t* codes) {
+  const auto hash = [](std::uint64_t v) { return (v + 1) * 0x9e3779b97f4a7c15ull >> 40; };
   std::uint64_t* end = codes;
   for_each_point(*points, [&](std::size_t, const auto* p) {
-    std::uint64_t cube = 0, code = 0;
-    for (int axis = 0; axis < 3; ++axis) {
-      const auto v = static_cast<std::uint64_t>(coordinate(*grid, axis, p[axis]));
-      cube = cube << 21 | v >> 2;
-      code = code << 21 | v;
-    }
-    if ((cube * 0x9e3779b97f4a7c15ull >> 40 & mask) == 0) *end++ = code;
+    const auto x = static_cast<std::uint64_t>(coordinate(*grid, 0, p[0]));
+    if ((hash(x >> cube_bits) & slab_mask) != 0) return;
+    const auto y = static_cast<std::uint64_t>(coordinate(*grid, 1, p[1]));
+    const auto z = static_cast<std::uint64_t>(coordinate(*grid, 2, p[2]));
+    if ((hash((y >> cube_bits) << 21 | z >> cube_bits) & cube_mask) != 0) return;
+    *end++ = x << 42 | y << 21 | z;
   });
   return end - codes;
 }
