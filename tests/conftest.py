@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("COLUMNS", "300")  # folders of tests have long names: no line breaks where a test looks
 if "PYTEST_XDIST_WORKER" in os.environ:  # processes that share the tests share the processors
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 

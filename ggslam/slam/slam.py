@@ -71,7 +71,7 @@ class Slam:
         self.mapper, self.pager, self.loops = parts.mapper, parts.pager, parts.loops
         self._notes, self._on_device = parts.notes, parts.on_device
         if extra_loss is not None and self._on_device:
-            raise ConfigError("a loss of your own (extra_loss) needs device: cpu; on a GPU losses are computed by kernels only")
+            raise ConfigError("a loss of your own (extra_loss) needs device: cpu; on a GPU kernels compute the losses")
         self.mapper.extra_loss = extra_loss
         self.policy = KeyframePolicy(self.config.keyframes)
         self.scale = 1.0

@@ -54,7 +54,7 @@ def test_depth_scale(room: Path, factor: float) -> None:
     true = open_sequence(room).depth_scale
     told = [text for text in warnings_of(room, depth_scale=true * factor) if "is suspicious" in text]
     assert len(told) == 1 and f"depth scale {true * factor:g} is suspicious" in told[0]
-    assert f"try --depth-scale {true:g}" in told[0]
+    assert f"try `depth_scale` {true:g}" in told[0]
 
 
 def test_depth_scale_without_poses(copy: Path) -> None:
@@ -101,7 +101,7 @@ def test_quaternion_order(copy: Path) -> None:
     (copy / "poses.txt").write_text("\n".join(lines))
     (text,) = warnings_of(copy)
     assert "the true poses look like quaternions in the order wxyz" in text
-    assert text.endswith("try --pose-convention wxyz")
+    assert text.endswith("try `pose_convention` wxyz")
     assert_remedy(copy, "wxyz", poses)
 
 
