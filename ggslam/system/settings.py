@@ -184,8 +184,9 @@ class Known:
 
     @property
     def is_number(self) -> bool:
-        """Whether it is an int or a float, or None instead."""
-        return bool({int, float} & {self.kind, *typing.get_args(self.kind)})
+        """Whether it is one int or float, or None instead."""
+        parts = () if typing.get_origin(self.kind) is tuple else typing.get_args(self.kind)
+        return bool({int, float} & {self.kind, *parts})
 
     def range(self) -> str:
         """`1 to 16`, `0.001 to 10 m`; empty: no range."""

@@ -108,7 +108,7 @@ def refuse_by_file(path: Path) -> None:
         (lambda path: PhotometricSettings(shrink=0), "PhotometricSettings.shrink"),
         (lambda path: dataclasses.replace(PhotometricSettings(), shrink=0), "PhotometricSettings.shrink"),
         (lambda path: Config(tracking={"photometric": {"shrink": 0}}), "tracking.photometric.shrink"),  # type: ignore[arg-type]
-        (lambda path: load_config(None, ["tracking.photometric.shrink=0"]), "--set: tracking.photometric.shrink"),
+        (lambda path: load_config(None, ["tracking.photometric.shrink=0"]), "`overrides`: tracking.photometric.shrink"),
         (refuse_by_file, "tracking.photometric.shrink"),
     ],
 )

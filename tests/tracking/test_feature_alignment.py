@@ -86,7 +86,7 @@ def test_edges_see_what_planes_do_not() -> None:
         local_map.add(split_features(wall, line, NOISE), np.eye(4))
         found = local_map.align(split_features(wall - move, line - move, NOISE), np.eye(4))
         errors[weight] = np.abs(found.T_map_sensor[:3, 3] - move)
-    assert errors[1.0][0] < 2e-3 and errors[0.0][0] > 0.008
+    assert errors[1.0][0] < 1e-3 and errors[0.0][0] > 4e-3  # of 3 cm; how far it slides depends on rounding
     assert errors[0.0][2] < 2e-3
 
 
