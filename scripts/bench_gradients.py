@@ -39,13 +39,13 @@ class Errors:
 def make_splat(length_px: float, aspect: float, camera: Camera, random: np.random.Generator) -> GaussianTensors:
     """One Gaussian facing the camera near the middle of the image, turned at random about the optical axis and a
     little out of the plane."""
-    sigma = length_px * DEPTH_M / FOCAL
+    sigma = length_px * DEPTH_M / camera.fx
     angle, tilt = random.uniform(0, math.pi), random.normal(0, 0.1, 2)
     quaternion = np.array([math.cos(angle / 2), *tilt, math.sin(angle / 2)])
     offset = random.uniform(-0.2, 0.2, 2)
     numbers = {
         "means": [[*offset, DEPTH_M]], "quaternions": [quaternion / np.linalg.norm(quaternion)],
-        "log_scales": [np.log([sigma, sigma / aspect, sigma / aspect])], "opacity_logits": [0.5],
+        "log_scales": [np.log([sigma, sigma / aspect, sigma / aspect / 1.1])], "opacity_logits": [0.5],
         "sh": [[[0.3, -0.2, 0.5]]], "features": np.zeros((1, 0)),
     }  # fmt: skip
     return GaussianTensors(**{name: torch.tensor(np.array(v), dtype=torch.float32) for name, v in numbers.items()})
