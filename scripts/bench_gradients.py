@@ -55,7 +55,7 @@ def reference_gradients(
     splat: GaussianTensors, camera: Camera, gradient: torch.Tensor, dtype: torch.dtype
 ) -> dict[str, torch.Tensor]:
     """Gradients of sum(gradient * image) by autograd in the given precision."""
-    parts = {name: getattr(splat, name).to(dtype).requires_grad_(name in NAMES) for name in vars(splat)}
+    parts = {name: value.clone().to(dtype).requires_grad_(name in NAMES) for name, value in vars(splat).items()}
     rendered = render_reference(GaussianTensors(**parts), camera, torch.eye(4, dtype=dtype))
     (rendered.image * gradient.to(dtype)).sum().backward()
     return {name: parts[name].grad.double() for name in NAMES}
