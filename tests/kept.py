@@ -9,6 +9,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,17 @@ def cached_folder(name: str, *sources: Path) -> Path:
     for source in sources:
         digest.update(source.read_bytes())
     return CHECKOUT / "build" / "tests" / f"{name}-{digest.hexdigest()[:16]}"
+
+
+@contextmanager
+def points_in_voxels_of(size: float) -> Iterator[None]:
+    """Runs that are saved, also after edits, sample their clouds in voxels of this size, metres, not of 0.01."""
+    from ggslam.formats.point_sampling import sample_parts
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("runs.saving_parts", "jobs.edit.edited_run"):
+            patch.setattr(f"ggslam.{module}.sample_parts", partial(sample_parts, voxel_size=size))
+        yield
 
 
 def generated_recording(factory: pytest.TempPathFactory, name: str, **options: Any) -> Path:
