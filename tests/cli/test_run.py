@@ -58,7 +58,7 @@ def test_a_run_leaves_everything_it_promises(finished: Path) -> None:
     assert len(list((finished / "renders").glob("*.png"))) == 6
     assert [p.name for p in finished.iterdir() if p.name.startswith(".")] == []  # no temporary files
     assert len(read_tum(finished / "trajectory.txt")) == 24
-    assert read_points(finished / "points.ply").voxel_size == read_points(finished / "points_grid.ply").voxel_size == 0.01
+    assert {read_points(finished / name).voxel_size for name in ("points.ply", "points_grid.ply")} == {0.01}
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["map"]["gaussians"] == len(read_gaussian_ply(finished / "map.ply"))
 
