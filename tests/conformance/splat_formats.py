@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The splat formats of `ggslam export`: who reads them, and how near to the map what is read has to be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from splat_maps import DIRECTIONS, Splats, from_compressed_ply, from_glb, from_ply, from_splat, from_spz
+
+UPRIGHT = np.diag([1.0, -1.0, -1.0])
+"""From the map's axes to those of a file whose y axis points upwards and whose z axis backwards."""
+Bars = tuple[float, float, float, float]
+"""One for each degree of spherical harmonics."""
+
+
+@dataclass(frozen=True)
+class SplatFormat:
+    """How a format is read, and the most that may be wrong in the maps of these tests.
+
+    Attributes:
+        suffix: of its files.
+        read: the reader.
+        decibels: of pictures of what was read against pictures of the map, at least.
+        position: metres.
+        shape: of covariances, against their norm.
+        opacity: 0 to 1.
+        color: mean error, seen from three sides.
+        upright: the file's y axis points upwards, its z axis backwards.
+        keeps_ids: whether it has the object ids of a run that has objects.
+        base_colors: only those that are the same from all sides are there.
+        recolored: colours are those of the objects.
+        package: without which it is not written.
+    """
+
+    suffix: str
+    read: Callable[[Path], Splats]
+    decibels: Bars
+    position: float = 1e-6
+    shape: float = 1e-5
+    opacity: float = 1e-6
+    color: Bars = (1e-5, 1e-5, 1e-5, 1e-5)
+    upright: bool = False
+    keeps_ids: bool = False
+    base_colors: bool = False
+    recolored: bool = False
+    package: str | None = None
+
+    @property
+    def turn(self) -> np.ndarray:
+        """Rotation from the map's axes to the file's; its own inverse."""
+        return UPRIGHT if self.upright else np.eye(3)
+
+    def check(self, seen: Splats, written: Splats, degree: int) -> None:
+        """What a reader of the file found, against the map."""
+        seen = seen.take(rows_of(seen.means @ self.turn, written.means))
+        assert np.abs(seen.means @ self.turn - written.means).max() <= self.position
+        expected = self.turn @ written.covariances() @ self.turn.T
+        difference = np.linalg.norm(seen.covariances() - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
+        assert difference.max() <= self.shape
+        assert np.abs(seen.opacities - written.opacities).max() <= self.opacity
+        assert seen.sh.shape[1] == (1 if self.base_colors or self.recolored else (degree + 1) ** 2)
+        if self.base_colors:
+            written = without_harmonics(written)
+        for direction in DIRECTIONS:
+            found, given = seen.colors(self.turn @ direction), written.colors(direction)
+            if self.base_colors:
+                given = given.clip(0, 1)
+            assert np.abs(found - given).mean() <= self.color[degree]
+        if seen.object_ids is not None:
+            np.testing.assert_array_equal(seen.object_ids, written.object_ids)
+
+    def require(self) -> None:
+        """Skips a test where the package that writes the format is not installed."""
+        if self.package is not None:
+            pytest.importorskip(self.package, reason=f"{self.package} is not installed (it writes the format)")
+
+    def pose(self, T_camera_world: np.ndarray) -> np.ndarray:
+        """The same pose in the file's axes."""
+        T = T_camera_world.copy()
+        T[:3, :3] = T[:3, :3] @ self.turn.T
+        return T
+
+
+def rows_of(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """For each position the row that is nearest to it, each row once: formats may store Gaussians in an order of their
+    own."""
+    rows = cKDTree(found).query(wanted)[1]
+    assert len(found) == len(wanted) == len(np.unique(rows))
+    return rows
+
+
+def without_harmonics(splats: Splats) -> Splats:
+    """The same from all sides."""
+    return Splats(splats.means, splats.log_scales, splats.quaternions, splats.opacities, splats.sh[:, :1],
+                  splats.object_ids)  # fmt: skip
+
+
+SPLAT_FORMATS = {
+    "ply": SplatFormat(".ply", from_ply, (100, 100, 100, 100), keeps_ids=True),
+    "segmented": SplatFormat(".ply", from_ply, (100, 100, 100, 100), keeps_ids=True, recolored=True),
+    "gltf": SplatFormat(".glb", from_glb, (100, 100, 100, 100), upright=True, keeps_ids=True),
+    "compressed-ply": SplatFormat(
+        ".compressed.ply", from_compressed_ply, (30, 30, 30, 30), position=0.01, shape=0.03, opacity=0.51 / 255,
+        color=(0.002, 0.02, 0.02, 0.02),
+    ),
+    "spz": SplatFormat(
+        ".spz", from_spz, (30, 30, 30, 30), position=0.51 / 4096, shape=0.08, opacity=1.01 / 255,
+        color=(0.01, 0.02, 0.04, 0.06), upright=True, package="gaussforge",
+    ),
+    "splat": SplatFormat(
+        ".splat", from_splat, (30, 10, 10, 10), shape=0.05, opacity=0.51 / 255, color=(0.002,) * 4, base_colors=True,
+    ),
+}  # fmt: skip
+SPLAT_FORMATS["spz4"] = SPLAT_FORMATS["spz"]
+OTHER_FORMATS = {"points", "pcd", "mesh", "trajectory", "colmap", "nerfstudio"}
+"""Of `ggslam export`; other files of these tests are about them."""
