@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from splat_maps import DIRECTIONS, Splats, from_compressed_ply, from_glb, from_ply, from_splat, from_spz
+from splat_maps import C0, DIRECTIONS, Splats, from_compressed_ply, from_glb, from_ply, from_splat, from_spz
 
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 """From the map's axes to those of a file whose y axis points upwards and whose z axis backwards."""
@@ -20,7 +20,8 @@ Bars = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class SplatFormat:
-    """How a format is read, and the most that may be wrong in the maps of these tests.
+    """How a format is read, and the most that may be wrong in the maps of these tests. Those of formats that round are
+    what was found, and a little more.
 
     Attributes:
         suffix: of its files.
@@ -32,8 +33,8 @@ class SplatFormat:
         color: mean error, seen from three sides.
         upright: the file's y axis points upwards, its z axis backwards.
         keeps_ids: whether it has the object ids of a run that has objects.
-        base_colors: only those that are the same from all sides are there.
-        recolored: colours are those of the objects.
+        base_colors: they are the same from all sides, and from 0 to 1.
+        recolored: they are those of the objects.
         package: without which it is not written.
     """
 
@@ -63,13 +64,9 @@ class SplatFormat:
         difference = np.linalg.norm(seen.covariances() - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
         assert difference.max() <= self.shape
         assert np.abs(seen.opacities - written.opacities).max() <= self.opacity
-        assert seen.sh.shape[1] == (1 if self.base_colors or self.recolored else (degree + 1) ** 2)
-        if self.base_colors:
-            written = without_harmonics(written)
+        assert seen.sh.shape[1] == (1 if self.base_colors else (degree + 1) ** 2)
         for direction in DIRECTIONS:
             found, given = seen.colors(self.turn @ direction), written.colors(direction)
-            if self.base_colors:
-                given = given.clip(0, 1)
             assert np.abs(found - given).mean() <= self.color[degree]
         if seen.object_ids is not None:
             np.testing.assert_array_equal(seen.object_ids, written.object_ids)
@@ -94,26 +91,28 @@ def rows_of(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return rows
 
 
-def without_harmonics(splats: Splats) -> Splats:
-    """The same from all sides."""
-    return Splats(splats.means, splats.log_scales, splats.quaternions, splats.opacities, splats.sh[:, :1],
-                  splats.object_ids)  # fmt: skip
+def with_colors(splats: Splats, colors: np.ndarray) -> Splats:
+    """In colours that are the same from all sides, [N, 3]."""
+    sh = (colors[:, None] - 0.5) / C0
+    return Splats(splats.means, splats.log_scales, splats.quaternions, splats.opacities, sh, splats.object_ids)
 
 
+EXACT = (120.0, 120.0, 120.0, 120.0)
 SPLAT_FORMATS = {
-    "ply": SplatFormat(".ply", from_ply, (100, 100, 100, 100), keeps_ids=True),
-    "segmented": SplatFormat(".ply", from_ply, (100, 100, 100, 100), keeps_ids=True, recolored=True),
-    "gltf": SplatFormat(".glb", from_glb, (100, 100, 100, 100), upright=True, keeps_ids=True),
+    "ply": SplatFormat(".ply", from_ply, EXACT, keeps_ids=True),
+    "segmented": SplatFormat(".ply", from_ply, EXACT, keeps_ids=True, recolored=True),
+    "gltf": SplatFormat(".glb", from_glb, EXACT, upright=True, keeps_ids=True),
     "compressed-ply": SplatFormat(
-        ".compressed.ply", from_compressed_ply, (30, 30, 30, 30), position=0.01, shape=0.03, opacity=0.51 / 255,
-        color=(0.002, 0.02, 0.02, 0.02),
+        ".compressed.ply", from_compressed_ply, (53.0, 48.0, 46.0, 45.5), position=0.0075, shape=0.008,
+        opacity=0.51 / 255, color=(0.0015, 0.005, 0.0075, 0.010),
     ),
     "spz": SplatFormat(
-        ".spz", from_spz, (30, 30, 30, 30), position=0.51 / 4096, shape=0.08, opacity=1.01 / 255,
-        color=(0.01, 0.02, 0.04, 0.06), upright=True, package="gaussforge",
+        ".spz", from_spz, (49.5, 45.0, 38.0, 35.0), position=0.51 / 4096, shape=0.075, opacity=0.51 / 255,
+        color=(0.0025, 0.0095, 0.0235, 0.034), upright=True, package="gaussforge",
     ),
     "splat": SplatFormat(
-        ".splat", from_splat, (30, 10, 10, 10), shape=0.05, opacity=0.51 / 255, color=(0.002,) * 4, base_colors=True,
+        ".splat", from_splat, (49.0, 49.0, 49.0, 49.0), shape=0.04, opacity=0.51 / 255, color=(0.0015,) * 4,
+        base_colors=True,
     ),
 }  # fmt: skip
 SPLAT_FORMATS["spz4"] = SPLAT_FORMATS["spz"]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_readers import FOREIGN_READERS
-from splat_formats import OTHER_FORMATS, SPLAT_FORMATS
+from splat_formats import OTHER_FORMATS, SPLAT_FORMATS, with_colors
 from splat_maps import C0, Splats
 from splat_rendering import Pinhole, decibels, look_at, render
 
@@ -31,26 +31,28 @@ def original(run_of: Callable[[int, bool], RunFolder]) -> Callable[[str, int, bo
     """What an export shall show."""
 
     def of(kind: str, degree: int, with_objects: bool) -> Splats:
-        run = run_of(degree, with_objects)
+        run, known = run_of(degree, with_objects), SPLAT_FORMATS[kind]
         found = Splats.of(run.gaussians())
-        if not SPLAT_FORMATS[kind].recolored:
-            return found
-        colors = run.object_table().palette()[found.object_ids] / 255
-        sh = (colors[:, None] - 0.5) / C0
-        return Splats(found.means, found.log_scales, found.quaternions, found.opacities, sh, found.object_ids)
+        if known.recolored:
+            return with_colors(found, run.object_table().palette()[found.object_ids] / 255)
+        return with_colors(found, (0.5 + C0 * found.sh[:, 0]).clip(0, 1)) if known.base_colors else found
 
     return of
 
 
 @pytest.fixture(scope="session")
 def pictures(original: Callable[[str, int, bool], Splats]) -> Callable[[str, int, bool], list[np.ndarray]]:
-    """The map, seen from three sides."""
+    """The same, seen from three sides."""
 
     @cache
     def of(kind: str, degree: int, with_objects: bool) -> list[np.ndarray]:
         return [render(original(kind, degree, with_objects), CAMERA, pose) for pose in POSES]
 
-    return lambda kind, degree, objects: of(kind if SPLAT_FORMATS[kind].recolored else "ply", degree, objects)
+    def like(kind: str, degree: int, with_objects: bool) -> list[np.ndarray]:
+        changed = SPLAT_FORMATS[kind].recolored or SPLAT_FORMATS[kind].base_colors
+        return of(kind if changed else "ply", degree, with_objects)
+
+    return like
 
 
 def seen(kind: str, splats: Splats) -> list[np.ndarray]:
