@@ -43,11 +43,11 @@ def run_of(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Cal
         folder = RunFolder.open(path)
         if with_objects:
             classifier = IdentityClassifier.from_file(room_run.path / "classifier.npz")
-            gaussians = small_map(degree, 800, -2.0, channels=room_run.gaussians().feature_channels)
+            gaussians = small_map(degree, 500, -1.8, channels=room_run.gaussians().feature_channels)
             table = ObjectTable.build(gaussians, classifier, "masks", NAMES)
             folder.save_objects(SegmentedMap(gaussians, classifier, table))
         else:
-            write_gaussian_ply(path / "map.ply", small_map(degree, 800, -2.0))
+            write_gaussian_ply(path / "map.ply", small_map(degree, 500, -1.8))
         return folder
 
     return make

@@ -103,12 +103,12 @@ SPLAT_FORMATS = {
     "segmented": SplatFormat(".ply", from_ply, EXACT, keeps_ids=True, recolored=True),
     "gltf": SplatFormat(".glb", from_glb, EXACT, upright=True, keeps_ids=True),
     "compressed-ply": SplatFormat(
-        ".compressed.ply", from_compressed_ply, (53.0, 48.0, 46.0, 45.5), position=0.0075, shape=0.008,
-        opacity=0.51 / 255, color=(0.0015, 0.005, 0.0075, 0.010),
+        ".compressed.ply", from_compressed_ply, (54.0, 50.5, 47.3, 45.6), position=0.0075, shape=0.008,
+        opacity=0.51 / 255, color=(0.0012, 0.0045, 0.007, 0.0095),
     ),
     "spz": SplatFormat(
-        ".spz", from_spz, (49.5, 45.0, 38.0, 35.0), position=0.51 / 4096, shape=0.075, opacity=0.51 / 255,
-        color=(0.0025, 0.0095, 0.0235, 0.034), upright=True, package="gaussforge",
+        ".spz", from_spz, (47.7, 44.7, 36.5, 35.6), position=0.51 / 4096, shape=0.075, opacity=0.51 / 255,
+        color=(0.0022, 0.0095, 0.0225, 0.034), upright=True, package="gaussforge",
     ),
     "splat": SplatFormat(
         ".splat", from_splat, (49.0, 49.0, 49.0, 49.0), shape=0.04, opacity=0.51 / 255, color=(0.0015,) * 4,

@@ -22,7 +22,7 @@ from ggslam.runs.folder import RunFolder
 
 DEGREES = [0, 1, 2, 3]
 CAMERA = Pinhole.centred()
-POSES = [look_at((0.5, -1.0, -5.0)), look_at((4.0, 2.0, 3.0)), look_at((0.2, 0.1, 0.3), (2.0, 0.5, 1.0))]
+POSES = [look_at((0.5, -1.0, -5.0)), look_at((0.2, 0.1, 0.3), (2.0, 0.5, 1.0))]
 FOREIGN = [(reader, kind) for reader, known in FOREIGN_READERS.items() for kind in known.formats]
 
 
@@ -41,16 +41,16 @@ def original(run_of: Callable[[int, bool], RunFolder]) -> Callable[[str, int, bo
 
 
 @pytest.fixture(scope="session")
-def pictures(original: Callable[[str, int, bool], Splats]) -> Callable[[str, int, bool], list[np.ndarray]]:
-    """The same, seen from three sides."""
+def pictures(original: Callable[[str, int, bool], Splats]) -> Callable[[str, int], list[np.ndarray]]:
+    """The same, seen from outside and from within."""
 
     @cache
-    def of(kind: str, degree: int, with_objects: bool) -> list[np.ndarray]:
-        return [render(original(kind, degree, with_objects), CAMERA, pose) for pose in POSES]
+    def of(kind: str, degree: int) -> list[np.ndarray]:
+        return [render(original(kind, degree, True), CAMERA, pose) for pose in POSES]
 
-    def like(kind: str, degree: int, with_objects: bool) -> list[np.ndarray]:
+    def like(kind: str, degree: int) -> list[np.ndarray]:
         changed = SPLAT_FORMATS[kind].recolored or SPLAT_FORMATS[kind].base_colors
-        return of(kind if changed else "ply", degree, with_objects)
+        return of(kind if changed else "ply", degree)
 
     return like
 
@@ -68,7 +68,7 @@ def test_every_format_is_read_by_somebody() -> None:
 @pytest.mark.parametrize("kind", SPLAT_FORMATS)
 def test_as_the_formats_are_described(
     kind: str, degree: int, with_objects: bool, exported: Callable[[str, int, bool], Path],
-    original: Callable[[str, int, bool], Splats], pictures: Callable[[str, int, bool], list[np.ndarray]],
+    original: Callable[[str, int, bool], Splats], pictures: Callable[[str, int], list[np.ndarray]],
     run_of: Callable[[int, bool], RunFolder], tmp_path: Path,
 ) -> None:  # fmt: skip
     known = SPLAT_FORMATS[kind]
@@ -79,17 +79,18 @@ def test_as_the_formats_are_described(
     found = known.read(exported(kind, degree, with_objects))
     known.check(found, original(kind, degree, with_objects), degree)
     assert (found.object_ids is not None) == (with_objects and known.keeps_ids)
-    assert decibels(seen(kind, found), pictures(kind, degree, with_objects)) >= known.decibels[degree]
+    if with_objects:  # or all that is shown is the same
+        assert decibels(seen(kind, found), pictures(kind, degree)) >= known.decibels[degree]
 
 
 @pytest.mark.parametrize("degree", DEGREES)
 @pytest.mark.parametrize(("reader", "kind"), FOREIGN, ids=[f"{reader}-{kind}" for reader, kind in FOREIGN])
 def test_as_others_read_them(
     reader: str, kind: str, degree: int, exported: Callable[[str, int, bool], Path],
-    original: Callable[[str, int, bool], Splats], pictures: Callable[[str, int, bool], list[np.ndarray]],
+    original: Callable[[str, int, bool], Splats], pictures: Callable[[str, int], list[np.ndarray]],
     tmp_path: Path,
 ) -> None:  # fmt: skip
     known = SPLAT_FORMATS[kind]
     found = FOREIGN_READERS[reader].read(exported(kind, degree, True), tmp_path)
     known.check(found, original(kind, degree, True), degree)
-    assert decibels(seen(kind, found), pictures(kind, degree, True)) >= known.decibels[degree]
+    assert decibels(seen(kind, found), pictures(kind, degree)) >= known.decibels[degree]

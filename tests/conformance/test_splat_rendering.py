@@ -91,12 +91,12 @@ def ours(gaussians: GaussianMap, camera: Pinhole, pose: np.ndarray) -> np.ndarra
     return image.numpy().transpose(1, 2, 0).astype(float)
 
 
-POSES = [look_at((0.5, -1.0, -5.0)), look_at((4.0, 2.0, 3.0)), look_at((0.2, 0.1, 0.3), (2.0, 0.5, 1.0))]
+POSES = [look_at((0.5, -1.0, -5.0)), look_at((0.2, 0.1, 0.3), (2.0, 0.5, 1.0))]
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_our_rasterizer_draws_the_same_by_its_own_rules(degree: int) -> None:
-    gaussians, camera = small_map(degree, 800, -2.0), Pinhole.centred()
+    gaussians, camera = small_map(degree, 500, -1.8), Pinhole.centred()
     for pose in POSES:
         expected = render(Splats.of(gaussians), camera, pose, OURS)
         assert expected.max() > 0.5
@@ -108,7 +108,7 @@ def test_our_rasterizer_draws_the_same_by_its_own_rules(degree: int) -> None:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_our_rasterizer_shows_what_others_show(degree: int) -> None:
     """With their low-pass, near plane and colours; two rules of its own are left."""
-    splats, camera = Splats.of(small_map(degree, 800, -2.0)), Pinhole.centred()
+    splats, camera = Splats.of(small_map(degree, 500, -1.8)), Pinhole.centred()
     images = [standard_picture(splats, Camera(**vars(camera)), pose) for pose in POSES]
     assert decibels(images, [render(splats, camera, pose) for pose in POSES]) > 90
 
