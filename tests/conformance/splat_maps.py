@@ -5,16 +5,20 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
 from ggslam.scene.gaussian_map import GaussianMap
 
 C0 = 0.28209479177387814
+DIRECTIONS = np.array([[0.3, -0.5, 0.8], [-0.7, 0.2, -0.1], [0.1, 0.9, 0.4]])
 PLY_TYPES = {"float": "<f4", "uint": "<u4", "int": "<i4", "uchar": "u1"}
 GLTF_TYPES = {5121: "u1", 5123: "<u2", 5126: "<f4"}
 GLTF_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -61,6 +65,12 @@ class Splats:
             -0.5900435899 * x * (x * x - 3 * y * y),
         ])  # fmt: skip
         return 0.5 + np.einsum("k,nkc->nc", basis[: self.sh.shape[1]], self.sh)
+
+
+def convert(command: list[str], *words: str | Path) -> None:
+    """Runs splat-transform."""
+    done = subprocess.run([*command, "-w", *map(str, words)], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def small_map(degree: int, count: int = 600) -> GaussianMap:
@@ -185,3 +195,56 @@ def from_glb(path: Path) -> Splats:
     with np.errstate(divide="ignore"):
         log_scales = np.log(found[f"{prefix}SCALE"])
     return Splats(found["POSITION"], log_scales, np.stack([w, x, y, z], 1), found[f"{prefix}OPACITY"][:, 0], sh)
+
+
+def sog_files(path: Path) -> dict[str, bytes]:
+    """The files of a packed SOG, or of the folder of a meta.json."""
+    if path.suffix == ".sog":
+        with zipfile.ZipFile(path) as archive:
+            assert archive.testzip() is None
+            return {name: archive.read(name) for name in archive.namelist()}
+    return {file.name: file.read_bytes() for file in path.parent.iterdir()}
+
+
+def sog_pixels(data: bytes, count: int) -> np.ndarray:
+    """The first pixels of a WebP image, row by row, RGBA [count, 4]."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    rgba = cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGBA)
+    assert rgba.shape[0] * rgba.shape[1] >= count
+    return rgba.reshape(-1, 4)[:count].astype(np.int64)
+
+
+def from_sog(path: Path) -> Splats:
+    """SOG, version 2, as its description says, but quaternions in the order wxyz, and logarithms of sizes in the table,
+    as the programs of those who wrote it have them."""
+    files = sog_files(path)
+    meta = json.loads(files["meta.json"])
+    assert meta["version"] == 2
+    count = meta["count"]
+
+    def pixels(part: str, number: int = 0, size: int = count) -> np.ndarray:
+        return sog_pixels(files[meta[part]["files"][number]], size)
+
+    steps = (pixels("means", 1) << 8 | pixels("means"))[:, :3] / 65535
+    low, high = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
+    logs = low + (high - low) * steps
+    quats = pixels("quats")
+    three = (quats[:, :3] / 255 - 0.5) * np.sqrt(2)
+    assert (quats[:, 3] >= 252).all()
+    quaternions = np.zeros((count, 4))
+    for row, largest in enumerate(quats[:, 3] - 252):
+        quaternions[row, [i for i in range(4) if i != largest]] = three[row]
+        quaternions[row, largest] = np.sqrt(max(0, 1 - np.square(three[row]).sum()))
+    sh0, table = pixels("sh0"), np.array(meta["sh0"]["codebook"])
+    assert len(table) == len(meta["scales"]["codebook"]) == 256
+    sh = table[sh0[:, :3]][:, None]
+    if "shN" in meta:
+        coefficients = [3, 8, 15][meta["shN"]["bands"] - 1]
+        entries = pixels("shN", 0, 64 * coefficients * -(-meta["shN"]["count"] // 64))[:, :3]
+        palette = np.array(meta["shN"]["codebook"])[entries].reshape(-1, coefficients, 3)
+        labels = pixels("shN", 1)
+        label = labels[:, 0] | labels[:, 1] << 8
+        assert label.max() < meta["shN"]["count"] <= 65536
+        sh = np.concatenate([sh, palette[label]], 1)
+    log_scales = np.array(meta["scales"]["codebook"])[pixels("scales")[:, :3]]
+    return Splats(np.sign(logs) * np.expm1(np.abs(logs)), log_scales, quaternions, sh0[:, 3] / 255, sh)

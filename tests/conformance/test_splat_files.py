@@ -1,23 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Splat files at every degree of spherical harmonics, read back without any of our code: as the formats' descriptions
-say (splat_maps.py), and by PlayCanvas' splat-transform, where there is one: a command in GGSLAM_SPLAT_TRANSFORM, or
-`splat-transform` on the PATH (npm install -g @playcanvas/splat-transform)."""
+say (splat_maps.py), and by PlayCanvas' splat-transform, where there is one (conftest.py)."""
 
 from __future__ import annotations
 
 import gzip
-import os
-import shlex
-import shutil
 import struct
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from splat_maps import (
+    DIRECTIONS,
     Splats,
+    convert,
     from_compressed_ply,
     from_glb,
     from_ply,
@@ -36,21 +33,6 @@ from ggslam.formats.packed_splats import write_spz
 from ggslam.formats.splat_file import write_splat
 
 DEGREES = [0, 1, 2, 3]
-DIRECTIONS = np.array([[0.3, -0.5, 0.8], [-0.7, 0.2, -0.1], [0.1, 0.9, 0.4]])
-
-
-@pytest.fixture(scope="session")
-def splat_transform() -> list[str]:
-    """The command."""
-    command = os.environ.get("GGSLAM_SPLAT_TRANSFORM") or shutil.which("splat-transform")
-    if not command:
-        pytest.skip("splat-transform is not there (GGSLAM_SPLAT_TRANSFORM, or on the PATH)")
-    return shlex.split(command)
-
-
-def convert(command: list[str], *words: str | Path) -> None:
-    done = subprocess.run([*command, "-w", *map(str, words)], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def check_same(seen: Splats, written: Splats, turn: np.ndarray | None = None, rounding: float = 1e-6) -> None:
