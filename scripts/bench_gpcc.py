@@ -8,7 +8,7 @@ reference software.
 Clouds of about a million points: each recording is back-projected with its true poses and voxelised at 10 bits, one
 point per voxel with the mean colour. Voxels with the fewest measurements, which are noise, are dropped until one slice
 can hold the cloud (1.1 million points). Times are the best of the repeats, which take turns; ratios and overheads are
-to one slice coded by one worker in the same run. Nothing else should run on the machine.
+to one slice coded by one thread in the same run. Nothing else should run on the machine.
 
 With --golden, streams of the reference encoder are decoded and compared, and its payloads with ours. Sparse clouds are
 coded with and without planes. If GGSLAM_TMC3 names a tmc3 binary of release-v12.9, or one is on PATH, streams are
@@ -44,9 +44,9 @@ from ggslam.sequences.sequence import Sequence
 
 BITS = 10
 SPLITS: tuple[Split, ...] = ("count", "interval")
-LAYOUTS = [(1, SPLITS[0], 1), *((4, split, workers) for split in SPLITS for workers in (1, 2, 4))]
-"""Slices, how they are cut, workers; the first is what the others are compared with."""
-COLUMNS = ("cloud, QP", "slices", "workers", "bytes", "overhead", "bits/point", "encode s", "M points/s/core", "ratio",
+LAYOUTS = [(1, SPLITS[0], 1), *((4, split, threads) for split in SPLITS for threads in (1, 2, 4))]
+"""Slices, how they are cut, threads; the first is what the others are compared with."""
+COLUMNS = ("cloud, QP", "slices", "threads", "bytes", "overhead", "bits/point", "encode s", "M points/s/core", "ratio",
            "decode s", "ratio", "Y dB")  # fmt: skip
 
 
@@ -104,20 +104,20 @@ def merged(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def bench(cloud: Cloud, qp: int, repeats: int) -> None:
     """Prints the lines of one cloud at one quantiser parameter."""
-    layouts = [CodecSettings(qp=qp, slices=n, split=split, workers=workers) for n, split, workers in LAYOUTS]
+    layouts = [CodecSettings(qp=qp, slices=n, split=split, threads=threads) for n, split, threads in LAYOUTS]
     colors = {"color": cloud.colors}
     coded = [encode_cloud(cloud.grid, colors, settings) for settings in layouts]
     encode_s, decode_s = np.full((2, len(layouts)), np.inf)
     for _ in range(repeats):  # by turns, so that a slow moment of the machine hits no layout alone
         for i, settings in enumerate(layouts):
             encode_s[i] = min(encode_s[i], *seconds(partial(encode_cloud, cloud.grid, colors, settings), 1))
-            decode_s[i] = min(decode_s[i], *seconds(partial(decode_cloud, coded[i].data, settings.workers), 1))
+            decode_s[i] = min(decode_s[i], *seconds(partial(decode_cloud, coded[i].data, settings.threads), 1))
     for settings, encoded, encode, decode in zip(layouts, coded, encode_s, decode_s, strict=True):
         quality, size = decoded_quality(cloud, encoded.data), len(encoded.data)
-        slices, workers = len(encoded.report.slices), settings.workers or available_processors()
-        cores = min(workers, available_processors(), slices)
+        slices, threads = len(encoded.report.slices), settings.threads or available_processors()
+        cores = min(threads, available_processors(), slices)
         cells = [
-            f"{cloud.name}, {qp}", f"{slices} {settings.split if slices > 1 else ''}", f"{workers}", f"{size}",
+            f"{cloud.name}, {qp}", f"{slices} {settings.split if slices > 1 else ''}", f"{threads}", f"{size}",
             f"{100 * (size / len(coded[0].data) - 1):+.2f} %", f"{8 * size / len(cloud.grid):.3f}",
             f"{encode:.3f}", f"{len(cloud.grid) / encode / cores / 1e6:.2f}", f"{encode / encode_s[0]:.2f}",
             f"{decode:.3f}", f"{decode / decode_s[0]:.2f}", f"{quality:.2f}",
@@ -241,7 +241,7 @@ def by_turns(cloud: Cloud, qp: int, binary: str, repeats: int) -> None:
         folder = Path(temporary)
         write_point_cloud(folder / "in.ply", cloud.grid.astype(np.float32), {"color": cloud.colors})
         for _ in range(repeats):
-            settings = CodecSettings(qp=qp, workers=1)
+            settings = CodecSettings(qp=qp, threads=1)
             ours += seconds(partial(encode_cloud, cloud.grid, {"color": cloud.colors}, settings), 1)
             said = run_tmc3(binary, **_options(folder, qp))
             theirs.append(float(re.findall(r"Processing time \(user\): ([0-9.]+)", said)[-1]))
