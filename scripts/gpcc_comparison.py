@@ -153,9 +153,7 @@ def print_rates(cloud: Cloud, binary: str, folder: Path) -> None:
     _print_bd("lossy geometry", lossy, ("Y", "U", "V"), 1, 2)
 
 
-def _both(
-    cloud: Cloud, scale: float, qp: int, binary: str, source: Path, normals: np.ndarray
-) -> tuple[Rated, Rated]:
+def _both(cloud: Cloud, scale: float, qp: int, binary: str, source: Path, normals: np.ndarray) -> tuple[Rated, Rated]:
     ours = encode_cloud(cloud.grid, {"color": cloud.colors}, CodecSettings(qp=qp, geometry_scale=scale)).data
     stream = source.with_name("theirs.bin")
     reference_encode(binary, source, stream, qp, scale)
