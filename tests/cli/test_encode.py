@@ -59,7 +59,7 @@ def by_grid(cloud: VoxelCloud) -> np.ndarray:
     return rows[np.lexsort(rows.T[::-1])]
 
 
-@pytest.mark.parametrize("options", [[], ["--slices", 4], ["--slices", 4, "--split", "interval", "--workers", 1],
+@pytest.mark.parametrize("options", [[], ["--slices", 4], ["--slices", 4, "--split", "interval", "--threads", 1],
                                      ["--slices", 6, "--split", "octree"]])  # fmt: skip
 def test_voxel_clouds_come_back_with_their_grid_and_ids(ggslam: Ggslam, tmp_path: Path, options: list[object]) -> None:
     cloud = voxel_cloud()
