@@ -20,7 +20,7 @@ from ggslam.localization.surface import NORMAL
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import fingerprint
-from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
+from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays, read_array
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
@@ -169,10 +169,7 @@ def _cloud(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     if path.suffix.lower() == ".bin":
         return read_raw_points(path, 4)[:, :3], {}
     if path.suffix.lower() == ".npy":
-        try:
-            points = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise FormatError(f"{path}: cannot be read: {error}") from None
+        points = read_array(path)
         if getattr(points, "ndim", 0) != 2 or points.shape[1] < 3 or points.dtype.kind != "f":
             raise FormatError(f"{path}: expected floating-point numbers [n, 3 or more], found {list(np.shape(points))}")
         return points[:, :3], {}
