@@ -20,6 +20,7 @@ from ggslam.formats.pcd import read_pcd, write_pcd
 from ggslam.formats.ply import read_ply, write_ply
 from ggslam.formats.point_ply import grid_positions
 from ggslam.scene.gaussian_map import SH_C0
+from ggslam.system.foreign import open_foreign
 
 COLORS = ("red", "green", "blue")
 _COLOR_NAMES = (COLORS, ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -72,7 +73,7 @@ def read_point_cloud(path: str | Path) -> ColoredCloud:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_foreign(path) as file:
             start = file.read(4)
     except OSError as error:
         raise FormatError(f"cannot read {path}: {error.strerror or error}") from error

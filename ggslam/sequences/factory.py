@@ -118,6 +118,7 @@ def _read_recording(
     recording = _find_format(folder, format).read(folder, options)
     if not recording.files:
         raise SequenceError(f"{folder}: holds no frames")
+    _check_places(recording)
     if options.depth_camera is not None:
         use_depth_camera(recording, options.depth_camera)
     if options.min_confidence is not None:
@@ -133,6 +134,24 @@ def _read_recording(
     if not (math.isfinite(recording.depth_scale) and recording.depth_scale > 0):
         raise SequenceError(f"{folder}: depth scale must be a positive number, found {recording.depth_scale}")
     return recording
+
+
+def _check_places(recording: Recording) -> None:
+    """Raises SequenceError if a recording takes a file from outside its folder, by name or through a link: it may come
+    from somebody who wants to know what is there."""
+    root = recording.path if recording.path.is_dir() else recording.path.parent
+    inside: dict[Path, bool] = {}
+    resolved = root.resolve()
+    for entry in recording.files:
+        for path in (entry.color, entry.depth, entry.mask, entry.confidence):
+            if not isinstance(path, Path):
+                continue
+            if path.parent not in inside:
+                inside[path.parent] = path.parent.resolve().is_relative_to(resolved)
+            if not inside[path.parent] or (path.is_symlink() and not path.resolve().is_relative_to(resolved)):
+                raise SequenceError(
+                    f"{path}: lies outside the recording {root}; copy it there, or give the folder that holds both"
+                )
 
 
 def _use_masks(recording: Recording, folder: Path) -> None:

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from foreign_readers import splat_transform_command
+from foreign_readers import command_of, splat_transform_command
 from splat_formats import SPLAT_FORMATS
 from splat_maps import small_map
 
@@ -26,8 +26,14 @@ NAMES = {1: "mug", 3: "chair \u00e4"}
 
 @pytest.fixture(scope="session")
 def splat_transform() -> list[str]:
-    """The command."""
+    """PlayCanvas' program."""
     return splat_transform_command()
+
+
+@pytest.fixture(scope="session")
+def usd_convert_gsplat() -> list[str]:
+    """NVIDIA's program (pip install usd-convert-gsplat usd-core)."""
+    return command_of("usd-convert-gsplat", "GGSLAM_USD_CONVERT_GSPLAT")
 
 
 @pytest.fixture(scope="session")

@@ -13,19 +13,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splat_maps import Splats, convert, from_ply
+from usd_reader import splats_of
+
+
+def command_of(program: str, variable: str) -> list[str]:
+    """What a variable of the environment says, or a program on the PATH; skips the test where there is neither."""
+    command = os.environ.get(variable) or shutil.which(program)
+    if not command:
+        pytest.skip(f"{program} is not there ({variable}, or on the PATH)")
+    return shlex.split(command)
 
 
 def splat_transform_command() -> list[str]:
-    """PlayCanvas' splat-transform: GGSLAM_SPLAT_TRANSFORM, or `splat-transform` on the PATH."""
-    command = os.environ.get("GGSLAM_SPLAT_TRANSFORM") or shutil.which("splat-transform")
-    if not command:
-        pytest.skip("splat-transform is not there (GGSLAM_SPLAT_TRANSFORM, or on the PATH)")
-    return shlex.split(command)
+    """PlayCanvas' program (npm install -g @playcanvas/splat-transform)."""
+    return command_of("splat-transform", "GGSLAM_SPLAT_TRANSFORM")
 
 
 def by_splat_transform(path: Path, folder: Path) -> Splats:
     """By way of a 3DGS PLY, into which it copies what stands in the file, axes as they are."""
-    convert(splat_transform_command(), path, folder / "seen.ply")
+    source = [path / "lod-meta.json", "-L", "0"] if path.is_dir() else [path]
+    convert(splat_transform_command(), *source, folder / "seen.ply")
     return from_ply(folder / "seen.ply")
 
 
@@ -48,6 +55,21 @@ def by_gaussforge(path: Path, folder: Path) -> Splats:
     return from_ply(folder / "seen.ply")
 
 
+def by_usd_core(path: Path, folder: Path) -> Splats:
+    """OpenUSD's own library, which knows the schema."""
+    pytest.importorskip("pxr", reason="usd-core is not installed (extra [usd])")
+    from pxr import Usd, UsdVol
+
+    stage = Usd.Stage.Open(str(path))
+    (prim,) = [prim for prim in stage.Traverse() if prim.IsA(UsdVol.ParticleField3DGaussianSplat)]
+    names = ("positions", "scales", "opacities", "radiance:sphericalHarmonicsCoefficients", "primvars:object_id")
+    values = {name: np.array(prim.GetAttribute(name).Get()) for name in names if prim.HasAttribute(name)}
+    turns = prim.GetAttribute("orientations").Get()
+    values["orientations"] = np.array([[q.GetReal(), *q.GetImaginary()] for q in turns])
+    degree = UsdVol.ParticleField3DGaussianSplat(prim).GetRadianceSphericalHarmonicsDegreeAttr().Get()
+    return splats_of(values, degree)
+
+
 @dataclass(frozen=True)
 class ForeignReader:
     """A reader and the formats of `ggslam export` that it takes."""
@@ -58,8 +80,9 @@ class ForeignReader:
 
 FOREIGN_READERS = {
     "splat-transform": ForeignReader(
-        by_splat_transform, ("ply", "segmented", "compressed-ply", "spz", "spz4", "splat")
+        by_splat_transform, ("ply", "segmented", "compressed-ply", "spz", "spz4", "splat", "sog", "streamed-sog")
     ),
     "gsply": ForeignReader(by_gsply, ("ply", "segmented", "compressed-ply", "spz")),
+    "usd-core": ForeignReader(by_usd_core, ("usd",)),
     "gaussforge": ForeignReader(by_gaussforge, ("ply", "segmented", "splat")),
 }  # fmt: skip

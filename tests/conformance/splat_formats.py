@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from sog_reader import from_sog, from_streamed_sog
 from splat_maps import C0, DIRECTIONS, Splats, from_compressed_ply, from_glb, from_ply, from_splat, from_spz
+from usd_reader import from_usda
 
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 """From the map's axes to those of a file whose y axis points upwards and whose z axis backwards."""
@@ -114,7 +116,13 @@ SPLAT_FORMATS = {
         ".splat", from_splat, (49.0, 49.0, 49.0, 49.0), shape=0.04, opacity=0.51 / 255, color=(0.0015,) * 4,
         base_colors=True,
     ),
+    "sog": SplatFormat(
+        ".sog", from_sog, (55.5, 57.0, 57.5, 55.5), position=3e-4, shape=0.035, opacity=0.51 / 255,
+        color=(0.001, 0.0013, 0.0017, 0.0022), keeps_ids=True,
+    ),
+    "usd": SplatFormat(".usda", from_usda, EXACT, upright=True, keeps_ids=True, package="pxr"),
 }  # fmt: skip
 SPLAT_FORMATS["spz4"] = SPLAT_FORMATS["spz"]
+SPLAT_FORMATS["streamed-sog"] = replace(SPLAT_FORMATS["sog"], suffix="", read=from_streamed_sog)
 OTHER_FORMATS = {"points", "pcd", "mesh", "trajectory", "colmap", "nerfstudio"}
 """Of `ggslam export`; other files of these tests are about them."""

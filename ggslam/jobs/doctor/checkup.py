@@ -47,6 +47,7 @@ class Extra:
 EXTRAS = {
     "masks": Extra(("onnxruntime",), "instance masks by a segmentation model in an ONNX file"),
     "splats": Extra(("gaussforge", "zstandard"), "export as SPZ"),
+    "usd": Extra(("pxr",), "export as OpenUSD"),
     "mesh": Extra(("trimesh",), "meshes as OBJ and GLB"),
     "octomap": Extra(("pyoctomap",), "occupancy in trees of OctoMap's own library"),
     "formats": Extra(("gsply",), "SPZ in scripts/bench_splats.py"),
