@@ -133,21 +133,22 @@ def test_eval_render_export(finished: Path, tmp_path: Path) -> None:
 
 
 def test_realtime_keeps_pace(room: Path, tmp_path: Path) -> None:
-    done = ggslam("run", room, "--out", tmp_path / "run", "--realtime", 6)
+    done = ggslam("run", room, "--out", tmp_path / "run", "--realtime", 6, "--stop", 14, "--no-eval")
     assert done.returncode == 0, done.stderr
+    assert ggslam("eval", tmp_path / "run", "--no-lpips", "--every", 4).returncode == 0
     m = json.loads((tmp_path / "run" / "metrics.json").read_text())
     frames = json.loads((tmp_path / "run" / "keyframes.json").read_text())["frames"]
     assert m["speed"]["frames_per_s"] < 8
-    assert len(frames) + m["speed"]["dropped_frames"] == 24
+    assert len(frames) + m["speed"]["dropped_frames"] == 14
     assert m["images"]["held_out"]["psnr"] > 20
 
 
-@pytest.mark.long("two processes, each of which loads everything")
+@pytest.mark.long("a process that loads everything")
 def test_a_process_of_its_own(room: Path, tmp_path: Path) -> None:
     done = in_a_process("run", room, "--out", tmp_path / "run", "--stop", 3, "--iterations", 1, "--no-eval")
     assert done.returncode == 0 and "3 frames" in " ".join(done.stdout.split()), done  # lines may break anywhere
-    done = in_a_process("eval", tmp_path)
-    assert done.returncode == 2 and "run.json" in " ".join(done.stderr.split()) and "Traceback" not in done.stderr
+    done = in_a_process("inspect", tmp_path / "nowhere")  # a command that loads little
+    assert done.returncode == 2 and "nowhere" in " ".join(done.stderr.split()) and "Traceback" not in done.stderr
 
 
 def copy_of(room: Path, to: Path) -> Path:
@@ -264,14 +265,14 @@ def test_scores_are_of_the_run_s_own_recording(finished: Path, room: Path, tmp_p
 
 def test_a_stopped_run_can_be_scored(room: Path, tmp_path: Path) -> None:
     folder = copy_of(room, tmp_path / "room")
-    victim = depth_files(folder)[14]
+    victim = depth_files(folder)[8]
     victim.write_bytes(victim.read_bytes()[:-200])
     refuse(ggslam("run", folder, "--out", tmp_path / "run", "--iterations", 1), victim.name)
     done = ggslam("eval", tmp_path / "run", "--no-lpips")
     assert done.returncode == 0, done.stderr
     m = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert m["images"]["all"]["frames"] == 14 and m["images"]["all"]["frames_without_pose"] == 0
-    assert any("ends at frame 13" in note for note in m["notes"])
+    assert m["images"]["all"]["frames"] == 8 and m["images"]["all"]["frames_without_pose"] == 0
+    assert any("ends at frame 7" in note for note in m["notes"])
 
 
 def test_other_shares_of_held_out_frames(room: Path, tmp_path: Path) -> None:

@@ -134,8 +134,9 @@ def test_objects_of_a_map_on_disk(turning: Path, tmp_path: Path) -> None:
     assert votes is not None and (votes.labels() == ids)[votes.labels() > 0].mean() > 0.9
 
 
+@pytest.mark.long("the mapper computes for as long as the recording lasts")
 def test_real_time(turning: Path, tmp_path: Path) -> None:
-    outcome = executed(turning, tmp_path / "live", *LESS, REFINED, "realtime_fps=8", stop=BEGINNING)
+    outcome = executed(turning, tmp_path / "live", *LESS, "refine_iterations=5", "realtime_fps=10", stop=BEGINNING)
     assert outcome.error is None and outcome.result.cells is not None
     assert len(read_gaussian_ply(outcome.folder.path / "map.ply")) == outcome.result.gaussian_count > 2000
 
@@ -184,7 +185,7 @@ def test_an_interrupt_keeps_what_was_done(
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(GridStore, "put_cells", put)
-    outcome = executed(turning, tmp_path / "stopped", *SMALL)
+    outcome = executed(turning, tmp_path / "stopped", *LESS)
     folder = outcome.folder.path
     assert isinstance(outcome.error, KeyboardInterrupt) and 5 < len(outcome.result.frames) < 44
     run = json.loads((folder / "run.json").read_text())
