@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -47,7 +48,7 @@ def read_array(path: str | Path, error: type[GgslamError] = FormatError) -> np.n
             _check_claim(math.prod(shape) * dtype.itemsize, os.fstat(file.fileno()).st_size - file.tell())
             file.seek(0)
             return np.asarray(npy.read_array(file, allow_pickle=False))
-        except (OSError, ValueError, EOFError, TypeError, KeyError, SyntaxError, MemoryError) as reason:
+        except _DAMAGE as reason:
             raise error(f"{path}: cannot be read: {reason}") from None
 
 
@@ -154,5 +155,5 @@ def _check_claim(claimed: int, held: int) -> None:
 
 
 _DAMAGE = (OSError, ValueError, KeyError, EOFError, TypeError, SyntaxError, RuntimeError, NotImplementedError,
-           OverflowError, MemoryError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+           OverflowError, MemoryError, RecursionError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)  # fmt: skip
 """What Python's and NumPy's readers raise for damaged, encrypted or strange files."""

@@ -30,6 +30,7 @@ from ggslam.sequences.masks import find_masks
 from ggslam.sequences.pose_conventions import convert_poses
 from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat
 from ggslam.sequences.sequence import OnBadFrame, Sequence
+from ggslam.system.foreign import refuse_links
 
 FORMATS: tuple[RecordingFormat, ...] = (
     SyntheticFormat(),
@@ -115,7 +116,10 @@ def _read_recording(
     """Reads a recording's description and applies the user's options; arguments and errors as in `open_sequence`."""
     if not folder.exists():
         raise SequenceError(f"{folder}: no such folder or file")
-    recording = _find_format(folder, format).read(folder, options)
+    found = _find_format(folder, format)
+    if folder.is_dir():
+        refuse_links(folder, SequenceError)
+    recording = found.read(folder, options)
     if not recording.files:
         raise SequenceError(f"{folder}: holds no frames")
     _check_places(recording)
@@ -137,8 +141,8 @@ def _read_recording(
 
 
 def _check_places(recording: Recording) -> None:
-    """Raises SequenceError if a recording takes a file from outside its folder, by name or through a link: it may come
-    from somebody who wants to know what is there."""
+    """Raises SequenceError if a recording names a file outside its folder: it may come from somebody who wants to know
+    what is there."""
     root = recording.path if recording.path.is_dir() else recording.path.parent
     inside: dict[Path, bool] = {}
     resolved = root.resolve()
@@ -148,7 +152,7 @@ def _check_places(recording: Recording) -> None:
                 continue
             if path.parent not in inside:
                 inside[path.parent] = path.parent.resolve().is_relative_to(resolved)
-            if not inside[path.parent] or (path.is_symlink() and not path.resolve().is_relative_to(resolved)):
+            if not inside[path.parent]:
                 raise SequenceError(
                     f"{path}: lies outside the recording {root}; copy it there, or give the folder that holds both"
                 )

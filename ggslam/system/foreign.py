@@ -104,14 +104,14 @@ def member(folder: str | Path, name: str, error: type[GgslamError] = FormatError
 
 
 def refuse_links(folder: str | Path, error: type[GgslamError] = FormatError) -> None:
-    """Looks through a folder, and those in it, for links that lead out of it.
+    """Looks through a folder, and those in it, for links that lead out of it, pipes, sockets and devices.
 
     Args:
         folder: may be a link itself: whoever names it has chosen so.
         error: class of the error to raise.
 
     Raises:
-        error: there is such a link; names it and where it leads.
+        error: there is one; names it and, of a link, where it leads.
     """
     root = Path(folder).resolve()
     waiting = [str(root)]
@@ -125,6 +125,8 @@ def refuse_links(folder: str | Path, error: type[GgslamError] = FormatError) -> 
                         raise error(f"{Path(folder) / inner}: is a link to {target}, outside {folder}")
                 elif entry.is_dir(follow_symlinks=False):
                     waiting.append(entry.path)
+                elif not entry.is_file(follow_symlinks=False):
+                    raise error(f"{Path(folder) / Path(entry.path).relative_to(root)}: is not a regular file")
 
 
 def printable(text: str) -> str:

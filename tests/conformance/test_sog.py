@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SOG at every degree of spherical harmonics, packed and in a folder, read back as its description says (splat_maps.py)
+"""SOG at every degree of spherical harmonics, packed and in a folder, read back as its description says (sog_reader.py)
 and by PlayCanvas' splat-transform."""
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from splat_maps import DIRECTIONS, Splats, convert, from_ply, from_sog, small_map, sog_files, sog_pixels
+from sog_reader import from_sog, sog_files, sog_pixels
+from splat_maps import DIRECTIONS, Splats, convert, from_ply, small_map
 
 from ggslam.errors import FormatError
 from ggslam.formats.morton import morton_order

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from splat_maps import Splats, convert, from_ply, from_sog, small_map
+from sog_reader import from_sog
+from splat_maps import Splats, convert, from_ply, small_map
 
 from ggslam.errors import FormatError
 from ggslam.formats import streamed_sog

@@ -5,7 +5,6 @@ usd-convert-gsplat writes (conftest.py)."""
 
 from __future__ import annotations
 
-import re
 import subprocess
 import zipfile
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from splat_maps import DIRECTIONS, Splats, small_map
+from usd_reader import from_text, splats_of
 
 from ggslam.errors import FormatError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
@@ -23,25 +23,6 @@ pxr = pytest.importorskip("pxr", reason="usd-core is not installed (extra [usd])
 DEGREES = [0, 1, 2, 3]
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 NAMES = {1: "mug", 2: "", 3: "chair \u00e4"}
-
-
-def splats_of(values: dict[str, np.ndarray], degree: int) -> Splats:
-    """From the schema's attributes; quaternions have the real part first in text."""
-    count = len(values["positions"])
-    sh = values["radiance:sphericalHarmonicsCoefficients"].reshape(count, (degree + 1) ** 2, 3)
-    return Splats(values["positions"], np.log(values["scales"]), values["orientations"], values["opacities"], sh)
-
-
-def from_text(path: Path) -> tuple[Splats, dict[str, np.ndarray], str]:
-    """A .usda with one splat: what it says, all arrays, and the text without them."""
-    text = path.read_text(encoding="utf-8")
-    arrays: dict[str, np.ndarray] = {}
-    for kind, name, body in re.findall(r"^\s+(\w+)\[\] ([\w:]+) = \[(.*?)\]", text, re.M | re.S):
-        numbers = np.array(re.findall(r"[-+.\deE]+", body), float)
-        width = {"point3f": 3, "float3": 3, "color3f": 3, "quatf": 4}.get(kind)
-        arrays[name] = numbers if width is None else numbers.reshape(-1, width)
-    (degree,) = re.findall(r"uniform int radiance:sphericalHarmonicsDegree = (\d)", text)
-    return splats_of(arrays, int(degree)), arrays, re.sub(r"= \[.*?\]", "", text, flags=re.S)
 
 
 def splat_of(stage: Any) -> Any:
