@@ -2,9 +2,9 @@
 """Levels of detail of a Gaussian map: fewer, larger Gaussians that look the same from farther away.
 
 Neighbours are merged in pairs, those first that differ least: in the manner of Ward (1963), a pair costs what a
-weighted variance grows by, of positions in units of the Gaussians' own size and of colours. The weight of a Gaussian is
-the area that it hides. In a round each Gaussian is merged with one other at most, so that levels get coarser everywhere.
-`scripts/bench_levels.py` compares this with other ways.
+weighted variance grows by, of positions in units of the Gaussians' own size and of colours. The weight of a Gaussian
+is the area that it hides. In a round each Gaussian is merged with one other at most, so that levels get coarser
+everywhere. `scripts/bench_levels.py` compares this with other ways.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ _NEIGHBOURS = 8
 _COLOR_WEIGHT = 10.0
 """Of a squared difference of colours (0 to 1), against one of positions in units of the pair's size."""
 _MATCHINGS = 6
+_SPREAD = 1.6
+"""By this the distance of merged Gaussians counts more in their variance than a sum of both would have it: Gaussians of
+the right variance fall off too fast to leave no gaps to the next. Chosen by `scripts/bench_levels.py`."""
 _MOST_OPAQUE = 0.99
 _LEAST_VARIANCE = 1e-12
 """Square metres."""
@@ -83,8 +86,8 @@ def _cheapest_pairs(
 
 
 def merge(columns: SplatColumns, groups: np.ndarray) -> SplatColumns:
-    """One Gaussian for each group, with the mean and covariance of all in it; what each hides (its optical depth times
-    its area) is its weight and is kept. An object id is that of the heaviest.
+    """One Gaussian for each group, with the mean and covariance of all in it, a little wider; what each hides (its
+    optical depth times its area) is its weight and is kept. An object id is that of the heaviest.
 
     Args:
         columns: Gaussians.
@@ -103,7 +106,7 @@ def merge(columns: SplatColumns, groups: np.ndarray) -> SplatColumns:
 
     means = mean(ordered.means.astype(np.float64))
     offsets = ordered.means - means.repeat(sizes, 0)
-    spread = _covariances(ordered) + offsets[:, :, None] * offsets[:, None, :]
+    spread = _covariances(ordered) + _SPREAD * offsets[:, :, None] * offsets[:, None, :]
     variances, axes = np.linalg.eigh(mean(spread))
     log_scales = 0.5 * np.log(variances.clip(_LEAST_VARIANCE))
     opacity = (-np.expm1(-total / _area(log_scales))).clip(1e-6, _MOST_OPAQUE)
