@@ -29,6 +29,7 @@ class SplatFormat:
         suffix: of its files.
         read: the reader.
         decibels: of pictures of what was read against pictures of the map, at least.
+        trained: the same of a map that was trained, seen from where it was recorded.
         position: metres.
         shape: of covariances, against their norm.
         opacity: 0 to 1.
@@ -43,6 +44,7 @@ class SplatFormat:
     suffix: str
     read: Callable[[Path], Splats]
     decibels: Bars
+    trained: float = 120.0
     position: float = 1e-6
     shape: float = 1e-5
     opacity: float = 1e-6
@@ -105,19 +107,19 @@ SPLAT_FORMATS = {
     "segmented": SplatFormat(".ply", from_ply, EXACT, keeps_ids=True, recolored=True),
     "gltf": SplatFormat(".glb", from_glb, EXACT, upright=True, keeps_ids=True),
     "compressed-ply": SplatFormat(
-        ".compressed.ply", from_compressed_ply, (54.0, 50.5, 47.3, 45.6), position=0.0075, shape=0.008,
-        opacity=0.51 / 255, color=(0.0012, 0.0045, 0.007, 0.0095),
+        ".compressed.ply", from_compressed_ply, (54.0, 50.5, 47.3, 45.6), 56.0, position=0.0075,
+        shape=0.008, opacity=0.51 / 255, color=(0.0012, 0.0045, 0.007, 0.0095),
     ),
     "spz": SplatFormat(
-        ".spz", from_spz, (47.7, 44.7, 36.5, 35.6), position=0.51 / 4096, shape=0.075, opacity=0.51 / 255,
-        color=(0.0022, 0.0095, 0.0225, 0.034), upright=True, package="gaussforge",
+        ".spz", from_spz, (47.7, 44.7, 36.5, 35.6), 53.0, position=0.51 / 4096, shape=0.075,
+        opacity=0.51 / 255, color=(0.0022, 0.0095, 0.0225, 0.034), upright=True, package="gaussforge",
     ),
     "splat": SplatFormat(
-        ".splat", from_splat, (49.0, 49.0, 49.0, 49.0), shape=0.04, opacity=0.51 / 255, color=(0.0015,) * 4,
+        ".splat", from_splat, (49.0, 49.0, 49.0, 49.0), 53.0, shape=0.04, opacity=0.51 / 255, color=(0.0015,) * 4,
         base_colors=True,
     ),
     "sog": SplatFormat(
-        ".sog", from_sog, (55.5, 57.0, 57.5, 55.5), position=3e-4, shape=0.035, opacity=0.51 / 255,
+        ".sog", from_sog, (55.5, 57.0, 57.5, 55.5), 60.0, position=3e-4, shape=0.035, opacity=0.51 / 255,
         color=(0.001, 0.0013, 0.0017, 0.0022), keeps_ids=True,
     ),
     "usd": SplatFormat(".usda", from_usda, EXACT, upright=True, keeps_ids=True, package="pxr"),

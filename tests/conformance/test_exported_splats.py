@@ -10,15 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import succeed
 from foreign_readers import FOREIGN_READERS
+from scipy.spatial import cKDTree
 from splat_formats import OTHER_FORMATS, SPLAT_FORMATS, with_colors
 from splat_maps import C0, Splats
 from splat_rendering import Pinhole, decibels, look_at, render
+from standard_pictures import standard_picture
 
 from ggslam.errors import RunFolderError
 from ggslam.jobs.export.export_run import export_run
 from ggslam.jobs.export.formats import ExportFormat
 from ggslam.runs.folder import RunFolder
+from ggslam.scene.poses import inverse
 
 DEGREES = [0, 1, 2, 3]
 CAMERA = Pinhole.centred()
@@ -94,3 +98,22 @@ def test_as_others_read_them(
     found = FOREIGN_READERS[reader].read(exported(kind, degree, True), tmp_path)
     known.check(found, original(kind, degree, True), degree)
     assert decibels(seen(kind, found), pictures(kind, degree)) >= known.decibels[degree]
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+def test_a_run_by_the_command_line(kind: str, room_run: RunFolder, tmp_path: Path) -> None:
+    """A map that was trained, from where the recording's camera was."""
+    known, written = SPLAT_FORMATS[kind], Splats.of(room_run.gaussians())
+    known.require()
+    path = tmp_path / f"map{known.suffix}"
+    said = succeed("export", room_run.path, "--format", kind, "--out", path)
+    found, count = known.read(path), len(written.means)
+    assert len(found.means) == count and str(count) in said
+    rows = cKDTree(found.means @ known.turn).query(written.means)[1]
+    if known.keeps_ids:
+        assert found.object_ids is not None and (found.object_ids[rows] == written.object_ids).mean() > 0.999
+    if known.recolored:
+        written = with_colors(written, room_run.object_table().palette()[written.object_ids] / 255)
+    camera, poses = room_run.sequence().camera, [inverse(k.T_world_camera) for k in room_run.keyframes().keyframes]
+    images = [standard_picture(found, camera, known.pose(pose)) for pose in poses]
+    assert decibels(images, [standard_picture(written, camera, pose) for pose in poses]) >= known.trained
