@@ -74,8 +74,9 @@ def main() -> None:
     for problem in problems(table):
         print(f"not allowed: {problem}")
     if not given.check:
-        lines = ["# Licences", "", "ggslam is under Apache-2.0. What it depends on, as the packages themselves say; written",
-                 "by `scripts/make_licence_table.py`.", "", "| package | needed by | licence |", "|---|---|---|"]  # fmt: skip
+        lines = ["# Licences", "", "ggslam is under Apache-2.0. What it depends on, as the packages themselves say;",
+                 "written by `scripts/make_licence_table.py`.", "", "| package | needed by | licence |",
+                 "|---|---|---|"]  # fmt: skip
         lines += [f"| {name} | {extra} | {licence} |" for name, extra, licence in table]
         PAGE.write_text("\n".join([*lines, ""]))
         print(f"{PAGE}: {len(table)} packages")
