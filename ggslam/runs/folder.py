@@ -26,7 +26,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from ggslam import __version__
 from ggslam.errors import RunFolderError
@@ -50,6 +49,8 @@ from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.atomic import write_bytes, write_text
+from ggslam.system.foreign import read_foreign_text, refuse_links
+from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.staging import finish_saving, leftovers
 
 MARKER = RunRecord.FILE
@@ -81,6 +82,7 @@ class RunFolder:
         """
         folder = RunFolder(path)
         try:
+            refuse_links(folder.path, RunFolderError)
             if folder.path.is_dir() and set(folder.path.iterdir()) - set(leftovers(folder.path)):
                 if not (folder.path / MARKER).exists():
                     raise RunFolderError(f"{path}: not empty and not a run of ggslam; choose another folder with `out`")
@@ -104,6 +106,7 @@ class RunFolder:
         if not (Path(path) / MARKER).is_file():
             reason = "is not a run of ggslam (no run.json)" if Path(path).is_dir() else "no such folder"
             raise RunFolderError(f"{path}: {reason}")
+        refuse_links(path, RunFolderError)
         finish_saving(Path(path), MARKER)
         return RunFolder(path)
 
@@ -226,8 +229,8 @@ class RunFolder:
         """The settings of the run."""
         path = self.path / "config.yaml"
         try:
-            return config_from_dict(yaml.safe_load(path.read_text()), str(path))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            return config_from_dict(parse_yaml(read_foreign_text(path, RunFolderError)), str(path))
+        except PlainYamlError as error:
             raise RunFolderError(f"{path}: cannot be read: {error}") from None
 
     def gaussians(self, with_moments: bool = False) -> GaussianMap:

@@ -4,14 +4,11 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping
 
-import numpy as np
 import torch
 
-from ggslam.errors import FormatError
-from ggslam.scene.arrays import arrays_to_bytes
+from ggslam.scene.arrays import arrays_of, arrays_to_bytes
 from ggslam.scene.gaussian_map import GaussianMap
 
 Rows = Mapping[str, torch.Tensor]
@@ -29,11 +26,9 @@ def decode_rows(data: bytes, source: str) -> dict[str, torch.Tensor]:
     Raises:
         FormatError: damaged; names `source`.
     """
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            return {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise FormatError(f"{source}: no Gaussians written by ggslam: {error}") from None
+    what = f"{source}: no Gaussians written by ggslam"
+    arrays = arrays_of(io.BytesIO(data), what, lambda held: {name: held[name] for name in held.files})
+    return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
 
 def map_like(gaussians: GaussianMap, rows: Rows | None = None) -> GaussianMap:

@@ -30,6 +30,7 @@ from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_poi
 from ggslam.jobs.code.attributes import attributes_to_code, restored_attributes
 from ggslam.runs.folder import RunFolder
 from ggslam.system.atomic import make_folder, write_bytes
+from ggslam.system.foreign import read_foreign
 
 PRESETS = ("pointcloud", "splat")
 Box = tuple[Sequence[float], Sequence[float]]
@@ -215,10 +216,7 @@ def list_stream(path: Path) -> StreamListing:
 
 def read_bytes(path: Path) -> bytes:
     """A whole file; FormatError if it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
+    return read_foreign(path)
 
 
 def _input_file(source: Path, preset: str) -> Path:
