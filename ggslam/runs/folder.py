@@ -34,6 +34,7 @@ from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
+from ggslam.runs.checkpoints import has_checkpoints
 from ggslam.runs.environment import environment
 from ggslam.runs.map_index import MAP_INDEX, MapIndex, MapInParts
 from ggslam.runs.records.keyframes import KeyframesRecord
@@ -50,6 +51,7 @@ from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.atomic import write_bytes, write_text
+from ggslam.system.folder_lock import LOCK_FILE, refuse_other_writers
 from ggslam.system.staging import finish_saving, leftovers
 
 MARKER = RunRecord.FILE
@@ -80,9 +82,12 @@ class RunFolder:
             RunFolderError: it holds something else, or a run that was not to be replaced, or cannot be written to.
         """
         folder = RunFolder(path)
+        refuse_other_writers(folder.path)
         try:
-            if folder.path.is_dir() and set(folder.path.iterdir()) - set(leftovers(folder.path)):
-                if not (folder.path / MARKER).exists():
+            if folder.path.is_dir() and folder._content():
+                if not overwrite and has_checkpoints(folder.path):
+                    raise RunFolderError(f"{path}: there is a run that was cut off; use `resume` or `overwrite`")
+                if not (folder.path / MARKER).exists() and not has_checkpoints(folder.path):
                     raise RunFolderError(f"{path}: not empty and not a run of ggslam; choose another folder with `out`")
                 if not overwrite:
                     raise RunFolderError(f"{path}: there is a run already; use `overwrite` or another `out`")
@@ -107,6 +112,25 @@ class RunFolder:
         finish_saving(Path(path), MARKER)
         return RunFolder(path)
 
+    @staticmethod
+    def open_unfinished(path: Path) -> RunFolder:
+        """A run that was cut off, and left checkpoints.
+
+        Raises:
+            RunFolderError: no such folder, or there is nothing to go on from.
+        """
+        refuse_other_writers(Path(path))
+        if has_checkpoints(Path(path)):
+            return RunFolder(path)
+        folder = RunFolder.open(path)
+        whole = folder.mark().complete
+        reason = "the run is complete" if whole else "it has no checkpoints"
+        raise RunFolderError(f"{path}: there is nothing to resume: {reason}")
+
+    def _content(self) -> set[Path]:
+        """What is in the folder, but for what killed programs left and the lock."""
+        return set(self.path.iterdir()) - {*leftovers(self.path), self.path / LOCK_FILE}
+
     def check_writable(self) -> None:
         """Raises RunFolderError if files cannot be written to the folder."""
         try:
@@ -124,7 +148,8 @@ class RunFolder:
 
     def discard(self) -> None:
         """Removes the folder if it was made by `create` and is still empty."""
-        if self._made_here and not any(self.path.iterdir()):
+        if self._made_here and not self._content():
+            (self.path / LOCK_FILE).unlink(missing_ok=True)
             self.path.rmdir()
 
     # --- writing -----------------------------------------------------------------------------------------------------
