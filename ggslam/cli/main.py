@@ -28,6 +28,7 @@ from ggslam.cli import (
     run_command,
     submaps_command,
     synth_command,
+    verify_command,
     view_command,
     volumes_command,
 )
@@ -85,6 +86,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "submaps": (submaps_command.submaps, submaps_command.EPILOG),
     "view": (view_command.view, view_command.EPILOG),
     "volumes": (volumes_command.volumes, volumes_command.EPILOG),
+    "verify": (verify_command.verify, verify_command.EPILOG),
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
 }  # fmt: skip
 for _name, (_function, _epilog) in _COMMANDS.items():

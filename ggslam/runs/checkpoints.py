@@ -62,8 +62,8 @@ class Checkpoints:
         self.folder = run / FOLDER
         self._kept = KeptArrays(self.folder)
         self._number = 0
-        self._states: dict[int, list[int]] = {}
-        """Numbers of the states that are there, and of the files of kept arrays that each needs."""
+        self._states: list[int] = []
+        """Numbers of the states that are there, rising."""
         self._helper: ThreadPoolExecutor | None = None
         self._finishing: Future[None] | None = None
 
@@ -95,11 +95,10 @@ class Checkpoints:
         tree, arrays = describe_state(slam, self._kept)
         kept = self._kept.write()
         known = {**self._kept.files, **({} if kept is None else {self._number: kept.written})}
-        needed = sorted(self._kept.used)
-        files = [[number, known[number].size, known[number].crc] for number in needed]
+        files = [[number, known[number].size, known[number].crc] for number in sorted(self._kept.used)]
         values = {"version": VERSION, "state": tree, "kept": files, "more": more}
         try:
-            state = write_array_file(self.folder / f"state-{self._number:06d}.bin", values, arrays)
+            state = write_array_file(self._path(self._number), values, arrays)
         except BaseException:
             if kept is not None:
                 kept.discard()
@@ -107,18 +106,21 @@ class Checkpoints:
         self._kept.commit(kept)
         if self._helper is None:
             self._helper = ThreadPoolExecutor(1, thread_name_prefix="checkpoints")
-        self._finishing = self._helper.submit(self._finish, self._number, state, kept, needed)
+        self._finishing = self._helper.submit(self._finish, self._number, state, kept)
 
-    def _finish(self, number: int, state: PendingFile, kept: PendingFile | None, needed: list[int]) -> None:
-        """Waits for the disk, and removes what no state needs any more."""
+    def _path(self, number: int) -> Path:
+        return self.folder / f"state-{number:06d}.bin"
+
+    def _finish(self, number: int, state: PendingFile, kept: PendingFile | None) -> None:
+        """Waits for the disk, and removes states that are older than the newest two."""
         if kept is not None:
             kept.finish()
         state.finish()
         sync_folder(self.folder)
-        self._states[number] = needed
-        for old in sorted(self._states)[:-STATES]:
-            (self.folder / f"state-{old:06d}.bin").unlink(missing_ok=True)
-            del self._states[old]
+        self._states.append(number)
+        for old in self._states[:-STATES]:
+            self._path(old).unlink(missing_ok=True)
+        del self._states[:-STATES]
 
     def settle(self) -> None:
         """Waits until the last state is on the disk.
@@ -175,24 +177,32 @@ class Checkpoints:
             try:
                 restore_state(slam, state.values["state"], state.arrays, state.kept)
             except FormatError as error:
-                raise RunFolderError(f"{self.folder / f'state-{state.number:06d}.bin'}: {error}") from None
+                raise RunFolderError(f"{self._path(state.number)}: {error}") from None
             for problem in problems:
                 note(f"{problem}; going on from the checkpoint before")
-            self._kept = state.kept
-            self._kept.close()
-            self._number = max([state.number, *self._numbers(_STATE), *self._numbers(_KEPT)])
-            self._states = {state.number: sorted(state.kept.files)}
+            self._go_on_after(state)
             return dict(state.values["more"])
         if problems:
             raise RunFolderError(f"no checkpoint is whole: {problems[0]}")
         return {}
+
+    def _go_on_after(self, state: _State) -> None:
+        """The next state is written after this one; those that were damaged go."""
+        self._kept = state.kept
+        self._kept.close()
+        there = self._numbers(_STATE)
+        self._number = max([state.number, *there, *self._numbers(_KEPT)])
+        self._states = sorted(number for number in there if number <= state.number)
+        for number in there:
+            if number > state.number:
+                self._path(number).unlink(missing_ok=True)
 
     def _newest(self, tell: Callable[[str], None]) -> Iterator[_State]:
         """States that are whole, the newest first; of others it is told what is wrong."""
         for number in sorted(self._numbers(_STATE), reverse=True):
             kept = KeptArrays(self.folder)
             try:
-                values, arrays = read_array_file(self.folder / f"state-{number:06d}.bin")
+                values, arrays = read_array_file(self._path(number))
                 if values["version"] != VERSION:
                     raise FormatError(f"{self.folder}: made by another version of ggslam")
                 kept.open({n: WrittenFile("", size, crc) for n, size, crc in values["kept"]})

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import os
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -30,12 +31,19 @@ _guard = threading.Lock()
 
 
 @contextmanager
-def folder_lock(folder: Path) -> Iterator[None]:
+def folder_lock(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
     """This process alone writes to a folder within the block. Blocks may be nested.
+
+    Args:
+        folder: which must exist.
+        wait_s: seconds to wait for another process.
 
     Raises:
         RunFolderError: another process does, naming it; or the folder cannot be written to.
     """
+    last = time.monotonic() + wait_s
+    while writer_of(folder) is not None and time.monotonic() < last:
+        time.sleep(0.02)
     key = _enter(folder)
     try:
         yield

@@ -13,6 +13,7 @@ from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.run.checkpointing import Checkpointing, start_record
+from ggslam.jobs.run.rescue import save_somewhere
 from ggslam.jobs.run.resuming import Resumption
 from ggslam.jobs.run.slam_loop import Follower, SlamLoop
 from ggslam.jobs.score.run import score_run
@@ -22,6 +23,7 @@ from ggslam.runs.recordings import SequenceRequest, describe, open_recording_of
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.starting import ancestors
+from ggslam.runs.writing import REPORT_FILE, RunToWrite
 from ggslam.sequences import Sequence
 from ggslam.sequences.live import LiveSequence
 from ggslam.slam.config import Config, load_config
@@ -49,12 +51,14 @@ class RunRequest:
 
 @dataclass
 class RunOutcome:
-    """A finished run, or what was saved of one that stopped early (`error` says why)."""
+    """A finished run, or what was saved of one that stopped early (`error` says why). If it could not be saved as it
+    should be, `failure` says so, and where it is."""
 
     folder: RunFolder
     result: SlamResult
     metrics: MetricsRecord | None = None
     error: BaseException | None = None
+    failure: GgslamError | None = None
 
     def headline(self) -> str:
         """One line for people."""
@@ -168,8 +172,9 @@ class _Run:
             reason = result.frames[0].reason if result.frames else "no frame could be read"
             raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
         outcome = self._save(result, error)
-        self._look_at(outcome)
-        if error is None:
+        if outcome.failure is None:
+            self._look_at(outcome)
+        if error is None and outcome.failure is None:
             checkpoints.remove()
         return outcome
 
@@ -195,17 +200,26 @@ class _Run:
         return Checkpointing(checkpoints, every, sequence, self.observer)
 
     def _save(self, result: SlamResult, error: BaseException | None) -> RunOutcome:
-        """Writes the folder."""
+        """Writes the folder, or if that cannot be, another one."""
         described = describe(self.request.sequence, self.sequence, self.earlier)
         lacking = _objects_notes(self.sequence, result, self.config, self.earlier)
         for text in [*LoopsRecord.of_result(result).notes(), *described.notes(), *lacking, *result.notes]:
             self.observer.note(text)
         names = {**_names(self.earlier), **self.sequence.instance_names}
+        scored = self.request.evaluate and error is None and self._frames_stay()
+        wanted = (*((MetricsRecord.FILE, "frames.csv") if scored else ()), REPORT_FILE)
+        told = None if error is None else repr(error)
         try:
-            self.folder.save(self.config, described, result, None if error is None else repr(error), names)
+            folder, failure = save_somewhere(
+                self.folder, RunToWrite(self.config, described, result, told, names, wanted)
+            )
         finally:
             result.close()
-        return RunOutcome(self.folder, result, error=error)
+        return RunOutcome(folder, result, error=error or failure, failure=failure)
+
+    def _frames_stay(self) -> bool:
+        """Whether the frames of the run can be read again."""
+        return isinstance(self.sequence, Sequence) or self.sequence.record is not None
 
     def _look_at(self, outcome: RunOutcome) -> None:
         """Scores and report."""

@@ -28,6 +28,7 @@ from ggslam.jobs.progress import Observer
 from ggslam.jobs.volumes.pictures import mesh_picture, occupancy_picture
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.publishing import changing_in_run
 from ggslam.system.atomic import make_folder
 from ggslam.system.json_files import write_json
 from ggslam.system.staging import finish_saving, new_staging, publish
@@ -231,7 +232,8 @@ def write_outputs(
     except BaseException:
         shutil.rmtree(writer.staged, ignore_errors=True)
         raise
-    publish(writer.staged, out, RECORD, earlier, {"complete": False})
+    with changing_in_run(out):
+        publish(writer.staged, out, RECORD, earlier, {"complete": False})
     return writer.outputs
 
 
