@@ -35,7 +35,8 @@ class Checkpointing:
 
     Args:
         checkpoints: of the run.
-        every: frames from one to the next; None: as often as takes no more than `SHARE` of the time.
+        every: frames from one to the next; None: as often as takes no more than `SHARE` of the time; 0: only when the
+            run ends early.
         sequence: the recording.
         observer: is told what goes wrong; the run goes on.
     """
@@ -57,7 +58,7 @@ class Checkpointing:
 
     def _is_due(self, slam: Slam) -> bool:
         if self._every is not None:
-            return self._frames >= self._every
+            return 0 < self._every <= self._frames
         passed = time.perf_counter() - self._last
         return passed > _SOONEST_S and SHARE * passed > _size_of(slam) / self._bytes_a_second
 
