@@ -18,6 +18,9 @@ FORMS: list[tuple[str, str, dict[str, Any]]] = [
     ("map.compressed.ply", "compressed-ply", {}),
     ("map.glb", "gltf", {}),
     ("map.spz", "spz", {}),  # extra [splats]
+    ("map.sog", "sog", {}),
+    ("map_web", "streamed-sog", {}),
+    ("map.usdz", "usd", {}),  # extra [usd]
     ("points", "points", {"voxel": 0.02}),
     ("map.pcd", "pcd", {"voxel": 0.02}),
     ("trajectory.txt", "trajectory", {}),

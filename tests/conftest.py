@@ -14,7 +14,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # processes that share the tests share 
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
-from kept import build_once, generated_recording, session_folder
+from kept import build_once, generated_recording, light_maps_kept, points_in_voxels_of, session_folder
 
 if TYPE_CHECKING:
     from ggslam.cuda.library import CudaLibrary
@@ -29,6 +29,20 @@ def fair_share() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         if "PYTEST_XDIST_WORKER" in os.environ:
             patch.setattr("ggslam.native.loader.available_processors", lambda: 1)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def coarse_points() -> Iterator[None]:
+    """Runs sample their clouds in voxels of 4 cm: those of 1 cm would be half of what a short run takes, and few tests
+    look at them. `with points_in_voxels_of(0.01)` is what users have."""
+    with points_in_voxels_of(0.04):
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_light_maps() -> Iterator[None]:
+    with light_maps_kept():
         yield
 
 

@@ -3,16 +3,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import hashlib
 import os
+import pickle
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from ggslam.synthetic import Scene
 
 CHECKOUT = Path(__file__).parents[1]
 
@@ -52,16 +59,56 @@ def cached_folder(name: str, *sources: Path) -> Path:
     return CHECKOUT / "build" / "tests" / f"{name}-{digest.hexdigest()[:16]}"
 
 
+@contextmanager
+def points_in_voxels_of(size: float) -> Iterator[None]:
+    """Runs that are saved, also after edits, sample their clouds in voxels of this size, metres, not of 0.01."""
+    from ggslam.formats.point_sampling import sample_parts
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("runs.saving_parts", "jobs.edit.edited_run"):
+            patch.setattr(f"ggslam.{module}.sample_parts", partial(sample_parts, voxel_size=size))
+        yield
+
+
+@contextmanager
+def light_maps_kept() -> Iterator[None]:
+    """Light maps of large scenes are computed once, until what computes them changes: half a generated recording."""
+    from ggslam.synthetic import lighting, raycast
+
+    def bake(scene: Scene) -> lighting.LightMaps:
+        if len(scene.shapes) < 100:
+            return lighting.bake(scene)
+        bare = [dataclasses.replace(shape, material=None, faces={}) for shape in scene.shapes]  # type: ignore[arg-type]
+        precision = (lighting.PATCH, lighting.LARGEST_MAP, lighting.AMBIENT_RAYS)
+        words = pickle.dumps((dataclasses.replace(scene, shapes=bare), precision))
+        name = f"lights-{hashlib.sha256(words).hexdigest()[:16]}"
+
+        def build(folder: Path) -> None:
+            folder.mkdir()
+            np.savez(folder / "maps.npz", **vars(lighting.bake(scene)))
+
+        return lighting.LightMaps(**np.load(build_once(cached_folder(name, *_synthetic_sources()), build) / "maps.npz"))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(raycast, "bake", bake)
+        yield
+
+
+def _synthetic_sources() -> list[Path]:
+    import ggslam
+
+    package = Path(ggslam.__file__).parent
+    return sorted([*package.glob("synthetic/*.py"), *package.glob("scene/*.py")])
+
+
 def generated_recording(factory: pytest.TempPathFactory, name: str, **options: Any) -> Path:
     """A recording as `write_synthetic_sequence` draws it with these options, not to be changed. Drawing takes longest
     of all that tests need; it is kept until what draws changes, and every run of the tests has a copy."""
-    import ggslam
     from ggslam.synthetic import write_synthetic_sequence
 
-    package = Path(ggslam.__file__).parent
     words = "-".join([name, *(f"{key}={value}" for key, value in sorted(options.items()))])
     cached = build_once(
-        cached_folder(words, *sorted([*package.glob("synthetic/*.py"), *package.glob("scene/*.py")])),
+        cached_folder(words, *_synthetic_sources()),
         lambda folder: write_synthetic_sequence(folder, **options),
     )
     return build_once(session_folder(factory) / "recordings" / name, lambda to: shutil.copytree(cached, to))

@@ -159,7 +159,8 @@ def test_every_extra_is_in_the_list() -> None:
     extras = set(re.findall(r"^(\w+) = \[", (ROOT / "pyproject.toml").read_text().split("optional-dependencies]")[1]
                             .split("[project.scripts]")[0], re.M))  # fmt: skip
     listed = set(re.findall(r"^\| `\[(\w+)\]`", (DOCS / "getting-started.md").read_text(), re.M))
-    assert listed == extras - {"test", "dev", "bench", "formats", "browser"}  # these are for tests and benchmarks
+    for_us = {"test", "dev", "bench", "formats", "browser", "conformance"}  # for tests and benchmarks
+    assert listed == extras - for_us
 
 
 def test_pages_build_and_fetch_nothing(tmp_path: Path) -> None:

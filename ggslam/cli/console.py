@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console
@@ -18,13 +19,26 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
 from ggslam.cli.argument_names import with_options
+from ggslam.system.foreign import printable
 
 
-class CommandConsole(Console):
+class PlainConsole(Console):
+    """A console that never hands on control characters of what it is given: names in a recording or a run could move
+    the cursor, recolour or rename the terminal, or hide what is printed."""
+
+    def _render_buffer(self, buffer: Iterable[Segment]) -> str:
+        # The only place that all text passes, whatever it was part of; rich's own sequences are added in it.
+        return super()._render_buffer(
+            segment if segment.control else Segment(printable(segment.text), segment.style) for segment in buffer
+        )
+
+
+class CommandConsole(PlainConsole):
     """Prints what the library says with options in place of the arguments that it names."""
 
     def print(self, *objects: Any, **how: Any) -> None:

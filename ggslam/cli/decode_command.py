@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from ggslam.cli import options
 from ggslam.cli.console import console
 from ggslam.errors import ConfigError
 
@@ -29,13 +30,13 @@ def decode(
     box: Annotated[
         str | None, typer.Option(help='Decode the points in a box alone: "x0 y0 z0 x1 y1 z1", metres.')
     ] = None,
-    workers: Annotated[int | None, typer.Option(help="Threads; default: one per processor.", min=1, max=1024)] = None,
+    threads: options.Threads = None,
 ) -> None:
     """Decode an MPEG G-PCC stream, or one slice or box of it."""
     from ggslam.jobs.code.coding import decode_file
 
     corners = None if box is None else _corners(box)
-    done = decode_file(source, out, slice_id, corners, workers)
+    done = decode_file(source, out, slice_id, corners, threads)
     console.print(f"wrote {done.path}: {done.count} {done.what}", highlight=False, markup=False)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.errors import ConfigError
 
@@ -82,7 +83,7 @@ def encode(
     split: Annotated[
         Split, typer.Option(help="Equal numbers of points or equal intervals of the longest axis, or octree cubes.")
     ] = Split.by_count,
-    workers: Annotated[int | None, typer.Option(help="Threads; default: one per processor.", min=1, max=1024)] = None,
+    threads: options.Threads = None,
     preset: Annotated[
         Preset, typer.Option(help="pointcloud: positions and what they carry; splat: whole Gaussians of a 3DGS PLY.")
     ] = Preset.pointcloud,
@@ -102,7 +103,7 @@ def encode(
     _refuse_ignored(context, preset, sweep)
     settings = CodecSettings(
         qp=qp, chroma_offset=chroma_offset, geometry_scale=geometry_scale, voxel_size=voxel, geometry_bits=bits,
-        slices=slices, split="cube" if split is Split.by_octree else split.value, workers=workers,
+        slices=slices, split="cube" if split is Split.by_octree else split.value, threads=threads,
     )  # fmt: skip
     if sweep is not None:
         _study(source, out, settings, ["qp", "geometry"] if sweep is Sweep.both else [sweep.value], plots)

@@ -21,6 +21,12 @@ EPILOG = """
 
   ggslam export runs/kitchen --format gltf --out kitchen_splats.glb
 
+  ggslam export runs/kitchen --out kitchen.sog
+
+  ggslam export runs/kitchen --out kitchen.usdz
+
+  ggslam export kitchen.grid --format streamed-sog --out kitchen_web/
+
   ggslam export runs/kitchen --objects mug,7 --out objects/
 
   ggslam export runs/kitchen --format segmented --out kitchen_objects.ply
@@ -34,8 +40,9 @@ EPILOG = """
 OutPath = Annotated[
     Path,
     typer.Option(
-        help="File to write; its name says the format (.ply .glb .obj .spz .splat .pcd .txt, .compressed.ply). A "
-        "folder for points, colmap, nerfstudio, and for --objects with ply; with mesh, --objects takes either."
+        help="File to write; its name says the format (.ply .glb .obj .spz .splat .sog .usda .usdc .usdz .pcd .txt, "
+        ".compressed.ply; meta.json, lod-meta.json: SOG and streamed SOG in their folder). A folder for streamed-sog, "
+        "points, colmap, nerfstudio, and for --objects with ply; with mesh, --objects takes either."
     ),
 ]
 FormatName = Annotated[
@@ -43,9 +50,10 @@ FormatName = Annotated[
     typer.Option(
         "--format",
         help="ply: Gaussians as 3DGS stores them; segmented: the same in the colours of their objects; compressed-ply, "
-        "spz, spz4 (.spz, versions 3 and 4), splat: the same in fewer bytes; gltf: the same as .glb (without this "
-        "option a .glb is a mesh); points, pcd: coloured points; mesh: .glb, .obj or .ply; trajectory: TUM; colmap, "
-        "nerfstudio: images, poses and points for other trainers. Default: what the name of --out says.",
+        "spz, spz4 (.spz, versions 3 and 4), splat, sog: the same in fewer bytes; streamed-sog: in pieces and levels "
+        "of detail, for the web; gltf: the same as .glb (without this option a .glb is a mesh); usd: OpenUSD; points, "
+        "pcd: coloured points; mesh: .glb, .obj or .ply; trajectory: TUM; colmap, nerfstudio: images, poses and points "
+        "for other trainers. Default: what the name of --out says.",
     ),
 ]
 Voxel = Annotated[
@@ -56,8 +64,8 @@ Voxel = Annotated[
 MinOpacity = Annotated[float, typer.Option(help="Leave out fainter Gaussians (not for trajectory, mesh).")]
 Objects = Annotated[
     str | None,
-    typer.Option(help="Objects by name or id (mug,7), or all. ply: a file for each; segmented, mesh, gltf: only "
-                 "these."),
+    typer.Option(help="Objects by name or id (mug,7), or all. ply: a file for each; segmented, mesh, sog, "
+                 "streamed-sog, gltf, usd: only these."),
 ]  # fmt: skip
 Plain = Annotated[bool, typer.Option("--plain", help="Write only the fields of 3DGS: no object ids, no identities.")]
 Keyframes = Annotated[
@@ -70,8 +78,15 @@ Rendered = Annotated[
 ]  # fmt: skip
 
 
+SourcePath = Annotated[
+    Path,
+    typer.Argument(metavar="RUN", help="Folder that `ggslam run` wrote; for streamed-sog also a grid store that "
+                   "`ggslam submaps` wrote."),
+]  # fmt: skip
+
+
 def export(
-    run: options.RunPath,
+    run: SourcePath,
     out: OutPath,
     asked: FormatName = None,
     voxel: Voxel = None,

@@ -57,7 +57,6 @@ Voxel = Annotated[
     float | None,
     typer.Option(help="Edge of the voxels to align to, metres; default 0.03, of scans 0.15.", min=1e-3, max=10),
 ]
-Threads = Annotated[int | None, typer.Option(help="Number of threads; default: one per processor.", min=1, max=1024)]
 
 
 def localize(
@@ -78,7 +77,7 @@ def localize(
     pose_convention: options.PoseConvention = None,
     columns: options.Columns = 4,
     skip_bad_frames: options.SkipBadFrames = False,
-    threads: Threads = None,
+    threads: options.Threads = None,
 ) -> None:
     """Locate each frame or scan of a recording in a map, of which only the surroundings are in memory."""
     from ggslam.jobs.localize.locate import LocalizeRequest

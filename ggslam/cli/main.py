@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from typer.core import TyperGroup
 
@@ -33,6 +32,7 @@ from ggslam.cli import (
     volumes_command,
 )
 from ggslam.cli.argument_names import with_options
+from ggslam.cli.console import PlainConsole
 from ggslam.cli.old_names import Command
 from ggslam.errors import GgslamError
 from ggslam.system.interrupts import Interrupted, exit_code, stop_like_ctrl_c
@@ -97,7 +97,7 @@ for _name, (_function, _epilog) in _COMMANDS.items():
 def main() -> None:
     """Entry point. Exit codes: 0 done, 2 the user's input is at fault, 1 ggslam or the machine is, 130 Ctrl-C, 128 +
     the number of another signal that ended it (143 SIGTERM, 129 SIGHUP)."""
-    errors = Console(stderr=True)
+    errors = PlainConsole(stderr=True)
     try:
         app()
     except GgslamError as error:

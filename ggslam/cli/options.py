@@ -33,6 +33,7 @@ Start = Annotated[int, typer.Option("--start", help="First frame to use.", min=0
 Stop = Annotated[int | None, typer.Option(help="Stop before this frame.", min=1)]
 Stride = Annotated[int, typer.Option(help="Use only every n-th frame.", min=1)]
 Scale = Annotated[float, typer.Option(help="Resize the images by this factor, e.g. 0.5.")]
+Threads = Annotated[int | None, typer.Option(help="Number of threads; default: one per processor.", min=1, max=1024)]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
 DepthScale = Annotated[
     float | None, typer.Option(help="Units of the depth images per metre, instead of the recording's own.")

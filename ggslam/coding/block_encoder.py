@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coding of clouds that come in blocks: what is in memory is a block, or the slices that workers have in their hands.
+"""Coding of clouds that come in blocks: what is in memory is a block, or the slices that threads have in their hands.
 
 The blocks are gone through once and kept in a temporary file; slices are cut, sorted into a second one, and coded from
 there. The stream is, byte for byte, that of the whole cloud.
@@ -205,7 +205,7 @@ def _encode_cut(cloud: _Spool, cut: _Cut, coded: IO[bytes], out: Path) -> Coding
         return encode_slice(replace(shared, points=points, attributes=attributes), number)
 
     slices = []
-    for done in in_order(code, len(cut.counts), cloud.settings.workers):
+    for done in in_order(code, len(cut.counts), cloud.settings.threads):
         coded.write(done.data)
         slices.append(replace(done, data=b""))
     with atomic_write(out) as temporary, temporary.open("wb") as file:

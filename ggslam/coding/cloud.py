@@ -38,7 +38,7 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class SliceReport:
-    """One coded slice: sizes in bytes, unit headers included, and the time its worker took in seconds."""
+    """One coded slice: sizes in bytes, unit headers included, and the time its thread took in seconds."""
 
     slice_id: int
     points: int

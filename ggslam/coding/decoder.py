@@ -26,17 +26,17 @@ class SliceInfo:
     high: np.ndarray
 
 
-def decode_cloud(data: bytes | memoryview, workers: int | None = None) -> PointCloud:
+def decode_cloud(data: bytes | memoryview, threads: int | None = None) -> PointCloud:
     """Decodes a stream. Slices come in the order of the stream, points of a slice in Morton order.
 
     Args:
-        workers: threads that decode slices; None: one for each processor.
+        threads: that decode slices; None: one for each processor.
 
     Raises:
         FormatError: the stream is damaged, or uses a tool that this decoder lacks (the message names it).
     """
     stream = read_stream(data)
-    return _decode(stream, range(len(stream.slices)), workers)
+    return _decode(stream, range(len(stream.slices)), threads)
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class CloudInParts:
     parts: Iterator[PointCloud]
 
 
-def decode_in_parts(data: bytes | memoryview, workers: int | None = None) -> CloudInParts:
-    """`decode_cloud` slice by slice: no more slices are decoded in memory than two for each worker."""
+def decode_in_parts(data: bytes | memoryview, threads: int | None = None) -> CloudInParts:
+    """`decode_cloud` slice by slice: no more slices are decoded in memory than two for each thread."""
     stream = read_stream(data)
 
     chains = _chains(stream, range(len(stream.slices)))
@@ -64,7 +64,7 @@ def decode_in_parts(data: bytes | memoryview, workers: int | None = None) -> Clo
         return _join(stream, list(_decode_chain(stream, chains[number]).values()))
 
     count = sum(units.header.points for units in stream.slices)
-    return CloudInParts(count, _join(stream, []), in_order(decode_part, len(chains), workers))
+    return CloudInParts(count, _join(stream, []), in_order(decode_part, len(chains), threads))
 
 
 def list_slices(data: bytes | memoryview) -> list[SliceInfo]:
@@ -120,11 +120,11 @@ SlicePart = tuple[np.ndarray, dict[str, np.ndarray]]
 """Grid positions and attributes."""
 
 
-def _decode(stream: CodedStream, wanted: Sequence[int], workers: int | None) -> PointCloud:
+def _decode(stream: CodedStream, wanted: Sequence[int], threads: int | None) -> PointCloud:
     """The slices of these numbers, rising."""
     chains = _chains(stream, wanted)
     parts: dict[int, SlicePart] = {}
-    for chain in in_order(lambda number: _decode_chain(stream, chains[number]), len(chains), workers):
+    for chain in in_order(lambda number: _decode_chain(stream, chains[number]), len(chains), threads):
         parts |= chain
     return _join(stream, [parts[number] for number in wanted])
 

@@ -30,7 +30,7 @@ def encode_cloud(
     *,
     reconstruct: bool = False,
 ) -> EncodedCloud:
-    """Codes a cloud. The same input gives the same bytes, whatever the number of workers.
+    """Codes a cloud. The same input gives the same bytes, whatever the number of threads.
 
     Args:
         points: [N, 3], float (metres) or integer (voxels).
@@ -59,7 +59,7 @@ def encode_cloud(
     geometry = geometry_parameters(settings, sample)
     cloud = CloudToCode(points, arrays, numbers, plans, sequence, geometry, quantization, settings, reconstruct)
     count = 1 if numbers is None else int(numbers.max()) + 1
-    slices = list(in_order(lambda number: encode_slice(cloud, number), count, settings.workers))
+    slices = list(in_order(lambda number: encode_slice(cloud, number), count, settings.threads))
     data = parameter_units(cloud) + b"".join(coded.data for coded in slices)
     report = CodingReport(
         len(points), sum(coded.report.points for coded in slices), len(data),

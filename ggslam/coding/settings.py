@@ -75,7 +75,7 @@ class CodecSettings:
     """count: equal numbers of points along the longest axis; interval: equal lengths of it; cube: octree cubes."""
     max_points: int = setting(LEVEL_LIMIT, 1, LEVEL_LIMIT)
     """Points of a slice at most."""
-    workers: int | None = setting(None, 1, 1024)
+    threads: int | None = setting(None, 1, 1024)
     """Threads that code slices; None: one for each processor. The stream does not depend on it."""
     neighbour_boundary: Literal[0, 2, 3, 4, 5, 6, 7, 8] | None = None
     """Neighbours give contexts within cubes of 2^this nodes, 2 to 8; 0: siblings only (fast, for sparse clouds);

@@ -13,25 +13,25 @@ from ggslam.native.loader import available_processors
 Result = TypeVar("Result")
 
 
-def in_order(work: Callable[[int], Result], count: int, workers: int | None) -> Iterator[Result]:
-    """What `work` makes of the numbers 0 to count, one after the other. A worker has one of them in its hands, and no
-    more results wait than there are workers.
+def in_order(work: Callable[[int], Result], count: int, threads: int | None) -> Iterator[Result]:
+    """What `work` makes of the numbers 0 to count, one after the other. A thread has one of them in its hands, and no
+    more results wait than there are threads.
 
     Args:
         work: called by several threads; what it raises is raised here.
         count: of the numbers.
-        workers: threads; None: one for each processor.
+        threads: their number; None: one for each processor.
     """
-    workers = min(workers or available_processors(), count)
-    if workers <= 1:
+    threads = min(threads or available_processors(), count)
+    if threads <= 1:
         yield from map(work, range(count))
         return
     waiting: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(workers, thread_name_prefix="slice") as pool:
+    with ThreadPoolExecutor(threads, thread_name_prefix="slice") as pool:
         try:
             for number in range(count):
                 waiting.append(pool.submit(work, number))
-                if len(waiting) > workers:
+                if len(waiting) > threads:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

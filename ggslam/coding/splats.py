@@ -72,7 +72,7 @@ def splat_settings(settings: CodecSettings, rate: str, attributes: Mapping[str, 
     """The settings with those of a rate: grid, bit depths and quantisers. Gaussians that share a voxel stay apart.
 
     Args:
-        settings: slices, workers and tools are kept.
+        settings: slices, threads and tools are kept.
         rate: one of `RATES`.
         attributes: of `splat_attributes`.
 

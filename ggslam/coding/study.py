@@ -123,7 +123,7 @@ def run_sweep(
     Args:
         cloud: what is coded and compared with.
         steps: in any order.
-        settings: slices, workers and tools; quantisers and scale come from the steps.
+        settings: slices, threads and tools; quantisers and scale come from the steps.
         meter: reads the energy of encoding.
 
     Raises:
@@ -137,7 +137,7 @@ def run_sweep(
         with meter.measure() as energy:
             encode = partial(encode_cloud, cloud.grid, {"color": cloud.colors}, _settings(settings, step))
             encoded, encode_s = _measure(encode)
-        decoded, decode_s = _measure(partial(decode_cloud, encoded.data, settings.workers))
+        decoded, decode_s = _measure(partial(decode_cloud, encoded.data, settings.threads))
         joules = None if energy.joules is None else energy.joules / REPEATS
         color, d1, d2 = quality.of(decoded, step)
         report = encoded.report

@@ -17,7 +17,8 @@ VERSION = 2
 _SIGNATURES = {b"ggslam-1": 1, b"ggslam-2": VERSION}
 _SIGNATURE_BYTES = 8
 _SIGNATURE = b"ggslam-2"
-_MAX_BYTES = 1 << 24
+_MAX_BYTES = 1 << 21
+"""Of JSON in a unit: names of 65,535 objects fit; Python makes some 30 times as many of them."""
 
 
 def write_user_data(content: dict[str, Any]) -> bytes:

@@ -155,7 +155,7 @@ def _columns(path: str | Path, gaussians: GaussianMap, with_objects: bool) -> di
     }  # fmt: skip
     out |= dict(zip(_harmonics(gaussians.sh_degree), columns.sh.transpose(1, 0, 2), strict=True))
     if with_objects:
-        ids = gaussians.object_id.cpu().numpy()
+        ids = columns.object_id
         if len(ids) and (ids.min() < 0 or ids.max() > _LARGEST_ID):
             raise FormatError(f"{path}: object ids are 0 to {_LARGEST_ID} in glTF, found {ids.min()} to {ids.max()}")
         out["_FEATURE_ID_0"] = ids

@@ -4,7 +4,8 @@
 Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023. Per vertex, all float32:
 `x y z` (metres), `nx ny nz` (zero), `f_dc_0..2` (degree-0 colour coefficients), `f_rest_*` (higher degrees, all of red,
 then green, then blue), `opacity` (logit), `scale_0..2` (natural logarithm of metres), `rot_0..3` (quaternion wxyz).
-On request, properties that viewers pass over: `object_id` (int) and `identity_0..F-1` (float32).
+On request, properties that viewers pass over: `object_id` (whole numbers) and `identity_0..F-1`. They are float32, too:
+several readers take a file with a property of another type for damaged, or read other numbers than stand in it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ EXTRAS = ("object_id", "identity")
 _MEANS, _NORMALS = ["x", "y", "z"], ["nx", "ny", "nz"]
 _COLORS = [f"f_dc_{i}" for i in range(3)]
 _SCALES, _ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
+_LARGEST_ID = 2**24
+"""Up to here float32 holds whole numbers."""
 _REQUIRED = [*_MEANS, *_COLORS, "opacity", *_SCALES, *_ROTATIONS]
 
 
@@ -39,6 +42,7 @@ def write_gaussian_ply(
 
     Raises:
         ValueError: an unknown extra.
+        FormatError: an object id above 2^24.
         RunFolderError: the file cannot be written.
     """
     write_gaussian_parts(path, len(gaussians), [gaussians], gaussians, extra, comments)
@@ -58,18 +62,18 @@ def write_gaussian_parts(
 
     Raises:
         ValueError: an unknown extra, or another number of Gaussians than `count`.
+        FormatError: an object id above 2^24.
         RunFolderError: the file cannot be written.
     """
     unknown = set(extra) - set(EXTRAS)
     if unknown:
         raise ValueError(f"unknown extra properties {sorted(unknown)}, expected some of {EXTRAS}")
     empty = GaussianMap(like.sh_degree, like.features.shape[1], with_moments=False)
-    write_ply_parts(
-        path, "vertex", count, (_vertices(part, extra) for part in parts), _vertices(empty, extra).dtype, comments
-    )
+    rows = (_vertices(path, part, extra) for part in parts)
+    write_ply_parts(path, "vertex", count, rows, _vertices(path, empty, extra).dtype, comments)
 
 
-def _vertices(gaussians: GaussianMap, extra: Collection[str]) -> np.ndarray:
+def _vertices(path: str | Path, gaussians: GaussianMap, extra: Collection[str]) -> np.ndarray:
     """The rows of a map as they are stored, a structured array [N]."""
     count, rest = len(gaussians), gaussians.sh.shape[1] - 1
     quaternions = torch.nn.functional.normalize(gaussians.quaternions, dim=1)
@@ -83,7 +87,9 @@ def _vertices(gaussians: GaussianMap, extra: Collection[str]) -> np.ndarray:
     _add(columns, _SCALES, gaussians.log_scales)
     _add(columns, _ROTATIONS, quaternions)
     if "object_id" in extra:
-        _add(columns, ["object_id"], gaussians.object_id[:, None])
+        if count and int(gaussians.object_id.abs().max()) > _LARGEST_ID:
+            raise FormatError(f"{path}: object ids are at most {_LARGEST_ID} in a PLY of Gaussians")
+        _add(columns, ["object_id"], gaussians.object_id[:, None].float())
     if "identity" in extra:
         _add(columns, [f"identity_{i}" for i in range(gaussians.features.shape[1])], gaussians.features)
     rows = np.empty(count, [(name, column.dtype.str) for name, column in columns.items()])
@@ -110,6 +116,21 @@ def read_gaussian_ply(path: str | Path, device: torch.device | str = "cpu", with
     return gaussians_of_vertices(path, read_ply(path).elements.get("vertex"), device, with_moments)
 
 
+def object_ids(path: str | Path, vertex: np.ndarray, first: int = 0) -> np.ndarray:
+    """The property `object_id`, of whatever type, as int32 [N]; arguments as of `gaussians_of_vertices`.
+
+    Raises:
+        FormatError: it is not a whole number of 32 bits.
+    """
+    stored = vertex["object_id"]
+    with np.errstate(invalid="ignore"):
+        whole = stored.astype(np.int32)
+    if not np.array_equal(whole, stored):
+        row = int(np.argmax(whole != stored))
+        raise FormatError(f"{path}: 'object_id' of vertex {first + row} is {stored[row]}, expected a whole number")
+    return whole
+
+
 def gaussians_of_vertices(
     path: str | Path, vertex: np.ndarray | None, device: torch.device | str = "cpu", with_moments: bool = True,
     first: int = 0,
@@ -134,7 +155,7 @@ def gaussians_of_vertices(
         opacity_logits=_floats(path, first, vertex, ["opacity"])[:, 0],
         rgb=torch.zeros(len(vertex), 3),
         features=_floats(path, first, vertex, features),
-        object_id=torch.from_numpy(vertex["object_id"].astype(np.int32)) if "object_id" in names else None,
+        object_id=torch.from_numpy(object_ids(path, vertex, first)) if "object_id" in names else None,
     )
     out.sh[:, 0] = _floats(path, first, vertex, _COLORS).to(out.sh)
     channel_major = _floats(path, first, vertex, rest).reshape(len(vertex), 3, len(rest) // 3)

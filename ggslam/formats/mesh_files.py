@@ -12,7 +12,8 @@ from types import ModuleType
 
 import numpy as np
 
-from ggslam.errors import FormatError, MissingDependency
+from ggslam.errors import FormatError
+from ggslam.formats.optional_package import package_for
 from ggslam.formats.ply import write_ply
 from ggslam.formats.triangle_mesh import majority_labels
 from ggslam.system.atomic import write_bytes
@@ -90,13 +91,7 @@ def _write_ply(
 
 
 def _trimesh(path: str | Path) -> ModuleType:
-    try:
-        import trimesh
-    except ImportError as error:
-        raise MissingDependency(
-            f"to write {path} the package trimesh is needed: `pip install 'ggslam[mesh]'`, or write a .ply ({error})"
-        ) from None
-    return trimesh
+    return package_for(path, "trimesh", "mesh", otherwise="write a .ply")
 
 
 def _write_trimesh(

@@ -15,7 +15,8 @@ from types import ModuleType
 
 import numpy as np
 
-from ggslam.errors import FormatError, MissingDependency, RunFolderError
+from ggslam.errors import FormatError, RunFolderError
+from ggslam.formats.optional_package import package_for
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import write_bytes
@@ -24,34 +25,14 @@ SPZ_REACH = 2048.0
 """Metres: positions in SPZ are 24 bits with 12 behind the point."""
 
 
-def check_gaussforge(path: str | Path) -> ModuleType:
-    """The package gaussforge.
+def spz_packages(path: str | Path, version: int = 3) -> tuple[ModuleType, ModuleType | None]:
+    """The packages gaussforge and, for version 4, zstandard.
 
     Raises:
-        MissingDependency: it is not installed; says how to get it.
+        MissingDependency: one is not installed; says how to get it.
     """
-    try:
-        import gaussforge
-    except ImportError as error:
-        raise MissingDependency(
-            f"to write {path} the package gaussforge is needed: `pip install 'ggslam[splats]'` ({error})"
-        ) from None
-    return gaussforge
-
-
-def check_zstandard(path: str | Path) -> ModuleType:
-    """The package zstandard.
-
-    Raises:
-        MissingDependency: it is not installed; says how to get it.
-    """
-    try:
-        import zstandard
-    except ImportError as error:
-        raise MissingDependency(
-            f"to write {path} as version 4 the package zstandard is needed: `pip install 'ggslam[splats]'` ({error})"
-        ) from None
-    return zstandard
+    zstandard = package_for(path, "zstandard", "splats", otherwise="write version 3") if version == 4 else None
+    return package_for(path, "gaussforge", "splats"), zstandard
 
 
 def write_spz(path: str | Path, gaussians: GaussianMap, version: int = 3) -> None:
@@ -67,7 +48,7 @@ def write_spz(path: str | Path, gaussians: GaussianMap, version: int = 3) -> Non
         FormatError: a Gaussian is too far away for the format, or a number is not finite.
         RunFolderError: the file cannot be written.
     """
-    gaussforge, zstandard = check_gaussforge(path), check_zstandard(path) if version == 4 else None
+    gaussforge, zstandard = spz_packages(path, version)
     farthest = float(gaussians.means.abs().max())
     if not farthest < SPZ_REACH:
         raise FormatError(f"{path}: SPZ holds positions up to {SPZ_REACH:g} m, found {farthest:g} m; write a PLY")

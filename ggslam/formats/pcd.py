@@ -17,6 +17,7 @@ from ggslam.errors import FormatError
 from ggslam.formats import lzf
 from ggslam.formats.text_numbers import fit, parse_numbers
 from ggslam.system.atomic import write_bytes
+from ggslam.system.foreign import read_foreign
 
 _MAXIMUM_HEADER_BYTES = 1 << 16
 _KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
@@ -40,11 +41,7 @@ def read_pcd(path: str | Path) -> np.ndarray:
         FormatError: the file is missing, no PCD file, cut off or damaged; names file and reason.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
-    return parse_pcd(data, path)
+    return parse_pcd(read_foreign(path), path)
 
 
 def parse_pcd(data: bytes, path: str | Path) -> np.ndarray:

@@ -17,6 +17,7 @@ from ggslam.errors import FormatError
 from ggslam.formats.ply_header import FORMATS, PLY_NAMES, SIZED_NAMES, Element, Header, read_header
 from ggslam.formats.text_numbers import fit, parse_numbers
 from ggslam.system.atomic import atomic_write
+from ggslam.system.foreign import open_foreign
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def read_ply(path: str | Path) -> PlyFile:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_foreign(path) as file:
             header = read_header(file, path)
             if header.encoding == "ascii":
                 elements = _read_ascii(file, header, path)

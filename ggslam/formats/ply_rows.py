@@ -9,6 +9,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.ply_header import FORMATS, read_header
+from ggslam.system.foreign import open_foreign
 
 
 class PlyRows:
@@ -25,7 +26,7 @@ class PlyRows:
     def __init__(self, path: Path, element: str) -> None:
         self.path = path
         try:
-            with path.open("rb") as file:
+            with open_foreign(path) as file:
                 header = read_header(file, path)
         except OSError as error:
             raise FormatError(f"cannot read {path}: {error.strerror or error}") from error

@@ -15,10 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import FormatError
+from ggslam.formats.gaussian_ply import object_ids
 from ggslam.formats.pcd import read_pcd, write_pcd
 from ggslam.formats.ply import read_ply, write_ply
 from ggslam.formats.point_ply import grid_positions
 from ggslam.scene.gaussian_map import SH_C0
+from ggslam.system.foreign import open_foreign
 
 COLORS = ("red", "green", "blue")
 _COLOR_NAMES = (COLORS, ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -71,7 +73,7 @@ def read_point_cloud(path: str | Path) -> ColoredCloud:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_foreign(path) as file:
             start = file.read(4)
     except OSError as error:
         raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
@@ -153,6 +155,8 @@ def _cloud(path: Path, rows: np.ndarray, comments: list[str]) -> ColoredCloud:
     used = {"x", "y", "z", *(color_names or ()), *((reflectance,) if reflectance else ())}
     others = [n for n in rows.dtype.names or () if n not in used]
     labels = {n: rows[n] for n in others if rows.dtype[n].kind in "iu" and n.lower() not in _ALPHA}
+    if color_names == _GAUSSIAN_COLOR and "object_id" in others:  # of a 3DGS PLY, where all is float32
+        labels["object_id"] = object_ids(path, rows)
     left_out = tuple(n for n in others if n not in labels)
     cloud = ColoredCloud(points, colors, labels, left_out=left_out)
     if reflectance is not None:

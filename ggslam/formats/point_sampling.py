@@ -272,10 +272,12 @@ def _samples(
         owner = np.repeat(np.arange(start, stop), per_gaussian[start:stop])
         number = np.arange(bounds[start], bounds[stop]) - bounds[owner]
         offset = _lattice_point(number, steps[owner]) * step[owner]
-        alpha = opacity[owner] * np.exp(-0.5 * ((offset / scales[owner]) ** 2).sum(1))
+        a, b = ((offset / scales[owner]) ** 2).T
+        alpha = opacity[owner] * np.exp(-0.5 * (a + b))
         visible = alpha >= discs.minimum_opacity * (1 - 1e-9)
         owner, offset = owner[visible], offset[visible]
-        position = means[owner] + (axes[owner] * offset[:, None, :]).sum(2)
+        first, second = np.moveaxis(axes[owner] * offset[:, None, :], 2, 0)
+        position = means[owner] + (first + second)
         yield position, alpha[visible], color[owner], object_id[owner]
         start = stop
 

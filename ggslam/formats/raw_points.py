@@ -10,6 +10,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.formats.text_numbers import parse_numbers
 from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.system.foreign import MAX_TEXT_BYTES, read_foreign
 
 
 def read_raw_points(path: str | Path, columns: int = 3) -> np.ndarray:
@@ -20,10 +21,7 @@ def read_raw_points(path: str | Path, columns: int = 3) -> np.ndarray:
         FormatError: the file is missing, its size is no multiple of a row, or a coordinate is not finite.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
+    data = read_foreign(path)
     row = 4 * columns
     if len(data) % row:
         raise FormatError(f"{path}: {len(data)} bytes, expected a multiple of {row} ({columns} float32 per point)")
@@ -41,10 +39,7 @@ def read_pose_graph(path: str | Path) -> dict[str, np.ndarray]:
         FormatError: the file is missing, empty, or a line has something else.
     """
     path = Path(path)
-    try:
-        lines = path.read_bytes().splitlines()
-    except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
+    lines = read_foreign(path, MAX_TEXT_BYTES).splitlines()
     poses = {}
     for number, line in enumerate(lines, 1):
         words = line.split()

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ _ODD_IN_Y_AND_Z = (1, 2, 4, 7, 9, 11, 12, 14)
 
 @dataclass(frozen=True)
 class SplatColumns:
-    """Copies of what a map consists of, float32, in the order of the map.
+    """Copies of what a map consists of, float32 but for the ids, in the order of the map.
 
     Attributes:
         means: [N, 3] metres.
@@ -26,6 +27,7 @@ class SplatColumns:
         quaternions: [N, 4] wxyz, of unit length.
         logits: [N] of opacities.
         sh: [N, K, 3] spherical harmonics, the base colour first.
+        object_id: int32 [N], 0 = none.
     """
 
     means: np.ndarray
@@ -33,6 +35,10 @@ class SplatColumns:
     quaternions: np.ndarray
     logits: np.ndarray
     sh: np.ndarray
+    object_id: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.means)
 
     @staticmethod
     def of(path: str | Path, gaussians: GaussianMap) -> SplatColumns:
@@ -42,10 +48,19 @@ class SplatColumns:
         names = ("position", "size", "quaternion", "opacity", "colour")
         arrays = [values.detach().cpu().numpy().astype(np.float32) for values in tensors]
         for name, values in zip(names, arrays, strict=True):
-            bad = ~np.isfinite(values).reshape(len(values), -1).all(1)
+            bad = ~np.isfinite(values).all(tuple(range(1, values.ndim)))
             if bad.any():
                 raise FormatError(f"{path}: the {name} of Gaussian {int(bad.argmax())} is not a finite number")
-        return SplatColumns(*arrays)
+        return SplatColumns(*arrays, gaussians.object_id.cpu().numpy().copy())
+
+    @staticmethod
+    def join(parts: Sequence[SplatColumns]) -> SplatColumns:
+        """Those of maps one after the other, of which there is at least one."""
+        return SplatColumns(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(SplatColumns)))
+
+    def take(self, rows: np.ndarray) -> SplatColumns:
+        """Those of some rows, int64 [M]."""
+        return SplatColumns(*(getattr(self, f.name)[rows] for f in fields(SplatColumns)))
 
     def turn_upright(self) -> None:
         """Turns everything by 180 degrees about x: from x right, y down, z forward to y up, z backwards."""

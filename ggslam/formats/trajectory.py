@@ -15,6 +15,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.scene.poses import is_valid_pose, matrix_to_quaternion, orthonormalize, quaternion_to_matrix
 from ggslam.system.atomic import write_text
+from ggslam.system.foreign import read_foreign_text
 
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, metres)\n"
 
@@ -118,13 +119,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
 def _rows(path: Path, columns: tuple[int, ...]) -> Iterator[tuple[str, np.ndarray]]:
     """("file, line n", numbers) of each line with content; the number of columns must be one of `columns`."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"{path}: not a text file ({error.reason} at byte {error.start})") from error
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_foreign_text(path).splitlines(), start=1):
         words = line.split("#", 1)[0].split()
         if not words:
             continue

@@ -10,7 +10,6 @@ not known can be looked up (`loops.places`). The part `PLACES` of a cell holds a
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,7 +19,7 @@ from ggslam.errors import ConfigError, FormatError
 from ggslam.features.orb import FeatureView
 from ggslam.loops.places import Place, PlaceIndex, PlaceMatch
 from ggslam.loops.settings import PlaceSettings
-from ggslam.scene.arrays import arrays_to_bytes
+from ggslam.scene.arrays import arrays_of, arrays_to_bytes
 from ggslam.scene.camera import Camera
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
@@ -117,11 +116,8 @@ def stored_views(store: GridStore, key: CellKey, camera: Camera) -> list[StoredV
 
 def _arrays(store: GridStore, key: CellKey) -> Mapping[str, np.ndarray]:
     where = f"{store.path}: cell {key}: {PLACES}"
-    try:
-        with np.load(io.BytesIO(store.get(key, PLACES)), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in _NAMES}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise FormatError(f"{where}: damaged: {error}") from None
+    file = io.BytesIO(store.get(key, PLACES))
+    arrays = arrays_of(file, f"{where}: damaged", lambda held: {name: held[name] for name in _NAMES})
     views, landmarks = len(arrays["poses"]), int(arrays["counts"].sum())
     fits = len(arrays["counts"]) == len(arrays["codes"]) == views and arrays["poses"].shape[1:] == (4, 4)
     if not fits or not len(arrays["descriptors"]) == len(arrays["points"]) == landmarks:

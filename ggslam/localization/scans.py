@@ -18,6 +18,7 @@ from ggslam.errors import FormatError, SequenceError
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.raw_points import read_raw_points
 from ggslam.formats.trajectory import read_trajectory
+from ggslam.scene.arrays import read_array
 
 _SUFFIXES = (".bin", ".npy", ".pcd")
 _POSES = ("trajectory.txt", "groundtruth.txt", "poses.txt")
@@ -102,11 +103,8 @@ def _points(path: Path, columns: int) -> np.ndarray:
         return read_raw_points(path, columns)[:, :3]
     if path.suffix.lower() == ".pcd":
         return read_point_cloud(path).points.astype(np.float32)
-    try:
-        points = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise FormatError(f"{path}: cannot be read: {error}") from None
-    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind != "f":
+    points = read_array(path)
+    if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind != "f":
         shape = list(np.shape(points))
         raise FormatError(f"{path}: expected floating-point numbers [n, 3 or more], found {shape}")
     return np.ascontiguousarray(points[:, :3], np.float32)

@@ -35,6 +35,9 @@ Vector = Sequence[float]
 FARTHEST_M = 1000.0
 """Objects are not moved farther from the origin than this: clouds sampled from a map count cells in 21 bits."""
 
+MAX_NAME = 200
+"""Characters of the name of an object."""
+
 
 @dataclass(frozen=True)
 class Change:
@@ -199,6 +202,8 @@ def rename_object(scene: SegmentedMap, object_id: int, name: str) -> Change:
         ConfigError: unknown id; or a name that would be taken for an id or a list, or is "all", empty or another's.
     """
     what, name = _labels(scene, [object_id]), name.strip()
+    if len(name) > MAX_NAME:
+        raise ConfigError(f"name {name[:20]!r}...: {len(name)} characters, at most {MAX_NAME}")
     if not name or name.isdecimal() or "," in name or name.casefold() == "all" or not name.isprintable():
         raise ConfigError(f"name {name!r}: expected a printable word that is no number, without commas, and not 'all'")
     taken = [i for i, other in _names(scene.table).items() if other.casefold() == name.casefold() and i != object_id]

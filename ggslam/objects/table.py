@@ -21,6 +21,7 @@ from ggslam.objects.colors import id_palette
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.system.atomic import write_text
+from ggslam.system.foreign import read_foreign_text
 
 Supervision = Literal["masks", "associated masks", "geometry", "model"]
 """Where the ids came from: masks whose ids are constant in time; masks made consistent by association; the geometric
@@ -223,15 +224,13 @@ class ObjectTable:
             FormatError: missing, no JSON, or not as `save` writes it; the message names the object and the field.
         """
         try:
-            values = json.loads(Path(path).read_text(encoding="utf-8"))
+            values = json.loads(read_foreign_text(path))
             table = pydantic.TypeAdapter(ObjectTable).validate_python(values)
-        except FileNotFoundError:
-            raise FormatError(f"{path}: file is missing") from None
         except pydantic.ValidationError as error:
             first = error.errors()[0]
             place = ".".join(str(part) for part in first["loc"]) or "top level"
             raise FormatError(f"{path}: {place}: {first['msg']}, found {first['input']!r:.60}") from None
-        except (OSError, ValueError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:
             raise FormatError(f"{path}: cannot be read: {error}") from None
         twice = [name for name, times in Counter(table.ids()).items() if times > 1]
         if twice:

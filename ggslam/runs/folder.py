@@ -26,7 +26,6 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from ggslam import __version__
 from ggslam.errors import RunFolderError
@@ -50,6 +49,8 @@ from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config, config_from_dict
 from ggslam.slam.result import SlamResult
 from ggslam.system.folder_lock import LOCK_FILE, folder_lock, refuse_other_writers
+from ggslam.system.foreign import printable, read_foreign_text, refuse_links
+from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.staging import finish_saving, is_being_saved, leftovers
 
 MARKER = RunRecord.FILE
@@ -78,6 +79,7 @@ class RunFolder:
         folder = RunFolder(path)
         refuse_other_writers(folder.path)
         try:
+            refuse_links(folder.path, RunFolderError)
             if folder.path.is_dir() and folder._content():
                 if not overwrite and has_checkpoints(folder.path):
                     raise RunFolderError(f"{path}: there is a run that was cut off; use `resume` or `overwrite`")
@@ -105,6 +107,7 @@ class RunFolder:
                 raise RunFolderError(f"{path}: the run was cut off before it was saved; go on with it: `resume`")
             reason = "is not a run of ggslam (no run.json)" if Path(path).is_dir() else "no such folder"
             raise RunFolderError(f"{path}: {reason}")
+        refuse_links(path, RunFolderError)
         if is_being_saved(Path(path), MARKER):
             with folder_lock(Path(path), wait_s=5):
                 finish_saving(Path(path), MARKER)
@@ -123,7 +126,7 @@ class RunFolder:
         reason = mark.stopped_by or (f"lacks {', '.join(mark.missing)}" if mark.missing else "saving did not finish")
         problems += [] if mark.complete else [f"the run is incomplete: {reason}"]
         for problem in problems:
-            _log.warning("warning: %s: %s", self.path, problem)
+            _log.warning("warning: %s", printable(f"{self.path}: {problem}"))
 
     @staticmethod
     def open_unfinished(path: Path) -> RunFolder:
@@ -242,8 +245,8 @@ class RunFolder:
         """The settings of the run."""
         path = self.path / "config.yaml"
         try:
-            return config_from_dict(yaml.safe_load(path.read_text()), str(path))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            return config_from_dict(parse_yaml(read_foreign_text(path, RunFolderError)), str(path))
+        except PlainYamlError as error:
             raise RunFolderError(f"{path}: cannot be read: {error}") from None
 
     def gaussians(self, with_moments: bool = False) -> GaussianMap:

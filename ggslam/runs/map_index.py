@@ -24,6 +24,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.atomic import write_text
+from ggslam.system.foreign import read_foreign_text
 from ggslam.system.process_memory import release_early
 
 MAP_INDEX = "map_cells.json"
@@ -73,7 +74,7 @@ class MapIndex:
             FormatError: it is missing, damaged or of another version.
         """
         try:
-            values = json.loads(path.read_text())
+            values = json.loads(read_foreign_text(path))
             if values["version"] != _VERSION:
                 raise ValueError(f"version {values['version']}, this program reads version {_VERSION}")
             columns = [np.array([row[name] for row in values["cells"]]) for name in ("start", "count", "low", "high")]
@@ -81,7 +82,7 @@ class MapIndex:
             good = starts.ndim == 1 and low.shape == high.shape == (len(starts), 3) and np.isfinite(low + high).all()
             if not good or (counts < 1).any() or (starts != np.cumsum(counts) - counts).any():
                 raise ValueError("the cells do not follow each other")
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
             raise FormatError(f"{path}: not the index of a map: {error}") from None
         return MapIndex(starts.astype(np.int64), counts.astype(np.int64), low.astype(float), high.astype(float))
 

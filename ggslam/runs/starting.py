@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -126,16 +127,22 @@ def _bare_keyframe(number: int, T_world_camera: np.ndarray, camera: Camera) -> K
     return Keyframe(number, ELSEWHERE, float("nan"), camera, color, depth, inverse(T_world_camera))
 
 
-def _with_images(folder: RunFolder, keyframes: list[Keyframe], with_masks: bool) -> list[Keyframe]:
+def _with_images(
+    folder: RunFolder, keyframes: list[Keyframe], with_masks: bool, later: Sequence[Path] = ()
+) -> list[Keyframe]:
     """The same keyframes with their images, read again from the recordings they came from.
 
     Raises:
-        RunFolderError: a recording is not there any more.
+        RunFolderError: a recording is not there any more, or a run began with its own map (`later`: runs that began
+            with this one's).
     """
+    if folder.path.resolve() in later:
+        raise RunFolderError(f"{folder.path}: says that it began with its own map")
     if folder.sequence().map is not None:
         earlier = parent(folder)
         first = len(earlier.keyframes().keyframes)
-        keyframes = _with_images(earlier, keyframes[:first], with_masks) + keyframes[first:]
+        later = [*later, folder.path.resolve()]
+        keyframes = _with_images(earlier, keyframes[:first], with_masks, later) + keyframes[first:]
     else:
         first = 0
     records = folder.keyframes().keyframes[first:]

@@ -5,17 +5,26 @@ from __future__ import annotations
 
 import io
 import math
+import os
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 from numpy.lib import format as npy
 
-from ggslam.errors import FormatError
+from ggslam.errors import FormatError, GgslamError
+from ggslam.system.foreign import open_foreign
+
+T = TypeVar("T")
+MAX_EXPANDED_BYTES = 64 << 20
+"""What compressed arrays may expand to in memory whatever their file's size; beyond it at most `MAX_RATIO` times that
+size. ggslam writes its arrays uncompressed."""
+MAX_RATIO = 16
 
 
 def arrays_to_bytes(**arrays: np.ndarray) -> bytes:
@@ -23,6 +32,24 @@ def arrays_to_bytes(**arrays: np.ndarray) -> bytes:
     out = io.BytesIO()
     np.savez(out, **arrays)  # type: ignore[arg-type]
     return out.getvalue()
+
+
+def read_array(path: str | Path, error: type[GgslamError] = FormatError) -> np.ndarray:
+    """The array of a .npy file.
+
+    Raises:
+        error: missing, no array of numbers, or damaged; a header that claims more than the file holds included.
+    """
+    with open_foreign(path, error) as file:
+        try:
+            shape, _, dtype = _read_header(file)
+            if dtype.hasobject:
+                raise ValueError("it holds Python objects")
+            _check_claim(math.prod(shape) * dtype.itemsize, os.fstat(file.fileno()).st_size - file.tell())
+            file.seek(0)
+            return np.asarray(npy.read_array(file, allow_pickle=False))
+        except _DAMAGE as reason:
+            raise error(f"{path}: cannot be read: {reason}") from None
 
 
 def read_all_arrays(path: str | Path, content: str) -> dict[str, np.ndarray]:
@@ -47,13 +74,11 @@ def array_blocks(path: str | Path, content: str, *names: str, rows: int) -> Iter
     """The arrays of these names, as many rows of each at a time; arguments and errors as of `read_arrays`. They end
     with the shortest."""
     try:
-        with zipfile.ZipFile(path) as archive, ExitStack() as stack:
+        with open_foreign(path) as opened, zipfile.ZipFile(opened) as archive, ExitStack() as stack:
             members = [_Member(stack.enter_context(archive.open(f"{name}.npy"))) for name in names]
             for _ in range(0, min(member.rows for member in members), rows):
                 yield [member.read(rows) for member in members]
-    except FileNotFoundError:
-        raise FormatError(f"{path}: file is missing") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except _DAMAGE as error:
         raise FormatError(f"{path}: not {content} written by ggslam: {error}") from None
 
 
@@ -75,11 +100,60 @@ class _Member:
         return values.reshape(-1, *self._shape)
 
 
-def _read(path: str | Path, content: str, chosen: Callable[[Any], Any]) -> Any:
+def _read(path: str | Path, content: str, chosen: Callable[[Any], T]) -> T:
+    with open_foreign(path) as file:
+        return arrays_of(file, f"{path}: not {content} written by ggslam", chosen)
+
+
+def arrays_of(file: IO[bytes], what: str, chosen: Callable[[Any], T]) -> T:
+    """What `chosen` takes from the arrays of an open file, which is read and checked before anything large is made.
+
+    Args:
+        file: a .npz file.
+        what: for the message: `what`: reason.
+        chosen: takes arrays by name.
+
+    Raises:
+        FormatError: it is none, damaged, or expands to more than it may.
+    """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            held = sum(member.compress_size for member in members)
+            _check_claim(sum(member.file_size for member in members), max(MAX_EXPANDED_BYTES, MAX_RATIO * held))
+            for member in members:
+                _check_member(archive, member)
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as arrays:
             return chosen(arrays)
-    except FileNotFoundError:
-        raise FormatError(f"{path}: file is missing") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise FormatError(f"{path}: not {content} written by ggslam: {error}") from None
+    except _DAMAGE as error:
+        raise FormatError(f"{what}: {error}") from None
+
+
+def _check_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
+    if member.flag_bits & 1:
+        raise ValueError(f"{member.filename} is encrypted")
+    with archive.open(member) as file:
+        shape, _, dtype = _read_header(file)
+    if dtype.kind not in "biufUS" or min(shape, default=0) < 0:
+        raise ValueError(f"{member.filename} holds {dtype}, not numbers or text")
+    _check_claim(math.prod(shape) * dtype.itemsize, member.file_size)
+
+
+def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, order and type of an array; the file is left at its first byte."""
+    readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+    version = npy.read_magic(file)
+    if version not in readers:
+        raise ValueError(f"an array of version {version}")
+    return readers[version](file)
+
+
+def _check_claim(claimed: int, held: int) -> None:
+    if claimed > held:
+        raise ValueError(f"it claims {claimed:,} bytes of arrays, {held:,} can be there")
+
+
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, TypeError, SyntaxError, RuntimeError, NotImplementedError,
+           OverflowError, MemoryError, RecursionError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+"""What Python's and NumPy's readers raise for damaged, encrypted or strange files."""

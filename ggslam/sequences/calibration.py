@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import is_valid_pose
 from ggslam.sequences.recording import DepthCamera, Recording, read_text
+from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 
 MODELS = ("opencv", "fisheye")
 
@@ -39,9 +39,9 @@ def read_calibration(path: Path) -> dict[str, Any]:
         SequenceError: missing, not YAML, or without entries.
     """
     try:
-        settings = yaml.safe_load(read_text(path))
-    except yaml.YAMLError as error:
-        raise SequenceError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+        settings = parse_yaml(read_text(path))
+    except PlainYamlError as error:
+        raise SequenceError(f"{path}: not YAML: {error}") from None
     if not isinstance(settings, dict):
         raise SequenceError(f"{path}: expected entries width, height, fx, fy, cx, cy, depth_scale, found none")
     return settings

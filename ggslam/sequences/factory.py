@@ -30,6 +30,7 @@ from ggslam.sequences.masks import find_masks
 from ggslam.sequences.pose_conventions import convert_poses
 from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat
 from ggslam.sequences.sequence import OnBadFrame, Sequence
+from ggslam.system.foreign import refuse_links
 
 FORMATS: tuple[RecordingFormat, ...] = (
     SyntheticFormat(),
@@ -115,9 +116,13 @@ def _read_recording(
     """Reads a recording's description and applies the user's options; arguments and errors as in `open_sequence`."""
     if not folder.exists():
         raise SequenceError(f"{folder}: no such folder or file")
-    recording = _find_format(folder, format).read(folder, options)
+    found = _find_format(folder, format)
+    if folder.is_dir():
+        refuse_links(folder, SequenceError)
+    recording = found.read(folder, options)
     if not recording.files:
         raise SequenceError(f"{folder}: holds no frames")
+    _check_places(recording)
     if options.depth_camera is not None:
         use_depth_camera(recording, options.depth_camera)
     if options.min_confidence is not None:
@@ -133,6 +138,24 @@ def _read_recording(
     if not (math.isfinite(recording.depth_scale) and recording.depth_scale > 0):
         raise SequenceError(f"{folder}: depth scale must be a positive number, found {recording.depth_scale}")
     return recording
+
+
+def _check_places(recording: Recording) -> None:
+    """Raises SequenceError if a recording names a file outside its folder: it may come from somebody who wants to know
+    what is there."""
+    root = recording.path if recording.path.is_dir() else recording.path.parent
+    inside: dict[Path, bool] = {}
+    resolved = root.resolve()
+    for entry in recording.files:
+        for path in (entry.color, entry.depth, entry.mask, entry.confidence):
+            if not isinstance(path, Path):
+                continue
+            if path.parent not in inside:
+                inside[path.parent] = path.parent.resolve().is_relative_to(resolved)
+            if not inside[path.parent]:
+                raise SequenceError(
+                    f"{path}: lies outside the recording {root}; copy it there, or give the folder that holds both"
+                )
 
 
 def _use_masks(recording: Recording, folder: Path) -> None:

@@ -14,8 +14,12 @@ import cv2
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.scene.arrays import read_array
 from ggslam.sequences.recording import ImageFile
+from ggslam.system.foreign import MAX_IMAGE_BYTES, read_foreign
 
+MAX_PIXELS = 100_000_000
+"""Of one image: more than any camera of a recording has, and 300 MB in memory."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -75,13 +79,8 @@ def read_confidence(file: ImageFile) -> np.ndarray:
 
 
 def _read_array(path: Path) -> np.ndarray:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except FileNotFoundError:
-        raise SequenceError(f"{path}: image file is missing") from None
-    except (OSError, ValueError, EOFError) as error:
-        raise SequenceError(f"{path}: cannot be read: {error}") from None
-    if not isinstance(array, np.ndarray) or array.ndim not in (2, 3):
+    array = read_array(path, SequenceError)
+    if array.ndim not in (2, 3):
         raise SequenceError(f"{path}: expected an array of an image, found shape {list(np.shape(array))}")
     return array
 
@@ -98,12 +97,7 @@ def read_content(path: Path) -> bytes:
     Raises:
         SequenceError: missing, truncated, damaged, or not an image.
     """
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise SequenceError(f"{path}: image file is missing") from None
-    except OSError as error:
-        raise SequenceError(f"{path}: cannot be read: {error.strerror}") from None
+    content = read_foreign(path, MAX_IMAGE_BYTES, SequenceError)
     damage = find_damage(content)
     if damage:
         raise SequenceError(f"{path}: {damage}")
@@ -116,6 +110,9 @@ def decode(path: object, content: bytes, flags: int) -> np.ndarray:
     Raises:
         SequenceError: OpenCV cannot decode it.
     """
+    size = claimed_size(content)
+    if size is not None and size[0] * size[1] > MAX_PIXELS:
+        raise SequenceError(f"{path}: claims {size[0]}x{size[1]} pixels; at most {MAX_PIXELS:,} are read")
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error as error:
@@ -123,6 +120,21 @@ def decode(path: object, content: bytes, flags: int) -> np.ndarray:
     if image is None:
         raise SequenceError(f"{path}: cannot be decoded as an image ({len(content)} bytes)")
     return image
+
+
+def claimed_size(content: bytes) -> tuple[int, int] | None:
+    """(width, height) that the header of a PNG or JPEG file claims; None where it has none."""
+    if content.startswith(PNG_SIGNATURE):
+        return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
+    position = 2
+    while content.startswith(b"\xff\xd8") and position + 9 <= len(content) and content[position] == 0xFF:
+        marker = content[position + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a frame's header
+            height, width = content[position + 5 : position + 7], content[position + 7 : position + 9]
+            return int.from_bytes(width, "big"), int.from_bytes(height, "big")
+        padding = marker == 0xFF
+        position += 1 if padding else 2 + int.from_bytes(content[position + 2 : position + 4], "big")
+    return None
 
 
 def find_damage(content: bytes) -> str | None:

@@ -85,7 +85,7 @@ def _listed_codes(path: Path) -> np.ndarray | None:
     try:
         content = json.loads(read_text(path))
         codes = np.unique(np.array(list(_segment_ids(content)), np.int64))
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, SequenceError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, SequenceError) as error:
         _log.warning("%s is not used, it does not list segments as DEVA does: %r", path, error)
         return None
     codes = codes[codes != 0]

@@ -14,6 +14,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.images import PNG_SIGNATURE, decode, describe_channels, read_content
+from ggslam.system.foreign import open_foreign
 
 MaskKind = Literal["grey", "palette", "RGB"]
 
@@ -44,9 +45,9 @@ class MaskImage:
 def mask_kind(path: Path) -> MaskKind | None:
     """How a file holds its ids, by its first bytes; None when it is no PNG or cannot be read."""
     try:
-        with path.open("rb") as file:
+        with open_foreign(path, SequenceError) as file:
             header = file.read(_HEADER_SIZE)
-    except OSError:
+    except (OSError, SequenceError):
         return None
     return _format(header)[1]
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
+from ggslam.system.foreign import read_foreign_text
 
 NOMINAL_RATE = 30.0
 """Frames per second assumed when a recording tells no time."""
@@ -245,11 +246,6 @@ def read_text(path: Path) -> str:
     """Text of a small file.
 
     Raises:
-        SequenceError: missing, unreadable or not text.
+        SequenceError: missing, unreadable, too large or not text.
     """
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise SequenceError(f"{path}: file is missing") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise SequenceError(f"{path}: cannot be read as text: {error}") from None
+    return read_foreign_text(path, SequenceError)

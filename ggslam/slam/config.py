@@ -22,6 +22,8 @@ from ggslam.slam.loop_closing import LoopSettings
 from ggslam.slam.object_masks import MaskSettings
 from ggslam.submaps.paging_settings import PagingSettings
 from ggslam.system.atomic import write_text
+from ggslam.system.foreign import read_foreign_text
+from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
@@ -134,8 +136,8 @@ def load_config(preset_or_file: str | Path | None = None, overrides: list[str] |
         if not equals:
             raise ConfigError(f"`overrides` {override}: expected name=value")
         try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
+            value = parse_yaml(text)
+        except PlainYamlError as error:
             raise ConfigError(f"`overrides` {override}: cannot be read as a value: {error}") from None
         _assign(values, name.strip().split("."), value, override)
     return config_from_dict(values, "`overrides`" if overrides else origin)
@@ -151,10 +153,10 @@ def _assign(values: dict[str, Any], names: list[str], value: Any, override: str)
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        values = yaml.safe_load(path.read_text())
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file, nor a preset (presets: {', '.join(presets())})") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        if not path.exists():
+            raise ConfigError(f"{path}: no such file, nor a preset (presets: {', '.join(presets())})")
+        values = parse_yaml(read_foreign_text(path, ConfigError))
+    except PlainYamlError as error:
         raise ConfigError(f"{path}: cannot be read as YAML: {error}") from None
     return values if values is not None else {}
 

@@ -33,6 +33,9 @@ from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker
 
+SMALLEST_SIDE = 16
+"""Pixels; below it there are no windows to estimate normals in, nor tiles to draw."""
+
 
 @dataclass
 class RunParts:
@@ -65,6 +68,9 @@ def make_parts(
     camera: Camera, config: Config, has_masks: bool | None, paging: Path | None, library: CudaLibrary | None
 ) -> RunParts:
     """The parts that the settings name; arguments and errors as of `Slam`."""
+    if min(camera.width, camera.height) < SMALLEST_SIDE:
+        size = f"{camera.width}x{camera.height}"
+        raise ConfigError(f"images of {size} pixels are too small: at least {SMALLEST_SIDE} each way are needed")
     context, masks, notes = NativeContext(config.threads or None), ObjectMasks(config.masks, has_masks), []
     if library is None:
         library, reason = run_library(config)

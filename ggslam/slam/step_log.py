@@ -13,6 +13,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.mapping.mapper import LossSums, Mapper, MapperTimes
 from ggslam.slam.result import SlamTimes, StepReport, TrackedFrame
+from ggslam.system.foreign import read_foreign_text
 from ggslam.system.process_memory import resident_bytes
 
 STEPS_FILE = "steps.csv"
@@ -89,10 +90,7 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
     Raises:
         FormatError: it cannot be read, or a row has another number of columns than the header.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(f"{path}: cannot be read: {error}") from None
+    lines = read_foreign_text(path).splitlines()
     names = lines[0].split(",") if lines else []
     rows = [line.split(",") for line in lines[1:]]
     for number, row in enumerate(rows, start=2):

@@ -17,7 +17,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
-from ggslam.errors import RunFolderError
+import numpy as np
+
+from ggslam.errors import FormatError, RunFolderError
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.system.atomic import write_failure
 
@@ -33,8 +35,17 @@ class CellFiles:
         self.folder = folder
 
     def path(self, key: CellKey, version: int, part: str) -> Path:
-        """Where a part lies."""
-        return self._cell(key) / str(version) / part
+        """Where a part lies.
+
+        Raises:
+            FormatError: its name or a link leads out of the store.
+        """
+        if not _PART.fullmatch(part) or not isinstance(version, int):
+            raise FormatError(f"{self.folder}: cell {key}: {part!r}, version {version!r}: not a part of a cell")
+        path = self._own(key) / str(version) / part
+        if path.is_symlink() or path.parent.is_symlink():
+            raise FormatError(f"{path}: is a link, or lies in one")
+        return path
 
     def write(self, versions: Mapping[tuple[CellKey, int], Mapping[str, bytes]]) -> None:
         """Writes new versions of cells and waits until they and their names are on the disk.
@@ -50,7 +61,7 @@ class CellFiles:
         path = self.folder
         try:
             for (key, version), parts in versions.items():
-                path = self._cell(key) / str(version)
+                path = self._own(key) / str(version)
                 path.mkdir(parents=True)
                 folders |= {path: None, path.parent: None}
                 for name, data in parts.items():
@@ -64,10 +75,14 @@ class CellFiles:
             list(pool.map(wait_for_disk, [*written, *folders]))
 
     def sweep(self, key: CellKey, kept: Mapping[str, int]) -> None:
-        """Removes a cell's files, except the versions to keep of its parts. What cannot be removed stays."""
-        cell = self._cell(key)
-        with suppress(OSError):
+        """Removes a cell's files, except the versions to keep of its parts. What cannot be removed stays, and so does
+        what lies behind a link."""
+        with suppress(OSError, FormatError):
+            cell = self._own(key)
             for folder in list(cell.iterdir()):
+                if folder.is_symlink() or not folder.is_dir():
+                    folder.unlink()
+                    continue
                 parts = {name for name, version in kept.items() if str(version) == folder.name}
                 if not parts:
                     shutil.rmtree(folder, ignore_errors=True)
@@ -85,8 +100,16 @@ class CellFiles:
                 if match := _CELL.fullmatch(entry.name):
                     yield int(match[1]), int(match[2]), int(match[3])
 
-    def _cell(self, key: CellKey) -> Path:
-        return self.folder / "_".join(map(str, key))
+    def _own(self, key: CellKey) -> Path:
+        """The folder of a cell. Raises FormatError if it, or the folder of all cells, is a link, or the cell is none
+        (an index from elsewhere may hold anything)."""
+        if not all(isinstance(number, (int, np.integer)) for number in key):
+            raise FormatError(f"{self.folder}: {key!r} is not a cell")
+        cell = self.folder / "_".join(map(str, key))
+        for path in (self.folder, cell):
+            if path.is_symlink():
+                raise FormatError(f"{path}: is a link; a store holds none")
+        return cell
 
 
 class WriterLock:

@@ -20,7 +20,7 @@ from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.gaussian_rows import Rows, decode_rows, encode_rows, join, map_like
 from ggslam.submaps.grid import GridStore
 
-PART, ARRIVALS = "gaussians.npz", "arrivals.npz"
+PART, ARRIVALS = "gaussians.rows", "arrivals.rows"
 """Parts of a cell: its Gaussians, and while a correction is carried out those that come from other cells."""
 REACH_SIGMAS = 3.4
 """Standard deviations to which a Gaussian reaches: beyond, its alpha is below 1/255 whatever its opacity."""

@@ -106,6 +106,9 @@ class GridStore:
         path = Path(path)
         if not (path / _INDEX).is_file():
             raise FormatError(f"{path}: no grid store: there is no file {_INDEX}")
+        for entry in path.iterdir():
+            if entry.is_symlink():
+                raise FormatError(f"{entry}: is a link; a store holds none")
         with ExitStack() as undone:
             lock = None
             if write:

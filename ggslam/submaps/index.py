@@ -225,6 +225,8 @@ def _connect(path: Path, write: bool) -> sqlite3.Connection:
                 ) from error
             connection = sqlite3.connect(f"{uri}&immutable=1", uri=True, check_same_thread=False)
     connection.execute("PRAGMA synchronous = FULL")
+    connection.execute("PRAGMA trusted_schema = OFF")
+    connection.execute("PRAGMA cell_size_check = ON")
     return connection
 
 
@@ -249,6 +251,9 @@ def _read_settings(path: Path, connection: sqlite3.Connection) -> SubmapSettings
         raise FormatError(f"{path}: not the index of a grid store (application id {application:#x})")
     if version != FORMAT_VERSION:
         raise FormatError(f"{path}: format version {version}, this program reads version {FORMAT_VERSION}")
+    strange = connection.execute("SELECT name FROM sqlite_master WHERE type NOT IN ('table', 'index')").fetchone()
+    if strange is not None:
+        raise FormatError(f"{path}: holds {strange[0]!r}, which no index of ggslam does")
     try:
         return SubmapSettings(**json.loads(connection.execute("SELECT settings FROM store").fetchone()[0]))
     except (TypeError, ValueError, RecursionError, ConfigError) as error:

@@ -27,6 +27,8 @@ AMBIENT_RAYS = 16
 _STRIP = 16
 OFFSET = 2e-3
 """Metres by which rays start above the surface."""
+_MARGIN = 0.01
+"""Metres by which a shape has to be out of the way for its rays not to be looked at: far more than rounding."""
 
 
 @dataclass
@@ -69,49 +71,83 @@ def bake(scene: Scene) -> LightMaps:
             continue
         low, high = np.array(source.bounds)
         inside = np.nonzero(((patches.position >= low) & (patches.position <= high)).all(1))[0]
-        lit = _Patches(patches.position[inside], patches.normal[inside], patches.owner[inside])
         shapes = [shape if _reaches_into(shape, low, high) else None for shape in scene.shapes]
-        light[seen[inside]] += _direct(shapes, source, lit)
+        light[seen[inside]] += _direct(shapes, source, patches.of(inside))
     return _pack(light, sizes)
 
 
 class _Patches:
     """Patches to be lit: positions just above their surface and normals, float64 [n, 3]; number of their shape [n].
 
-    Most shapes matter to few patches. The tests below find these, first by bounding spheres around strips of patches.
+    Most shapes matter to few patches. The tests below find these, first by bounding spheres around strips of patches,
+    then by the boxes around shapes.
     """
 
     def __init__(self, position: np.ndarray, normal: np.ndarray, owner: np.ndarray) -> None:
         self.position, self.normal, self.owner = position, normal, owner
-        self._strip = np.arange(len(position)) // _STRIP
-        count = np.bincount(self._strip)
-        self._centre = np.stack([np.bincount(self._strip, position[:, k]) / count for k in range(3)], 1)
-        self._radius = np.zeros(len(count))
-        np.maximum.at(self._radius, self._strip, np.linalg.norm(position - self._centre[self._strip], axis=1))
+        self._height = _dot(position, normal)
+        strip = np.arange(len(position)) // _STRIP
+        count = np.bincount(strip)
+        self._centre, self._normal = (
+            np.stack([np.bincount(strip, of[:, k]) / count for k in range(3)], 1) for of in (position, normal)
+        )
+        self._radius, self._bend = np.zeros(len(count)), np.zeros(len(count))
+        np.maximum.at(self._radius, strip, _length(position - self._centre[strip]))
+        np.maximum.at(self._bend, strip, _length(normal - self._normal[strip]))
+
+    def of(self, rows: np.ndarray) -> _Patches:
+        """Some of them."""
+        return _Patches(self.position[rows], self.normal[rows], self.owner[rows])
 
     def near(self, number: int, shape: Shape, reach: float) -> np.ndarray:
         """Numbers of the patches that look at a shape and may be within `reach` metres of it."""
-        apart = np.linalg.norm(self._centre - shape.T_world_shape[:3, 3], axis=1)
-        chosen = self._patches_facing(number, shape, apart < reach + shape.radius() + self._radius)
+        apart = _length(self._centre - shape.T_world_shape[:3, 3])
+        chosen = self._facing(number, shape, np.nonzero(apart < reach + shape.radius() + self._radius)[0])
         return chosen[shape.distance(self.position[chosen]) < reach]
 
-    def find_shaded(self, number: int, shape: Shape, light: np.ndarray, spread: float) -> np.ndarray:
-        """Numbers of the patches that look at a shape which may hide part of a ball of radius `spread` at `light`."""
-        centre, way = shape.T_world_shape[:3, 3], light - self._centre
-        length = np.linalg.norm(way, axis=1)
-        share = np.clip(((centre - self._centre) * way).sum(1) / length**2, 0, 1)
-        apart = np.linalg.norm(self._centre + share[:, None] * way - centre, axis=1)
-        # The ways to the ball form a cone: they spread only towards the light.
+    def shaded(self, number: int, shape: Shape, light: np.ndarray) -> np.ndarray:
+        """Numbers of the patches that look at a shape which may hide some of the points [n, 3] of a light."""
+        middle = light.mean(0)
+        spread = float(_length(light - middle).max())
+        centre, way = shape.T_world_shape[:3, 3], middle - self._centre
+        length = _length(way)
+        share = np.clip(_dot(centre - self._centre, way) / length**2, 0, 1)
+        apart = _length(self._centre + share[:, None] * way - centre)
+        # The ways to a ball around the light form a cone: they spread only towards the light.
         farthest = np.minimum(share + (shape.radius() + spread) / length, 1)
-        return self._patches_facing(number, shape, apart < shape.radius() + farthest * spread + self._radius)
+        near = np.nonzero(apart < shape.radius() + farthest * spread + self._radius)[0]
+        near = near[~_beside(shape, light, self._centre[near], self._radius[near, None])]
+        chosen = self._facing(number, shape, near)
+        return chosen[~_beside(shape, light, self.position[chosen])]
 
-    def _patches_facing(self, number: int, shape: Shape, strips: np.ndarray) -> np.ndarray:
-        """Of the patches in some strips (bool), those with some of the shape above their plane. A convex shape hides
-        nothing from itself."""
-        chosen = np.nonzero(strips[self._strip])[0]
+    def _facing(self, number: int, shape: Shape, strips: np.ndarray) -> np.ndarray:
+        """Of the patches in some strips, those with some of the shape above their plane. A convex shape hides nothing
+        from itself."""
+        R, centre, bounds = shape.T_world_shape[:3, :3], shape.T_world_shape[:3, 3], shape.bounds()
+        middle, normal = self._centre[strips], self._normal[strips]
+        slack = self._radius[strips] + self._bend[strips] * (_length(centre - middle) + shape.radius())
+        above = normal @ centre - _dot(middle, normal) + np.abs(normal @ R) @ bounds + slack
+        chosen = (strips[above > -_MARGIN, None] * _STRIP + np.arange(_STRIP)).ravel()
+        chosen = chosen[: np.searchsorted(chosen, len(self.position))]
         chosen = chosen[self.owner[chosen] != number]
-        towards = shape.T_world_shape[:3, 3] - self.position[chosen]
-        return chosen[np.einsum("nk,nk->n", towards, self.normal[chosen]) > -shape.radius()]
+        normal = self.normal[chosen]
+        return chosen[normal @ centre - self._height[chosen] + np.abs(normal @ R) @ bounds > -_MARGIN]
+
+
+def _beside(shape: Shape, light: np.ndarray, points: np.ndarray, radius: np.ndarray | float = 0.0) -> np.ndarray:
+    """Whether points [n, 3], or balls there, and a light are on one side of a shape, as of a wall: it hides nothing."""
+    R, centre, reach = shape.T_world_shape[:3, :3], shape.T_world_shape[:3, 3], shape.bounds() + _MARGIN
+    own, lamp = (points - centre) @ R, (light - centre) @ R
+    apart = (np.minimum(own - radius, lamp.min(0)) > reach) | (np.maximum(own + radius, lamp.max(0)) < -reach)
+    return apart[:, 0] | apart[:, 1] | apart[:, 2]
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("nk,nk->n", a, b)
+
+
+def _length(a: np.ndarray) -> np.ndarray:
+    return np.sqrt(_dot(a, a))
 
 
 def _patches(side: float) -> int:
@@ -179,14 +215,11 @@ def _direct(shapes: Sequence[Shape | None], light: Light, patches: _Patches) -> 
     strength = np.maximum(falling, 0) / (squared + 0.05)
     if light.normal is not None:
         strength *= np.maximum(-np.einsum("knp,k->np", to_light, np.array(light.normal)) / length, 0)
-    lit = strength.max(1) > 1e-4
-    visible = np.ones(strength.shape, bool)
-    centre = light.points.mean(0)
-    spread = float(np.linalg.norm(light.points - centre, axis=1).max())
+    rows = np.nonzero(strength.max(1) > 1e-4)[0]
+    visible, lit = np.ones(strength.shape, bool), patches.of(rows)
     for number, shape in enumerate(shapes):
         if shape is not None and shape.casts_shadow:
-            chosen = patches.find_shaded(number, shape, centre, spread)
-            chosen = chosen[lit[chosen]]
+            chosen = rows[lit.shaded(number, shape, light.points)]
             visible[chosen] &= _first_hits(shape, patches.position[chosen], to_light[:, chosen]) > 1
     return (strength * visible).mean(1)[:, None] * np.array(light.power)
 

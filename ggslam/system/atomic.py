@@ -88,6 +88,18 @@ def make_folder(path: str | Path) -> None:
         raise RunFolderError(f"{path}: cannot be made: {error.strerror or error}") from None
 
 
+def make_empty_folder(path: str | Path) -> None:
+    """Makes a folder for files that must not lie among those of an earlier time.
+
+    Raises:
+        RunFolderError: there is something already, or it cannot be made.
+    """
+    path = Path(path)
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise RunFolderError(f"{path}: exists and is not an empty folder; choose another one with `out`")
+    make_folder(path)
+
+
 def write_failure(path: str | Path, error: OSError) -> RunFolderError:
     """The error to raise when the operating system would not write `path`; a full or broken disk is not the user's."""
     failure = RunFolderError(f"cannot write {path}: {error.strerror or error}")

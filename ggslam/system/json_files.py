@@ -11,6 +11,7 @@ import numpy as np
 
 from ggslam.errors import RunFolderError
 from ggslam.system.atomic import write_text
+from ggslam.system.foreign import read_foreign_text
 
 
 def json_ready(value: Any) -> Any:
@@ -43,8 +44,6 @@ def read_json(path: Path) -> Any:
         RunFolderError: it is missing or damaged.
     """
     try:
-        return json.loads(path.read_text())
-    except FileNotFoundError:
-        raise RunFolderError(f"{path}: missing") from None
-    except (OSError, ValueError, RecursionError) as error:
+        return json.loads(read_foreign_text(path, RunFolderError))
+    except (ValueError, RecursionError) as error:
         raise RunFolderError(f"{path}: cannot be read: {error}") from None

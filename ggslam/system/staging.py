@@ -16,8 +16,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ggslam.errors import RunFolderError
+from ggslam.errors import GgslamError, RunFolderError
 from ggslam.system.atomic import write_text
+from ggslam.system.foreign import is_plain_name, read_foreign_text
 
 _SAVING = "saving"
 _NAME = re.compile(r"\.staged-(\d+)-[0-9a-f]{8}")
@@ -98,10 +99,10 @@ def _exchange(staged: Path, target: Path, marker: str, stale: Sequence[str]) -> 
 def _read_saving(marker: Path) -> dict[str, Any] | None:
     """What a marker says of a saving under way; None if nothing, or if it was not written by `publish`."""
     try:
-        values = json.loads(marker.read_text())
+        values = json.loads(read_foreign_text(marker))
         record = values[_SAVING]
-        good = _NAME.fullmatch(record["from"]) and all(Path(name).name == name for name in record["stale"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        good = _NAME.fullmatch(record["from"]) and all(map(is_plain_name, record["stale"]))
+    except (GgslamError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return dict(record) if good else None
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
@@ -115,7 +116,10 @@ class EditableMap(ViewedMap, Protocol):
         """Name and content of a PLY file of an object."""
 
     def default_target(self) -> str:
-        """Folder to save to, if nobody names another."""
+        """Name to save as, if nobody gives another."""
+
+    def save_folder(self) -> Path:
+        """Folder that edited maps are saved in."""
 
     def save(self, target: str, inpaint: bool) -> str:
-        """Writes the edited map with all that belongs to it."""
+        """Writes the edited map with all that belongs to it, as a folder of this name in `save_folder`."""

@@ -47,7 +47,8 @@ class ObjectsTab:
         with gui.add_folder("Edits"):
             self._done = gui.add_markdown("")
             self._undo = gui.add_button("Undo", icon="arrow-back-up")
-            self._target = gui.add_text("Save to", model.default_target())
+            place = f"A new folder in {model.save_folder()}"
+            self._target = gui.add_text("Save as", model.default_target(), hint=place)
             self._inpaint = gui.add_checkbox("Close holes", False, hint="As `ggslam edit --inpaint` does; takes longer")
             self._save = gui.add_button("Save edited run", icon="device-floppy")
         self._connect()

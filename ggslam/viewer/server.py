@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from ggslam.errors import ConfigError, MissingDependency
 from ggslam.scene.camera import Camera
 from ggslam.viewer.cameras import fitting_fov
+from ggslam.viewer.gate import Gate, guard
 
 if TYPE_CHECKING:
     import viser
@@ -41,13 +42,17 @@ def open_server(host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, title: str =
         raise MissingDependency(text) from None
     _check_free(host, port)
 
+    gate = Gate(host)
+
     class LocalServer(viser.ViserServer):
-        """A server that never hands the page to an outside service, whatever a client asks for."""
+        """A server that lets in who has the printed address, and never hands the page to an outside service."""
+
+        token = gate.token
 
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
-    with _quiet():
+    with _quiet(), guard(gate):
         server = LocalServer(host=host, port=port, label=title, verbose=False)
     clear_page(server, title)
     return server
@@ -83,10 +88,11 @@ def close_server(server: viser.ViserServer) -> None:
 
 
 def address(server: viser.ViserServer) -> str:
-    """Where a browser finds it."""
+    """Where a browser finds it, with the token that lets it in."""
     host = server.get_host()
     name = "localhost" if host in ("127.0.0.1", "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-    return f"http://{name}:{server.get_port()}"
+    token = getattr(server, "token", None)
+    return f"http://{name}:{server.get_port()}" + (f"/?token={token}" if token else "")
 
 
 def _check_free(host: str, port: int) -> None:

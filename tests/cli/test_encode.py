@@ -59,7 +59,7 @@ def by_grid(cloud: VoxelCloud) -> np.ndarray:
     return rows[np.lexsort(rows.T[::-1])]
 
 
-@pytest.mark.parametrize("options", [[], ["--slices", 4], ["--slices", 4, "--split", "interval", "--workers", 1],
+@pytest.mark.parametrize("options", [[], ["--slices", 4], ["--slices", 4, "--split", "interval", "--threads", 1],
                                      ["--slices", 6, "--split", "octree"]])  # fmt: skip
 def test_voxel_clouds_come_back_with_their_grid_and_ids(ggslam: Ggslam, tmp_path: Path, options: list[object]) -> None:
     cloud = voxel_cloud()
@@ -234,7 +234,7 @@ def test_mistakes_are_named(ggslam: Ggslam, tmp_path: Path) -> None:
         (("decode", stream, tmp_path / "b.ply", "--box", "50 50 50 60 60 60"), "no points in the box"),
         (("decode", stream, tmp_path / "b.ply", "--box", "0 0 0 1 1 1", "--slice", 0), "not both"),
         (("inspect", points), "not a G-PCC stream"),
-        (("inspect", tmp_path / "none.bin"), "cannot read"),
+        (("inspect", tmp_path / "none.bin"), "file is missing"),
     ):
         code, _, err = ggslam(*words)
         assert code == 2 and expected in err, (words, err)

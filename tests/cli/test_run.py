@@ -18,10 +18,12 @@ import numpy as np
 import pytest
 import torch
 from command_line import ggslam, refuse
+from kept import points_in_voxels_of
 
 from ggslam.cli import main, run_command
 from ggslam.cli.run_command import _print
 from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.formats.point_ply import read_points
 from ggslam.formats.trajectory import read_tum
 from ggslam.jobs.run.pipeline import RunOutcome
 from ggslam.runs.folder import RunFolder
@@ -43,7 +45,8 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder of the generated room."""
     out = tmp_path_factory.mktemp("runs") / "room"
-    done = ggslam("run", room, "--out", out, "--refine", 20, "--threads", 2)
+    with points_in_voxels_of(0.01):  # as users have it
+        done = ggslam("run", room, "--out", out, "--refine", 20, "--threads", 2)
     assert done.returncode == 0, done.stderr
     return out
 
@@ -55,6 +58,7 @@ def test_a_run_leaves_everything_it_promises(finished: Path) -> None:
     assert len(list((finished / "renders").glob("*.png"))) == 6
     assert [p.name for p in finished.iterdir() if p.name.startswith(".")] == []  # no temporary files
     assert len(read_tum(finished / "trajectory.txt")) == 24
+    assert {read_points(finished / name).voxel_size for name in ("points.ply", "points_grid.ply")} == {0.01}
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["map"]["gaussians"] == len(read_gaussian_ply(finished / "map.ply"))
 

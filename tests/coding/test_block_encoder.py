@@ -47,8 +47,8 @@ def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
         CodecSettings(),
         CodecSettings(slices=7),
         CodecSettings(slices=200),
-        CodecSettings(max_points=500, workers=1),
-        CodecSettings(slices=5, split="interval", workers=3),
+        CodecSettings(max_points=500, threads=1),
+        CodecSettings(slices=5, split="interval", threads=3),
         CodecSettings(slices=40, split="interval", geometry_bits=4),  # some are empty
         CodecSettings(slices=3, split="interval", max_points=900),
         CodecSettings(slices=6, split="cube"),
@@ -71,7 +71,7 @@ def test_the_bytes_are_those_of_the_whole_cloud(settings: CodecSettings, tmp_pat
 def test_parts_of_a_stream_are_the_cloud() -> None:
     points, attributes = cloud()
     data = encode_cloud(points, attributes, CodecSettings(slices=5, attributes=IDS, metadata={"a": 1})).data
-    whole, parts = decode_cloud(data), decode_in_parts(data, workers=2)
+    whole, parts = decode_cloud(data), decode_in_parts(data, threads=2)
     found = list(parts.parts)
     assert len(found) == 5 and parts.count == len(whole) and len(parts.like) == 0
     assert np.array_equal(np.concatenate([part.points for part in found]), whole.points)

@@ -85,9 +85,9 @@ def sorted_rows(*columns: np.ndarray) -> np.ndarray:
 @given(data=st.data(), points=clouds(), choices=codec_settings)
 def test_decoding_gives_the_promised_reconstruction(data: Any, points: np.ndarray, choices: dict) -> None:
     values, own = data.draw(attributes(len(points)))
-    codec = CodecSettings(workers=1, attributes=own, **choices)
+    codec = CodecSettings(threads=1, attributes=own, **choices)
     coded = encode_cloud(points, values, codec, reconstruct=True)
-    cloud = decode_cloud(coded.data, workers=1)
+    cloud = decode_cloud(coded.data, threads=1)
     assert coded.reconstruction is not None
     assert_same(cloud, coded.reconstruction)
     if choices["duplicates"] == "keep":
@@ -100,11 +100,11 @@ def test_decoding_gives_the_promised_reconstruction(data: Any, points: np.ndarra
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data(), points=clouds(), choices=codec_settings)
-def test_slices_and_workers_do_not_matter(data: Any, points: np.ndarray, choices: dict) -> None:
+def test_slices_and_threads_do_not_matter(data: Any, points: np.ndarray, choices: dict) -> None:
     values, own = data.draw(attributes(len(points)))
-    coded = [encode_cloud(points, values, CodecSettings(workers=w, attributes=own, **choices)) for w in (1, 3)]
+    coded = [encode_cloud(points, values, CodecSettings(threads=w, attributes=own, **choices)) for w in (1, 3)]
     assert coded[0].data == coded[1].data
-    whole = decode_cloud(coded[0].data, workers=3)
+    whole = decode_cloud(coded[0].data, threads=3)
     start = 0
     for report in coded[0].report.slices:
         part = decode_slice(coded[0].data, report.slice_id)

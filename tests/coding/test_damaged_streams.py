@@ -38,7 +38,7 @@ def streams() -> list[bytes]:
             "depth": rng.integers(0, 4096, count).astype(np.uint16),
         }
         settings = CodecSettings(
-            slices=2, neighbour_boundary=boundary, duplicates=duplicates, workers=1,
+            slices=2, neighbour_boundary=boundary, duplicates=duplicates, threads=1,
             attributes={"id": AttributeSettings(lossless=True), "depth": AttributeSettings(bit_depth=12)},
         )  # fmt: skip
         made.append(encode_cloud(rng.integers(0, 1 << bits, (count, 3)), values, settings).data)
@@ -80,7 +80,7 @@ def test_damage_never_does_harm(streams: list[bytes]) -> None:
         data = damaged(streams[int(rng.integers(len(streams)))], rng)
         start = time.process_time()
         try:
-            decode_cloud(data, workers=1)
+            decode_cloud(data, threads=1)
             outcomes["decoded"] += 1
         except FormatError as error:
             assert str(error)
@@ -96,7 +96,7 @@ def test_every_truncation_is_noticed(streams: list[bytes]) -> None:
     for length in range(0, len(data), 7):
         if length not in ends:
             with pytest.raises(FormatError):
-                decode_cloud(data[:length], workers=1)
+                decode_cloud(data[:length], threads=1)
 
 
 def test_a_truncated_payload_is_noticed() -> None:
@@ -193,7 +193,7 @@ def test_damage_to_streams_of_every_tool(gpcc_data: Path) -> None:
         for _ in range(12):
             start = time.perf_counter()
             try:
-                decode_cloud(damaged(data, rng), workers=1)
+                decode_cloud(damaged(data, rng), threads=1)
                 outcomes["decoded"] += 1
             except FormatError as error:
                 assert str(error)

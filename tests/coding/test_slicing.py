@@ -113,7 +113,7 @@ def test_an_unknown_slice_is_refused(surface: tuple) -> None:
     [
         ({"split": "random"}, "split"), ({"slices": 0}, "slices"), ({"max_points": 2_000_000}, "max_points"),
         ({"qp": 3}, "qp"), ({"neighbour_boundary": 1}, "neighbour_boundary"), ({"duplicates": "drop"}, "duplicates"),
-        ({"workers": 0}, "workers"), ({"voxel_size": 0}, "voxel_size"),
+        ({"threads": 0}, "threads"), ({"voxel_size": 0}, "voxel_size"),
     ],
 )  # fmt: skip
 def test_impossible_settings_are_named(choices: dict, name: str) -> None:

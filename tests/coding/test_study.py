@@ -43,7 +43,7 @@ def test_the_grid_holds_one_point_per_voxel_with_the_mean_colour(cloud: GridClou
 
 def test_sweeps_move_the_right_way(cloud: GridCloud) -> None:
     steps = sweep_steps(["qp", "geometry"], [4, 22, 40], [0.25, 0.5, 1.0])
-    results = list(run_sweep(cloud, steps, CodecSettings(workers=1), EnergyMeter()))
+    results = list(run_sweep(cloud, steps, CodecSettings(threads=1), EnergyMeter()))
     qp, geometry = [row for row, _ in results[:3]], [row for row, _ in results[3:]]
     assert [row.total_bytes for row in qp] == sorted((row.total_bytes for row in qp), reverse=True)
     assert [row.color.y for row in qp] == sorted((row.color.y for row in qp), reverse=True)
@@ -66,7 +66,7 @@ def test_sweeps_move_the_right_way(cloud: GridCloud) -> None:
 
 def test_tables_and_pictures(cloud: GridCloud, tmp_path: Path) -> None:
     steps, seen = sweep_steps(["qp", "geometry"], [10, 34], [0.5]), []
-    settings = CodecSettings(slices=2, workers=1)
+    settings = CodecSettings(slices=2, threads=1)
     study = write_study(cloud, steps, settings, tmp_path / "study", plots=False, progress=seen.append)
     assert study.rows == seen and len(seen) == 3 and all(path.is_file() for path in study.files)
     with (tmp_path / "study" / "study.csv").open() as file:
@@ -88,7 +88,7 @@ def test_tables_and_pictures(cloud: GridCloud, tmp_path: Path) -> None:
 
 
 def test_plots(cloud: GridCloud, tmp_path: Path) -> None:
-    study = write_study(cloud, sweep_steps(["qp", "geometry"], [10, 34], [0.5]), CodecSettings(workers=1), tmp_path)
+    study = write_study(cloud, sweep_steps(["qp", "geometry"], [10, 34], [0.5]), CodecSettings(threads=1), tmp_path)
     names = {path.name for path in study.files}
     for name in ("rate_distortion_qp", "rate_distortion_geometry", "time_qp", "time_geometry"):
         assert {f"{name}.png", f"{name}.svg"} <= names

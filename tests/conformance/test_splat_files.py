@@ -1,23 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splat files at every degree of spherical harmonics, read back without any of our code: as the formats' descriptions
-say (splat_maps.py), and by PlayCanvas' splat-transform, where there is one: a command in GGSLAM_SPLAT_TRANSFORM, or
-`splat-transform` on the PATH (npm install -g @playcanvas/splat-transform)."""
+"""What is particular to single splat formats: how near their bits allow, what the rest of a file says, what they cannot
+hold. test_exported_splats.py holds them all to the same."""
 
 from __future__ import annotations
 
-import gzip
-import os
-import shlex
-import shutil
-import struct
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from splat_formats import UPRIGHT
 from splat_maps import (
+    DIRECTIONS,
     Splats,
+    convert,
     from_compressed_ply,
     from_glb,
     from_ply,
@@ -25,6 +21,7 @@ from splat_maps import (
     glb_parts,
     ply_elements,
     small_map,
+    spz_streams,
 )
 
 from ggslam.errors import FormatError
@@ -33,24 +30,8 @@ from ggslam.formats.gaussian_gltf import write_gaussian_gltf
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.morton import morton_order
 from ggslam.formats.packed_splats import write_spz
-from ggslam.formats.splat_file import write_splat
 
 DEGREES = [0, 1, 2, 3]
-DIRECTIONS = np.array([[0.3, -0.5, 0.8], [-0.7, 0.2, -0.1], [0.1, 0.9, 0.4]])
-
-
-@pytest.fixture(scope="session")
-def splat_transform() -> list[str]:
-    """The command."""
-    command = os.environ.get("GGSLAM_SPLAT_TRANSFORM") or shutil.which("splat-transform")
-    if not command:
-        pytest.skip("splat-transform is not there (GGSLAM_SPLAT_TRANSFORM, or on the PATH)")
-    return shlex.split(command)
-
-
-def convert(command: list[str], *words: str | Path) -> None:
-    done = subprocess.run([*command, "-w", *map(str, words)], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def check_same(seen: Splats, written: Splats, turn: np.ndarray | None = None, rounding: float = 1e-6) -> None:
@@ -92,26 +73,10 @@ def test_ply(degree: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_ply_by_splat_transform(degree: int, tmp_path: Path, splat_transform: list[str]) -> None:
-    gaussians = small_map(degree)
-    write_gaussian_ply(tmp_path / "map.ply", gaussians, ["object_id"])
-    convert(splat_transform, tmp_path / "map.ply", tmp_path / "seen.ply")
-    check_same(from_ply(tmp_path / "seen.ply"), Splats.of(gaussians))
-
-
-@pytest.mark.parametrize("degree", DEGREES)
 def test_compressed_ply(degree: int, tmp_path: Path) -> None:
     gaussians = small_map(degree)
     write_compressed_ply(tmp_path / "map.compressed.ply", gaussians)
     check_packed(from_compressed_ply(tmp_path / "map.compressed.ply"), Splats.of(gaussians))
-
-
-@pytest.mark.parametrize("degree", DEGREES)
-def test_compressed_ply_by_splat_transform(degree: int, tmp_path: Path, splat_transform: list[str]) -> None:
-    gaussians = small_map(degree)
-    write_compressed_ply(tmp_path / "map.compressed.ply", gaussians)
-    convert(splat_transform, tmp_path / "map.compressed.ply", tmp_path / "seen.ply")
-    check_packed(from_ply(tmp_path / "seen.ply"), Splats.of(gaussians))
 
 
 def test_extremes_in_a_compressed_ply(tmp_path: Path) -> None:
@@ -136,20 +101,6 @@ def test_what_no_compressed_ply_can_hold(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="at least one"):
         write_compressed_ply(tmp_path / "map.ply", gaussians)
     assert not list(tmp_path.iterdir())
-
-
-def test_splat_by_splat_transform(tmp_path: Path, splat_transform: list[str]) -> None:
-    gaussians = small_map(0)
-    write_splat(tmp_path / "map.splat", [gaussians])
-    convert(splat_transform, tmp_path / "map.splat", tmp_path / "seen.ply")
-    seen, written = from_ply(tmp_path / "seen.ply"), Splats.of(gaussians)
-    np.testing.assert_allclose(seen.means, written.means, atol=1e-6)
-    np.testing.assert_allclose(seen.log_scales, written.log_scales, atol=1e-5)
-    np.testing.assert_allclose(seen.opacities, written.opacities, atol=0.51 / 255)
-    np.testing.assert_allclose(seen.colors(DIRECTIONS[0]), written.colors(DIRECTIONS[0]).clip(0, 1), atol=0.51 / 255)
-
-
-UPRIGHT = np.diag([1.0, -1.0, -1.0])
 
 
 @pytest.mark.parametrize("degree", DEGREES)
@@ -228,49 +179,6 @@ def test_gltf_by_trimesh(tmp_path: Path) -> None:
     write_gaussian_gltf(tmp_path / "map.glb", 600, [gaussians], 1, {1: "mug"})
     (cloud,) = trimesh.load_scene(tmp_path / "map.glb").geometry.values()
     np.testing.assert_allclose(cloud.vertices, gaussians.means.numpy() @ UPRIGHT, atol=1e-6)
-
-
-def spz_streams(path: Path) -> list[bytes]:
-    """The attributes of an SPZ file of version 3 or 4."""
-    data = path.read_bytes()
-    if data[:4] != b"NGSP":
-        data = gzip.decompress(data)
-        assert struct.unpack_from("<4sI", data) == (b"NGSP", 3)
-        count, degree = struct.unpack_from("<IB", data, 8)
-        ends = np.cumsum([16, *(count * width for width in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)) if width)])
-        assert ends[-1] == len(data)
-        return [data[one:other] for one, other in zip(ends[:-1], ends[1:], strict=True)]
-    zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed (extra [splats])")
-    version, streams, start = *struct.unpack_from("<4xI", data), data[15], *struct.unpack_from("<I", data, 16)
-    assert version == 4
-    out, place = [], start + 16 * streams
-    for number in range(streams):
-        packed, size = struct.unpack_from("<QQ", data, start + 16 * number)
-        out.append(zstandard.ZstdDecompressor().decompress(data[place : place + packed]))
-        assert len(out[-1]) == size
-        place += packed
-    assert place == len(data)
-    return out
-
-
-@pytest.mark.parametrize("version", [3, 4])
-@pytest.mark.parametrize("degree", DEGREES)
-def test_spz_by_splat_transform(degree: int, version: int, tmp_path: Path, splat_transform: list[str]) -> None:
-    """It copies what stands in SPZ to PLY, where the map is upside down then."""
-    pytest.importorskip("gaussforge", reason="gaussforge is not installed (extra [splats])")
-    pytest.importorskip("zstandard", reason="zstandard is not installed (extra [splats])")
-    gaussians = small_map(degree)
-    write_spz(tmp_path / "map.spz", gaussians, version)
-    convert(splat_transform, tmp_path / "map.spz", tmp_path / "seen.ply")
-    seen, written = from_ply(tmp_path / "seen.ply"), Splats.of(gaussians)
-    np.testing.assert_allclose(seen.means, written.means @ UPRIGHT, atol=0.51 / 4096)
-    expected = UPRIGHT @ written.covariances() @ UPRIGHT
-    difference = np.linalg.norm(seen.covariances() - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
-    assert difference.max() < 0.08
-    np.testing.assert_allclose(seen.opacities, written.opacities, atol=1.01 / 255)
-    for direction in DIRECTIONS:
-        error = np.abs(seen.colors(UPRIGHT @ direction) - written.colors(direction))
-        assert error.mean() < 0.06 and error.max() < 0.01 + 3 * np.sqrt((degree + 1) ** 2 - 1) / 16
 
 
 @pytest.mark.parametrize("degree", DEGREES)

@@ -1,9 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Fibers start by ucontext, whose switches save the signal mask by a system call; all later switches are by _setjmp and
-// _longjmp, which do not.
 #include "fibers.hpp"
 
-#include <csetjmp>
+#include <algorithm>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -25,11 +23,63 @@ namespace {
 constexpr int kLanes = 32, kMaxThreads = 1024;
 constexpr std::size_t kStackBytes = 64 * 1024;
 
+// --- switching stacks: most of what an emulated kernel takes -----------------------------------------------------------
+
+#ifdef __x86_64__
+using Place = void*;  // stack pointer; on the stack lie the registers that a function has to preserve
+extern "C" void ggslam_emulation_switch(Place* left, Place entered);
+asm(R"(
+.pushsection .text
+.type ggslam_emulation_switch, @function
+ggslam_emulation_switch:
+  pushq %rbp
+  pushq %rbx
+  pushq %r12
+  pushq %r13
+  pushq %r14
+  pushq %r15
+  movq %rsp, (%rdi)
+  movq %rsi, %rsp
+  popq %r15
+  popq %r14
+  popq %r13
+  popq %r12
+  popq %rbx
+  popq %rbp
+  ret
+.size ggslam_emulation_switch, .-ggslam_emulation_switch
+.popsection
+)");
+
+void switch_stacks(Place& left, const Place& entered) { ggslam_emulation_switch(&left, entered); }
+
+// A place at the beginning of `code`, which never returns.
+void begin(Place& place, char* stack, std::size_t bytes, void (*code)()) {
+  const auto top = (reinterpret_cast<std::uintptr_t>(stack) + bytes) / 16 * 16;
+  auto* saved = reinterpret_cast<std::uintptr_t*>(top) - 8;  // six registers, where to go on, where `code` would return
+  std::fill(saved, saved + 8, std::uintptr_t{0});
+  saved[6] = reinterpret_cast<std::uintptr_t>(code);
+  place = saved;
+}
+#else  // slower: every switch saves the signal mask by a system call
+using Place = ucontext_t;
+
+void switch_stacks(Place& left, const Place& entered) { swapcontext(&left, &entered); }
+
+void begin(Place& place, char* stack, std::size_t bytes, void (*code)()) {
+  getcontext(&place);
+  place.uc_stack.ss_sp = stack;
+  place.uc_stack.ss_size = bytes;
+  makecontext(&place, code, 0);
+}
+#endif
+
 struct Fiber {
-  ucontext_t start;
-  jmp_buf place;
+  Place place;
   std::unique_ptr<char[]> stack;
-  bool started = false, done = false;
+  bool done = false;
+  const unsigned* waits_for = nullptr;  // a count of meetings, to become another one than...
+  unsigned meeting = 0;
 };
 
 struct Warp {
@@ -49,39 +99,39 @@ struct Block {
 Fiber fibers[kMaxThreads];
 Warp warps[kMaxThreads / kLanes];
 Block block;
-jmp_buf scheduler;
-ucontext_t scheduler_context;
+Place scheduler;
 bool progress;
 int order = 0;
 
-void pause_fiber() {
+// Until that meeting is over.
+void wait_for(const unsigned& meetings, unsigned meeting) {
   Fiber& mine = fibers[threadIdx.x];
-  if (_setjmp(mine.place) == 0) _longjmp(scheduler, 1);
+  mine.waits_for = &meetings, mine.meeting = meeting;
+  switch_stacks(mine.place, scheduler);
 }
 
 // Body of every fiber: one call of the kernel per block, then a pause until the next block.
 void fiber_main() {
   for (;;) {
     block.code(block.argument);
-    fibers[threadIdx.x].done = true;
+    Fiber& mine = fibers[threadIdx.x];
+    mine.done = true;
     progress = true;
-    pause_fiber();
+    switch_stacks(mine.place, scheduler);
   }
 }
 
+// Goes on with a thread if what it waits for has come.
 void resume(int thread) {
   Fiber& fiber = fibers[thread];
+  if (fiber.waits_for != nullptr && *fiber.waits_for == fiber.meeting) return;
+  fiber.waits_for = nullptr;
   threadIdx.x = static_cast<unsigned>(thread);
-  if (_setjmp(scheduler) != 0) return;
-  if (fiber.started) _longjmp(fiber.place, 1);
-  fiber.started = true;
-  fiber.stack.reset(new char[kStackBytes]);
-  getcontext(&fiber.start);
-  fiber.start.uc_stack.ss_sp = fiber.stack.get();
-  fiber.start.uc_stack.ss_size = kStackBytes;
-  fiber.start.uc_link = &scheduler_context;
-  makecontext(&fiber.start, fiber_main, 0);
-  setcontext(&fiber.start);
+  if (!fiber.stack) {
+    fiber.stack.reset(new char[kStackBytes]);
+    begin(fiber.place, fiber.stack.get(), kStackBytes, fiber_main);
+  }
+  switch_stacks(scheduler, fiber.place);
 }
 
 // The thread to resume as number i of a round: 0 upwards, 1 downwards, 2 in an order of jumps.
@@ -91,9 +141,11 @@ int in_order(int i) {
   return i;
 }
 
+thread_local char in_shared_memory;  // tells where it is for the calling thread
+
 // The memory of this library's thread_local variables, which are the shared memory of all kernels.
 struct SharedMemory {
-  void* place = nullptr;
+  std::ptrdiff_t offset = 0;  // from its beginning to the variable above
   std::size_t bytes = 0;
 };
 
@@ -108,15 +160,20 @@ int find_shared_memory(dl_phdr_info* library, std::size_t, void* found) {
     if (part.p_type == PT_TLS) bytes = part.p_memsz;
   }
   if (!mine) return 0;
-  *static_cast<SharedMemory*>(found) = {library->dlpi_tls_data, bytes};
+  *static_cast<SharedMemory*>(found) = {&in_shared_memory - static_cast<char*>(library->dlpi_tls_data), bytes};
   return 1;
 }
 
 // What was in shared memory before means nothing: as floats it is NaN.
 void spoil_shared_memory() {
-  SharedMemory shared;
-  dl_iterate_phdr(find_shared_memory, &shared);
-  if (shared.place != nullptr) std::memset(shared.place, 0xff, shared.bytes);
+  static const SharedMemory shared = [] {
+    in_shared_memory = 0;  // it is there from the first use on
+    SharedMemory found;
+    dl_iterate_phdr(find_shared_memory, &found);
+    if (found.bytes == 0) fail("no shared memory found");
+    return found;
+  }();
+  std::memset(&in_shared_memory - shared.offset, 0xff, shared.bytes);
 }
 
 // The block to run as number i: upwards, downwards or in an order of jumps.
@@ -152,7 +209,7 @@ void run_block(unsigned number, unsigned blocks, int threads, void (*code)(const
   blockIdx.x = number, gridDim.x = blocks, blockDim.x = static_cast<unsigned>(threads);
   block = Block{};
   block.threads = threads, block.code = code, block.argument = argument;
-  for (int i = 0; i < threads; ++i) fibers[i].done = false;
+  for (int i = 0; i < threads; ++i) fibers[i].done = false, fibers[i].waits_for = nullptr;
   spoil_shared_memory();
   for (Warp& warp : warps) warp.arrived = 0;
   for (int running = threads; running > 0;) {
@@ -179,7 +236,7 @@ int meet_block(int value) {
     ++block.meetings;
     progress = true;
   }
-  while (block.meetings == meeting) pause_fiber();
+  if (block.meetings == meeting) wait_for(block.meetings, meeting);
   return block.result[meeting % 2];
 }
 
@@ -194,7 +251,7 @@ const std::uint64_t* meet_warp(Operation operation, std::uint64_t value) {
     ++warp.meetings;
     progress = true;
   }
-  while (warp.meetings == meeting) pause_fiber();
+  if (warp.meetings == meeting) wait_for(warp.meetings, meeting);
   return warp.given[meeting % 2];
 }
 

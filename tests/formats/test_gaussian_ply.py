@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from ggslam.errors import FormatError
-from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from ggslam.formats.gaussian_ply import EXTRAS, read_gaussian_ply, write_gaussian_ply
 from ggslam.formats.ply import read_ply, write_ply
+from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.scene.gaussian_map import GaussianMap
 
 ARRAYS = ("means", "log_scales", "opacity_logits", "sh", "features", "object_id")
@@ -52,6 +53,32 @@ def test_extras_only_when_asked_and_field_names_of_3dgs(tmp_path: Path) -> None:
     assert read_gaussian_ply(tmp_path / "map.ply").feature_channels == 0
     with pytest.raises(ValueError, match="labels"):
         write_gaussian_ply(tmp_path / "map.ply", random_map(), extra=["labels"])
+
+
+def test_all_properties_are_of_one_type(tmp_path: Path) -> None:
+    """Several readers know no other; object ids are whole numbers, and integers are still read."""
+    written = random_map()
+    written.object_id[:2] = torch.tensor([65535, 0])
+    write_gaussian_ply(tmp_path / "map.ply", written, EXTRAS)
+    vertex = read_ply(tmp_path / "map.ply").elements["vertex"]
+    assert {vertex.dtype[name] for name in vertex.dtype.names or ()} == {np.dtype("<f4")}
+    np.testing.assert_array_equal(vertex["object_id"], written.object_id)
+    cloud = read_point_cloud(tmp_path / "map.ply")
+    np.testing.assert_array_equal(cloud.labels["object_id"], written.object_id)
+    assert cloud.labels["object_id"].dtype == np.int32 and list(cloud.labels) == ["object_id"]
+    kinds = [(name, "<i4" if name == "object_id" else "<f4") for name in vertex.dtype.names or ()]
+    write_ply(tmp_path / "whole.ply", {"vertex": vertex.astype(kinds)})
+    np.testing.assert_array_equal(read_gaussian_ply(tmp_path / "whole.ply").object_id, written.object_id)
+    for odd in (0.5, np.nan, 3e9):
+        broken = vertex.copy()
+        broken["object_id"][7] = odd
+        write_ply(tmp_path / "odd.ply", {"vertex": broken})
+        with pytest.raises(FormatError, match=r"'object_id' of vertex 7 is .*whole number"):
+            read_gaussian_ply(tmp_path / "odd.ply")
+    written.object_id[3] = 2**24 + 1
+    with pytest.raises(FormatError, match=r"map\.ply: object ids are at most 16777216"):
+        write_gaussian_ply(tmp_path / "map.ply", written, EXTRAS)
+    np.testing.assert_array_equal(read_ply(tmp_path / "map.ply").elements["vertex"], vertex)
 
 
 def test_higher_colour_degrees_are_channel_major(tmp_path: Path) -> None:

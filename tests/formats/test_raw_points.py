@@ -23,7 +23,7 @@ def test_damaged_points_are_refused(tmp_path: Path) -> None:
     np.array([[0, 0, 0], [0, np.nan, 0]], "<f4").tofile(tmp_path / "b.bin")
     with pytest.raises(FormatError, match="point 1 is"):
         read_raw_points(tmp_path / "b.bin")
-    with pytest.raises(FormatError, match="cannot read"):
+    with pytest.raises(FormatError, match="file is missing"):
         read_raw_points(tmp_path / "c.bin")
 
 

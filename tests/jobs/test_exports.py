@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run exports, opened by programs that know nothing of ggslam."""
+"""What a run exports: which parts of it, under which names. tests/conformance opens the files with other programs."""
 
 from __future__ import annotations
 
@@ -8,22 +8,18 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from ggslam.cli.main import app
 from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
-from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.jobs.export.export_run import export_run
 from ggslam.jobs.export.formats import ExportFormat, choose_format
-from ggslam.jobs.export.splats import ENDINGS, export_packed, export_pcd
+from ggslam.jobs.export.splats import ENDINGS, export_packed
 from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe
-from ggslam.scene.poses import quaternion_to_matrix
-from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam
 
@@ -43,72 +39,6 @@ def run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return folder
 
 
-def poses(run: RunFolder) -> dict[int, np.ndarray]:
-    return run.keyframes().poses()
-
-
-def seen_depth(points: np.ndarray, T_camera_world: np.ndarray, K: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Nearest depth of points in each pixel of an image whose top-left pixel's centre is (0.5, 0.5); inf: none."""
-    camera = points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    camera = camera[camera[:, 2] > 0.1]
-    u, v, w = (camera @ K.T).T
-    column, row = np.floor(u / w).astype(int), np.floor(v / w).astype(int)
-    inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
-    depth = np.full(shape, np.inf)
-    np.minimum.at(depth, (row[inside], column[inside]), camera[inside, 2])
-    return depth
-
-
-def test_colmap_folder_in_pycolmap(run: RunFolder, room: Path, tmp_path: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed (an independent reader)")
-    line = export_colmap(run, tmp_path / "colmap", voxel_size=0.03)
-    assert "14 images of 160x120 (2 held out)" in line
-    model = pycolmap.Reconstruction(str(tmp_path / "colmap" / "sparse" / "0"))
-    assert len(model.images) == 14 and len(model.cameras) == 1 and len(model.points3D) > 1000
-    camera, sequence = model.cameras[1], open_sequence(room)
-    K = sequence.camera.matrix()
-    assert camera.model.name == "PINHOLE" and (camera.width, camera.height) == (160, 120)
-    np.testing.assert_allclose(camera.params, [K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5])
-    points = np.array([point.xyz for point in model.points3D.values()])
-    for image in model.images.values():
-        index = int(image.name[6:12])
-        T_camera_world = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-        np.testing.assert_allclose(np.linalg.inv(T_camera_world), poses(run)[index], atol=1e-9)
-        stored = cv2.imread(str(tmp_path / "colmap" / "images" / image.name))[..., ::-1]
-        np.testing.assert_array_equal(stored, sequence.frame(index).color)
-        depth = seen_depth(points, T_camera_world, camera.calibration_matrix(), (120, 160))
-        measured = sequence.frame(index).depth
-        both = np.isfinite(depth) & (measured > 0)
-        assert both.sum() > 3000 and np.median(np.abs(depth - measured)[both]) < 0.03  # the points are in the pictures
-    names = (tmp_path / "colmap" / "sparse" / "0" / "test.txt").read_text().split()
-    assert names == [f"frame_{index:06d}.png" for index in HELD_OUT]
-
-
-def test_nerfstudio_folder(run: RunFolder, room: Path, tmp_path: Path) -> None:
-    """Read with nothing but json, OpenCV and the words of nerfstudio's documentation."""
-    out = tmp_path / "nerfstudio"
-    export_nerfstudio(run, out, voxel_size=0.03)
-    values = json.loads((out / "transforms.json").read_text())
-    assert values["val_filenames"] == values["test_filenames"] == [f"images/frame_{i:06d}.png" for i in HELD_OUT]
-    names = [frame["file_path"] for frame in values["frames"]]
-    assert sorted(values["train_filenames"] + values["test_filenames"]) == names and len(names) == 14
-    K = np.array([[values["fl_x"], 0, values["cx"]], [0, values["fl_y"], values["cy"]], [0, 0, 1]])
-    cloud = read_point_cloud(out / values["ply_file_path"])
-    sequence = open_sequence(room)
-    for index, frame in enumerate(values["frames"]):
-        T_world_camera = np.array(frame["transform_matrix"])  # camera axes: x right, y up, z backwards
-        np.testing.assert_allclose(T_world_camera @ np.diag([1, -1, -1, 1]), poses(run)[index], atol=1e-12)
-        color = cv2.imread(str(out / frame["file_path"]))[..., ::-1]
-        depth = cv2.imread(str(out / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
-        measured = sequence.frame(index).depth
-        assert color.shape == (values["h"], values["w"], 3) and depth.dtype == np.uint16
-        np.testing.assert_allclose(depth / 1000, measured, atol=0.00051)
-        T_camera_world = np.linalg.inv(T_world_camera @ np.diag([1, -1, -1, 1]))
-        of_points = seen_depth(cloud.points, T_camera_world, K, depth.shape)
-        both = np.isfinite(of_points) & (depth > 0)
-        assert both.sum() > 3000 and np.median(np.abs(of_points - depth / 1000)[both]) < 0.03
-
-
 def test_only_keyframes_and_what_is_held_out(run: RunFolder, tmp_path: Path) -> None:
     export_nerfstudio(run, tmp_path / "few", voxel_size=0.05, keyframes_only=True)
     values = json.loads((tmp_path / "few" / "transforms.json").read_text())
@@ -124,27 +54,6 @@ def test_a_folder_with_something_in_it_is_left_alone(run: RunFolder, tmp_path: P
         with pytest.raises(RunFolderError, match="not an empty folder"):
             export(run, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-
-
-def test_pcd_in_open3d(run: RunFolder, tmp_path: Path) -> None:
-    open3d = pytest.importorskip("open3d", reason="open3d is not installed (an independent reader)")
-    export_pcd(run, tmp_path / "cloud.pcd", 0.03)
-    seen = open3d.io.read_point_cloud(str(tmp_path / "cloud.pcd"))
-    own = read_point_cloud(tmp_path / "cloud.pcd")
-    np.testing.assert_array_equal(np.asarray(seen.points), own.points)
-    np.testing.assert_array_equal(np.rint(np.asarray(seen.colors) * 255), own.colors)
-    assert len(own) > 1000
-
-
-def test_trajectory_in_numpy(run: RunFolder, tmp_path: Path) -> None:
-    out = tmp_path / "trajectory.txt"
-    result = CliRunner().invoke(app, ["export", str(run.path), "--format", "trajectory", "--out", str(out)])
-    assert result.exit_code == 0, result.output
-    rows = np.loadtxt(out)
-    assert rows.shape == (14, 8) and (np.diff(rows[:, 0]) > 0).all()
-    for row, T in zip(rows, poses(run).values(), strict=True):
-        np.testing.assert_allclose(row[1:4], T[:3, 3], atol=1e-8)
-        np.testing.assert_allclose(quaternion_to_matrix(row[[7, 4, 5, 6]]), T[:3, :3], atol=1e-7)
 
 
 @pytest.mark.parametrize("kind", ["compressed-ply", "spz", "spz4", "splat"])

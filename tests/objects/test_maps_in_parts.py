@@ -216,7 +216,7 @@ def test_other_encodings_are_read_whole(tmp_path: Path, pair: tuple[RunFolder, R
     (tmp_path / "text.ply").write_text("\n".join([*header, "end_header", *numbers, ""]))
     rows = GaussianRows(tmp_path / "text.ply")
     assert len(rows) == 2 and rows.read(1, 1).means.tolist() == [[4, 5, 6]] and len(rows.like) == 0
-    with pytest.raises(FormatError, match="cannot read"):
+    with pytest.raises(FormatError, match="file is missing"):
         GaussianRows(tmp_path / "none.ply")
     index = json.loads((pair[0].path / MAP_INDEX).read_text())
     index["cells"].pop()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import shutil
@@ -39,9 +40,9 @@ def frames(room: Path) -> list[Frame]:
     return list(open_sequence(room).stream())
 
 
-def drifting(frames: list[Frame], confirmations: int = 2) -> tuple[Slam, np.ndarray]:
+def drifting(frames: list[Frame], confirmations: int = 2, keyframes: int = 24) -> tuple[Slam, np.ndarray]:
     """A camera goes through the room and back again, tracked with drift: 18 cm and 4 degrees in all. Whatever it
-    has not seen for a step is put aside. Gives the run and the true poses of its keyframes, which all frames are."""
+    has not seen for a step is put aside. Gives the run up to a keyframe, which all frames are, and their true poses."""
     loops = LoopSettings(
         confirmations=confirmations, activity=ActivitySettings(forget_after=0.05, near=0.15, batch=1, spread=0)
     )
@@ -52,7 +53,7 @@ def drifting(frames: list[Frame], confirmations: int = 2) -> tuple[Slam, np.ndar
     truth = [inverse(frames[0].T_world_camera) @ frames[i].T_world_camera for i in order]
     step = se3_exp(np.array([0.15, 0.06, -0.09, 0.0, np.radians(4), 0.0]) / len(order))
     assert slam.loops is not None
-    for k, i in enumerate(order):
+    for k, i in enumerate(order[:keyframes]):
         slam._follow_moves()
         T = slam.loops.poses[-1] @ inverse(truth[k - 1]) @ truth[k] @ step if k else np.eye(4)
         points = extract_points(frames[i].depth, slam.camera, config.tracking.points, DepthNoise(), slam.context)
@@ -62,13 +63,26 @@ def drifting(frames: list[Frame], confirmations: int = 2) -> tuple[Slam, np.ndar
     return slam, np.array(truth)
 
 
+@pytest.fixture(scope="module")
+def closing(frames: list[Frame]) -> tuple[Slam, np.ndarray]:
+    """A drifting camera that closes its loop."""
+    return drifting(frames)
+
+
+@pytest.fixture(scope="module")
+def unconfirmed(frames: list[Frame]) -> tuple[Slam, np.ndarray]:
+    """The same one, which believes no sighting that is not confirmed by a hundred others."""
+    return drifting(frames, confirmations=100)
+
+
 def error_of_keyframes(slam: Slam, truth: np.ndarray) -> float:
     return float(np.linalg.norm(slam.mapper.keyframes[-1].T_world_camera[:3, 3] - truth[-1, :3, 3]))
 
 
-def test_a_loop_is_closed_and_everything_follows(frames: list[Frame]) -> None:
-    slam, truth = drifting(frames)
-    unclosed, _ = drifting(frames, confirmations=100)
+def test_a_loop_is_closed_and_everything_follows(
+    closing: tuple[Slam, np.ndarray], unconfirmed: tuple[Slam, np.ndarray]
+) -> None:
+    (slam, truth), (unclosed, _) = closing, unconfirmed
     assert slam.loops is not None and unclosed.loops is not None
     closed = [e for e in slam.loops.events if e.kind == "closed"]
     assert closed, [e.reason for e in slam.loops.events]
@@ -85,17 +99,17 @@ def test_a_loop_is_closed_and_everything_follows(frames: list[Frame]) -> None:
     assert slam.moves_followed == len(closed) and slam.tracker.target is slam.surface.target
 
 
-def test_one_sighting_alone_closes_nothing(frames: list[Frame]) -> None:
-    slam, _ = drifting(frames, confirmations=100)
+def test_one_sighting_alone_closes_nothing(unconfirmed: tuple[Slam, np.ndarray]) -> None:
+    slam, _ = unconfirmed
     assert slam.loops is not None
     kinds = {event.kind for event in slam.loops.events}
     assert "verified" in kinds and "closed" not in kinds
 
 
-def test_false_closures_are_rejected_and_change_nothing(frames: list[Frame]) -> None:
-    slam, _ = drifting(frames)
+def test_false_closures_are_rejected_and_change_nothing(closing: tuple[Slam, np.ndarray]) -> None:
+    slam, _ = closing
     assert slam.loops is not None
-    graph = slam.loops.graph
+    graph = copy.deepcopy(slam.loops.graph)
     before = graph.optimise().poses
     for i, j in ((0, 9), (1, 11), (3, 8)):
         wrong = se3_exp(np.array([1.0, -0.5, 0.3, 0.3, 0.2, 0.4])) @ inverse(graph.poses[i]) @ graph.poses[j]
@@ -127,7 +141,7 @@ def test_a_lost_camera_is_found_far_from_where_it_was_lost(frames: list[Frame]) 
 
 
 def test_a_keyframe_from_before_the_loss_that_comes_late_hangs_on_the_one_before_it(frames: list[Frame]) -> None:
-    slam, _ = drifting(frames)
+    slam, _ = drifting(frames, keyframes=6)
     loops = slam.loops
     assert loops is not None
     points = extract_points(frames[4].depth, slam.camera, slam.config.tracking.points, DepthNoise(), slam.context)
@@ -237,7 +251,7 @@ def test_the_first_run_must_be_there_still(room: Path, first_half: Path, tmp_pat
     assert played(room, tmp_path / "b", start=12, stop=16, map=tmp_path / "a").error is None
     with pytest.raises(ConfigError, match="or one that this comes from"):
         played(room, tmp_path / "a", map=tmp_path / "b", overwrite=True)
-    assert played(room, tmp_path / "a", stop=14, overwrite=True).error is None
+    assert played(room, tmp_path / "a", stop=2, overwrite=True).error is None
     with pytest.raises(RunFolderError, match="not the run any more"):
         played(room, tmp_path / "c", map=tmp_path / "b")
     shutil.rmtree(tmp_path / "a")
@@ -249,8 +263,8 @@ def test_the_first_run_must_be_there_still(room: Path, first_half: Path, tmp_pat
 def test_a_grown_run_is_edited_and_then_no_map_to_start_in(room: Path, first_half: Path, tmp_path: Path) -> None:
     assert played(room, tmp_path / "b", start=12, stop=16, map=first_half).error is None
     grown = RunFolder.open(tmp_path / "b")
-    largest = max(grown.object_table().objects, key=lambda o: o.gaussians).id
-    edit_run(grown, [Edit("remove", str(largest))], tmp_path / "edited", inpainting=True)
+    small = min((o for o in grown.object_table().objects if o.gaussians > 100), key=lambda o: o.gaussians).id
+    edit_run(grown, [Edit("remove", str(small))], tmp_path / "edited", inpainting=True)
     with pytest.raises(RunFolderError, match="its map was edited"):
         played(room, tmp_path / "c", map=tmp_path / "edited")
 

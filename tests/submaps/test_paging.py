@@ -118,9 +118,8 @@ def test_a_cell_that_is_on_disk_takes_more(cells_for) -> None:
 
 @pytest.mark.parametrize("shift", [(0.02, 0, 0), (3.1, -1.7, 0.4)])
 def test_a_change_moves_gaussians_to_the_cells_they_are_in_then(cells_for, shift: tuple[float, ...]) -> None:
-    gaussians, step = random_map(), torch.tensor(shift, dtype=torch.float32)
-    cells = cells_for(gaussians)
-    expected = random_map()
+    gaussians, expected = (random_map(1500, extent=4.0) for _ in range(2))
+    cells, step = cells_for(gaussians), torch.tensor(shift, dtype=torch.float32)
     expected.means[expected.birth_keyframe == 2] += step
     cells.move_out(gaussians, cells.cells_of(gaussians))
 

@@ -12,7 +12,7 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.sequences import inspect_sequence, open_sequence
-from ggslam.synthetic import RayCaster, Scene, SceneBuilder, camera_path, furnished_room
+from ggslam.synthetic import RayCaster, Scene, SceneBuilder, camera_path, furnished_room, lighting
 from ggslam.synthetic.materials import MaterialMaker
 from ggslam.synthetic.scene import FACES, Kind, Shape
 from ggslam.synthetic.sensor import noisy_depth
@@ -162,6 +162,33 @@ def test_light_and_shadow() -> None:
     u, v = np.rint(90 * point[0] / point[2] + 79.5).astype(int), np.rint(90 * point[1] / point[2] + 59.5).astype(int)
     floor = images.color[images.mask == 1].astype(int).sum(1)
     assert images.mask[v[1], u[1]] == 1 and images.color[v[1], u[1]].astype(int).sum() > 1.5 * floor.min()
+
+
+def test_shapes_that_are_not_looked_at_hide_no_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The maps are to the bit those for which every shape is looked at from every patch."""
+    rng, b = np.random.default_rng(1), SceneBuilder()
+    b.instance("floor").box((0, 0, -0.05), (4, 4, 0.1), PLAIN)
+    b.instance("wall").box((0, 2.05, 1), (4, 0.1, 2.2), PLAIN)
+    for i in range(9):
+        size, place = rng.uniform(0.1, 0.8, 3), rng.uniform((-1.5, -1.5, 0.1), (1.5, 1.9, 1.5))
+        one = b.instance(f"{i}", tuple(place), rng.uniform(0, 90))
+        if i % 3 == 0:
+            one.box((0, 0, 0), tuple(size), PLAIN, tuple(rng.uniform(0, 90, 3)))
+        elif i % 3 == 1:
+            one.ellipsoid((0, 0, 0), tuple(size / 2), PLAIN)
+        else:
+            one.cylinder((0, 0, 0), size[0] / 2, size[2], PLAIN, tuple(rng.uniform(0, 90, 3)), top=rng.uniform(0.3, 2))
+    b.light(rng.uniform((-1, -1, 2), (0, 0, 2.2), (4, 3)), (3, 3, 3))
+    b.light(rng.uniform((1, 0.5, 0.4), (1.2, 0.8, 0.5), (3, 3)), (1, 1, 1), (-1.0, 0.0, 0.0))
+    found = lighting.bake(b.scene).atlas
+
+    def all_others(patches: lighting._Patches, number: int, shape: Shape, *_: object) -> np.ndarray:
+        return np.nonzero(patches.owner != number)[0]
+
+    monkeypatch.setattr(lighting._Patches, "near", all_others)
+    monkeypatch.setattr(lighting._Patches, "shaded", all_others)
+    every = lighting.bake(b.scene).atlas
+    assert found.tobytes() == every.tobytes() and len(np.unique(every)) > 1000
 
 
 def test_noise_of_the_sensor() -> None:

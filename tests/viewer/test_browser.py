@@ -39,7 +39,7 @@ def page(browser: Any, run: RunFolder) -> Iterator[tuple[Any, ViewedRun]]:
     """Server and model of a page that is open and shows splats."""
     server, model = serve_run(run, port=0, max_splats=MAX_SPLATS)
     try:
-        browser.get(address(server) + "/?fixedDpr=0.4")
+        browser.get(address(server) + "&fixedDpr=0.4")
         b.wait_for(lambda: "Gaussians" in b.said(browser) and server.get_clients())
         # The part of the window that shows space: what is drawn there has many colours.
         b.wait_for(lambda: b.screenshot(browser)[240:460, 40:460].std() > 8)
@@ -114,10 +114,10 @@ def test_an_object_is_edited_with_the_mouse(browser: Any, page: tuple[Any, Viewe
     assert record.id not in [left.id for left in model.objects()]
     b.press(browser, "button", "Undo")
     b.wait_for(lambda: len(model.edits()) == 2)
-    b.write_over(browser, model.default_target(), str(tmp_path / "saved"))
+    b.write_over(browser, model.default_target(), "saved-by-mouse")
     b.press(browser, "button", "Save edited run")
     b.wait_for(lambda: "saved to" in b.said(browser))
-    assert RunFolder.open(tmp_path / "saved").object_table().record(record.id).name == "thing"
+    assert RunFolder.open(model.save_folder() / "saved-by-mouse").object_table().record(record.id).name == "thing"
 
 
 def test_the_recording_is_gone_through(browser: Any, page: tuple[Any, ViewedRun], tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_names_of_objects_are_no_markup_on_the_page(browser: Any, run: RunFolder
     try:
         model.move(table.objects[0].id, np.eye(4))
         show_run(server, model)
-        browser.get(address(server) + "/?fixedDpr=0.4")
+        browser.get(address(server) + "&fixedDpr=0.4")
         b.wait_for(lambda: "r<i>x" in b.said(browser))
         b.press(browser, "[role=tab]", "Objects")
         b.wait_for(lambda: f"moved {name}" in text_of(browser))

@@ -78,11 +78,11 @@ def test_edits_are_saved_as_the_command_would(viewed: ViewedRun, tmp_path: Path)
     assert len(viewed.edits()) == 3 and ids[0] not in [r.id for r in viewed.objects()]
     moved = next(r for r in viewed.objects() if r.id == ids[1])
     assert np.allclose(moved.centroid, record.centroid + [0.1, -0.05, 0.2], atol=0.02)
-    viewed.save(str(tmp_path / "saved"), inpaint=False)
+    viewed.save("saved-from-a-page", inpaint=False)
     edits = [*viewed._edits]
     assert edits[0] == Edit("remove", str(ids[0])) and edits[1].rotation
     expected = edit_run(viewed.folder, edits, tmp_path / "expected").folder
-    saved = RunFolder.open(tmp_path / "saved")
+    saved = RunFolder.open(viewed.folder.path.resolve().parent / "saved-from-a-page")
     assert (saved.path / "map.ply").read_bytes() == (expected.path / "map.ply").read_bytes()
     assert saved.object_table().record(ids[2]).name == "thing"
     assert (viewed.folder.path / "map.ply").read_bytes() == before
@@ -137,10 +137,23 @@ def test_pictures(viewed: ViewedRun) -> None:
 def test_a_run_named_by_a_dot_has_a_place_to_save_to(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(run.path)
     model = ViewedRun(RunFolder.open(Path()))
-    assert model.default_target() == str(run.path.resolve()) + "-edited"
+    assert model.save_folder() / model.default_target() == Path(str(run.path.resolve()) + "-edited")
     model.rename(some_object(model), "thing")
-    with pytest.raises(ConfigError, match="~nobody-of-this-name"):
-        model.save("~nobody-of-this-name/x", inpaint=False)
+
+
+STRAY_NAMES = ["", "..", "/tmp/elsewhere", "../elsewhere", "~nobody/x", "a\x00b", "a\x1b[2J", "x" * 300]
+
+
+@pytest.mark.parametrize("target", STRAY_NAMES)
+def test_a_page_saves_in_one_folder_only(viewed: ViewedRun, target: str) -> None:
+    viewed.rename(some_object(viewed), "thing")
+    with pytest.raises(ConfigError, match="a name is needed"):
+        viewed.save(target, inpaint=False)
+
+
+def test_names_of_objects_have_an_end(viewed: ViewedRun) -> None:
+    with pytest.raises(ConfigError, match="201 characters"):
+        viewed.rename(some_object(viewed), "x" * 201)
 
 
 def test_a_run_all_of_whose_gaussians_were_removed_is_shown(run: RunFolder, tmp_path: Path) -> None:

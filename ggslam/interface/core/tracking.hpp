@@ -50,6 +50,26 @@ struct TargetSettings {
   float neighbour_weight;   // weight of the 26 neighbours in a voxel's scatter
 };
 
+// Sums over the members of a voxel.
+struct VoxelMoments {
+  float weight;
+  float offset[3];  // sum of w (mean - centre)
+  float outer[6];   // sum of w (mean - centre)(mean - centre)^T
+  float own[6];     // sum of w C with C the members' regularised covariances
+  float normal[3];  // sum of w (1 - thickness) n
+  float centre[3];
+};
+
+// A voxel of a target.
+struct alignas(64) Voxel {
+  float mean[3];
+  float weight;
+  float normal[3];
+  float reserved;
+  float covariance[6];  // regularised: median eigenvalue 1
+  float padding[2];
+};
+
 // How points are aligned to voxels.
 struct AlignSettings {
   double translation_tolerance, rotation_tolerance;  // metres, radians
@@ -123,7 +143,7 @@ GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target, int level);
 // Copies the moments of a level's voxels, [n, 22] in the order of struct VoxelMoments.
 GGSLAM_EXPORT void ggslam_gicp_target_moments(const void* target, int level, float* out);
 
-// Copies a level's voxels: [n, 16] mean(3) weight normal(3) 0 covariance(6) 0 0.
+// Copies a level's voxels, [n, 16] in the order of struct Voxel.
 GGSLAM_EXPORT void ggslam_gicp_target_voxels(const void* target, int level, float* out);
 
 // Number of blocks of a level. Copies them unless `out` is null: [n, 3] key, occupied, first.

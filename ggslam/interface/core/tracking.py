@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/tracking.hpp"
-HEADER_SHA256 = "60d1d967edbc04ced4279ab68132f20b89a9e4c6ca7916dcb510e1afde6cd3fc"
+HEADER_SHA256 = "c3860866e1ad0e9f6562bfcac4aa46bf518fc55215fff6a7d51f87489a42e690"
 
 
 class DepthPointsSettings(Structure):
@@ -46,6 +46,24 @@ class TargetSettings(Structure):
     _fields_ = [
         ("voxel", c_float), ("min_opacity_logit", c_float), ("min_thickness", c_float), ("max_thickness", c_float),
         ("max_elongation", c_float), ("scatter_weight", c_float), ("neighbour_weight", c_float),
+    ]
+
+
+class VoxelMoments(Structure):
+    """Sums over the members of a voxel."""
+
+    _fields_ = [
+        ("weight", c_float), ("offset", c_float * 3), ("outer", c_float * 6), ("own", c_float * 6),
+        ("normal", c_float * 3), ("centre", c_float * 3),
+    ]
+
+
+class Voxel(Structure):
+    """A voxel of a target."""
+
+    _fields_ = [
+        ("mean", c_float * 3), ("weight", c_float), ("normal", c_float * 3), ("reserved", c_float),
+        ("covariance", c_float * 6), ("padding", c_float * 2),
     ]
 
 
@@ -98,8 +116,8 @@ class AlignResult(Structure):
 
 
 STRUCTURES: tuple[type[Structure], ...] = (
-    DepthPointsSettings, DepthPointsOutput, TargetInput, TargetSettings, AlignSettings, AlignPoints, PhotometricPoints,
-    PhotometricReferenceView, AlignResult,
+    DepthPointsSettings, DepthPointsOutput, TargetInput, TargetSettings, VoxelMoments, Voxel, AlignSettings,
+    AlignPoints, PhotometricPoints, PhotometricReferenceView, AlignResult,
 )
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_depth_points": (c_int, [c_void_p, c_void_p, POINTER(DepthPointsSettings), POINTER(DepthPointsOutput)]),

@@ -15,6 +15,8 @@ using ggslam::PhotometricPoints;
 using ggslam::PhotometricReferenceView;
 using ggslam::TargetInput;
 using ggslam::TargetSettings;
+using ggslam::Voxel;
+using ggslam::VoxelMoments;
 
 namespace {
 constexpr std::size_t kLayout[] = {
@@ -34,6 +36,10 @@ constexpr std::size_t kLayout[] = {
     offsetof(TargetSettings, min_thickness), offsetof(TargetSettings, max_thickness),
     offsetof(TargetSettings, max_elongation), offsetof(TargetSettings, scatter_weight),
     offsetof(TargetSettings, neighbour_weight),
+    sizeof(VoxelMoments), offsetof(VoxelMoments, weight), offsetof(VoxelMoments, offset), offsetof(VoxelMoments, outer),
+    offsetof(VoxelMoments, own), offsetof(VoxelMoments, normal), offsetof(VoxelMoments, centre),
+    sizeof(Voxel), offsetof(Voxel, mean), offsetof(Voxel, weight), offsetof(Voxel, normal), offsetof(Voxel, reserved),
+    offsetof(Voxel, covariance), offsetof(Voxel, padding),
     sizeof(AlignSettings), offsetof(AlignSettings, translation_tolerance), offsetof(AlignSettings, rotation_tolerance),
     offsetof(AlignSettings, coarse_kernel_factor), offsetof(AlignSettings, noise_constant),
     offsetof(AlignSettings, noise_square), offsetof(AlignSettings, kernel_constant),

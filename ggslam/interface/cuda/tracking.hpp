@@ -36,16 +36,6 @@ struct DepthPointsJob {
   std::int32_t device, columns, rows;  // of the grid
 };
 
-// A voxel of a target.
-struct alignas(16) Voxel {
-  float mean[3];
-  float weight;
-  float normal[3];
-  float reserved;
-  float covariance[6];  // regularised: median eigenvalue 1
-  float padding[2];
-};
-
 // A block of 4 x 4 x 4 voxels, which lie one after the other in the order of their bits x + 4 y + 16 z.
 struct VoxelBlock {
   std::uint64_t key, occupied, first;
@@ -65,16 +55,6 @@ struct VoxelLevel {
   VoxelSlot* slots;
   std::uint64_t slot_mask;  // number of slots, a power of two, minus one
   float size, inverse_size;  // of a voxel, metres
-};
-
-// Sums over the members of a voxel, see the core.
-struct VoxelMoments {
-  float weight;
-  float offset[3];  // sum of w (mean - centre)
-  float outer[6];   // sum of w (mean - centre)(mean - centre)^T
-  float own[6];     // sum of w C with C the members' regularised covariances
-  float normal[3];
-  float centre[3];
 };
 
 // A level to set up.

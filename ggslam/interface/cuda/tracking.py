@@ -18,7 +18,7 @@ from ggslam.interface.core.tracking import (
 )
 
 HEADER = "cuda/tracking.hpp"
-HEADER_SHA256 = "c039b2060e48590d7c1a2ea7e41309a43d9aa3cc6eb966facee84e15b0d70b44"
+HEADER_SHA256 = "cd3a699e0b80fdde417cc2056d24938a8159c12cdc498f378759408c07795f86"
 
 
 class AlignResult(IntEnum):
@@ -67,15 +67,6 @@ class DepthPointsJob(Structure):
     ]
 
 
-class Voxel(Structure):
-    """A voxel of a target."""
-
-    _fields_ = [
-        ("mean", c_float * 3), ("weight", c_float), ("normal", c_float * 3), ("reserved", c_float),
-        ("covariance", c_float * 6), ("padding", c_float * 2),
-    ]
-
-
 class VoxelBlock(Structure):
     """A block of 4 x 4 x 4 voxels, which lie one after the other in the order of their bits x + 4 y + 16 z."""
 
@@ -94,15 +85,6 @@ class VoxelLevel(Structure):
     _fields_ = [
         ("voxels", c_void_p), ("slots", c_void_p), ("slot_mask", c_uint64), ("size", c_float),
         ("inverse_size", c_float),
-    ]
-
-
-class VoxelMoments(Structure):
-    """Sums over the members of a voxel, see the core."""
-
-    _fields_ = [
-        ("weight", c_float), ("offset", c_float * 3), ("outer", c_float * 6), ("own", c_float * 6),
-        ("normal", c_float * 3), ("centre", c_float * 3),
     ]
 
 
@@ -127,8 +109,7 @@ class AlignJob(Structure):
 
 
 STRUCTURES: tuple[type[Structure], ...] = (
-    PointsHeader, PointArrays, DepthPointsJob, Voxel, VoxelBlock, VoxelSlot, VoxelLevel, VoxelMoments, VoxelLevelJob,
-    AlignJob,
+    PointsHeader, PointArrays, DepthPointsJob, VoxelBlock, VoxelSlot, VoxelLevel, VoxelLevelJob, AlignJob,
 )
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_cuda_depth_points_bytes": (c_int64, [POINTER(DepthPointsJob)]),

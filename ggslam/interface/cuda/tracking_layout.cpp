@@ -10,11 +10,9 @@ using ggslam::cuda::AlignJob;
 using ggslam::cuda::DepthPointsJob;
 using ggslam::cuda::PointArrays;
 using ggslam::cuda::PointsHeader;
-using ggslam::cuda::Voxel;
 using ggslam::cuda::VoxelBlock;
 using ggslam::cuda::VoxelLevel;
 using ggslam::cuda::VoxelLevelJob;
-using ggslam::cuda::VoxelMoments;
 using ggslam::cuda::VoxelSlot;
 
 namespace {
@@ -25,15 +23,11 @@ constexpr std::size_t kLayout[] = {
     sizeof(DepthPointsJob), offsetof(DepthPointsJob, depth), offsetof(DepthPointsJob, out),
     offsetof(DepthPointsJob, workspace), offsetof(DepthPointsJob, stream), offsetof(DepthPointsJob, settings),
     offsetof(DepthPointsJob, device), offsetof(DepthPointsJob, columns), offsetof(DepthPointsJob, rows),
-    sizeof(Voxel), offsetof(Voxel, mean), offsetof(Voxel, weight), offsetof(Voxel, normal), offsetof(Voxel, reserved),
-    offsetof(Voxel, covariance), offsetof(Voxel, padding),
     sizeof(VoxelBlock), offsetof(VoxelBlock, key), offsetof(VoxelBlock, occupied), offsetof(VoxelBlock, first),
     sizeof(VoxelSlot), offsetof(VoxelSlot, key), offsetof(VoxelSlot, occupied), offsetof(VoxelSlot, first),
     offsetof(VoxelSlot, reserved),
     sizeof(VoxelLevel), offsetof(VoxelLevel, voxels), offsetof(VoxelLevel, slots), offsetof(VoxelLevel, slot_mask),
     offsetof(VoxelLevel, size), offsetof(VoxelLevel, inverse_size),
-    sizeof(VoxelMoments), offsetof(VoxelMoments, weight), offsetof(VoxelMoments, offset), offsetof(VoxelMoments, outer),
-    offsetof(VoxelMoments, own), offsetof(VoxelMoments, normal), offsetof(VoxelMoments, centre),
     sizeof(VoxelLevelJob), offsetof(VoxelLevelJob, blocks), offsetof(VoxelLevelJob, moments),
     offsetof(VoxelLevelJob, level), offsetof(VoxelLevelJob, voxels), offsetof(VoxelLevelJob, stream),
     offsetof(VoxelLevelJob, settings), offsetof(VoxelLevelJob, device), offsetof(VoxelLevelJob, block_count),

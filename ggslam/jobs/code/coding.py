@@ -30,6 +30,7 @@ from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_poi
 from ggslam.jobs.code.attributes import attributes_to_code, restored_attributes
 from ggslam.runs.folder import RunFolder
 from ggslam.system.atomic import make_folder, write_bytes
+from ggslam.system.foreign import read_foreign
 
 PRESETS = ("pointcloud", "splat")
 Box = tuple[Sequence[float], Sequence[float]]
@@ -149,7 +150,7 @@ def study_cloud(source: Path, settings: CodecSettings) -> GridCloud:
 
 
 def decode_file(
-    source: Path, out: Path, slice_id: int | None = None, box: Box | None = None, workers: int | None = None
+    source: Path, out: Path, slice_id: int | None = None, box: Box | None = None, threads: int | None = None
 ) -> Decoded:
     """Decodes a stream, or one slice or box of it, into a PLY (or PCD) file; a stream of Gaussians into a 3DGS PLY.
 
@@ -166,9 +167,9 @@ def decode_file(
     _refuse_itself(source, out)
     data = read_bytes(source)
     try:
-        if slice_id is None and box is None and (splats := _splats_in_parts(data, workers)) is not None:
+        if slice_id is None and box is None and (splats := _splats_in_parts(data, threads)) is not None:
             return _write_splats(splats, out)
-        cloud = _decode_part(data, slice_id, box, workers)
+        cloud = _decode_part(data, slice_id, box, threads)
         if is_splat_cloud(cloud):
             if not len(cloud):
                 raise FormatError("no Gaussians in the box")
@@ -184,9 +185,9 @@ def decode_file(
     return Decoded(out, len(cloud), "points")
 
 
-def _splats_in_parts(data: bytes, workers: int | None) -> CloudInParts | None:
+def _splats_in_parts(data: bytes, threads: int | None) -> CloudInParts | None:
     """The Gaussians of a stream; None if it is one of points."""
-    cloud = decode_in_parts(data, workers)
+    cloud = decode_in_parts(data, threads)
     return cloud if is_splat_cloud(cloud.like) else None
 
 
@@ -215,10 +216,7 @@ def list_stream(path: Path) -> StreamListing:
 
 def read_bytes(path: Path) -> bytes:
     """A whole file; FormatError if it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
+    return read_foreign(path)
 
 
 def _input_file(source: Path, preset: str) -> Path:
@@ -256,11 +254,11 @@ def _corner(origin: np.ndarray, voxel_size: float) -> tuple[np.ndarray, tuple[fl
     return corner.astype(np.int32), (float(left[0]), float(left[1]), float(left[2]))
 
 
-def _decode_part(data: bytes, slice_id: int | None, box: Box | None, workers: int | None) -> PointCloud:
+def _decode_part(data: bytes, slice_id: int | None, box: Box | None, threads: int | None) -> PointCloud:
     if slice_id is not None:
         return decode_slice(data, slice_id)
     if box is None:
-        return decode_cloud(data, workers)
+        return decode_cloud(data, threads)
     return decode_box(data, *box)
 
 

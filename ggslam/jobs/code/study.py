@@ -51,7 +51,7 @@ def write_study(
     Args:
         cloud: from `on_grid`.
         steps: from `sweep_steps`.
-        settings: slices, workers and tools.
+        settings: slices, threads and tools.
         folder: where to.
         plots: whether to draw the plots.
         progress: is given each row when it is there.
@@ -86,7 +86,7 @@ def write_tables(
     write_text(folder / "study.csv", text.getvalue())
     about = {
         "points": len(cloud.grid), "peak": cloud.peak, "voxels_per_unit": cloud.quantization.scale,
-        "workers": settings.workers, "slices": settings.slices, "split": settings.split, "note": note or None,
+        "threads": settings.threads, "slices": settings.slices, "split": settings.split, "note": note or None,
     }  # fmt: skip
     write_json(folder / "study.json", {**about, "rows": table})
     return [folder / "study.csv", folder / "study.json"]

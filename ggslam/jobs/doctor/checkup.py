@@ -47,10 +47,12 @@ class Extra:
 EXTRAS = {
     "masks": Extra(("onnxruntime",), "instance masks by a segmentation model in an ONNX file"),
     "splats": Extra(("gaussforge", "zstandard"), "export as SPZ"),
+    "usd": Extra(("pxr",), "export as OpenUSD"),
     "mesh": Extra(("trimesh",), "meshes as OBJ and GLB"),
     "octomap": Extra(("pyoctomap",), "occupancy in trees of OctoMap's own library"),
     "formats": Extra(("gsply",), "SPZ in scripts/bench_splats.py"),
     "bench": Extra(("pyoctomap", "open3d", "edt"), "what the benchmarks of volumes compare with"),
+    "conformance": Extra(("gsply", "gaussforge", "trimesh", "pycolmap", "open3d"), "readers of others for the tests"),
     "cuda": Extra(("nvidia.cu13.nvvm",), "nvcc for run --device cuda, where no CUDA toolkit is installed"),
     "gsplat": Extra(("gsplat",), "an alternative renderer on an NVIDIA GPU"),
     "viewer": Extra(("viser",), "maps in the browser: ggslam view, ggslam run --view"),

@@ -8,7 +8,6 @@ from pathlib import Path
 from ggslam.errors import ConfigError
 from ggslam.jobs.export.formats import ExportFormat, choose_format
 from ggslam.jobs.export.map_files import (
-    export_gltf,
     export_objects,
     export_points,
     export_segmented,
@@ -16,12 +15,16 @@ from ggslam.jobs.export.map_files import (
     export_trajectory,
 )
 from ggslam.jobs.export.meshes import MeshRequest, export_mesh
+from ggslam.jobs.export.scenes import export_scene
 from ggslam.jobs.export.splats import export_packed, export_pcd
+from ggslam.jobs.export.streams import stream_run, stream_store
 from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.jobs.progress import Observer
+from ggslam.jobs.submaps.stores import is_store
 from ggslam.runs.folder import RunFolder
 
-_WITH_OBJECTS = (ExportFormat.ply, ExportFormat.segmented, ExportFormat.mesh, ExportFormat.gltf)
+_SCENES = (ExportFormat.gltf, ExportFormat.sog, ExportFormat.usd)
+_WITH_OBJECTS = (ExportFormat.ply, ExportFormat.segmented, ExportFormat.mesh, ExportFormat.streamed_sog, *_SCENES)
 _WITH_VIEWS = (ExportFormat.colmap, ExportFormat.nerfstudio)
 
 
@@ -43,21 +46,21 @@ def export_run(
     written.
 
     Args:
-        run: the run, or its folder.
+        run: the run, or its folder; for streamed-sog also the folder of a grid store.
         out: file or, for points, colmap, nerfstudio and for objects one by one, folder to write.
         format: ply: 3DGS Gaussians; segmented: the same in the colours of their objects; compressed-ply, spz, spz4,
-            splat: the same in fewer bytes; gltf: the same as .glb (a .glb without `format` is a mesh); points, pcd:
-            coloured clouds; mesh: .glb, .obj or .ply; trajectory: TUM; colmap, nerfstudio: images with poses and
-            points. None: what the name of `out` says.
+            splat, sog: the same in fewer bytes; streamed-sog: in pieces and levels of detail; gltf: .glb (a .glb
+            without `format` is a mesh); usd: .usda, .usdc, .usdz; points, pcd: coloured clouds; mesh: .glb, .obj or
+            .ply; trajectory: TUM; colmap, nerfstudio: images with poses and points. None: what the name of `out` says.
         voxel: metres: distance of points (default 0.01), or the edge of a mesh's voxels (default: as the run's
             settings say).
-        objects: names or ids, "mug,7", or "all", for ply, segmented, mesh and gltf: only these.
+        objects: names or ids, "mug,7", or "all", for ply, segmented, mesh, sog, streamed-sog, gltf, usd: only these.
         min_opacity: leave out fainter Gaussians (not of trajectory, mesh, colmap, nerfstudio).
-        plain: ply, segmented, gltf: only the fields of 3DGS.
+        plain: ply, segmented, sog, streamed-sog, gltf, usd: only the fields of 3DGS.
         keyframes: colmap, nerfstudio: only keyframes and held-out frames.
         recording: where the recording is now, if it was moved (colmap, nerfstudio, mesh).
         rendered: mesh: from depth rendered from the map, even if the recording is there.
-        observer: receives progress updates of meshes.
+        observer: receives progress updates of meshes and streamed SOG.
 
     Raises:
         ConfigError: an unknown format or object, or arguments that do not go together.
@@ -65,9 +68,12 @@ def export_run(
         RunFolderError: no run, a damaged one, or nothing to write.
         SequenceError: the recording cannot be read.
     """
-    folder, place = run if isinstance(run, RunFolder) else RunFolder.open(Path(run)), Path(out)
+    place = Path(out)
     kind = choose_format(None if format is None else _format_named(format), place, objects)
     _refuse_ignored(kind, objects, keyframes, recording, rendered)
+    if not isinstance(run, RunFolder) and is_store(Path(run)):
+        return _export_store(Path(run), place, kind, objects, min_opacity, observer)
+    folder = run if isinstance(run, RunFolder) else RunFolder.open(Path(run))
     images, points = None if recording is None else Path(recording), 0.01 if voxel is None else voxel
     if kind is ExportFormat.mesh:
         return export_mesh(folder, place, MeshRequest(voxel, objects, rendered, images), observer)
@@ -76,8 +82,10 @@ def export_run(
         return write(folder, place, points, keyframes, images)
     if kind is ExportFormat.segmented:
         return export_segmented(folder, place, objects, min_opacity, plain)
-    if kind is ExportFormat.gltf:
-        return export_gltf(folder, place, objects, min_opacity, plain)
+    if kind in _SCENES:
+        return export_scene(folder, place, kind.value, objects, min_opacity, plain)
+    if kind is ExportFormat.streamed_sog:
+        return stream_run(folder, place, objects, min_opacity, plain, observer)
     if kind is ExportFormat.ply and objects is not None:
         return export_objects(folder, place, objects, min_opacity, plain)
     if kind is ExportFormat.ply:
@@ -89,6 +97,16 @@ def export_run(
     if kind is ExportFormat.trajectory:
         return export_trajectory(folder, place)
     return export_packed(folder, place, kind.value, min_opacity)
+
+
+def _export_store(
+    path: Path, out: Path, kind: ExportFormat, objects: str | None, min_opacity: float, observer: Observer | None
+) -> str:
+    if kind is not ExportFormat.streamed_sog:
+        raise ConfigError(f"{path}: is a grid store, of which `format` streamed-sog can be written, not {kind.value}")
+    if objects is not None:
+        raise ConfigError(f"{path}: is a grid store, which has no table of objects: leave out `objects`")
+    return stream_store(path, out, min_opacity, observer)
 
 
 def _format_named(name: str) -> ExportFormat:
@@ -104,7 +122,8 @@ def _refuse_ignored(
 ) -> None:
     """Raises ConfigError for an argument that this format leaves without effect."""
     if objects is not None and kind not in _WITH_OBJECTS:
-        raise ConfigError(f"`objects` goes with `format` ply, segmented, mesh or gltf, not {kind.value}")
+        with_objects = ", ".join(kind.value for kind in _WITH_OBJECTS)
+        raise ConfigError(f"`objects` goes with `format` {with_objects}, not {kind.value}")
     if keyframes and kind not in _WITH_VIEWS:
         raise ConfigError(f"`keyframes` goes with `format` colmap or nerfstudio, not {kind.value}")
     if recording is not None and kind not in (*_WITH_VIEWS, ExportFormat.mesh):

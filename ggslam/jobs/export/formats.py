@@ -20,7 +20,10 @@ class ExportFormat(str, Enum):
     spz = "spz"
     spz4 = "spz4"
     splat = "splat"
+    sog = "sog"
+    streamed_sog = "streamed-sog"
     gltf = "gltf"
+    usd = "usd"
     pcd = "pcd"
     mesh = "mesh"
     colmap = "colmap"
@@ -33,10 +36,20 @@ SUFFIXES = {
     ".obj": (ExportFormat.mesh,),
     ".spz": (ExportFormat.spz, ExportFormat.spz4),
     ".splat": (ExportFormat.splat,),
+    ".sog": (ExportFormat.sog,),
+    ".usd": (ExportFormat.usd,),
+    ".usda": (ExportFormat.usd,),
+    ".usdc": (ExportFormat.usd,),
+    ".usdz": (ExportFormat.usd,),
     ".pcd": (ExportFormat.pcd,),
     ".txt": (ExportFormat.trajectory,),
 }
 """Formats that a file with this suffix may hold; the first is meant where none is asked for."""
+NAMES = {
+    ".compressed.ply": ExportFormat.compressed_ply, "meta.json": ExportFormat.sog,
+    "lod-meta.json": ExportFormat.streamed_sog,
+}  # fmt: skip
+"""Formats of files whose whole name, or more than a suffix of it, says which."""
 
 
 def choose_format(asked: ExportFormat | None, out: Path, objects: str | None) -> ExportFormat:
@@ -50,8 +63,9 @@ def choose_format(asked: ExportFormat | None, out: Path, objects: str | None) ->
     Raises:
         ConfigError: the name says no format, or says another one than `asked`.
     """
-    suffix = out.suffix.lower()
-    named = (ExportFormat.compressed_ply,) if out.name.lower().endswith(".compressed.ply") else SUFFIXES.get(suffix, ())
+    name = out.name.lower()
+    whole = tuple(kind for end, kind in NAMES.items() if name == end or (end[0] == "." and name.endswith(end)))
+    named = whole or SUFFIXES.get(out.suffix.lower(), ())
     if asked is not None:
         if named and asked not in named:
             raise ConfigError(f"`out` {out}: the name says {named[0].value}, but `format` says {asked.value}")

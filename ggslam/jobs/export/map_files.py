@@ -5,20 +5,16 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
 import torch
 
-from ggslam.errors import ConfigError, FormatError, RunFolderError
-from ggslam.formats.gaussian_gltf import write_gaussian_gltf
-from ggslam.formats.gaussian_ply import write_gaussian_parts
-from ggslam.formats.gaussian_rows import GaussianRows
+from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.point_ply import write_points_in_parts
 from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.formats.trajectory import write_tum
+from ggslam.jobs.export.chosen import ChosenGaussians
 from ggslam.objects.table import ObjectRecord
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MapInParts
@@ -38,7 +34,7 @@ def export_splats(folder: RunFolder, path: Path, min_opacity: float = 0.0, plain
     (`NAME_classifier.npz`), unless `plain`.
     """
     with_objects = folder.has_objects() and not plain
-    chosen = _Chosen.of(folder, folder.map_in_parts().rows, min_opacity)
+    chosen = ChosenGaussians.of(folder, folder.map_in_parts().rows, min_opacity)
     make_folder(path.parent)
     count = chosen.write(path, OBJECT_EXTRAS if with_objects else ())
     if not with_objects:
@@ -68,7 +64,7 @@ def export_objects(
     chosen = [scene.table.record(i) for i in scene.table.select(objects)]
     if not chosen:
         raise RunFolderError(f"{folder.path}: the run found no object; nothing to export")
-    opaque, total = _Chosen.of(folder, scene.map.rows, min_opacity), 0
+    opaque, total = ChosenGaussians.of(folder, scene.map.rows, min_opacity), 0
     make_folder(path)
     for record in chosen:
         total += opaque.objects([record.id]).write(path / object_file_name(record), () if plain else OBJECT_EXTRAS)
@@ -94,7 +90,7 @@ def export_segmented(
     """
     scene = ObjectsInParts.of(folder)
     ids = None if objects is None else scene.table.select(objects)
-    chosen = _Chosen.of(folder, scene.map.rows, min_opacity, ids)
+    chosen = ChosenGaussians.of(folder, scene.map.rows, min_opacity, ids)
     make_folder(path.parent)
     palette = torch.from_numpy(scene.table.palette())
     count = chosen.write(path, () if plain else OBJECT_EXTRAS, lambda part: _color_by_object(part, palette))
@@ -107,35 +103,6 @@ def _color_by_object(gaussians: GaussianMap, palette: torch.Tensor) -> None:
     """Gives each Gaussian the colour of its object, from all sides; unlabelled ones become grey."""
     gaussians.sh[:] = 0
     gaussians.sh[:, 0] = rgb_to_sh(palette[gaussians.object_id.long()].float() / 255)
-
-
-def export_gltf(
-    folder: RunFolder, path: Path, objects: str | None = None, min_opacity: float = 0.0, plain: bool = False
-) -> str:
-    """Writes the Gaussians as binary glTF with KHR_gaussian_splatting; returns a line that says so.
-
-    Args:
-        folder: of the run.
-        path: file to write; ends in .glb.
-        objects: only these, as in `export_objects`; None: the whole map.
-        min_opacity: leave out fainter Gaussians.
-        plain: leave out object ids and names, which are written of runs with objects.
-
-    Raises:
-        ConfigError, RunFolderError: as in `export_objects`.
-        FormatError: another ending, or what glTF cannot hold.
-    """
-    if path.suffix.lower() != ".glb":
-        raise FormatError(f"{path}: a file of the format gltf ends in .glb")
-    table = folder.object_table() if objects is not None or folder.has_objects() else None
-    ids = None if table is None or objects is None else table.select(objects)
-    rows = folder.map_in_parts().rows
-    chosen = _Chosen.of(folder, rows, min_opacity, ids)
-    names = None if table is None or plain else {i: table.record(i).name or "" for i in ids or table.ids()}
-    make_folder(path.parent)
-    write_gaussian_gltf(path, chosen.count, chosen.parts(), rows.like.sh_degree, names)
-    found = "" if names is None else f" with the ids of {len(names)} object{'s' * (len(names) != 1)}"
-    return f"wrote {path}: {chosen.count} Gaussians{found}, {path.stat().st_size / 1e6:.1f} MB"
 
 
 def object_file_name(record: ObjectRecord) -> str:
@@ -173,62 +140,6 @@ def export_trajectory(folder: RunFolder, path: Path) -> str:
     make_folder(path.parent)
     written = write_tum(path, trajectory.timestamps, trajectory.T_world_camera)
     return f"wrote {path}: {written} poses"
-
-
-@dataclasses.dataclass(frozen=True)
-class _Chosen:
-    """Gaussians of a map on disk that are to be exported.
-
-    Attributes:
-        rows: the map.
-        min_opacity: fainter ones are left out.
-        ids: of the objects whose Gaussians are wanted; None: all.
-        found: of each block of rows, how many are opaque enough, by object id.
-    """
-
-    rows: GaussianRows
-    min_opacity: float
-    ids: Sequence[int] | None
-    found: Sequence[Counter[int]]
-
-    @staticmethod
-    def of(folder: RunFolder, rows: GaussianRows, min_opacity: float, ids: Sequence[int] | None = None) -> _Chosen:
-        """Finds out how many there are; raises RunFolderError if there is none."""
-        found = [Counter(b.object_id[b.opacities >= min_opacity].tolist()) for b in rows.blocks()]
-        chosen = _Chosen(rows, min_opacity, ids, found)
-        if not chosen.count:
-            raise RunFolderError(f"{folder.path}: no Gaussian is at least {min_opacity} opaque; nothing to export")
-        return chosen
-
-    def objects(self, ids: Sequence[int]) -> _Chosen:
-        """Those of some objects only."""
-        return dataclasses.replace(self, ids=ids)
-
-    @property
-    def count(self) -> int:
-        """How many there are."""
-        return sum(map(self._count, self.found))
-
-    def _count(self, found: Counter[int]) -> int:
-        return found.total() if self.ids is None else sum(found[i] for i in self.ids)
-
-    def write(
-        self, path: Path, extra: Collection[str], change: Callable[[GaussianMap], None] = lambda part: None
-    ) -> int:
-        """Writes a 3DGS PLY of them, changed; returns how many there are."""
-        write_gaussian_parts(path, self.count, self.parts(change), self.rows.like, extra)
-        return self.count
-
-    def parts(self, change: Callable[[GaussianMap], None] = lambda part: None) -> Iterator[GaussianMap]:
-        """They themselves, block by block, changed."""
-        for number, found in enumerate(self.found):
-            if not self._count(found):
-                continue
-            part = self.rows.block(number)
-            wanted = part.opacities >= self.min_opacity
-            part.keep(wanted if self.ids is None else wanted & torch.isin(part.object_id, torch.tensor(self.ids)))
-            change(part)
-            yield part
 
 
 def _write_classifier(ply: Path, classifier: IdentityClassifier) -> Path:

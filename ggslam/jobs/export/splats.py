@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.compressed_ply import write_compressed_ply
-from ggslam.formats.packed_splats import check_gaussforge, check_zstandard, write_spz
+from ggslam.formats.packed_splats import spz_packages, write_spz
 from ggslam.formats.point_cloud import write_point_cloud
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.splat_file import write_splat
@@ -37,9 +37,7 @@ def export_packed(folder: RunFolder, path: Path, kind: str, min_opacity: float =
     """
     _check_ending(path, kind)
     if kind in ("spz", "spz4"):
-        check_gaussforge(path)
-    if kind == "spz4":
-        check_zstandard(path)
+        spz_packages(path, 4 if kind == "spz4" else 3)
     make_folder(path.parent)
     parts = _some(_parts(folder, min_opacity, whole=kind != "splat"), folder, min_opacity)
     if kind == "splat":

@@ -18,7 +18,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.scene.camera import Camera
 from ggslam.sequences import Sequence
-from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.atomic import make_empty_folder, make_folder, write_text
 
 IMAGES, DEPTHS, MODEL = "images", "depth", "sparse/0"
 
@@ -72,7 +72,7 @@ def export_colmap(
         SequenceError: the recording cannot be read.
     """
     views, cloud = _views(folder, keyframes_only, recording), _cloud(folder, voxel_size)
-    _make_empty(out)
+    make_empty_folder(out)
     make_folder(out / MODEL)
     written = list(_write_images(views, out, with_depth=False))
     write_colmap_model(
@@ -89,7 +89,7 @@ def export_nerfstudio(
     """Writes `images/`, `depth/` (16 bit, millimetres), `points.ply` and `transforms.json`, which names the images to
     train on and those that were held out; returns a line that says so. Arguments and errors as in `export_colmap`."""
     views, cloud = _views(folder, keyframes_only, recording), _cloud(folder, voxel_size)
-    _make_empty(out)
+    make_empty_folder(out)
     written = list(_write_images(views, out, with_depth=True))
     write_metric_points(out / "points.ply", cloud)
     frames = [
@@ -120,13 +120,6 @@ def _cloud(folder: RunFolder, voxel_size: float) -> VoxelCloud:
     if not len(cloud):
         raise RunFolderError(f"{folder.path}: the map has no points to export")
     return cloud
-
-
-def _make_empty(out: Path) -> None:
-    """Images of an earlier export must not stay among new ones."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise RunFolderError(f"{out}: exists and is not an empty folder; choose another one with `out`")
-    make_folder(out)
 
 
 def _write_images(views: _Views, out: Path, with_depth: bool) -> Iterator[_View]:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points, associate
@@ -24,6 +23,8 @@ from ggslam.runs.writing import REPORT_FILE, TRUTH_FILE
 from ggslam.sequences import Sequence
 from ggslam.slam.config import Config, config_to_dict
 from ggslam.slam.step_log import STEPS_FILE, read_table
+from ggslam.system.foreign import read_foreign_text
+from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.volumes.map_upright import upright_of
 from ggslam.volumes.upright import estimate_up
 
@@ -68,9 +69,11 @@ def _table(folder: RunFolder, name: str) -> dict[str, np.ndarray]:
 def _settings(folder: RunFolder) -> dict[str, Any]:
     path = folder.path / "config.yaml"
     try:
-        values = yaml.safe_load(path.read_text()) if path.is_file() else {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        values = parse_yaml(read_foreign_text(path, RunFolderError)) if path.is_file() else {}
+    except PlainYamlError as error:
         raise RunFolderError(f"{path}: cannot be read: {error}") from None
+    if not isinstance(values or {}, dict):
+        raise RunFolderError(f"{path}: expected settings, found {type(values).__name__}")
     return flat(values or {})
 
 

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.formats.point_cloud import read_point_cloud
@@ -18,13 +20,14 @@ from ggslam.localization.surface import NORMAL
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import fingerprint
-from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
+from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays, read_array
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
 from ggslam.slam.saved_places import PLACES_FILE
-from ggslam.submaps.cell_keys import partition
+from ggslam.submaps.cell_keys import CellKey, partition
 from ggslam.submaps.cell_records import CellWrite
+from ggslam.submaps.gaussian_rows import decode_rows
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
@@ -112,6 +115,25 @@ def store_of_cloud(path: Path, store: GridStore, visit: str | None = None, at: f
     store_cloud(store, points[due], {name: values[due] for name, values in attributes.items()}, at or 0.0)
 
 
+def gaussians_of_cell(store: GridStore, key: CellKey) -> GaussianMap:
+    """The Gaussians whose means lie in a cell that has some, without optimizer state.
+
+    Raises:
+        FormatError: their file is missing or damaged.
+    """
+    source = f"{store.path}: cell {key}"
+    rows = decode_rows(store.get(key, GAUSSIANS), source)
+    try:
+        means, sh, features = rows["means"], rows["sh"], rows["features"]
+        out = GaussianMap(math.isqrt(sh.shape[1]) - 1, features.shape[1], with_moments=False)
+        out.insert(means, rows["quaternions"], rows["log_scales"], rows["opacity_logits"], torch.zeros(len(means), 3),
+                   features=features, object_id=rows["object_id"])  # fmt: skip
+        out.sh[:] = sh
+    except (KeyError, ValueError, IndexError, RuntimeError, TypeError) as error:
+        raise FormatError(f"{source}: no Gaussians written by ggslam: {error}") from None
+    return out
+
+
 class _Due(dict[tuple[int, int, int], bool]):
     """Which cells are to be recorded now; asks the store once a cell."""
 
@@ -147,10 +169,7 @@ def _cloud(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     if path.suffix.lower() == ".bin":
         return read_raw_points(path, 4)[:, :3], {}
     if path.suffix.lower() == ".npy":
-        try:
-            points = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise FormatError(f"{path}: cannot be read: {error}") from None
+        points = read_array(path)
         if getattr(points, "ndim", 0) != 2 or points.shape[1] < 3 or points.dtype.kind != "f":
             raise FormatError(f"{path}: expected floating-point numbers [n, 3 or more], found {list(np.shape(points))}")
         return points[:, :3], {}

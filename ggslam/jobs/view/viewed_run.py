@@ -17,6 +17,7 @@ from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.jobs.edit.edits import Edit, apply_edit, edit_run
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS, object_file_name
 from ggslam.jobs.view.pictures import ViewPictures
+from ggslam.objects.editing import MAX_NAME
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.table import ObjectRecord
 from ggslam.reporting.pictures import color_of_depth, depth_range
@@ -26,6 +27,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
+from ggslam.system.foreign import is_plain_name
 from ggslam.viewer.model import Coloring, ListedObject
 from ggslam.viewer.splats import Splats, most_visible, splats_of
 from ggslam.viewer.static_page import static_page
@@ -240,22 +242,22 @@ class ViewedRun:
 
     def default_target(self) -> str:
         """See `EditableMap`."""
-        path = self.folder.path.resolve()  # "." has no name
-        return str(path.with_name(path.name + "-edited"))
+        return self.folder.path.resolve().name + "-edited"  # "." has no name
+
+    def save_folder(self) -> Path:
+        """Where edited runs are saved: beside this one, whatever a page asks for."""
+        return self.folder.path.resolve().parent
 
     def save(self, target: str, inpaint: bool) -> str:
         """See `EditableMap`; an earlier run at `target` is not replaced."""
         with self._lock:
             if not self._edits:
                 raise ConfigError("nothing was edited, so there is nothing to save")
-            if not target.strip():
-                raise ConfigError("a folder is needed to save to")
+            if not is_plain_name(target.strip()) or not target.isprintable() or len(target) > MAX_NAME:
+                raise ConfigError(f"a name is needed to save as, of a new folder in {self.save_folder()}")
             sequence = self._sequence_path if inpaint else None
             edits = list(self._edits)
-        try:
-            out = Path(target).expanduser()
-        except RuntimeError as error:  # "~nobody"
-            raise ConfigError(f"{target}: cannot be saved to: {error}") from None
+        out = self.save_folder() / target.strip()
         outcome = edit_run(self.folder, edits, out, inpainting=inpaint, sequence=sequence)
         return "\n".join([f"saved to {outcome.folder.path}", *outcome.notes])
 

@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections.abc import Sequence
@@ -30,7 +29,8 @@ from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import changing_in_run
 from ggslam.system.atomic import make_folder
-from ggslam.system.json_files import write_json
+from ggslam.system.foreign import is_plain_name
+from ggslam.system.json_files import read_json, write_json
 from ggslam.system.staging import finish_saving, new_staging, publish
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.maps import VolumeMaps
@@ -254,9 +254,9 @@ def prepare_folder(out: Path) -> None:
 def _earlier_files(out: Path) -> list[str]:
     """Names of the files that earlier volumes left in the folder, and that later ones replace."""
     try:
-        names = json.loads((out / RECORD).read_text())["files"]
-        return [name for name in names if Path(name).name == name and name != RECORD and (out / name).is_file()]
-    except (OSError, ValueError, KeyError, TypeError):
+        names = read_json(out / RECORD)["files"]
+        return [name for name in names if is_plain_name(name) and name != RECORD and (out / name).is_file()]
+    except (RunFolderError, KeyError, TypeError):
         return []
 
 

@@ -63,7 +63,7 @@ class ReplicaFormat:
             camera = Camera(int(c["w"]), int(c["h"]), float(c["fx"]), float(c["fy"]), float(c["cx"]), float(c["cy"]))
             names = {int(key): str(value) for key, value in content.get("instances", {}).items()}
             depth_scale = float(c["scale"])
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
             raise SequenceError(
                 f'{path}: expected {{"camera": {{w, h, fx, fy, cx, cy, scale}}}} with numbers; problem: {error!r}'
             ) from None

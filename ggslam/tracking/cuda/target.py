@@ -14,7 +14,8 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.cuda.transfers import Upload
 from ggslam.interface.arrays import address
-from ggslam.interface.cuda.tracking import Voxel, VoxelBlock, VoxelLevel, VoxelLevelJob, VoxelMoments, VoxelSlot
+from ggslam.interface.core.tracking import Voxel, VoxelMoments
+from ggslam.interface.cuda.tracking import VoxelBlock, VoxelLevel, VoxelLevelJob, VoxelSlot
 from ggslam.native.loader import load_library
 from ggslam.tracking.gicp import GicpTarget
 

@@ -50,8 +50,8 @@ RigidPose move(const RigidPose& pose, const double* twist) {
 
 template <typename Args>
 void set_pose(const RigidPose& pose, Args& args) {
-  for (int i = 0; i < 9; ++i) args.rotation[i] = static_cast<float>(pose.rotation(i / 3, i % 3));
-  for (int i = 0; i < 3; ++i) args.translation[i] = static_cast<float>(pose.translation[i]);
+  cast<float>(pose.rotation).to(args.rotation);
+  cast<float>(pose.translation).to(args.translation);
 }
 
 // Gram-Schmidt on the rows: rounding of a dozen products is all there is to remove.

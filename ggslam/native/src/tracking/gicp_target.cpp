@@ -154,8 +154,7 @@ void coarsen(const VoxelLevel& fine, Merge merge, VoxelLevel& coarse) {
   };
   std::vector<Entry> entries;
   for (std::size_t b = 0; b < fine.blocks.size(); ++b) {
-    int c[3];
-    block_coordinates(fine.block_keys[b], c);
+    const Vec3i c = block_coordinates(fine.block_keys[b]);
     entries.push_back({block_key(c[0] >> 2, c[1] >> 2, c[2] >> 2), (c[0] & 3) + 4 * (c[1] & 3) + 16 * (c[2] & 3),
                        static_cast<int>(b)});
   }

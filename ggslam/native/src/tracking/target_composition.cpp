@@ -230,8 +230,7 @@ class Composer {
     std::vector<char> chosen(out_.fine.blocks.size(), 0);
     for (std::size_t i = 0; i < changes.size(); ++i) {
       if (i && changes[i].order == changes[i - 1].order) continue;
-      int c[3];
-      block_coordinates(changes[i].key, c);
+      const Vec3i c = block_coordinates(changes[i].key);
       for (int n = 0; n < 27; ++n) {
         const int b = out_.fine.block_of(block_key(c[0] + n % 3 - 1, c[1] + n / 3 % 3 - 1, c[2] + n / 9 - 1));
         if (b >= 0) chosen[static_cast<std::size_t>(b)] = 1;

@@ -33,6 +33,13 @@ std::vector<Member> sorted_members(Isa isa, const TargetInput& input, const Targ
   return members;
 }
 
+// Three numbers of `bits` each, x lowest, less `half`.
+Vec3i unpack(uint64_t packed, int bits, int half) {
+  const uint64_t mask = (uint64_t{1} << bits) - 1;
+  const Vec3<uint64_t> c{{packed & mask, packed >> bits & mask, packed >> 2 * bits & mask}};
+  return cast<int>(c) - Vec3i::all(half);
+}
+
 template <typename T>
 std::size_t bytes_of(const std::vector<T>& values) {
   return values.capacity() * sizeof(T);
@@ -40,31 +47,24 @@ std::size_t bytes_of(const std::vector<T>& values) {
 
 }  // namespace
 
-void block_coordinates(uint64_t key, int c[3]) {
-  for (int a = 0; a < 3; ++a) c[a] = static_cast<int>(key >> (21 * a) & ((1u << 21) - 1)) - (1 << 20);
-}
+Vec3i block_coordinates(uint64_t key) { return unpack(key, 21, 1 << 20); }
 
 VoxelMoments empty_moments(uint64_t key, int bit, float size) {
   VoxelMoments m{};
-  int block[3];
-  block_coordinates(key, block);
-  const int local[3] = {bit & 3, bit >> 2 & 3, bit >> 4};
-  for (int a = 0; a < 3; ++a) m.centre[a] = (4 * block[a] + local[a] + 0.5f) * size;
+  const Vec3i voxel = 4 * block_coordinates(key) + Vec3i{{bit & 3, bit >> 2 & 3, bit >> 4}};
+  (size * (cast<float>(voxel) + Vec3f::all(0.5f))).to(m.centre);
   return m;
 }
 
 uint64_t block_order(uint64_t key) {
-  int c[3];
-  block_coordinates(key, c);
+  const Vec3i c = block_coordinates(key);
   uint64_t order = 0;
   for (int a = 2; a >= 0; --a) order = order << kCoarseBits | static_cast<uint64_t>((c[a] >> 2) + kCoarseHalf);
   return order << 6 | static_cast<uint64_t>((c[0] & 3) + 4 * (c[1] & 3) + 16 * (c[2] & 3));
 }
 
 uint64_t coarse_key_of(uint64_t order) {
-  int c[3];
-  for (int a = 0; a < 3; ++a)
-    c[a] = static_cast<int>(order >> (6 + kCoarseBits * a) & ((1u << kCoarseBits) - 1)) - kCoarseHalf;
+  const Vec3i c = unpack(order >> 6, kCoarseBits, kCoarseHalf);
   return block_key(c[0], c[1], c[2]);
 }
 

@@ -4,11 +4,12 @@
 #include <vector>
 
 #include "common/context.hpp"
+#include "common/vector.hpp"
 #include "tracking/tracking_types.hpp"
 
 namespace ggslam {
 
-void block_coordinates(uint64_t key, int c[3]);
+Vec3i block_coordinates(uint64_t key);
 
 // Moments of a voxel without members: bit `bit` of the block, voxels of `size` metres.
 VoxelMoments empty_moments(uint64_t key, int bit, float size);

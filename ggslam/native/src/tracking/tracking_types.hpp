@@ -8,27 +8,7 @@
 
 namespace ggslam {
 
-// --- points of a depth image ------------------------------------------------------------------------------------
-
 // --- voxel grid the points are aligned to --------------------------------------------------------------------------
-
-struct VoxelMoments {
-  float weight;
-  float offset[3];         // sum of w (mean - centre)
-  float outer[6];          // sum of w (mean - centre)(mean - centre)^T
-  float own[6];            // sum of w C with C the members' regularised covariances
-  float normal[3];         // sum of w (1 - thickness) n
-  float centre[3];
-};
-
-struct alignas(64) Voxel {
-  float mean[3];
-  float weight;
-  float normal[3];
-  float reserved;
-  float covariance[6];     // regularised: median eigenvalue 1
-  float padding[2];
-};
 
 // Voxels are grouped in blocks of 4 x 4 x 4; those of a block lie one after the other in the order of their bits.
 struct VoxelBlock {

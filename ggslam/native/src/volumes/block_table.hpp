@@ -5,11 +5,16 @@
 #include <cstdint>
 #include <vector>
 
+#include "common/box.hpp"
+
 namespace ggslam::volumes {
 
 struct BlockCoordinates {
   int32_t x, y, z;
 };
+
+static inline Vec3i vector_of(BlockCoordinates at) { return {{at.x, at.y, at.z}}; }
+static inline Box3i box_of(BlockCoordinates at) { return Box3i::at(vector_of(at)); }
 
 // What a look-up reads. Kernels look up, too, hence the functions are static: each instruction set has its own copy.
 struct TableView {

@@ -15,32 +15,33 @@ constexpr float kMargin = 1.0f / 128;
 }  // namespace
 
 EdgeVertex::EdgeVertex(const SurfaceBlock& block, uint16_t min_weight, int axis, int i, int j, int k)
-    : block_(block), min_weight_(min_weight), axis_(axis), at_{i, j, k} {
-  ends_[0] = voxel(i, j, k);
-  ends_[1] = voxel(i + (axis == 0), j + (axis == 1), k + (axis == 2));
+    : block_(block), min_weight_(min_weight), axis_(axis), at_{{i, j, k}} {
+  Vec3i end = at_;
+  ++end[axis];
+  ends_[0] = voxel(at_), ends_[1] = voxel(end);
   const float a = static_cast<float>(ends_[0].value()), b = static_cast<float>(ends_[1].value());
   share_ = std::min(std::max(a / (a - b), kMargin), 1 - kMargin);
 }
 
 // A voxel of the block or of those around it.
-EdgeVertex::Voxel EdgeVertex::voxel(int x, int y, int z) const {
-  const VoxelBlock* owner = block_.voxels[around_index(x >> 3, y >> 3, z >> 3)];
-  return {owner, (x & 7) + 8 * (y & 7) + 64 * (z & 7)};
+EdgeVertex::Voxel EdgeVertex::voxel(const Vec3i& at) const {
+  const VoxelBlock* owner = block_.voxels[around_index(at[0] >> 3, at[1] >> 3, at[2] >> 3)];
+  return {owner, (at[0] & 7) + 8 * (at[1] & 7) + 64 * (at[2] & 7)};
 }
 
 void EdgeVertex::position(float voxel, float out[3]) const {
-  const int32_t block[3] = {block_.at.x, block_.at.y, block_.at.z};
-  for (int a = 0; a < 3; ++a)
-    out[a] = voxel * (static_cast<float>(kSide * block[a] + at_[a]) + 0.5f + (a == axis_ ? share_ : 0.0f));
+  Vec3f p = cast<float>(kSide * vector_of(block_.at) + at_) + Vec3f::all(0.5f);
+  p[axis_] += share_;
+  (voxel * p).to(out);
 }
 
 // The field beside the vertex, `step` voxels along an axis across the edge; false where it is not known.
 bool EdgeVertex::beside(int axis, int step, float& value) const {
-  int at[3] = {at_[0], at_[1], at_[2]};
+  Vec3i at = at_;
   at[axis] += step;
-  const Voxel a = voxel(at[0], at[1], at[2]);
+  const Voxel a = voxel(at);
   ++at[axis_];
-  const Voxel b = voxel(at[0], at[1], at[2]);
+  const Voxel b = voxel(at);
   if (a.block->weight[a.row] < min_weight_ || b.block->weight[b.row] < min_weight_) return false;
   value = (1 - share_) * a.value() + share_ * b.value();
   return true;
@@ -61,16 +62,17 @@ void EdgeVertex::normal(float out[3]) const {
 }
 
 void EdgeVertex::color(uint8_t out[3]) const {
-  float color[2][3], share[2] = {1 - share_, share_};
+  Vec3f color[2];
+  float share[2] = {1 - share_, share_};
   for (int e = 0; e < 2; ++e) {
     const VoxelBlock& b = *ends_[e].block;
     const int row = ends_[e].row;
-    color[e][0] = b.red[row], color[e][1] = b.green[row], color[e][2] = b.blue[row];
+    color[e] = cast<float>(Vec3<uint8_t>{{b.red[row], b.green[row], b.blue[row]}});
     if (b.red[row] == 0 && b.green[row] == 0 && b.blue[row] == 0) share[e] = 0;
   }
   const float scale = share[0] + share[1] > 0 ? 1 / (share[0] + share[1]) : 0;
-  for (int a = 0; a < 3; ++a)
-    out[a] = static_cast<uint8_t>((share[0] * color[0][a] + share[1] * color[1][a]) * scale + 0.5f);
+  const Vec3f mixed = scale * (share[0] * color[0] + share[1] * color[1]);
+  cast<uint8_t>(mixed + Vec3f::all(0.5f)).to(out);
 }
 
 uint16_t EdgeVertex::label() const {

@@ -29,11 +29,12 @@ class EdgeVertex {
 
   const SurfaceBlock& block_;
   uint16_t min_weight_;
-  int axis_, at_[3];
+  int axis_;
+  Vec3i at_;
   Voxel ends_[2];
   float share_;  // of the way from the first end to the other
 
-  Voxel voxel(int x, int y, int z) const;
+  Voxel voxel(const Vec3i& at) const;
   bool beside(int axis, int step, float& value) const;
 };
 

@@ -19,12 +19,6 @@ struct FieldBlock {
   float required = 0;  // how far from its voxels sites were read last time at most, voxels; 0: never computed
 };
 
-// Half-open range of blocks or voxels.
-struct Range {
-  int low[3], high[3];
-  int64_t size(int axis) const { return high[axis] - low[axis]; }
-};
-
 // A block to compute and how far around it sites are looked for.
 struct Task {
   int32_t row;
@@ -53,10 +47,10 @@ class Esdf {
   float first_pad(int32_t row) const;
   void compute(Context& context, std::vector<Task> tasks, FieldStats& stats);
   // esdf_box.cpp
-  void solve(Context& context, const std::vector<Task>& tasks, const Range& box, FieldStats& stats,
+  void solve(Context& context, const std::vector<Task>& tasks, const Box3i& box, FieldStats& stats,
              std::vector<Task>& again);
-  void collect(Context& context, const Range& padded, const Range& frame);
-  void transform(Context& context, const Range& box, const Range& frame);
+  void collect(Context& context, const Box3i& padded, const Box3i& frame);
+  void transform(Context& context, const Box3i& box, const Box3i& frame);
 
   const Tsdf& tsdf_;
   const float max_distance_;  // voxels
@@ -64,7 +58,7 @@ class Esdf {
   BlockTable table_;
   std::vector<FieldBlock> blocks_;        // by row of the table
   std::vector<BlockCoordinates> site_changes_;  // blocks whose sites changed
-  Range bounds_{};                        // of all blocks with sites
+  Box3i bounds_{};                        // of all blocks with sites
 
   // Of the box at work.
   std::vector<SiteCell> cells_;
@@ -76,11 +70,11 @@ class Esdf {
 // Splits tasks into boxes of blocks that together are cheap to compute, reordering them: `done` is called with a box
 // (blocks) and its tasks.
 struct TaskBox {
-  Range box;
+  Box3i box;
   std::size_t begin, end;
 };
-std::vector<TaskBox> split_into_boxes(std::vector<Task>& tasks, const BlockTable& table, const Range& bounds);
+std::vector<TaskBox> split_into_boxes(std::vector<Task>& tasks, const BlockTable& table, const Box3i& bounds);
 // The voxels of `box` (blocks) and `pad` around, but not farther than `bounds` (blocks).
-Range padded_box(const Range& box, float pad, const Range& bounds);
+Box3i padded_box(const Box3i& box, float pad, const Box3i& bounds);
 
 }  // namespace ggslam::volumes

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The distance field as seen from outside.
+#include <algorithm>
 #include <limits>
 
 #include "common/context.hpp"
@@ -54,12 +55,9 @@ GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* norm
     const BlockCoordinates b = f.table().at(row);
     for (const Site& site : f.block(row).sites) {
       if (points != nullptr) {
-        const int v[3] = {kSide * b.x + site.voxel % kSide, kSide * b.y + site.voxel / kSide % kSide,
-                          kSide * b.z + site.voxel / (kSide * kSide)};
-        for (int a = 0; a < 3; ++a) {
-          points[3 * n + a] = (static_cast<float>(v[a]) + 0.5f + site.point[a]) * f.voxel();
-          normals[3 * n + a] = site.normal[a];
-        }
+        const ggslam::Vec3f voxel = ggslam::cast<float>(kSide * vector_of(b) + voxel_of(site.voxel));
+        (f.voxel() * (voxel + ggslam::Vec3f::all(0.5f) + ggslam::Vec3f::from(site.point))).to(points + 3 * n);
+        std::copy_n(site.normal, 3, normals + 3 * n);
       }
       ++n;
     }

@@ -64,21 +64,18 @@ void link_neighbours(ThreadPool& pool, const std::vector<int32_t>& row_start, in
 }  // namespace
 
 // The sites in the voxels of `padded`, in order of z, y, x, with positions from `frame.low`; rows are those of `frame`.
-void Esdf::collect(Context& context, const Range& padded, const Range& frame) {
+void Esdf::collect(Context& context, const Box3i& padded, const Box3i& frame) {
   const int rows_y = static_cast<int>(frame.size(1)), rows_z = static_cast<int>(frame.size(2));
   std::vector<BoxSite> found;
   row_start_.assign(static_cast<std::size_t>(rows_y) * rows_z + 1, 0);
   const auto take = [&](std::size_t row) {
-    const BlockCoordinates at = table_.at(row);
+    const Vec3i at = vector_of(table_.at(row));
     for (const Site& site : blocks_[row].sites) {
-      const int v[3] = {kSide * at.x + site.voxel % kSide, kSide * at.y + site.voxel / kSide % kSide,
-                        kSide * at.z + site.voxel / (kSide * kSide)};
-      bool inside = true;
-      for (int a = 0; a < 3; ++a) inside = inside && v[a] >= padded.low[a] && v[a] < padded.high[a];
-      if (!inside) continue;
+      const Vec3i v = kSide * at + voxel_of(site.voxel);
+      if (!padded.contains(v)) continue;
+      const auto cell = cast<int16_t>(v - frame.low);
       BoxSite s{};
-      s.cell = {static_cast<int16_t>(v[0] - frame.low[0]), static_cast<int16_t>(v[1] - frame.low[1]),
-                static_cast<int16_t>(v[2] - frame.low[2])};
+      s.cell = {cell[0], cell[1], cell[2]};
       std::copy_n(site.point, 3, s.point);
       std::copy_n(site.normal, 3, s.normal);
       found.push_back(s);
@@ -87,11 +84,7 @@ void Esdf::collect(Context& context, const Range& padded, const Range& frame) {
   };
   for (std::size_t row = 0; row < blocks_.size(); ++row) {
     if (blocks_[row].sites.empty()) continue;
-    const BlockCoordinates at = table_.at(row);
-    const int c[3] = {at.x, at.y, at.z};
-    bool inside = true;
-    for (int a = 0; a < 3; ++a) inside = inside && kSide * (c[a] + 1) > padded.low[a] && kSide * c[a] < padded.high[a];
-    if (inside) take(row);
+    if (padded.intersects(box_of(table_.at(row)).scale(kSide))) take(row);
   }
   for (std::size_t r = 1; r < row_start_.size(); ++r) row_start_[r] += row_start_[r - 1];
   sites_.resize(found.size());
@@ -109,7 +102,7 @@ void Esdf::collect(Context& context, const Range& padded, const Range& frame) {
 }
 
 // Fills nearest_: [y in box][z in frame][x in box], of which those z in the box count.
-void Esdf::transform(Context& context, const Range& box, const Range& frame) {
+void Esdf::transform(Context& context, const Box3i& box, const Box3i& frame) {
   const int rows_y = static_cast<int>(frame.size(1)), rows_z = static_cast<int>(frame.size(2));
   const int columns = static_cast<int>(box.size(0)), x = box.low[0] - frame.low[0];
   const std::size_t slice = static_cast<std::size_t>(rows_z) * columns;
@@ -161,16 +154,14 @@ void Esdf::transform(Context& context, const Range& box, const Range& frame) {
   });
 }
 
-void Esdf::solve(Context& context, const std::vector<Task>& tasks, const Range& blocks, FieldStats& stats,
+void Esdf::solve(Context& context, const std::vector<Task>& tasks, const Box3i& blocks, FieldStats& stats,
                  std::vector<Task>& again) {
   float pad = 0;
   for (const Task& task : tasks) pad = std::max(pad, task.pad);
-  const Range padded = padded_box(blocks, pad, bounds_);
-  Range box, frame;
-  for (int a = 0; a < 3; ++a) {
-    box.low[a] = kSide * blocks.low[a], box.high[a] = kSide * blocks.high[a];
-    frame.low[a] = std::min(box.low[a], padded.low[a]), frame.high[a] = std::max(box.high[a], padded.high[a]);
-  }
+  const Box3i padded = padded_box(blocks, pad, bounds_);
+  const Box3i box = blocks.scale(kSide);
+  Box3i frame = box;
+  frame.include(padded);
   collect(context, padded, frame);
   transform(context, box, frame);
   stats.transformed += box.size(0) * box.size(1) * box.size(2);
@@ -189,10 +180,9 @@ void Esdf::solve(Context& context, const std::vector<Task>& tasks, const Range& 
   context.pool.parallel_for(tasks.size(), 4, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t i = begin; i < end; ++i) {
       FieldBlock& block = blocks_[tasks[i].row];
-      const BlockCoordinates at = table_.at(tasks[i].row);
+      const Vec3i first = kSide * vector_of(table_.at(tasks[i].row));
       RefineInput in = common;
-      const int first[3] = {kSide * at.x, kSide * at.y, kSide * at.z};
-      for (int a = 0; a < 3; ++a) in.origin[a] = first[a] - frame.low[a];
+      (first - frame.low).to(in.origin);
       in.nearest = nearest_.data() + (first[1] - box.low[1]) * in.stride_y + in.origin[2] * in.stride_z +
                    (first[0] - box.low[0]);
       in.known = block.known, in.negative = block.negative;

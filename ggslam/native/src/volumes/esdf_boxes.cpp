@@ -14,32 +14,25 @@ constexpr int64_t kMostVoxels = int64_t{1} << 25;
 // Edge of a box at most, blocks: places in a padded box must fit SiteCell.
 constexpr int64_t kLongest = 1024;
 
-const int* coordinates(const BlockCoordinates& at) { return &at.x; }
-
 struct Splitter {
   std::vector<Task>& tasks;
   const BlockTable& table;
-  const Range& bounds;
+  const Box3i& bounds;
   std::vector<TaskBox> boxes;
 
-  Range bound(std::size_t begin, std::size_t end, float& pad) const {
-    Range box;
-    for (int a = 0; a < 3; ++a) box.low[a] = std::numeric_limits<int>::max(), box.high[a] = -box.low[a];
+  Box3i bound(std::size_t begin, std::size_t end, float& pad) const {
+    Box3i box = Box3i::empty();
     pad = 0;
     for (std::size_t i = begin; i < end; ++i) {
-      const BlockCoordinates at = table.at(tasks[i].row);
       pad = std::max(pad, tasks[i].pad);
-      for (int a = 0; a < 3; ++a) {
-        box.low[a] = std::min(box.low[a], coordinates(at)[a]);
-        box.high[a] = std::max(box.high[a], coordinates(at)[a] + 1);
-      }
+      box.include(box_of(table.at(tasks[i].row)));
     }
     return box;
   }
 
   // Voxels through each pass over a box, an estimate of its time; and the largest array.
-  double cost(const Range& box, float pad, int64_t& largest) const {
-    const Range p = padded_box(box, pad, bounds);
+  double cost(const Box3i& box, float pad, int64_t& largest) const {
+    const Box3i p = padded_box(box, pad, bounds);
     const double x = kSide * static_cast<double>(box.size(0)), y = kSide * static_cast<double>(box.size(1)),
                  z = kSide * static_cast<double>(box.size(2));
     const double py = static_cast<double>(p.size(1)), pz = static_cast<double>(p.size(2));
@@ -49,14 +42,14 @@ struct Splitter {
 
   double cost_of(std::size_t begin, std::size_t end, int64_t& largest) const {
     float pad;
-    const Range box = bound(begin, end, pad);
+    const Box3i box = bound(begin, end, pad);
     return cost(box, pad, largest);
   }
 
   // Halves the tasks at the middle of the axis where that costs least, as long as it lowers the cost.
   void split(std::size_t begin, std::size_t end) {
     float pad;
-    const Range box = bound(begin, end, pad);
+    const Box3i box = bound(begin, end, pad);
     int64_t largest, unused;
     const double whole = cost(box, pad, largest);
     const bool too_large = largest > kMostVoxels || std::max({box.size(0), box.size(1), box.size(2)}) > kLongest;
@@ -65,7 +58,7 @@ struct Splitter {
     const auto half = [&](int a) {
       const int middle = box.low[a] + static_cast<int>(box.size(a) / 2);
       return std::partition(tasks.begin() + begin, tasks.begin() + end,
-                            [&](const Task& t) { return coordinates(table.at(t.row))[a] < middle; }) - tasks.begin();
+                            [&](const Task& t) { return vector_of(table.at(t.row))[a] < middle; }) - tasks.begin();
     };
     for (int a = 0; a < 3; ++a) {
       if (box.size(a) < 2) continue;
@@ -85,17 +78,12 @@ struct Splitter {
 
 }  // namespace
 
-Range padded_box(const Range& box, float pad, const Range& bounds) {
-  const int voxels = static_cast<int>(std::ceil(pad));
-  Range p;
-  for (int a = 0; a < 3; ++a) {
-    p.low[a] = std::max(kSide * box.low[a] - voxels, kSide * bounds.low[a]);
-    p.high[a] = std::max(p.low[a], std::min(kSide * box.high[a] + voxels, kSide * bounds.high[a]));
-  }
-  return p;
+Box3i padded_box(const Box3i& box, float pad, const Box3i& bounds) {
+  const Box3i p = intersection(box.scale(kSide).grow(static_cast<int>(std::ceil(pad))), bounds.scale(kSide));
+  return {p.low, max(p.low, p.high)};
 }
 
-std::vector<TaskBox> split_into_boxes(std::vector<Task>& tasks, const BlockTable& table, const Range& bounds) {
+std::vector<TaskBox> split_into_boxes(std::vector<Task>& tasks, const BlockTable& table, const Box3i& bounds) {
   Splitter splitter{tasks, table, bounds, {}};
   if (!tasks.empty()) splitter.split(0, tasks.size());
   return std::move(splitter.boxes);

@@ -15,16 +15,15 @@ constexpr BlockCoordinates kFaces[6] = {{-1, 0, 0}, {1, 0, 0}, {0, -1, 0}, {0, 1
 
 BlockCoordinates operator+(BlockCoordinates a, BlockCoordinates b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 
-// Copies what a block has at [low, high) (its own voxels, -1: the halo before it, 8: behind) out of one at `shift`.
-void copy_values(const Tsdf& map, int64_t row, const int low[3], const int high[3], BlockCoordinates shift,
-                 int16_t* values) {
+// Copies what a block has in a box (its own voxels, -1: the halo before it, 8: behind) out of one at `shift`.
+void copy_values(const Tsdf& map, int64_t row, const Box3i& box, BlockCoordinates shift, int16_t* values) {
   if (row < 0) return;
   const Block& block = map.block(row);
   const VoxelBlock* from = map.voxels(block);
   if (from == nullptr && block.free_weight == 0) return;
-  for (int k = low[2]; k < high[2]; ++k)
-    for (int j = low[1]; j < high[1]; ++j)
-      for (int i = low[0]; i < high[0]; ++i) {
+  for (int k = box.low[2]; k < box.high[2]; ++k)
+    for (int j = box.low[1]; j < box.high[1]; ++j)
+      for (int i = box.low[0]; i < box.high[0]; ++i) {
         const int v = (i - kSide * shift.x) + (j - kSide * shift.y) * kSide + (k - kSide * shift.z) * kSide * kSide;
         const int16_t value = from == nullptr ? kFreeValue
                               : from->weight[v] == 0 ? kUnseen
@@ -34,9 +33,8 @@ void copy_values(const Tsdf& map, int64_t row, const int low[3], const int high[
 }
 
 bool same_site(const Site& a, const Site& b) {
-  bool same = a.voxel == b.voxel;
-  for (int i = 0; i < 3; ++i) same = same && a.point[i] == b.point[i] && a.normal[i] == b.normal[i];
-  return same;
+  return a.voxel == b.voxel && Vec3f::from(a.point) == Vec3f::from(b.point) &&
+         Vec3f::from(a.normal) == Vec3f::from(b.normal);
 }
 
 // How many came, went or moved. Both are in order of their voxels.
@@ -57,16 +55,11 @@ int64_t count_changes(const std::vector<Site>& before, const Site* now, int coun
 // Values of a block and the voxels at its faces, as esdf_crossings reads them.
 void Esdf::gather(BlockCoordinates at, int16_t* values) const {
   std::fill_n(values, kHalo * kHalo * kHalo, kUnseen);
-  const int low[3] = {0, 0, 0}, high[3] = {kSide, kSide, kSide};
-  copy_values(tsdf_, tsdf_.find(at), low, high, {0, 0, 0}, values);
+  const Box3i own{Vec3i::all(0), Vec3i::all(kSide)};
+  copy_values(tsdf_, tsdf_.find(at), own, {0, 0, 0}, values);
   for (const BlockCoordinates& face : kFaces) {
-    const int shift[3] = {face.x, face.y, face.z};
-    int from[3], to[3];
-    for (int a = 0; a < 3; ++a) {
-      from[a] = shift[a] > 0 ? kSide : shift[a] < 0 ? -1 : 0;
-      to[a] = shift[a] > 0 ? kSide + 1 : shift[a] < 0 ? 0 : kSide;
-    }
-    copy_values(tsdf_, tsdf_.find(at + face), from, to, face, values);
+    const Box3i halo = intersection(own.shift(kSide * vector_of(face)), own.grow(1));
+    copy_values(tsdf_, tsdf_.find(at + face), halo, face, values);
   }
 }
 

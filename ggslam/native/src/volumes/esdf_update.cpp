@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <limits>
 
 #include "volumes/esdf.hpp"
 
@@ -23,15 +22,8 @@ double milliseconds(Clock::time_point since) {
 class BlockGaps {
  public:
   BlockGaps(const std::vector<BlockCoordinates>& sources, int window) : window_(window) {
-    for (int a = 0; a < 3; ++a) range_.low[a] = std::numeric_limits<int>::max(), range_.high[a] = -range_.low[a];
-    for (const BlockCoordinates& at : sources) {
-      const int c[3] = {at.x, at.y, at.z};
-      for (int a = 0; a < 3; ++a) {
-        range_.low[a] = std::min(range_.low[a], c[a] - window);
-        range_.high[a] = std::max(range_.high[a], c[a] + window + 1);
-      }
-    }
-    for (int a = 0; a < 3; ++a) size_[a] = static_cast<std::size_t>(range_.size(a));
+    for (const BlockCoordinates& at : sources) range_.include(box_of(at).grow(window));
+    size_ = cast<std::size_t>(range_.high - range_.low);
     gap_.assign(size_[0] * size_[1] * size_[2], kFar);
     for (const BlockCoordinates& at : sources) gap_[index(at)] = 0;
   }
@@ -49,21 +41,19 @@ class BlockGaps {
   }
 
   int gap(BlockCoordinates at) const {
-    const int c[3] = {at.x, at.y, at.z};
-    for (int a = 0; a < 3; ++a)
-      if (c[a] < range_.low[a] || c[a] >= range_.high[a]) return kFar;
-    return gap_[index(at)];
+    return range_.contains(box_of(at)) ? gap_[index(at)] : kFar;
   }
 
  private:
   static constexpr int kFar = 1 << 29;
   const int window_;
-  Range range_;
-  std::size_t size_[3];
+  Box3i range_ = Box3i::empty();
+  Vec3<std::size_t> size_;
   std::vector<int> gap_;
 
   std::size_t index(BlockCoordinates at) const {
-    return (at.x - range_.low[0]) + size_[0] * ((at.y - range_.low[1]) + size_[1] * (at.z - range_.low[2]));
+    const Vec3i p = vector_of(at) - range_.low;
+    return p[0] + size_[0] * (p[1] + size_[1] * p[2]);
   }
 
   void spread_line(int* values, std::size_t stride, std::vector<int>& line) const {
@@ -118,19 +108,10 @@ std::vector<Task> Esdf::affected(Context& context, const std::vector<int32_t>& c
 }
 
 void Esdf::compute(Context& context, std::vector<Task> tasks, FieldStats& stats) {
-  for (int a = 0; a < 3; ++a) bounds_.low[a] = std::numeric_limits<int>::max(), bounds_.high[a] = -bounds_.low[a];
-  bool any = false;
-  for (std::size_t row = 0; row < blocks_.size(); ++row) {
-    if (blocks_[row].sites.empty()) continue;
-    any = true;
-    const BlockCoordinates at = table_.at(row);
-    const int c[3] = {at.x, at.y, at.z};
-    for (int a = 0; a < 3; ++a) {
-      bounds_.low[a] = std::min(bounds_.low[a], c[a]);
-      bounds_.high[a] = std::max(bounds_.high[a], c[a] + 1);
-    }
-  }
-  if (!any) bounds_ = Range{};
+  bounds_ = Box3i::empty();
+  for (std::size_t row = 0; row < blocks_.size(); ++row)
+    if (!blocks_[row].sites.empty()) bounds_.include(box_of(table_.at(row)));
+  if (bounds_.is_empty()) bounds_ = Box3i{};
   std::vector<Task> again;
   while (!tasks.empty()) {
     again.clear();

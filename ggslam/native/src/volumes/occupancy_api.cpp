@@ -45,9 +45,8 @@ bool insert(Context& context, OccupancyMap& map, const float* points, std::size_
 }
 
 void put_keys(std::uint16_t*& out, std::uint64_t code) {
-  int key[3];
-  keys_of_morton(code, key);
-  for (int a = 0; a < 3; ++a) *out++ = static_cast<std::uint16_t>(key[a]);
+  cast<std::uint16_t>(keys_of_morton(code)).to(out);
+  out += 3;
 }
 
 }  // namespace

@@ -6,6 +6,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "common/vector.hpp"
+
 namespace ggslam {
 
 constexpr int kKeyBits = 16;             // levels of the octree
@@ -40,16 +42,16 @@ static inline std::uint32_t gather_bits(std::uint64_t x) {
   return static_cast<std::uint32_t>((x | (x >> 16)) & 0xffff);
 }
 
-static inline std::uint64_t morton_code(const int key[3]) {
+static inline std::uint64_t morton_code(const Vec3i& key) {
   return spread_bits(key[0]) | spread_bits(key[1]) << 1 | spread_bits(key[2]) << 2;
 }
 
-static inline void keys_of_morton(std::uint64_t code, int key[3]) {
-  for (int i = 0; i < 3; ++i) key[i] = static_cast<int>(gather_bits(code >> i));
+static inline Vec3i keys_of_morton(std::uint64_t code) {
+  return cast<int>(Vec3<std::uint32_t>{{gather_bits(code), gather_bits(code >> 1), gather_bits(code >> 2)}});
 }
 
 // False where a coordinate is not finite or lies outside the grid (less its margin).
-static inline bool key_of_point(const KeyGrid& grid, const float point[3], int key[3]) {
+static inline bool key_of_point(const KeyGrid& grid, const Vec3f& point, Vec3i& key) {
   for (int i = 0; i < 3; ++i) {
     const double k = std::floor(grid.factor * point[i]) + kKeyOffset;
     if (!(k >= kKeyMargin && k < 2 * kKeyOffset - kKeyMargin)) return false;

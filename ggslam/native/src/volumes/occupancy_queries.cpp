@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <limits>
 
+#include "common/box.hpp"
 #include "volumes/occupancy_walk.hpp"
 
 namespace ggslam {
@@ -26,47 +27,31 @@ struct LeafSink {
   void leaf(std::uint64_t code, int depth, float v) {
     if (which != 0 && (v >= threshold) != (which == 1)) return;
     const double size = grid.resolution * (1 << (kKeyBits - depth));
-    int key[3];
-    keys_of_morton(code, key);
     OccupancyLeaf out{{}, static_cast<float>(size), v};
-    for (int a = 0; a < 3; ++a) out.centre[a] = static_cast<float>((key[a] - kKeyOffset) * grid.resolution + size / 2);
+    const Vec3d low = grid.resolution * cast<double>(keys_of_morton(code) - Vec3i::all(kKeyOffset));
+    cast<float>(low + Vec3d::all(size / 2)).to(out.centre);
     leaves.push_back(out);
   }
 };
 
-void extend(std::int32_t low[3], std::int32_t high[3], std::uint64_t code, int edge) {
-  int key[3];
-  keys_of_morton(code, key);
-  for (int a = 0; a < 3; ++a) {
-    low[a] = std::min(low[a], key[a]);
-    high[a] = std::max(high[a], key[a] + edge - 1);
-  }
-}
+constexpr Box3i kNoKeys{Vec3i::all(2 * kKeyOffset), Vec3i::all(0)};
 
-// The box of the set voxels of 64 neighbours, whose first has the code `code`.
-void extend_by_word(std::int32_t low[3], std::int32_t high[3], std::uint64_t code, std::uint64_t word) {
-  if (word == 0) return;
-  int key[3];
-  keys_of_morton(code, key);
-  bool inside = true;
-  for (int a = 0; a < 3; ++a) inside &= key[a] >= low[a] && key[a] + 3 <= high[a];
-  if (inside) return;
-  for (; word != 0; word &= word - 1) extend(low, high, code + __builtin_ctzll(word), 1);
+// Includes the set voxels of 64 neighbours, whose first has the code `code`.
+void include_word(Box3i& box, std::uint64_t code, std::uint64_t word) {
+  if (word == 0 || box.contains(Box3i::at(keys_of_morton(code), 4))) return;
+  for (; word != 0; word &= word - 1) box.include(Box3i::at(keys_of_morton(code + __builtin_ctzll(word))));
 }
 
 class Summarizer {
  public:
-  Summarizer(const OccupancyTree& tree, float threshold) : tree_(tree), threshold_(threshold) {
-    for (int a = 0; a < 3; ++a) {
-      out_.known_low[a] = out_.occupied_low[a] = 2 * kKeyOffset;
-      out_.known_high[a] = out_.occupied_high[a] = -1;
-    }
-  }
+  Summarizer(const OccupancyTree& tree, float threshold) : tree_(tree), threshold_(threshold) {}
 
   OccupancySummary run() {
     visit(tree_.root, 0, 0);
     out_.blocks = tree_.blocks.used(), out_.nodes = tree_.nodes.used();
     out_.bytes = tree_.blocks.bytes() + tree_.nodes.bytes();
+    known_.low.to(out_.known_low), (known_.high - Vec3i::all(1)).to(out_.known_high);
+    occupied_.low.to(out_.occupied_low), (occupied_.high - Vec3i::all(1)).to(out_.occupied_high);
     return out_;
   }
 
@@ -81,10 +66,10 @@ class Summarizer {
   }
 
   void visit_leaf(bool occupied, std::uint64_t code, int depth) {
-    const int edge = 1 << (kKeyBits - depth);
+    const Box3i box = Box3i::at(keys_of_morton(code), 1 << (kKeyBits - depth));
     (occupied ? out_.occupied : out_.free) += std::uint64_t{1} << (3 * (kKeyBits - depth));
-    extend(out_.known_low, out_.known_high, code, edge);
-    if (occupied) extend(out_.occupied_low, out_.occupied_high, code, edge);
+    known_.include(box);
+    if (occupied) occupied_.include(box);
   }
 
   void visit_block(const OccupancyBlock& block, std::uint64_t code) {
@@ -95,13 +80,14 @@ class Summarizer {
       occupied &= block.known[w];
       const int known = __builtin_popcountll(block.known[w]), full = __builtin_popcountll(occupied);
       out_.occupied += full, out_.free += known - full;
-      extend_by_word(out_.known_low, out_.known_high, code + 64 * w, block.known[w]);
-      extend_by_word(out_.occupied_low, out_.occupied_high, code + 64 * w, occupied);
+      include_word(known_, code + 64 * w, block.known[w]);
+      include_word(occupied_, code + 64 * w, occupied);
     }
   }
 
   const OccupancyTree& tree_;
   float threshold_;
+  Box3i known_ = kNoKeys, occupied_ = kNoKeys;
   OccupancySummary out_{};
 };
 
@@ -113,9 +99,9 @@ void look_up(Context& context, const OccupancyTree& tree, const float* points, s
     std::uint64_t last = ~std::uint64_t{0};
     Cell cell;
     for (std::size_t i = begin; i < end; ++i) {
-      int key[3];
+      Vec3i key;
       float value = std::numeric_limits<float>::quiet_NaN();
-      if (key_of_point(tree.grid, points + 3 * i, key)) {
+      if (key_of_point(tree.grid, Vec3f::from(points + 3 * i), key)) {
         const std::uint64_t code = morton_code(key);
         if (code >> 9 != last) cell = tree.find(last = code >> 9);
         if (cell.kind == CellKind::leaf) value = cell.value;

@@ -56,7 +56,7 @@ class TileRanges {
     const Mat3f to_camera = Mat3f::from(view_.rotation).transpose();
     const Vec3f first = to_camera * (low_corner - Vec3f::from(view_.position));
     int beyond[4] = {0, 0, 0, 0};  // corners beyond the planes through the camera and the image's sides
-    float low[3] = {1e30f, 1e30f, 1e30f}, high[3] = {-1e30f, -1e30f, -1e30f};  // column, row, depth
+    Vec3f low = Vec3f::all(1e30f), high = Vec3f::all(-1e30f);  // column, row, depth
     for (int c = 0; c < 8; ++c) {
       const Vec3f step{{static_cast<float>(c & 1), static_cast<float>((c >> 1) & 1), static_cast<float>(c >> 2)}};
       const Vec3f p = first + kPart * voxel_ * (to_camera * step);
@@ -65,8 +65,8 @@ class TileRanges {
       beyond[2] += v < -p[2], beyond[3] += v > view_.height * p[2];
       // Beside the camera the projection is of no use: the box may be anywhere in the image.
       const float inverse = 1 / std::max(p[2], 1e-6f);
-      const float seen[3] = {u * inverse, v * inverse, p[2]};
-      for (int a = 0; a < 3; ++a) low[a] = std::min(low[a], seen[a]), high[a] = std::max(high[a], seen[a]);
+      const Vec3f seen{{u * inverse, v * inverse, p[2]}};
+      low = min(low, seen), high = max(high, seen);
     }
     if (high[2] < view_.near || low[2] > view_.far || *std::max_element(beyond, beyond + 4) == 8) return;
     const bool beside = low[2] <= 0;

@@ -16,26 +16,22 @@ namespace {
 constexpr std::size_t kRayChunk = 1024, kPointChunk = 8192;
 
 struct Origin {
-  const float* point;
-  int key[3];
+  Vec3f point;
+  Vec3i key;
   std::uint64_t code;
 };
 
-double norm(const float v[3]) {
-  const float square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
-  return std::sqrt(static_cast<double>(square));
-}
+double norm(const Vec3f& v) { return std::sqrt(static_cast<double>(dot(v, v))); }
 
 // Puts the ray from the origin to `end` into the batch; the two lie in different voxels.
-void prepare_ray(const KeyGrid& grid, const Origin& origin, const float end[3], std::uint64_t end_code,
+void prepare_ray(const KeyGrid& grid, const Origin& origin, const Vec3f& end, std::uint64_t end_code,
                  RayBatch& batch) {
   const std::uint64_t axes[3] = {kAxisX, kAxisY, kAxisZ};
   const int i = batch.count++;
-  float direction[3];
-  for (int a = 0; a < 3; ++a) direction[a] = end[a] - origin.point[a];
-  const float length = static_cast<float>(norm(direction));
+  const Vec3f way = end - origin.point;
+  const float length = static_cast<float>(norm(way));
+  const Vec3f direction = way / length;
   for (int a = 0; a < 3; ++a) {
-    direction[a] /= length;
     const int sign = direction[a] > 0 ? 1 : direction[a] < 0 ? -1 : 0;
     // One less is, within an axis of a Morton code, the addition of all its bits.
     batch.step[a][i] = sign > 0 ? std::int64_t{1} << a : sign < 0 ? static_cast<std::int64_t>(axes[a]) : 0;
@@ -51,22 +47,19 @@ void prepare_ray(const KeyGrid& grid, const Origin& origin, const float end[3], 
 }
 
 // The end of a ray that is cut at the range; false: the point is nearer.
-bool cut_at_range(const Origin& origin, const float point[3], double max_range, float end[3]) {
-  float direction[3];
-  for (int a = 0; a < 3; ++a) direction[a] = point[a] - origin.point[a];
-  const double distance = norm(direction);
+bool cut_at_range(const Origin& origin, const Vec3f& point, double max_range, Vec3f& end) {
+  const Vec3f way = point - origin.point;
+  const double distance = norm(way);
   if (max_range < 0 || distance <= max_range) return false;
-  const float length = static_cast<float>(distance), range = static_cast<float>(max_range);
-  for (int a = 0; a < 3; ++a) end[a] = origin.point[a] + direction[a] / length * range;
+  end = origin.point + static_cast<float>(max_range) * (way / static_cast<float>(distance));
   return true;
 }
 
 void list_centres(const KeyGrid& grid, const VoxelMasks& voxels, std::vector<float>& centres) {
   centres.clear();
   for_each_voxel(voxels, [&](std::uint64_t code) {
-    int key[3];
-    keys_of_morton(code, key);
-    for (int a = 0; a < 3; ++a) centres.push_back(static_cast<float>(key_centre(grid, key[a])));
+    const Vec3i key = keys_of_morton(code);
+    for (const int k : key.v) centres.push_back(static_cast<float>(key_centre(grid, k)));
   });
 }
 
@@ -105,7 +98,7 @@ void count_points(const std::vector<std::int64_t>& codes, const VoxelMasks& voxe
 
 bool Scan::cast(Context& context, const KeyGrid& grid, const ScanSettings& settings, const float* points,
                 std::size_t n) {
-  Origin origin{settings.origin, {}, 0};
+  Origin origin{Vec3f::from(settings.origin), {}, 0};
   if (!key_of_point(grid, origin.point, origin.key)) return false;
   origin.code = morton_code(origin.key);
   while (workers_.size() < static_cast<std::size_t>(context.pool.size())) workers_.emplace_back(new Worker);
@@ -125,9 +118,9 @@ bool Scan::cast(Context& context, const KeyGrid& grid, const ScanSettings& setti
   context.pool.parallel_for(n, kRayChunk, [&](std::size_t begin, std::size_t end, int thread) {
     Worker& worker = *workers_[thread];
     for (std::size_t i = begin; i < end; ++i) {
-      const float* point = points + 3 * i;
-      float cut[3];
-      int key[3];
+      const Vec3f point = Vec3f::from(points + 3 * i);
+      Vec3f cut;
+      Vec3i key;
       if (!key_of_point(grid, point, key)) continue;
       const bool beyond = cut_at_range(origin, point, settings.max_range, cut);
       if (beyond && !key_of_point(grid, cut, key)) continue;

@@ -25,6 +25,9 @@ struct alignas(64) VoxelBlock {
   uint8_t votes[kVoxels];    // for `label`, less those against it
 };
 
+// (i, j, k) of a row.
+static inline Vec3i voxel_of(int row) { return {{row % kSide, row / kSide % kSide, row / (kSide * kSide)}}; }
+
 // The centre of voxel (i, j, k) of block (x, y, z) is at (8 x + i + 0.5, 8 y + j + 0.5, 8 z + k + 0.5) voxels.
 struct Block {
   BlockCoordinates at;

@@ -20,32 +20,28 @@ CandidateSearch::CandidateSearch(const Tsdf& map, const FusionInput& input, cons
                                  const FusionImages& images)
     : map_(map), in_(input), settings_(settings), images_(images), block_(static_cast<double>(map.voxel) * kSide),
       rotation_(Mat3d::from(input.rotation)), translation_(Vec3d::from(input.translation)),
-      position_(-1.0 * (rotation_.transpose() * translation_)) {
+      position_(-1.0 * (rotation_.transpose() * translation_)), axes_(cast<float>(rotation_.transpose())) {
   for (int a = 0; a < 3; ++a) {
     const Vec3d& r = rotation_.row[a];
     extent_[a] = static_cast<float>(0.5 * block_ * (std::fabs(r[0]) + std::fabs(r[1]) + std::fabs(r[2])));
-    for (int b = 0; b < 3; ++b) axes_[a][b] = static_cast<float>(rotation_(b, a));
-    spread_[a] = std::fabs(axes_[a][0]) / in_.fx + std::fabs(axes_[a][1]) / in_.fy;
+    spread_[a] = std::fabs(axes_(a, 0)) / in_.fx + std::fabs(axes_(a, 1)) / in_.fy;
   }
-  double low[3], high[3];
+  Vec3d low, high;
+  const Mat3d axes = cast<double>(axes_);
   const double far = images.farthest + map.truncation;
   const double right[2] = {(-0.5 - in_.cx) / in_.fx, (in_.width - 0.5 - in_.cx) / in_.fx};
   const double down[2] = {(-0.5 - in_.cy) / in_.fy, (in_.height - 0.5 - in_.cy) / in_.fy};
   for (int corner = -1; corner < 4; ++corner) {
     const double z = corner < 0 ? 0 : far;
-    const double q[3] = {z * right[corner & 1], z * down[(corner >> 1) & 1], z};
-    for (int a = 0; a < 3; ++a) {
-      const double x = position_[a] + axes_[a][0] * q[0] + axes_[a][1] * q[1] + axes_[a][2] * q[2];
-      low[a] = corner < 0 ? x : std::min(low[a], x);
-      high[a] = corner < 0 ? x : std::max(high[a], x);
-    }
+    const Vec3d x = position_ + z * right[corner & 1] * axes.column(0) + z * down[(corner >> 1) & 1] * axes.column(1) +
+                    z * axes.column(2);
+    low = corner < 0 ? x : min(low, x);
+    high = corner < 0 ? x : max(high, x);
   }
   do {
     cell_ *= 2;
-    for (int a = 0; a < 3; ++a) {
-      first_[a] = static_cast<int32_t>(std::floor(low[a] / (cell_ * block_)));
-      count_[a] = static_cast<int32_t>(std::floor(high[a] / (cell_ * block_))) - first_[a] + 1;
-    }
+    first_ = floor(low / (cell_ * block_));
+    count_ = floor(high / (cell_ * block_)) - first_ + Vec3i::all(1);
   } while (static_cast<double>(count_[0]) * count_[1] * count_[2] > kMostCells);
 }
 
@@ -92,11 +88,11 @@ void CandidateSearch::emit_free(BlockCoordinates at, int side, std::vector<Candi
 
 // A cube of side^3 blocks.
 CandidateSearch::Cube CandidateSearch::cube(BlockCoordinates at, int side) const {
-  const Vec3d p{{(at.x + 0.5 * side) * block_, (at.y + 0.5 * side) * block_, (at.z + 0.5 * side) * block_}};
+  const Vec3d p = block_ * (cast<double>(vector_of(at)) + Vec3d::all(0.5 * side));
   Cube out;
   out.half = static_cast<float>(0.5 * side * block_);
-  out.centre = to_float(rotation_ * p + translation_);
-  out.offset = to_float(p - position_);
+  out.centre = cast<float>(rotation_ * p + translation_);
+  out.offset = cast<float>(p - position_);
   out.near = out.centre[2] - side * extent_[2], out.far = out.centre[2] + side * extent_[2];
   return out;
 }
@@ -129,7 +125,7 @@ bool CandidateSearch::meets(int level, int u, int v, const Cube& cube, float& z0
   const float x = ((2 * u + 1) * half - 0.5f - in_.cx) / in_.fx, y = ((2 * v + 1) * half - 0.5f - in_.cy) / in_.fy;
   z0 = std::max(cube.near, kNear), z1 = cube.far;
   for (int a = 0; a < 3; ++a) {
-    const float direction = axes_[a][0] * x + axes_[a][1] * y + axes_[a][2];
+    const float direction = axes_(a, 0) * x + axes_(a, 1) * y + axes_(a, 2);
     const float spread = half * spread_[a];
     const float low = cube.offset[a] - cube.half, high = cube.offset[a] + cube.half;
     // z (direction + spread) >= low and z (direction - spread) <= high

@@ -157,20 +157,15 @@ void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings&
   view.clearing = settings.clearing;
   view.weight_scale = kFullWeight / map.max_weight;
   view.max_free_weight = settings.max_free_weight * view.weight_scale;
-  for (int axis = 0; axis < 3; ++axis)
-    for (int a = 0; a < 3; ++a) view.step[axis][a] = static_cast<float>(in.rotation[3 * a + axis] * map.voxel);
+  const Mat3d rotation = Mat3d::from(in.rotation);
+  for (int axis = 0; axis < 3; ++axis) cast<float>(map.voxel * rotation.column(axis)).to(view.step[axis]);
   const auto kernel = GGSLAM_DISPATCH(context.isa, tsdf_fuse_block);
   context.pool.parallel_for(scratch.updates.size(), 8, [&](std::size_t begin, std::size_t end, int) {
     VoxelUpdate own = view;
     for (std::size_t n = begin; n < end; ++n) {
       FusionScratch::Update& update = scratch.updates[n];
-      const double p[3] = {(kSide * static_cast<double>(update.at.x) + 0.5) * map.voxel,
-                           (kSide * static_cast<double>(update.at.y) + 0.5) * map.voxel,
-                           (kSide * static_cast<double>(update.at.z) + 0.5) * map.voxel};
-      for (int a = 0; a < 3; ++a) {
-        const double* r = in.rotation + 3 * a;
-        own.origin[a] = static_cast<float>(r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + in.translation[a]);
-      }
+      const Vec3d p = map.voxel * (kSide * cast<double>(vector_of(update.at)) + Vec3d::all(0.5));
+      cast<float>(rotation * p + Vec3d::from(in.translation)).to(own.origin);
       update.flags = kernel(own, *update.voxels);
     }
   });

@@ -89,9 +89,9 @@ class CandidateSearch {
   Mat3d rotation_;       // of T_camera_map
   Vec3d translation_;
   Vec3d position_;       // of the camera
-  float axes_[3][3];     // of the camera in the map
+  Mat3f axes_;           // of the camera in the map
   float spread_[3];      // along the map's axes at z = 1, of one pixel
-  int32_t first_[3], count_[3];
+  Vec3i first_, count_;
 
   void descend(BlockCoordinates at, int side, std::vector<Candidate>& out) const;
   void emit(BlockCoordinates at, Sight sight, std::vector<Candidate>& out) const;

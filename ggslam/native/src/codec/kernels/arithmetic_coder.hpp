@@ -106,13 +106,12 @@ class BinaryEncoder {
   int pending_ = 0;
 };
 
-class BinaryDecoder {
+// What decoders do with the range; where its bits come from is theirs to say: Decoder::refill() is called when `spare_` is
+// negative, and makes it positive again.
+template <class Decoder>
+class RangeDecoder {
  public:
   static constexpr bool kEncoder = false;
-  BinaryDecoder(const std::uint8_t* data, std::size_t size) : at_(data), end_(data + size) {
-    for (int i = 0; i < 6; ++i) value_ = value_ << 8 | next();
-    spare_ = 32;
-  }
 
   int code(int /*bit*/, Probability& p) {
     renormalise();
@@ -124,28 +123,27 @@ class BinaryDecoder {
     renormalise();
     return split(range_ >> 1);
   }
-
-  // True once the bits in use lie well past the end of the data: whatever was decoded is made up.
-  bool failed() const { return corrupt_ || past_end_ * 8 > spare_ + 8 * kSlack; }
   void mark_corrupt() { corrupt_ = true; }
 
- private:
-  static constexpr int kSlack = 4;
-  std::uint64_t next() {
-    if (at_ < end_) return *at_++;
-    if (past_end_ < (1 << 24)) ++past_end_;
-    return 0xff;
-  }
+ protected:
+  static constexpr int kSlack = 4;  // bytes that may be made up after the end
+  static constexpr int kMostMadeUp = 1 << 24;
+
   void renormalise() {
     if (range_ > 0x4000) return;
     const int shift = doublings(range_);
     range_ <<= shift;
     spare_ -= shift;
-    if (spare_ < 0) {
-      for (int i = 0; i < 4; ++i) value_ = value_ << 8 | next();
-      spare_ += 32;
-    }
+    if (spare_ < 0) static_cast<Decoder*>(this)->refill();
   }
+
+  std::uint64_t value_ = 0;    // distance from the low end of the range, with spare_ bits that are not yet in use
+  std::uint32_t range_ = 0xffff;
+  int spare_ = 0;
+  int past_end_ = 0;           // bytes that were made up
+  bool corrupt_ = false;
+
+ private:
   int split(std::uint32_t zero_part) {
     const std::uint64_t threshold = static_cast<std::uint64_t>(zero_part) << spare_;
     if (value_ >= threshold) {
@@ -156,14 +154,33 @@ class BinaryDecoder {
     range_ = zero_part;
     return 0;
   }
+};
+
+// The decoder of plain streams takes four bytes at a time.
+class BinaryDecoder : public RangeDecoder<BinaryDecoder> {
+ public:
+  BinaryDecoder(const std::uint8_t* data, std::size_t size) : at_(data), end_(data + size) {
+    for (int i = 0; i < 6; ++i) value_ = value_ << 8 | next();
+    spare_ = 32;
+  }
+
+  // True once the bits in use lie well past the end of the data: whatever was decoded is made up.
+  bool failed() const { return corrupt_ || past_end_ * 8 > spare_ + 8 * kSlack; }
+
+ private:
+  friend RangeDecoder<BinaryDecoder>;
+  std::uint64_t next() {
+    if (at_ < end_) return *at_++;
+    if (past_end_ < kMostMadeUp) ++past_end_;
+    return 0xff;
+  }
+  void refill() {
+    for (int i = 0; i < 4; ++i) value_ = value_ << 8 | next();
+    spare_ += 32;
+  }
 
   const std::uint8_t* at_;
   const std::uint8_t* end_;
-  std::uint64_t value_ = 0;    // distance from the low end of the range, with spare_ bits that are not yet in use
-  std::uint32_t range_ = 0xffff;
-  int spare_ = 0;
-  int past_end_ = 0;           // bytes that were made up
-  bool corrupt_ = false;
 };
 
 }  // namespace ggslam::GGSLAM_ISA::codec

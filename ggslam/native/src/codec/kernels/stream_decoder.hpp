@@ -91,29 +91,19 @@ class ChunkReader {
   std::uint8_t held_ = 0;
 };
 
-class StreamDecoder {
+class StreamDecoder : public RangeDecoder<StreamDecoder> {
  public:
-  static constexpr bool kEncoder = false;
   // `separate_bits`: bins of equal probability are a stream of their own.
   StreamDecoder(const std::uint8_t* data, std::size_t size, bool separate_bits)
       : at_(data), end_(data + size), chunks_(data, separate_bits ? size : 0), separate_bits_(separate_bits) {
     begin();
   }
 
-  int code(int /*bit*/, Probability& p) {
-    renormalise();
-    const int bit = split((range_ * p.zero) >> 16);
-    p.update(bit);
-    return bit;
-  }
-  int bypass(int /*bit*/) {
-    if (!separate_bits_) {
-      renormalise();
-      return split(range_ >> 1);
-    }
-    const int bit = chunks_.bit();
-    if (bit < 0) corrupt_ = true;
-    return bit > 0;
+  int bypass(int bit) {
+    if (!separate_bits_) return RangeDecoder::bypass(bit);
+    const int found = chunks_.bit();
+    if (found < 0) corrupt_ = true;
+    return found > 0;
   }
 
   // Ends a codeword and begins the next.
@@ -124,10 +114,9 @@ class StreamDecoder {
   }
 
   bool failed() const { return corrupt_ || past_end_ > kSlack; }
-  void mark_corrupt() { corrupt_ = true; }
 
  private:
-  static constexpr int kSlack = 4;
+  friend RangeDecoder<StreamDecoder>;
   void begin() {
     range_ = 0xffff;
     spare_ = 0;
@@ -137,35 +126,17 @@ class StreamDecoder {
   std::uint32_t next() {
     const int byte = separate_bits_ ? chunks_.byte() : at_ < end_ ? *at_++ : -1;
     if (byte >= 0) return static_cast<std::uint32_t>(byte);
-    if (past_end_ < (1 << 24)) ++past_end_;
+    if (past_end_ < kMostMadeUp) ++past_end_;
     return 0xff;
   }
-  void renormalise() {
-    if (range_ > 0x4000) return;
-    const int shift = doublings(range_);
-    range_ <<= shift;
-    for (spare_ -= shift; spare_ < 0; spare_ += 8) value_ = value_ << 8 | next();
-  }
-  int split(std::uint32_t zero_part) {
-    const std::uint64_t threshold = static_cast<std::uint64_t>(zero_part) << spare_;
-    if (value_ >= threshold) {
-      value_ -= threshold;
-      range_ -= zero_part;
-      return 1;
-    }
-    range_ = zero_part;
-    return 0;
+  void refill() {
+    for (; spare_ < 0; spare_ += 8) value_ = value_ << 8 | next();
   }
 
   const std::uint8_t* at_;
   const std::uint8_t* end_;
   ChunkReader chunks_;
   const bool separate_bits_;
-  std::uint64_t value_ = 0;  // distance from the low end of the range, with spare_ bits that are not yet in use
-  std::uint32_t range_ = 0;
-  int spare_ = 0;
-  int past_end_ = 0;
-  bool corrupt_ = false;
 };
 
 inline void mark_corrupt(StreamDecoder& coder) { coder.mark_corrupt(); }

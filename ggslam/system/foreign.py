@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that came from elsewhere: read whole and within a limit, never through a name that leads out of their folder.
+
+Recordings, runs, stores and streams are passed around, so nothing in them is trusted: not a size, not a name, not the
+kind of a file. Whoever reads one reads it through here.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from ggslam.errors import FormatError, GgslamError
+
+MAX_TEXT_BYTES = 256 << 20
+"""Descriptions, tables and trajectories in text: a trajectory of a day at 30 frames/s has 200 MB."""
+MAX_IMAGE_BYTES = 256 << 20
+"""One image file."""
+
+
+def open_foreign(path: str | Path, error: type[GgslamError] = FormatError) -> BinaryIO:
+    """Opens a regular file for reading; a pipe, a device or a folder of that name is refused, not waited for.
+
+    Args:
+        path: of the file.
+        error: class of the error to raise.
+
+    Raises:
+        error: it is missing, no regular file, or cannot be read; names it and the reason.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        raise error(f"{path}: file is missing") from None
+    except (OSError, ValueError) as reason:  # ValueError: a name with a zero byte
+        raise error(f"{path}: cannot be read: {getattr(reason, 'strerror', None) or reason}") from None
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise error(f"{path}: is not a regular file")
+    return os.fdopen(handle, "rb")
+
+
+def read_foreign(path: str | Path, limit: int | None = None, error: type[GgslamError] = FormatError) -> bytes:
+    """The bytes of a regular file.
+
+    Args:
+        path: of the file.
+        limit: bytes it may have; None: as many as there are.
+        error: class of the error to raise.
+
+    Raises:
+        error: as `open_foreign`, or larger than `limit`.
+    """
+    with open_foreign(path, error) as file:
+        size = os.fstat(file.fileno()).st_size
+        if limit is not None and size > limit:
+            raise error(f"{path}: too large for what it is: {size:,} bytes, at most {limit:,} are read")
+        try:
+            return file.read() if limit is None else file.read(limit + 1)[:limit]
+        except OSError as reason:
+            raise error(f"{path}: cannot be read: {reason.strerror or reason}") from None
+        except MemoryError:
+            raise error(f"{path}: {size:,} bytes do not fit into memory") from None
+
+
+def read_foreign_text(path: str | Path, error: type[GgslamError] = FormatError, limit: int = MAX_TEXT_BYTES) -> str:
+    """Text of a file in UTF-8, with or without a byte order mark; line ends become `\\n`.
+
+    Raises:
+        error: as `read_foreign`, or not text.
+    """
+    try:
+        text = read_foreign(path, limit, error).decode("utf-8-sig")
+    except UnicodeDecodeError as reason:
+        raise error(f"{path}: cannot be read as text: {reason}") from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def is_plain_name(name: object) -> bool:
+    """Whether this is a name of a file in a folder, and nothing that leads elsewhere."""
+    return isinstance(name, str) and name not in ("", ".", "..") and not set(name) & {"/", "\\", "\0"}
+
+
+def member(folder: str | Path, name: str, error: type[GgslamError] = FormatError) -> Path:
+    """Path of a file that a description in `folder` names, relative to it; the file need not be there.
+
+    Args:
+        folder: that the description is of.
+        name: relative path with `/`.
+        error: class of the error to raise.
+
+    Raises:
+        error: the name leads out of the folder, by itself or through a link.
+    """
+    path = Path(folder) / name
+    if "\0" in name:
+        raise error(f"{folder}: names a file with a zero byte")
+    if not path.resolve().is_relative_to(Path(folder).resolve()):
+        raise error(f"{folder}: names {name}, which lies outside the folder")
+    return path
+
+
+def refuse_links(folder: str | Path, error: type[GgslamError] = FormatError) -> None:
+    """Looks through a folder, and those in it, for links that lead out of it, pipes, sockets and devices.
+
+    Args:
+        folder: may be a link itself: whoever names it has chosen so.
+        error: class of the error to raise.
+
+    Raises:
+        error: there is one; names it and, of a link, where it leads.
+    """
+    root = Path(folder).resolve()
+    waiting = [str(root)]
+    while waiting:
+        with suppress(OSError), os.scandir(waiting.pop()) as entries:
+            for entry in entries:
+                if entry.is_symlink():
+                    target = Path(entry.path).resolve()
+                    if not target.is_relative_to(root):
+                        inner = Path(entry.path).relative_to(root)
+                        raise error(f"{Path(folder) / inner}: is a link to {target}, outside {folder}")
+                elif entry.is_dir(follow_symlinks=False):
+                    waiting.append(entry.path)
+                elif not entry.is_file(follow_symlinks=False):
+                    raise error(f"{Path(folder) / Path(entry.path).relative_to(root)}: is not a regular file")
+
+
+def printable(text: str) -> str:
+    """Text without control characters, which could move a terminal's cursor, colour it or rename it; tabs and line
+    breaks stay."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in "\n\t" else f"\\x{ord(c):02x}" for c in text)

@@ -1,0 +1,165 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""What `ggslam export` makes of runs, format by format: bytes, time, what viewers of others show, object ids.
+
+    ggslam run livingroom --scale 0.5 --stop 100 --out runs/livingroom
+    python scripts/bench_exports.py runs/livingroom [--every 1] [--check]
+
+Every format is written as `ggslam export --format` does it; its time is that of all processors together, without
+starting Python. Splat formats are read back as tests/conformance reads them, by the descriptions of the formats, and
+the frames that the run held out are rendered by the rules of 3D Gaussian Splatting: 0.3 px^2 of low-pass, nothing
+nearer than 0.2 m, no colours below 0. "vs map" is against the map of the run rendered so, over all pixels; "vs
+recording" against the frames, over pixels with measured depth, as `ggslam eval` scores. The first line is the map by
+ggslam's own rules. "ids": whether every Gaussian has the object id that it has in the run.
+
+Pictures come from ggslam's rasterizer with that low-pass, which differs from 3DGS in two rules (it draws the Gaussian
+that makes a pixel opaque, and lets one cover 0.999 of it, not 0.99); --check prints how far it is from the tests' own
+renderer, which keeps all of them, on the first view, which takes seconds to minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(1, str(Path(__file__).parents[1] / "tests" / "conformance"))
+
+import numpy as np
+from foreign_readers import by_usd_core
+from held_out import held_out_poses
+from scipy.spatial import cKDTree
+from splat_formats import SPLAT_FORMATS
+from splat_maps import Splats
+from splat_rendering import Pinhole, decibels, render
+from standard_pictures import standard_picture
+
+from ggslam.errors import GgslamError
+from ggslam.evaluation.images import psnr, unit_range
+from ggslam.jobs.export.export_run import export_run
+from ggslam.jobs.export.formats import ExportFormat
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import open_recording_of
+from ggslam.scene.frame import Frame
+
+COLUMNS = ("format", "bytes", "bytes/Gaussian", "write, CPU s", "dB vs map", "dB vs recording", "ids")
+FORMATS = SPLAT_FORMATS | {
+    "usd": replace(SPLAT_FORMATS["usd"], suffix=".usdc", read=lambda path: by_usd_core(path, path.parent))
+}
+"""Of the files that splats are written to; OpenUSD's binary one is smaller than text."""
+SUFFIXES = {"pcd": ".pcd", "mesh": ".ply", "trajectory": ".txt"}
+"""Of the files that are no splats; other formats are folders."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A held-out frame with its pose as the run estimated it, and what the map shows there by the rules of 3DGS."""
+
+    frame: Frame
+    T_camera_world: np.ndarray
+    of_map: np.ndarray
+
+
+def held_out_views(folder: RunFolder, recording: Path | None, every: int, splats: Splats) -> list[View]:
+    """The frames that the run never trained on; of a run that held out none, those that are no keyframes."""
+    poses, sequence = held_out_poses(folder), open_recording_of(folder, recording)
+    views = []
+    for index in list(poses)[::every]:
+        frame = sequence.frame(index, masks=False)
+        views.append(View(frame, poses[index], standard_picture(splats, frame.camera, poses[index])))
+    return views
+
+
+def against_recording(views: list[View], images: list[np.ndarray]) -> float:
+    """Mean dB over pixels with measured depth."""
+    found = [psnr(unit_range(image), unit_range(view.frame.color), view.frame.depth > 0)
+             for view, image in zip(views, images, strict=True)]  # fmt: skip
+    return float(np.nanmean(found))
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a file, or of all files of a folder."""
+    return sum(p.stat().st_size for p in ([path] if path.is_file() else path.rglob("*")) if p.is_file())
+
+
+def line(
+    folder: RunFolder, kind: str, plain: bool, views: list[View], original: Splats, out: Path
+) -> list[str]:  # fmt: skip
+    """The cells of a format."""
+    known = FORMATS.get(kind)
+    path = out / f"map{known.suffix if known else SUFFIXES.get(kind, '')}"
+    start = time.process_time()
+    try:
+        export_run(folder, path, kind, plain=plain)
+    except GgslamError as error:
+        return [kind, f"not written: {error}", *[""] * (len(COLUMNS) - 2)]
+    seconds = time.process_time() - start
+    size = size_of(path)
+    cells = [f"{kind} --plain" if plain else kind, f"{size}", f"{size / len(original.means):.2f}", f"{seconds:.2f}"]
+    if known is None:
+        return [*cells, "", "", ""]
+    seen = known.read(path)
+    if known.recolored:
+        return [*cells, "", "", kept(seen, original, known.turn)]
+    images = [standard_picture(seen, view.frame.camera, known.pose(view.T_camera_world)) for view in views]
+    same = decibels(images, [view.of_map for view in views])
+    return [*cells, f"{same:.1f}", f"{against_recording(views, images):.2f}", kept(seen, original, known.turn)]
+
+
+def kept(seen: Splats, original: Splats, turn: np.ndarray) -> str:
+    """How many of the object ids are there, for people."""
+    if seen.object_ids is None:
+        return "no"
+    rows = cKDTree(seen.means @ turn).query(original.means)[1]
+    right = float((seen.object_ids[rows] == original.object_ids).mean())
+    return "yes" if right == 1 and len(seen.means) == len(original.means) else f"{100 * right:.2f} %"
+
+
+def check(splats: Splats, view: View) -> None:
+    """Prints how far the rasterizer is from the tests' renderer on a view."""
+    camera = Pinhole(**{name: getattr(view.frame.camera, name) for name in Pinhole.__dataclass_fields__})
+    expected = render(splats, camera, view.T_camera_world)
+    error = np.abs(view.of_map - expected.clip(0, 1))
+    found = psnr(view.of_map.astype(float), expected.clip(0, 1))
+    print(f"rasterizer against the tests' renderer, one view: {found:.1f} dB, at most {error.max():.3f}\n")
+
+
+def bench(run: Path, recording: Path | None, every: int, checked: bool) -> None:
+    """Prints the table of a run."""
+    folder = RunFolder.open(run)
+    gaussians = folder.gaussians()
+    original = Splats.of(gaussians)
+    views = held_out_views(folder, recording, every, original)
+    print(f"{run}: {len(gaussians)} Gaussians of SH degree {gaussians.sh_degree}, {len(views)} held-out views of "
+          f"{views[0].frame.camera.width}x{views[0].frame.camera.height}\n")  # fmt: skip
+    if checked:
+        check(original, views[0])
+    print("| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS))
+    own = CpuRasterizer()
+    images = [own.forward(gaussians, v.frame.camera, v.T_camera_world).image.numpy().transpose(1, 2, 0).copy()
+              for v in views]  # fmt: skip
+    print(f"| the map by ggslam's rules | | | | | {against_recording(views, images):.2f} | |")
+    for kind, plain in [("ply", True), *((kind.value, False) for kind in ExportFormat)]:
+        with tempfile.TemporaryDirectory() as out:
+            print("| " + " | ".join(line(folder, kind, plain, views, original, Path(out))) + " |", flush=True)
+    print()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="+", help="folders that `ggslam run` wrote")
+    parser.add_argument("--recording", type=Path, help="the recording, if it is not where it was")
+    parser.add_argument("--every", type=int, default=1, help="render every n-th held-out frame")
+    parser.add_argument("--check", action="store_true", help="hold the rasterizer against the tests' renderer")
+    arguments = parser.parse_args()
+    for run in arguments.runs:
+        bench(run, arguments.recording, arguments.every, arguments.check)
+
+
+if __name__ == "__main__":
+    main()

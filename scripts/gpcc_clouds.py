@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clouds of about a million points, of recordings with true poses, for the benchmarks of the codec."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.coding.settings import LEVEL_LIMIT
+from ggslam.sequences import open_sequence
+from ggslam.sequences.sequence import Sequence
+
+BITS = 10
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A voxelised recording: grid int32 [N, 3], colours uint8 [N, 3]."""
+
+    name: str
+    grid: np.ndarray
+    colors: np.ndarray
+
+
+def voxelise(path: Path, every: int) -> Cloud:
+    """Back-projects every n-th frame and averages the colours in each voxel."""
+    sequence = open_sequence(path, stride=every)
+    extents = []
+    for index in range(len(sequence)):
+        points, _ = world_points(sequence, index)
+        if len(points):
+            extents.append((points.min(0), points.max(0)))
+    low, high = np.min([e[0] for e in extents], 0), np.max([e[1] for e in extents], 0)
+    scale = ((1 << BITS) - 1) / (high - low).max()
+    keys, sums = np.empty(0, np.int64), np.empty((0, 4), np.int64)
+    for index in range(len(sequence)):
+        points, colors = world_points(sequence, index)
+        grid = np.floor((points - low) * scale).astype(np.int64)
+        key = grid[:, 0] << 2 * BITS | grid[:, 1] << BITS | grid[:, 2]
+        keys, sums = add_up(np.append(keys, key), np.concatenate([sums, np.insert(colors.astype(np.int64), 3, 1, 1)]))
+    counts = np.sort(sums[:, 3])
+    if len(counts) > LEVEL_LIMIT:
+        enough = sums[:, 3] > counts[-LEVEL_LIMIT - 1]
+        keys, sums = keys[enough], sums[enough]
+    limit = (1 << BITS) - 1
+    grid = np.stack([keys >> 2 * BITS, keys >> BITS & limit, keys & limit], 1).astype(np.int32)
+    return Cloud(path.name, grid, np.rint(sums[:, :3] / sums[:, 3:]).astype(np.uint8))
+
+
+def world_points(sequence: Sequence, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points [N, 3] in world coordinates and colours [N, 3] of a frame; none if its pose is not known."""
+    frame = sequence.frame(index, masks=False)
+    if frame.T_world_camera is None:
+        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
+    seen = frame.depth > 0
+    points = frame.camera.back_project(frame.depth)[seen]
+    return points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3], frame.color[seen]
+
+
+def add_up(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One row for all rows of equal key, their sum."""
+    order = np.argsort(keys, kind="stable")
+    keys, sums = keys[order], sums[order]
+    starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
+    return keys[starts], np.add.reduceat(sums, starts)

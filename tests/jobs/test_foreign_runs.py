@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs, stores and recordings made to reach outside their folder: every command refuses them, or works, and nothing
+outside is read, changed or deleted."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import ggslam
+
+from ggslam.errors import FormatError, GgslamError
+from ggslam.runs.folder import RunFolder
+from ggslam.submaps.grid import GridStore, SubmapSettings
+
+SECRET = "the content of a file outside"
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[Path]:
+    """A folder that must stay as it is, beside the attacker's."""
+    folder = tmp_path / "home"
+    (folder / "papers").mkdir(parents=True)
+    (folder / "papers" / "thesis.txt").write_text(SECRET)
+    (folder / "map.ply").write_text(SECRET)
+    before = listing(folder)
+    yield folder
+    assert listing(folder) == before
+
+
+def listing(folder: Path) -> dict[str, tuple[str, int]]:
+    return {
+        str(path.relative_to(folder)): (path.read_text() if path.is_file() else "", path.stat().st_mode)
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def change_mark(run: Path, **entries: object) -> None:
+    mark = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps({**mark, **entries}))
+
+
+def stale(name: str) -> Callable[[Path, Path], None]:
+    def attack(run: Path, home: Path) -> None:
+        (run / ".staged-1-00000000").mkdir()
+        (run / ".staged-1-00000000" / "run.json").write_text((run / "run.json").read_text())
+        change_mark(run, saving={"from": ".staged-1-00000000", "stale": [name.replace("HOME", str(home))]})
+
+    return attack
+
+
+def staged_from_home(run: Path, home: Path) -> None:
+    (run / ".staged-1-00000000").symlink_to(home)
+    change_mark(run, saving={"from": ".staged-1-00000000", "stale": []})
+
+
+def staged_elsewhere(run: Path, home: Path) -> None:
+    change_mark(run, saving={"from": "../home", "stale": []})
+
+
+def link(name: str, target: str) -> Callable[[Path, Path], None]:
+    def attack(run: Path, home: Path) -> None:
+        path = run / name
+        path.parent.mkdir(exist_ok=True)
+        if path.is_dir():
+            shutil.rmtree(path)
+        path.unlink(missing_ok=True)
+        path.symlink_to(home / target if target else home)
+
+    return attack
+
+
+ATTACKS: dict[str, Callable[[Path, Path], None]] = {
+    "stale parent": stale(".."), "stale path": stale("../home/map.ply"), "stale absolute": stale("HOME"),
+    "stale dot": stale("."), "stale empty": stale(""), "staging is a link": staged_from_home,
+    "staging has a path": staged_elsewhere, "map is a link": link("map.ply", "map.ply"),
+    "run.json is a link": link("run.json", "papers/thesis.txt"), "report is a link": link("report.html", "map.ply"),
+    "renders is a link": link("renders", ""), "plots is a link": link("plots", ""),
+    "volumes is a link": link("volumes", ""),
+    "a picture is a link": link("renders/0.png", "papers/thesis.txt"),
+    "config is a link": link("config.yaml", "papers/thesis.txt"),
+    "metrics is a link": link("metrics.json", "papers/thesis.txt"),
+    "objects is a link": link("objects.json", "papers/thesis.txt"),
+    "a link to a device": lambda run, home: link("votes.npz", "../../../../../../../../dev/zero")(run, home),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("attack", ATTACKS.values(), ids=ATTACKS.keys())
+def test_a_run_from_elsewhere_stays_in_its_folder(
+    room_run: RunFolder, tmp_path: Path, home: Path, attack: Callable[[Path, Path], None]
+) -> None:
+    run = Path(shutil.copytree(room_run.path, tmp_path / "run"))
+    attack(run, home)
+    commands: list[tuple[object, ...]] = [
+        ("export", run, "--out", tmp_path / "out.ply"), ("edit", run, "--rename", "1", "mug", "--in-place"),
+        ("run", tmp_path / "no-recording", "--out", run, "--overwrite"),
+    ]  # fmt: skip
+    if (run / "report.html").is_symlink() or (run / "plots").is_symlink():
+        commands.append(("report", run))
+    for command in commands:
+        done = ggslam(*command)
+        assert done.returncode in (0, 2) and SECRET not in done.stdout + done.stderr
+    assert not (tmp_path / "out.ply").exists() or SECRET not in (tmp_path / "out.ply").read_text(errors="replace")
+
+
+def test_a_pipe_in_a_run_is_not_waited_for(room_run: RunFolder, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(room_run.path, tmp_path / "run"))
+    (run / "map.ply").unlink()
+    os.mkfifo(run / "map.ply")
+    done = ggslam("export", run, "--out", tmp_path / "out.ply")
+    assert done.returncode == 2 and "not a regular file" in done.stderr
+
+
+def test_names_from_a_run_move_no_cursor(room_run: RunFolder, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(room_run.path, tmp_path / "a\x1b[2Jrun"))
+    (run / "objects.json").write_text("{")
+    done = ggslam("report", run)
+    assert "\x1b[2J" not in done.stdout + done.stderr and "\\x1b[2J" in done.stdout + done.stderr
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    path = tmp_path / "store"
+    with GridStore.create(path, SubmapSettings()) as made:
+        made.put((0, 0, 0), {"points.pcd": b"1"})
+        made.put((1, 0, 0), {"points.pcd": b"2"})
+    return path
+
+
+def store_index(path: Path) -> Path:
+    return next(entry for entry in path.iterdir() if entry.suffix in (".sqlite", ".db", ".sqlite3"))
+
+
+@pytest.mark.parametrize("place", ["cells", "cells/0_0_0", "cells/0_0_0/1", "cells/0_0_0/1/points.pcd", "index"])
+def test_a_store_with_links_touches_nothing(store: Path, home: Path, place: str) -> None:
+    path = store_index(store) if place == "index" else store / place
+    if not path.exists():
+        path = next((store / "cells" / "0_0_0").iterdir())
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+    path.symlink_to(home / "map.ply" if path.suffix else home)
+    with pytest.raises(FormatError, match="link"), GridStore.open(store, write=True) as opened:
+        opened.get((0, 0, 0), "points.pcd")
+        opened.put((0, 0, 0), {"points.pcd": b"3"})
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("version", "../../../home"), ("name", "../../../home/map.ply"), ("x", "../../home")]
+)
+def test_an_index_with_paths_for_numbers(store: Path, home: Path, column: str, value: str) -> None:
+    connection = sqlite3.connect(store_index(store))
+    connection.execute("PRAGMA ignore_check_constraints = ON")
+    for table in ("parts", "cells"):
+        try:
+            connection.execute(f"UPDATE {table} SET {column} = ? WHERE x = 0", (value,))
+        except sqlite3.Error:
+            continue
+    connection.commit()
+    connection.close()
+    try:
+        with GridStore.open(store, write=True) as opened:
+            for key in opened.cells():
+                opened.get(key, "points.pcd")
+                opened.put(key, {"points.pcd": b"3"})
+    except (GgslamError, KeyError) as error:  # KeyError: no such part
+        assert SECRET not in str(error)
+
+
+def test_a_recording_that_names_files_elsewhere(tmp_path: Path, home: Path) -> None:
+    from ggslam.errors import SequenceError
+    from ggslam.sequences import open_sequence
+
+    recording = tmp_path / "recording"
+    (recording / "rgb").mkdir(parents=True)
+    (recording / "depth").mkdir()
+    (recording / "rgb.txt").write_text("0.0 ../home/map.ply\n1.0 ../home/map.ply\n")
+    (recording / "depth.txt").write_text("0.0 depth/0.png\n1.0 depth/1.png\n")
+    np.zeros(1).tofile(recording / "depth" / "0.png")
+    with pytest.raises(SequenceError, match="outside"):
+        open_sequence(recording)

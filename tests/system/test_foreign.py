@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from ggslam.errors import FormatError, RunFolderError
+from ggslam.system.foreign import is_plain_name, member, printable, read_foreign, read_foreign_text, refuse_links
+
+
+def test_a_file_is_read_within_its_limit(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"12345")
+    assert read_foreign(path) == read_foreign(path, 5) == b"12345"
+    with pytest.raises(FormatError, match=r"a\.bin: too large.*5 bytes, at most 4"):
+        read_foreign(path, 4)
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder", "pipe", "device"])
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)  # reading it would wait for ever
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    with pytest.raises(RunFolderError, match="missing" if kind == "missing" else "not a regular file"):
+        read_foreign(path, 10, RunFolderError)
+
+
+def test_text_may_have_any_line_ends_and_a_mark(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"\xef\xbb\xbfone\r\ntwo\rthree\n")
+    assert read_foreign_text(path) == "one\ntwo\nthree\n"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FormatError, match="as text"):
+        read_foreign_text(path)
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "/etc", "..\\x", "a\0", None, 3, ["x"]])
+def test_names_that_lead_elsewhere(name: object) -> None:
+    assert not is_plain_name(name)
+    assert is_plain_name("map.ply") and is_plain_name("..map")
+
+
+def test_members_stay_in_their_folder(tmp_path: Path) -> None:
+    inside = tmp_path / "recording"
+    (inside / "rgb").mkdir(parents=True)
+    (inside / "out").symlink_to(tmp_path)
+    (inside / "in").symlink_to(inside / "rgb")
+    assert member(inside, "rgb/0.png") == inside / "rgb" / "0.png"
+    assert member(inside, "in/0.png") == inside / "in" / "0.png"
+    for name in ("../secret", "/etc/passwd", "out/secret", "rgb/../../secret", "a\0b"):
+        with pytest.raises(FormatError):
+            member(inside, name)
+
+
+def test_links_out_of_a_folder_are_found_however_deep(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    (folder / "renders" / "deep").mkdir(parents=True)
+    (folder / "latest").symlink_to("renders")
+    (folder / "loop").symlink_to(folder)
+    refuse_links(folder)
+    (tmp_path / "named").symlink_to(folder)
+    refuse_links(tmp_path / "named")  # whoever names a link has chosen where it leads
+    (folder / "renders" / "deep" / "x.png").symlink_to("/etc/passwd")
+    with pytest.raises(FormatError, match=r"deep/x\.png: is a link to /etc/passwd, outside"):
+        refuse_links(folder)
+
+
+def test_control_characters_are_shown_not_sent() -> None:
+    assert printable("mug \x1b[2J\x07\u202e\n\tä 杯") == "mug \\x1b[2J\\x07\\x202e\n\tä 杯"
