@@ -149,7 +149,8 @@ def main() -> None:
     if options.splat_transform:
         methods["splat-transform"] = lambda count: decimate(options.splat_transform, whole, count)
     print(f"{options.run}: {len(columns)} Gaussians, {len(views)} views, median depth {views[0].depth:.2f} m\n")
-    print("| level | distance m | method | Gaussians | PSNR dB | against all Gaussians dB | seconds |\n|" + " --- |" * 7)
+    print("| level | distance m | method | Gaussians | PSNR dB | against all Gaussians dB | seconds |")
+    print("|" + " --- |" * 7)
     for level in MODEL_LEVELS:
         distance, count = FIRST_DISTANCE * STEP ** (level - 0.5), -(-len(columns) // LEVEL_RATIO**level)
         images = [wanted(whole, camera, view, distance) for view in views]

@@ -3,7 +3,8 @@
 
 Neighbours are merged in pairs, those first that differ least: in the manner of Ward (1963), a pair costs what a
 weighted variance grows by, of positions in units of the Gaussians' own size and of colours. The weight of a Gaussian is
-the area that it hides. In a round each Gaussian is merged with one other at most, so that levels get coarser everywhere.
+the area that it hides. In a round each Gaussian is merged with one other at most, so that levels get
+coarser everywhere.
 `scripts/bench_levels.py` compares this with other ways.
 """
 

@@ -172,7 +172,7 @@ class Checkpoints:
         Raises:
             RunFolderError: no state is whole.
         """
-        problems = []
+        problems: list[str] = []
         for state in self._newest(problems.append):
             try:
                 restore_state(slam, state.values["state"], state.arrays, state.kept)
