@@ -154,16 +154,11 @@ def run(
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
     from ggslam.jobs.run.pipeline import execute
-    from ggslam.jobs.run.pipeline import resume as go_on
     from ggslam.runs.recordings import SequenceRequest
 
     watched = _Watched(log, (host, port) if view else None)
     if resume is not None:
-        given = refuse_other_options(context)
-        again = partial(go_on, resume, recording=sequence, checkpoint_every=checkpoint_every)
-        again = partial(again, evaluate=evaluate) if "evaluate" in given else again
-        _run_and_show(again, resume.resolve().name, watched)
-        return
+        return _go_on(context, resume, sequence, checkpoint_every, evaluate, watched)
     if sequence is None:
         raise ConfigError("expected a recording (SEQUENCE), or --resume with a run")
     reading = SequenceRequest(
@@ -175,13 +170,25 @@ def run(
         "threads": threads, "seed": seed, "loops.enabled": loops,
         "tracker": None if tracker is None else tracker.value, "device": None if device is None else device.value,
     }  # fmt: skip
-    overrides = [*(settings or []), *(f"{name}={value}" for name, value in shortcuts.items() if value is not None)]
-    request = _request(reading, record)
+    given = [*(settings or []), *(f"{name}={value}" for name, value in shortcuts.items() if value is not None)]
     request = replace(
-        request, out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite, map=earlier,
-        localize_only=localize_only, checkpoint_every=checkpoint_every,
+        _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
+        map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every,
     )  # fmt: skip
     _run_and_show(partial(execute, request), sequence.resolve().name, watched)
+
+
+def _go_on(
+    context: typer.Context, run: Path, recording: Path | None, checkpoint_every: int | None, evaluate: bool,
+    watched: _Watched,
+) -> None:  # fmt: skip
+    """Goes on with a run that was cut off."""
+    from ggslam.jobs.run.pipeline import resume
+
+    given = refuse_other_options(context)
+    again = partial(resume, run, recording=recording, checkpoint_every=checkpoint_every)
+    again = partial(again, evaluate=evaluate) if "evaluate" in given else again
+    _run_and_show(again, run.resolve().name, watched)
 
 
 def refuse_other_options(context: typer.Context) -> set[str]:

@@ -36,7 +36,7 @@ from ggslam.objects.table import ObjectTable
 from ggslam.runs.checkpoints import has_checkpoints
 from ggslam.runs.manifest import refuse_mixed
 from ggslam.runs.map_index import MAP_INDEX, MapIndex, MapInParts
-from ggslam.runs.publishing import changing, publish_run
+from ggslam.runs.publishing import change_files, publish_run
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.mark import RunRecord
@@ -211,9 +211,9 @@ class RunFolder:
 
         publish_run(self.path, write, RUN_FILES, f"{self.path}: the trajectory cannot be written")
 
-    def changing(self, *names: str) -> AbstractContextManager[None]:
-        """Files (or folders of files) of the run are written within the block; see `publishing.changing`."""
-        return changing(self.path, names)
+    def change_files(self, *names: str) -> AbstractContextManager[None]:
+        """Files (or folders of files) of the run are written within the block; see `publishing.change_files`."""
+        return change_files(self.path, names)
 
     # --- reading -----------------------------------------------------------------------------------------------------
 

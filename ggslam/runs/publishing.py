@@ -37,13 +37,13 @@ def publish_run(target: Path, write: Callable[[Path], RunRecord], old: Sequence[
         try:
             make_folder(staged)
             mark = write(staged)
-            mark = mark.model_copy(update={"files": {**_kept(staged, target, old), **files_in(staged)}})
+            mark = mark.model_copy(update={"files": {**_files_that_stay(staged, target, old), **files_in(staged)}})
             mark.write(staged)
             sync_all(staged)
         except BaseException as error:
             shutil.rmtree(staged, ignore_errors=True)
             if isinstance(error, OSError):
-                raise _explained(failure, error) from None
+                raise _explain(failure, error) from None
             raise
         meanwhile = {"complete": False, "stopped_by": "saving did not finish"}
         try:
@@ -58,7 +58,7 @@ def publish_run(target: Path, write: Callable[[Path], RunRecord], old: Sequence[
 
 
 @contextmanager
-def changing(run: Path, names: Sequence[str]) -> Iterator[None]:
+def change_files(run: Path, names: Sequence[str]) -> Iterator[None]:
     """Files (or folders of files) of a run are written within the block; the manifest follows. If the program is killed
     within, they are known to be unfinished.
 
@@ -79,16 +79,16 @@ def changing(run: Path, names: Sequence[str]) -> Iterator[None]:
 
 
 @contextmanager
-def changing_in_run(path: Path | None) -> Iterator[None]:
-    """A file or folder is written within the block; if it lies in a run's folder, see `changing`."""
+def change_in_run(path: Path | None) -> Iterator[None]:
+    """A file or folder is written within the block; if it lies in a run's folder, see `change_files`."""
     if path is None or not (path.parent / RunRecord.FILE).is_file():
         yield
         return
-    with changing(path.parent, [path.name]):
+    with change_files(path.parent, [path.name]):
         yield
 
 
-def _kept(staged: Path, target: Path, old: Sequence[str]) -> dict[str, object]:
+def _files_that_stay(staged: Path, target: Path, old: Sequence[str]) -> dict[str, object]:
     """What the manifest at the target says of files that stay."""
     try:
         files = RunRecord.read(target).files or {}
@@ -112,7 +112,7 @@ def sync_all(folder: Path) -> None:
     sync_folder(folder)
 
 
-def _explained(failure: str, error: OSError) -> RunFolderError:
+def _explain(failure: str, error: OSError) -> RunFolderError:
     """As `write_failure`, which knows a full disk from a mistake."""
     explained = write_failure("", error)
     found = RunFolderError(f"{failure}: {error.strerror or error}")

@@ -169,15 +169,15 @@ def _but(*made: str, **more: Any) -> Rule:
     return Rule(frozenset(made), **more)
 
 
-def _named(*names: str) -> frozenset[str]:
+def _names(*names: str) -> frozenset[str]:
     return frozenset(names)
 
 
 RULES: Rules = {
     **dict.fromkeys(_settings_classes(Config) - {Config}, Rule(checked=True)),
     Slam: _but("camera", "config", "context", "pager", "_notes", "_on_device"),
-    SlamTimes: _but("_started", growing=_named("tracking_by_frame"), after=_go_on),
-    FramePoses: Rule(growing=_named("frames")),
+    SlamTimes: _but("_started", growing=_names("tracking_by_frame"), after=_go_on),
+    FramePoses: Rule(growing=_names("frames")),
     MapCorrections: _but("_surface", "_mapper", "_pager", "_publishing"),
     RunObjects: _but("_masks"),
     ObjectMasks: _but("settings", "_segment"),
@@ -189,25 +189,25 @@ RULES: Rules = {
     FeatureView: _but("_features"),
     KeyframePolicy: _but("settings"),
     MeasuredSurface: _but("_context", "_archive", "target", "finish", after=MeasuredSurface.gather_again),
-    _Part: Rule(fixed=_named("_arrays")),
+    _Part: Rule(fixed=_names("_arrays")),
     LocalFeatureMap: _but("settings", "clock", "_aligner"),
     FeatureMap: _but("settings", "_shift", "_mask", "_corners", "_ones", "_isotropic"),
     # loops
     LoopCloser: _but(
         "settings", "_camera", "_surface", "_tracker", "_context", "_lock", "_helper", "_begun",
-        growing=_named("events"),
+        growing=_names("events"),
     ),
-    PoseGraph: _but("settings", growing=_named("loops")),
-    OdometryTree: Rule(growing=_named("parents", "poses", "covariances", "steps")),
+    PoseGraph: _but("settings", growing=_names("loops")),
+    OdometryTree: Rule(growing=_names("parents", "poses", "covariances", "steps")),
     PlaceIndex: _but(
         "camera", "settings", "_bits", "_fern_pixels", "_fern_colors", "_fern_depths", "_lists",
-        growing=_named("_places"), after=PlaceIndex.list_again,
+        growing=_names("_places"), after=PlaceIndex.list_again,
     ),
     ActiveKeyframes: _but("settings"),
     # mapping
     CpuMapper: _but("settings", "residency", "extra_loss", "_rasterizer", "_loss", "_standard_adam"),
     GaussianMap: Rule(save=_save_map, take=_take_map),
-    Keyframe: Rule(fixed=_named("color", "depth", "mask")),
+    Keyframe: Rule(fixed=_names("color", "depth", "mask")),
     CpuIdentityLearner: _but("settings", "seed"),
     PixelPool: Rule(save=_save_pool),
     NeighbourIndex: Rule(save=_save_index, take=_take_index),

@@ -52,7 +52,7 @@ class KeptArrays:
         forgotten."""
         self._begin(number)
 
-    def known(self, array: np.ndarray) -> list[int] | None:
+    def find(self, array: np.ndarray) -> list[int] | None:
         """See `Keeper`."""
         for found in (self._arrays.get(id(array)), self._new_arrays.get(id(array))):
             if found is not None and found[0]() is array:
@@ -62,7 +62,7 @@ class KeptArrays:
 
     def place(self, array: np.ndarray) -> list[int]:
         """See `Keeper`."""
-        place = self.known(array)
+        place = self.find(array)
         if place is None:
             place = [self._number, len(self._new)]
             self._new.append(array)
@@ -70,7 +70,7 @@ class KeptArrays:
             self.used.add(self._number)
         return place
 
-    def grown(self, items: list[Any], describe: Callable[[Any, Callable[[np.ndarray], int]], Any]) -> list[list[int]]:
+    def parts(self, items: list[Any], describe: Callable[[Any, Callable[[np.ndarray], int]], Any]) -> list[list[int]]:
         """See `Keeper`."""
         found = self._lists.get(id(items))
         known, places = (found[1], found[2]) if found is not None and found[0] is items else (0, [])

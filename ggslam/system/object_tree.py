@@ -58,10 +58,10 @@ class Keeper(Protocol):
     def place(self, array: np.ndarray) -> list[int]:
         """Where an array is kept: numbers of file and array."""
 
-    def known(self, array: np.ndarray) -> list[int] | None:
+    def find(self, array: np.ndarray) -> list[int] | None:
         """The same, None if it is not kept."""
 
-    def grown(self, items: list[Any], describe: Callable[[Any, Callable[[np.ndarray], int]], Any]) -> list[list[int]]:
+    def parts(self, items: list[Any], describe: Callable[[Any, Callable[[np.ndarray], int]], Any]) -> list[list[int]]:
         """Where the parts of a list that grows are kept, numbers of file and part; `describe` makes an item's tree and
         is told how to place an array in the same file."""
 
@@ -161,7 +161,7 @@ class _Describer:
                 continue
             place = f"{where}.{attribute}"
             if attribute in rule.growing and self._keeper is not None:
-                attributes[attribute] = self._grown(content, place)
+                attributes[attribute] = self._list_in_parts(content, place)
             else:
                 attributes[attribute] = self.describe(content, place, attribute in rule.fixed)
         return {"o": [name, attributes]}
@@ -171,28 +171,28 @@ class _Describer:
             raise TypeError(f"{where}: there is no rule for saving {kind.__module__}.{kind.__qualname__}")
         return self._names[kind]
 
-    def _grown(self, items: list[Any], where: str) -> Any:
+    def _list_in_parts(self, items: list[Any], where: str) -> Any:
         assert self._keeper is not None
         self._seen[id(items)] = len(self._seen)
 
         def part(item: Any, place: Callable[[np.ndarray], int]) -> Any:
             inner = _Describer(self._rules, None)
-            inner._array = lambda array, fixed: _strided(place(array), array)  # type: ignore[method-assign]
+            inner._array = lambda array, fixed: _place_of(place(array), array)  # type: ignore[method-assign]
             return inner.describe(item, where)
 
-        return {"l": self._keeper.grown(items, part)}
+        return {"l": self._keeper.parts(items, part)}
 
     def _array(self, array: np.ndarray, fixed: bool) -> Any:
         place = None
         if self._keeper is not None:
-            place = self._keeper.place(array) if fixed else self._keeper.known(array)
+            place = self._keeper.place(array) if fixed else self._keeper.find(array)
         if place is not None:
-            return _strided(place, array)
+            return _place_of(place, array)
         self.arrays.append(array)
-        return _strided(len(self.arrays) - 1, array)
+        return _place_of(len(self.arrays) - 1, array)
 
 
-def _strided(place: Any, array: np.ndarray) -> Any:
+def _place_of(place: Any, array: np.ndarray) -> Any:
     """Place of an array, and of one that is not in C order its strides: the last bits of products go with them."""
     return place if array.flags.c_contiguous else {"p": place, "strides": list(array.strides)}
 
@@ -225,9 +225,9 @@ class _Restorer:
             return np.dtype(content[0]).type(content[1])
         if letter == "e":
             return self._classes[content[0]][content[1]]  # type: ignore[index]
-        return self._shared(letter, content, there)
+        return self._object_or_array(letter, content, there)
 
-    def _shared(self, letter: str, content: Any, there: Any) -> Any:
+    def _object_or_array(self, letter: str, content: Any, there: Any) -> Any:
         """What may be in more than one place."""
         if letter == "o":
             return self._object(content, there)
@@ -252,7 +252,7 @@ class _Restorer:
         elif letter == "g":
             value = _generator(content, there)
         elif letter == "l":
-            value = self._grown(content, there)
+            value = self._list_in_parts(content, there)
         else:
             raise ValueError(f"unknown kind of value: {letter}")
         self._known[number] = value
@@ -306,7 +306,7 @@ class _Restorer:
             self.pending.append(lambda: after(value))
         return value
 
-    def _grown(self, content: Any, there: Any) -> list[Any]:
+    def _list_in_parts(self, content: Any, there: Any) -> list[Any]:
         assert self._kept is not None
         value: list[Any] = there if type(there) is list else []
         value.clear()

@@ -114,7 +114,7 @@ def test_what_is_written_later_joins(run: Path) -> None:
 
 
 def test_an_interrupted_change_is_told(run: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with pytest.raises(KeyboardInterrupt), RunFolder(run).changing("metrics.json", "renders"):
+    with pytest.raises(KeyboardInterrupt), RunFolder(run).change_files("metrics.json", "renders"):
         mark = RunFolder(run).mark()
         assert "metrics.json" not in (mark.files or {})
         (run / "metrics.json").write_text("{}")

@@ -24,7 +24,7 @@ from ggslam.reporting.pictures import (
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MapInParts
 from ggslam.runs.objects_in_parts import ObjectsInParts
-from ggslam.runs.publishing import changing_in_run
+from ggslam.runs.publishing import change_in_run
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
@@ -78,7 +78,7 @@ def render_frames(
     objects = ObjectsInParts.of(folder) if set(what) & set(OBJECT_KINDS) else None
     parts = folder.map_in_parts() if objects is None else objects.map
     make_folder(out)
-    with changing_in_run(out):
+    with change_in_run(out):
         return _render(folder, frames, what, out, camera, parts, objects, progress)
 
 

@@ -153,7 +153,7 @@ class _Run:
             observer.note(warning)
         checkpoints = Checkpoints(folder.path)
         try:
-            checkpointing = self._checkpointing(checkpoints, resumption)
+            checkpointing = self._make_checkpointing(checkpoints, resumption)
             loop = SlamLoop(
                 sequence, self.config, observer, folder, self.earlier, not self.request.localize_only, self.follower,
                 checkpointing, self.stop,
@@ -178,7 +178,7 @@ class _Run:
             checkpoints.remove()
         return outcome
 
-    def _checkpointing(self, checkpoints: Checkpoints, resumption: Resumption | None) -> Checkpointing | None:
+    def _make_checkpointing(self, checkpoints: Checkpoints, resumption: Resumption | None) -> Checkpointing | None:
         """What saves the state; None: nothing does."""
         every, sequence = self.request.checkpoint_every, self.sequence
         reason = reason_against_saving(self.config)

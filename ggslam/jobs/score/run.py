@@ -53,7 +53,7 @@ def score_run(
     Returns:
         What `metrics.json` holds.
     """
-    with folder.changing(MetricsRecord.FILE, "frames.csv", "renders"):
+    with folder.change_files(MetricsRecord.FILE, "frames.csv", "renders"):
         return _score(folder, sequence, observer, lpips, every, masks)
 
 
