@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("COLUMNS", "300")  # folders of tests have long names: no line breaks where a test looks
+os.environ.setdefault("NUMBA_DISABLE_JIT", "1")  # a reader of splats that tests ask would compile for 13 s
 if "PYTEST_XDIST_WORKER" in os.environ:  # processes that share the tests share the processors
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -21,6 +24,11 @@ if TYPE_CHECKING:
     from ggslam.runs.folder import RunFolder
 
 pytest_plugins = ["long_tests"]
+
+
+def pytest_collection_finish() -> None:
+    """What the modules of all tests hold stays: the garbage collector need not look at it again and again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -37,6 +45,19 @@ def coarse_points() -> Iterator[None]:
     """Runs sample their clouds in voxels of 4 cm: those of 1 cm would be half of what a short run takes, and few tests
     look at them. `with points_in_voxels_of(0.01)` is what users have."""
     with points_in_voxels_of(0.04):
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_command_line() -> Iterator[None]:
+    """Options are read from the functions of the commands once, not for every command line that a test gives."""
+    import typer.main
+    import typer.testing
+
+    once = lru_cache(typer.main.get_command)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.main, "get_command", once)
+        patch.setattr(typer.testing, "_get_command", once)
         yield
 
 

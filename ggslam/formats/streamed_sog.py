@@ -104,7 +104,7 @@ class _Writer:
         self.filenames: list[str] = []
         self.bytes = 0
         self._folder = folder
-        self._objects = None if objects is None else {}
+        self._objects: dict[int, str] | None = None if objects is None else {}
         self._done = done
         self._parts = 0
         self._coefficients = 0

@@ -63,16 +63,23 @@ def write_run(room: Any, path: Path, supervision: Any = "masks", objects: bool =
     return folder
 
 
-@pytest.fixture
-def run(segmented_room: Any, tmp_path: Path) -> RunFolder:
-    """Fresh for every test."""
-    return write_run(segmented_room, tmp_path / "run")
+@pytest.fixture(scope="module")
+def saved(shared_segmented_room: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Folders of the room's run with objects and without, not to be changed."""
+    room, runs = shared_segmented_room, tmp_path_factory.mktemp("runs")
+    return {name: write_run(room, runs / name, objects=name == "run").path for name in ("run", "plain")}
 
 
 @pytest.fixture
-def plain_run(segmented_room: Any, tmp_path: Path) -> RunFolder:
+def run(saved: dict[str, Path], tmp_path: Path) -> RunFolder:
+    """A run to be changed."""
+    return RunFolder.open(shutil.copytree(saved["run"], tmp_path / "run"))
+
+
+@pytest.fixture
+def plain_run(saved: dict[str, Path], tmp_path: Path) -> RunFolder:
     """The same without objects."""
-    return write_run(segmented_room, tmp_path / "plain", objects=False)
+    return RunFolder.open(shutil.copytree(saved["plain"], tmp_path / "plain"))
 
 
 def ggslam(*arguments: object) -> Result:
@@ -95,8 +102,8 @@ def refused(*arguments: object) -> GgslamError:
 # --- the folder ------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_saved_is_loaded(run: RunFolder, segmented_room: Any) -> None:
-    segmented, room = run.segmented_map(), segmented_room
+def test_what_is_saved_is_loaded(run: RunFolder, shared_segmented_room: Any) -> None:
+    segmented, room = run.segmented_map(), shared_segmented_room
     assert torch.equal(segmented.gaussians.object_id, room.gaussians.object_id)
     assert torch.equal(segmented.gaussians.features, room.gaussians.features)
     assert (segmented.classifier.class_ids == room.classifier.class_ids).all()
@@ -113,10 +120,10 @@ def test_a_run_without_objects_says_so(plain_run: RunFolder) -> None:
         plain_run.segmented_map()
 
 
-def test_objects_of_an_earlier_run_do_not_stay(run: RunFolder, segmented_room: Any) -> None:
+def test_objects_of_an_earlier_run_do_not_stay(run: RunFolder, shared_segmented_room: Any) -> None:
     recording = run.sequence()
     again = RunFolder.create(run.path, overwrite=True)
-    again.save(Config(), recording, result_of(segmented_room))
+    again.save(Config(), recording, result_of(shared_segmented_room))
     assert not again.has_objects() and not (run.path / "classifier.npz").exists() and again.votes() is None
 
 
@@ -138,7 +145,7 @@ def test_a_save_that_fails_leaves_a_map_without_objects(run: RunFolder, monkeypa
     assert not run.has_objects() and len(run.gaussians()) == len(segmented.gaussians)
 
 
-def test_files_that_do_not_belong_together(run: RunFolder, segmented_room: Any) -> None:
+def test_files_that_do_not_belong_together(run: RunFolder) -> None:
     rest = votes_for(np.ones(5, np.uint16))
     (run.path / "votes.npz").write_bytes(rest.to_bytes())
     with pytest.raises(RunFolderError, match="votes.npz.*found 5"):
@@ -236,16 +243,16 @@ def test_file_names_are_safe(run: RunFolder) -> None:
 # --- pictures --------------------------------------------------------------------------------------------------------
 
 
-def test_rendered_ids_and_identities(run: RunFolder, segmented_room: Any, tmp_path: Path) -> None:
+def test_rendered_ids_and_identities(run: RunFolder, shared_segmented_room: Any, tmp_path: Path) -> None:
     out = tmp_path / "pictures"
     done("render", run.path, "--what", "color,ids,pca", "--frames", "0,4,8", "--out", out)
     names = {f"frame{i:06d}_{kind}.png" for i in (0, 4, 8) for kind in ("color", "ids", "pca")}
     assert {p.name for p in out.iterdir()} == {*names, "legend.png"}
     ids = cv2.imread(str(out / "frame000008_ids.png"))[..., ::-1]
-    truth = run.object_table().palette()[segmented_room.frames[1].mask]
+    truth = run.object_table().palette()[shared_segmented_room.frames[1].mask]
     assert (ids == truth).all(-1).mean() > 0.8  # outlines and rims aside
     a, b = (cv2.imread(str(out / f"frame{i:06d}_pca.png")).reshape(-1, 3).astype(int) for i in (0, 4))
-    masks = [segmented_room.sequence.frame(i).mask.reshape(-1) for i in (0, 4)]
+    masks = [shared_segmented_room.sequence.frame(i).mask.reshape(-1) for i in (0, 4)]
     largest = np.bincount(masks[0][masks[0] > 0]).argmax()
     colors = [np.median(picture[mask == largest], 0) for picture, mask in zip((a, b), masks, strict=True)]
     assert np.abs(colors[0] - colors[1]).max() < 12  # an object looks the same in every frame
@@ -296,7 +303,7 @@ def test_scores_of_a_map_with_true_labels(run: RunFolder) -> None:
 
 
 def test_renamed_objects_are_matched(run: RunFolder) -> None:
-    before = scores_of(run)[0]
+    before = scores_of(run, "--every", 4)[0]
     segmented = run.segmented_map()
     other = np.append(np.uint16(0), np.random.default_rng(0).permutation(np.arange(1, 65536)).astype(np.uint16))
     ids = other[segmented.gaussians.object_id.numpy()]
@@ -305,7 +312,7 @@ def test_renamed_objects_are_matched(run: RunFolder) -> None:
     segmented.table = ObjectTable.build(segmented.gaussians, segmented.classifier, "geometry")
     segmented.votes = None
     run.save_objects(segmented)
-    after, notes, _ = scores_of(run)
+    after, notes, _ = scores_of(run, "--every", 4)
     assert after["matching"] == "assignment" and "did not supervise" in notes
     assert after["all"]["miou"] == pytest.approx(before["all"]["miou"])
     assert after["gaussians"]["accuracy"] == pytest.approx(before["gaussians"]["accuracy"])
@@ -322,8 +329,8 @@ def copied_masks(sequence: Sequence, to: Path, keep: int = 24) -> Path:
     return to
 
 
-def test_masks_from_elsewhere_are_the_truth(run: RunFolder, segmented_room: Any, tmp_path: Path) -> None:
-    folder = copied_masks(segmented_room.sequence, tmp_path / "truth", keep=10)
+def test_masks_from_elsewhere_are_the_truth(run: RunFolder, shared_segmented_room: Any, tmp_path: Path) -> None:
+    folder = copied_masks(shared_segmented_room.sequence, tmp_path / "truth", keep=10)
     wrong = np.full((120, 160), 3, np.uint16)
     for number in (0, 8):
         cv2.imwrite(str(folder / f"{number:06d}.png"), wrong)
@@ -336,16 +343,16 @@ def test_masks_from_elsewhere_are_the_truth(run: RunFolder, segmented_room: Any,
 
 
 def test_runs_and_recordings_that_lack_something(
-    run: RunFolder, plain_run: RunFolder, segmented_room: Any, tmp_path: Path
+    run: RunFolder, plain_run: RunFolder, shared_segmented_room: Any, tmp_path: Path
 ) -> None:
     bare = tmp_path / "bare"
-    shutil.copytree(segmented_room.sequence.path, bare)
+    shutil.copytree(shared_segmented_room.sequence.path, bare)
     shutil.rmtree(bare / "masks")
     s, notes, printed = scores_of(run, "--sequence", bare, "--every", 4)
     assert s is None and "no masks" in notes and "mIoU" not in printed
     assert cv2.imread(str(next((run.path / "renders").glob("compare*.png")))).shape[0] == 3 * 120 + 2 * 4
     s, notes, _ = scores_of(plain_run, "--every", 4)
     assert s is None and notes == ""
-    truth = copied_masks(segmented_room.sequence, tmp_path / "truth")
+    truth = copied_masks(shared_segmented_room.sequence, tmp_path / "truth")
     assert "no objects" in scores_of(plain_run, "--every", 4, "--masks", truth)[1]
     assert "nowhere" in str(refused("eval", run.path, "--masks", tmp_path / "nowhere"))

@@ -16,7 +16,9 @@ import pytest
 from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
-from ggslam.runs.recordings import SequenceRequest
+from ggslam.jobs.score.run import score_run
+from ggslam.runs.recordings import SequenceRequest, open_recording_of
+from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
@@ -29,9 +31,15 @@ from scramble_masks import scramble_recording  # noqa: E402
 FAST = ["mapping.iterations_per_frame=2", "mapping.first_frame_iterations=10"]
 
 
-def run(recording: Path, out: Path, *overrides: str, masks: Path | None = None, evaluate: bool = True) -> RunOutcome:
-    request = SequenceRequest(recording, masks=masks)
-    return execute(RunRequest(request, out, overrides=[*FAST, *overrides], evaluate=evaluate))
+def run(
+    recording: Path, out: Path, *overrides: str, masks: Path | None = None, stop: int | None = None
+) -> RunOutcome:  # fmt: skip
+    request = SequenceRequest(recording, masks=masks, stop=stop)
+    return execute(RunRequest(request, out, overrides=[*FAST, *overrides], evaluate=False))
+
+
+def scores(outcome: RunOutcome) -> MetricsRecord:
+    return score_run(outcome.folder, open_recording_of(outcome.folder), SilentObserver(), lpips=False)
 
 
 def table(folder: Path) -> dict:
@@ -43,33 +51,32 @@ def own_ids(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOutcome:
     return run(room, tmp_path_factory.mktemp("runs") / "own")
 
 
-def test_masks_with_consistent_ids_are_learned_by_name(own_ids: RunOutcome) -> None:
-    assert own_ids.metrics is not None
+@pytest.fixture(scope="module")
+def own_scores(own_ids: RunOutcome) -> MetricsRecord:
+    return scores(own_ids)
+
+
+def test_masks_with_consistent_ids_are_learned_by_name(own_ids: RunOutcome, own_scores: MetricsRecord) -> None:
     content = table(own_ids.folder.path)
     assert content["supervision"] == "masks"
     names = {record["name"] for record in content["objects"]}
     assert {"floor", "sofa", "coffee table"} <= names
-    scores = own_ids.metrics.segmentation.held_out
-    assert scores.miou > 0.75 and scores.votes_miou > 0.7 and scores.accuracy > 0.95
-    assert own_ids.metrics.segmentation.matching == "same"
-    assert own_ids.metrics.segmentation.gaussians.accuracy > 0.9
+    held_out = own_scores.segmentation.held_out
+    assert held_out.miou > 0.75 and held_out.votes_miou > 0.7 and held_out.accuracy > 0.95
+    assert own_scores.segmentation.matching == "same"
+    assert own_scores.segmentation.gaussians.accuracy > 0.9
 
 
-def test_objects_cost_no_quality(room: Path, tmp_path: Path, own_ids: RunOutcome) -> None:
-    plain = run(room, tmp_path / "plain", "identity.enabled=false")
-    assert plain.metrics is not None and own_ids.metrics is not None
-    assert plain.metrics.images == own_ids.metrics.images
-    assert not (tmp_path / "plain" / "objects.json").exists() and plain.metrics.segmentation is None
+def test_objects_cost_no_quality(room: Path, tmp_path: Path, own_scores: MetricsRecord) -> None:
+    plain = scores(run(room, tmp_path / "plain", "identity.enabled=false"))
+    assert plain.images == own_scores.images
+    assert not (tmp_path / "plain" / "objects.json").exists() and plain.segmentation is None
 
 
 def test_shuffled_ids_become_objects(room: Path, tmp_path: Path) -> None:
     scramble_recording(room, tmp_path / "masks", 0, 0.2, 0.05, 0.01)
-    outcome = run(room, tmp_path / "run", masks=tmp_path / "masks", evaluate=False)
+    outcome = run(room, tmp_path / "run", masks=tmp_path / "masks")
     assert table(tmp_path / "run")["supervision"] == "associated masks"
-    from ggslam.jobs.progress import SilentObserver
-    from ggslam.jobs.score.run import score_run
-    from ggslam.runs.recordings import open_recording_of
-
     truth = open_recording_of(outcome.folder, masks=room / "masks")
     metrics = score_run(outcome.folder, truth, SilentObserver(), lpips=False, masks=room / "masks")
     assert metrics.segmentation.matching == "assignment"
@@ -104,7 +111,7 @@ def test_masks_of_any_kind_are_handled(room: Path, tmp_path: Path, kind: str) ->
         elif number % 2:
             continue
         cv2.imwrite(str(masks / path.name), mask)
-    run(room, tmp_path / "run", masks=masks, evaluate=False)
+    run(room, tmp_path / "run", masks=masks, stop=12)
     if kind == "empty":
         assert not (tmp_path / "run" / "objects.json").exists()
         return
