@@ -129,22 +129,23 @@ def check(splats: Splats, view: View) -> None:
     print(f"rasterizer against the tests' renderer, one view: {found:.1f} dB, at most {error.max():.3f}\n")
 
 
-def bench(run: Path, recording: Path | None, every: int, checked: bool) -> None:
+def bench(run: Path, arguments: argparse.Namespace) -> None:
     """Prints the table of a run."""
     folder = RunFolder.open(run)
     gaussians = folder.gaussians()
     original = Splats.of(gaussians)
-    views = held_out_views(folder, recording, every, original)
+    views = held_out_views(folder, arguments.recording, arguments.every, original)
     print(f"{run}: {len(gaussians)} Gaussians of SH degree {gaussians.sh_degree}, {len(views)} held-out views of "
           f"{views[0].frame.camera.width}x{views[0].frame.camera.height}\n")  # fmt: skip
-    if checked:
+    if arguments.check:
         check(original, views[0])
     print("| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS))
     own = CpuRasterizer()
     images = [own.forward(gaussians, v.frame.camera, v.T_camera_world).image.numpy().transpose(1, 2, 0).copy()
               for v in views]  # fmt: skip
     print(f"| the map by ggslam's rules | | | | | {against_recording(views, images):.2f} | |")
-    for kind, plain in [("ply", True), *((kind.value, False) for kind in ExportFormat)]:
+    wanted = arguments.formats or [kind.value for kind in ExportFormat]
+    for kind, plain in [(name, plain) for name in wanted for plain in ([True, False] if name == "ply" else [False])]:
         with tempfile.TemporaryDirectory() as out:
             print("| " + " | ".join(line(folder, kind, plain, views, original, Path(out))) + " |", flush=True)
     print()
@@ -155,10 +156,11 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", help="folders that `ggslam run` wrote")
     parser.add_argument("--recording", type=Path, help="the recording, if it is not where it was")
     parser.add_argument("--every", type=int, default=1, help="render every n-th held-out frame")
+    parser.add_argument("--formats", nargs="+", metavar="FORMAT", help="only these")
     parser.add_argument("--check", action="store_true", help="hold the rasterizer against the tests' renderer")
     arguments = parser.parse_args()
     for run in arguments.runs:
-        bench(run, arguments.recording, arguments.every, arguments.check)
+        bench(run, arguments)
 
 
 if __name__ == "__main__":

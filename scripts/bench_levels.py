@@ -1,6 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""How levels of detail look from where they are seen: Gaussians merged in voxels, and the most important ones alone.
+"""How levels of detail look from where they are seen: Gaussians merged in pairs, as streamed SOG has them, merged in
+voxels, and the most important ones alone.
 
     python scripts/bench_levels.py runs/kitchen [--every 4] [--splat-transform "npx splat-transform"]
 
@@ -30,7 +31,7 @@ from timing import seconds
 
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from ggslam.formats.splat_columns import SplatColumns
-from ggslam.formats.splat_levels import coarser, most_important
+from ggslam.formats.splat_levels import coarser, merge
 from ggslam.formats.streamed_sog import LEVEL_RATIO
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.runs.folder import RunFolder
@@ -69,16 +70,50 @@ def seen_from(distance: float, camera: Camera, view: View, finer: int = 1) -> Ca
     return small.resize(small.width * finer, small.height * finer)
 
 
-def psnr(columns: SplatColumns, whole: GaussianMap, camera: Camera, views: list[View], distance: float) -> float:
-    """Mean over views, in dB."""
+def wanted(whole: GaussianMap, camera: Camera, view: View, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """What is there to be seen from a distance, and what the whole map looks like from there."""
+    small = seen_from(distance, camera, view)
+    fine = draw(whole, seen_from(distance, camera, view, FINER), view.T_camera_world).clip(0, 1)
+    there = cv2.resize(fine, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    return there, draw(whole, small, view.T_camera_world).clip(0, 1)
+
+
+def psnr(
+    columns: SplatColumns, camera: Camera, views: list[View], distance: float,
+    images: list[tuple[np.ndarray, np.ndarray]],
+) -> tuple[float, float]:  # fmt: skip
+    """Against what is there to be seen and against the whole map, means over views, in dB."""
     gaussians, scores = map_of(columns), []
-    for view in views:
-        small = seen_from(distance, camera, view)
-        fine = draw(whole, seen_from(distance, camera, view, FINER), view.T_camera_world).clip(0, 1)
-        wanted = cv2.resize(fine, (small.width, small.height), interpolation=cv2.INTER_AREA)
-        found = draw(gaussians, small, view.T_camera_world).clip(0, 1)
-        scores.append(-10 * np.log10(np.square(found - wanted).mean() + 1e-12))
-    return float(np.mean(scores))
+    for view, both in zip(views, images, strict=True):
+        found = draw(gaussians, seen_from(distance, camera, view), view.T_camera_world).clip(0, 1)
+        scores.append([-10 * np.log10(np.square(found - image).mean() + 1e-12) for image in both])
+    there, same = np.mean(scores, 0)
+    return float(there), float(same)
+
+
+def merge_in_voxels(columns: SplatColumns, count: int) -> SplatColumns:
+    """Those in a voxel become one; the voxels are as small as gives at most so many."""
+    offsets = (columns.means - columns.means.min(0)).astype(np.float64)
+    small, large = 0.0, 2 * float(offsets.max())
+    groups = np.zeros(len(columns), np.int64)
+    for _ in range(24):
+        edge = (small + large) / 2
+        tried = np.unique(np.floor(offsets / edge), axis=0, return_inverse=True)[1].reshape(-1)
+        if tried.max() < count:
+            large, groups = edge, tried
+        else:
+            small = edge
+    return merge(columns, groups)
+
+
+def most_important(columns: SplatColumns, count: int) -> SplatColumns:
+    """Those that hide most, enlarged to hide together what all did."""
+    s = np.exp(columns.log_scales)
+    hidden = (s[:, 0] * s[:, 1] + s[:, 1] * s[:, 2] + s[:, 2] * s[:, 0]) / (1 + np.exp(-columns.logits))
+    kept = np.sort(np.argsort(-hidden, kind="stable")[:count])
+    out = columns.take(kept)
+    out.log_scales[:] += 0.5 * np.log(hidden.sum() / hidden[kept].sum())
+    return out
 
 
 def decimate(command: str, gaussians: GaussianMap, count: int) -> SplatColumns:
@@ -107,20 +142,24 @@ def main() -> None:
         seen = (z > 0.1) & (np.abs(u) < camera.width / 2)
         views.append(View(pose, float(np.median(z[seen]))))
     methods: dict[str, Callable[[int], SplatColumns]] = {
-        "as it is": lambda count: columns, "merged in voxels": lambda count: coarser(columns, count),
+        "as it is": lambda count: columns, "merged in pairs": lambda count: coarser(columns, count),
+        "merged in voxels": lambda count: merge_in_voxels(columns, count),
         "most important": lambda count: most_important(columns, count),
     }  # fmt: skip
     if options.splat_transform:
         methods["splat-transform"] = lambda count: decimate(options.splat_transform, whole, count)
     print(f"{options.run}: {len(columns)} Gaussians, {len(views)} views, median depth {views[0].depth:.2f} m\n")
-    print("| level | distance m | method | Gaussians | PSNR dB | seconds |\n|" + " --- |" * 6)
+    print("| level | distance m | method | Gaussians | PSNR dB | against all Gaussians dB | seconds |")
+    print("|" + " --- |" * 7)
     for level in MODEL_LEVELS:
         distance, count = FIRST_DISTANCE * STEP ** (level - 0.5), -(-len(columns) // LEVEL_RATIO**level)
+        images = [wanted(whole, camera, view, distance) for view in views]
         for name, method in methods.items():
             few = method(count)
             time = min(seconds(lambda m=method, n=count: m(n), 1))
-            score = psnr(few, whole, camera, views, distance)
-            print(f"| {level} | {distance:.1f} | {name} | {len(few)} | {score:.2f} | {time:.2f} |", flush=True)
+            there, same = psnr(few, camera, views, distance, images)
+            scores = f"{there:.2f} | {same:.2f}"
+            print(f"| {level} | {distance:.1f} | {name} | {len(few)} | {scores} | {time:.2f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -5,17 +5,20 @@
     python scripts/bench_occupancy.py ../shared/data/redkitchen
     python scripts/bench_occupancy.py ../shared/data/livingroom --voxels 0.08 0.02 --frames 5
 
-Ways (all but the last into a tree of pyoctomap):
+Ways (all but the last two into a tree of pyoctomap):
     raw        insertPointCloud with every point: the reference, and the map that agreement is measured against
     discretize insertPointCloud with discretize=True
     quantised  the voxel centres that `quantize` gives, through insertPointCloud
     batched    `insert_batched`: the scan's voxels found natively, the tree updated voxel by voxel
     rebuilt    `insert_rebuilding`: tree to native map, native insertion, new tree
     native     `OccupancyMap.insert`
+    every      `OccupancyMap.insert` with quantize=False
 
 Times are milliseconds a frame: means over the frames of each frame's fastest run, in the same process; in brackets how
-many times faster than raw. The maps of all ways but raw must be equal byte for byte, and so must raw's and that of
-`OccupancyMap` with quantize=False; a line tells if they are not.
+many times faster than raw. Like for like, which a line of its own has: `every` against raw (a ray for every point), and
+native against the faster of discretize and quantised (a ray for every voxel). OctoMap uses one thread, ours as many as
+the first line says (--threads). The maps of all ways but raw and `every` must be equal byte for byte, and so must those
+two; a line tells if they are not.
 
 Agreement is that of the quantised with the unquantised map, both native, after more frames: equal voxels among those
 known to both / known to either, with OctoMap's log-odds and with the raised ones in the quantised map.
@@ -111,6 +114,9 @@ def bench(voxel: float, scans: list[Scan], context: NativeContext, budget: float
     def rebuilt(target: Any, scan: Scan) -> Any:
         return insert_rebuilding(target, scan.points, scan.origin, context=context)
 
+    def every_point() -> OccupancyMap:
+        return OccupancyMap(voxel, OccupancySettings(quantize=False), context)
+
     raw, raw_tree = milliseconds(tree, lambda t, s: plain(t, s.wide_points, s), scans, budget)
     ways = [
         milliseconds(tree, lambda t, s: plain(t, s.wide_points, s, discretize=True), scans, budget),
@@ -118,14 +124,17 @@ def bench(voxel: float, scans: list[Scan], context: NativeContext, budget: float
         milliseconds(tree, batched, scans, budget),
         milliseconds(tree, rebuilt, scans, budget),
         milliseconds(native, into_native, scans, budget),
+        milliseconds(every_point, into_native, scans, budget),
     ]
-    reference = OccupancyMap(voxel, OccupancySettings(quantize=False), context)
-    for scan in scans:
-        into_native(reference, scan)
-    ours = ways[-1][1]
-    cells = "".join(f"{time:8.1f} ({raw / time:5.1f}x)" for time, _ in ways)
+    ours, reference = ways[-2][1], ways[-1][1]
+    times = [time for time, _ in ways]
+    cells = "".join(f"{time:8.1f} ({raw / time:5.1f}x)" for time in times)
     print(f"{100 * voxel:4g} cm {raw:9.1f}{cells}", flush=True)
-    same = all(full_octomap(ours) == way_tree.write() for _, way_tree in ways[:-1])
+    print(
+        f"        like for like: a ray for every point {raw / times[-1]:.1f}x, for every voxel "
+        f"{min(times[:2]) / times[-2]:.1f}x; between the two {raw / times[-2]:.1f}x"
+    )
+    same = all(full_octomap(ours) == way_tree.write() for _, way_tree in ways[:-2])
     if not same or full_octomap(reference) != raw_tree.write():
         print("        the maps of the ways differ")
     size = ours.summary()
@@ -155,12 +164,13 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=3)
     parser.add_argument("--agreement-frames", type=int, default=40)
     parser.add_argument("--budget", type=float, default=3.0, help="seconds for the runs of one way")
+    parser.add_argument("--threads", type=int, help="of our ways; default: one per processor")
     arguments = parser.parse_args()
-    context = NativeContext()
+    context = NativeContext(arguments.threads)
     scans = list(load_scans(arguments.recording, arguments.frames))
     sizes = ", ".join(str(len(scan.points)) for scan in scans)
     print(f"{len(scans)} frames of {sizes} points, {context.threads} threads")
-    ways = "".join(f"{way:>17}" for way in ("discretize", "quantised", "batched", "rebuilt", "native"))
+    ways = "".join(f"{way:>17}" for way in ("discretize", "quantised", "batched", "rebuilt", "native", "every"))
     print(f"  voxel       raw{ways}")
     for voxel in arguments.voxels:
         bench(voxel, scans, context, arguments.budget)

@@ -13,6 +13,7 @@ from ggslam.sequences import open_sequence
 from ggslam.sequences.sequence import Sequence
 
 BITS = 10
+_FRAMES_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
@@ -34,19 +35,27 @@ def voxelise(path: Path, every: int) -> Cloud:
             extents.append((points.min(0), points.max(0)))
     low, high = np.min([e[0] for e in extents], 0), np.max([e[1] for e in extents], 0)
     scale = ((1 << BITS) - 1) / (high - low).max()
-    keys, sums = np.empty(0, np.int64), np.empty((0, 4), np.int64)
+    keys, sums = [np.empty(0, np.int64)], [np.empty((0, 4), np.int64)]
     for index in range(len(sequence)):
         points, colors = world_points(sequence, index)
         grid = np.floor((points - low) * scale).astype(np.int64)
-        key = grid[:, 0] << 2 * BITS | grid[:, 1] << BITS | grid[:, 2]
-        keys, sums = add_up(np.append(keys, key), np.concatenate([sums, np.insert(colors.astype(np.int64), 3, 1, 1)]))
+        keys.append(grid[:, 0] << 2 * BITS | grid[:, 1] << BITS | grid[:, 2])
+        sums.append(np.insert(colors.astype(np.int64), 3, 1, 1))
+        if len(keys) > _FRAMES_AT_ONCE or index == len(sequence) - 1:
+            key, total = add_up(np.concatenate(keys), np.concatenate(sums))
+            keys, sums = [key], [total]
+    return _largest(path.name, keys[0], sums[0])
+
+
+def _largest(name: str, keys: np.ndarray, sums: np.ndarray) -> Cloud:
+    """The cloud of the voxels with the most measurements, as many as a slice may have."""
     counts = np.sort(sums[:, 3])
     if len(counts) > LEVEL_LIMIT:
         enough = sums[:, 3] > counts[-LEVEL_LIMIT - 1]
         keys, sums = keys[enough], sums[enough]
     limit = (1 << BITS) - 1
     grid = np.stack([keys >> 2 * BITS, keys >> BITS & limit, keys & limit], 1).astype(np.int32)
-    return Cloud(path.name, grid, np.rint(sums[:, :3] / sums[:, 3:]).astype(np.uint8))
+    return Cloud(name, grid, np.rint(sums[:, :3] / sums[:, 3:]).astype(np.uint8))
 
 
 def world_points(sequence: Sequence, index: int) -> tuple[np.ndarray, np.ndarray]:

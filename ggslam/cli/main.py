@@ -27,6 +27,7 @@ from ggslam.cli import (
     run_command,
     submaps_command,
     synth_command,
+    verify_command,
     view_command,
     volumes_command,
 )
@@ -34,16 +35,20 @@ from ggslam.cli.argument_names import with_options
 from ggslam.cli.console import PlainConsole
 from ggslam.cli.old_names import Command
 from ggslam.errors import GgslamError
+from ggslam.system.interrupts import Interrupted, exit_code, stop_like_ctrl_c
 
 
 class _Commands(TyperGroup):
     def invoke(self, context: Any) -> Any:
         """Runs a command; errors that name arguments name options from here on."""
         try:
-            return super().invoke(context)
+            with stop_like_ctrl_c():
+                return super().invoke(context)
         except GgslamError as error:
             error.args = (with_options(str(error)),)
             raise
+        except Interrupted as stop:  # Ctrl-C itself is typer's
+            raise SystemExit(exit_code(stop)) from None
 
 
 app = typer.Typer(
@@ -81,6 +86,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "submaps": (submaps_command.submaps, submaps_command.EPILOG),
     "view": (view_command.view, view_command.EPILOG),
     "volumes": (volumes_command.volumes, volumes_command.EPILOG),
+    "verify": (verify_command.verify, verify_command.EPILOG),
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
 }  # fmt: skip
 for _name, (_function, _epilog) in _COMMANDS.items():
@@ -89,7 +95,8 @@ for _name, (_function, _epilog) in _COMMANDS.items():
 
 
 def main() -> None:
-    """Entry point. Exit codes: 0 done, 2 the user's input is at fault, 1 ggslam or the machine is, 130 interrupted."""
+    """Entry point. Exit codes: 0 done, 2 the user's input is at fault, 1 ggslam or the machine is, 130 Ctrl-C, 128 +
+    the number of another signal that ended it (143 SIGTERM, 129 SIGHUP)."""
     errors = PlainConsole(stderr=True)
     try:
         app()
@@ -97,7 +104,7 @@ def main() -> None:
         errors.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(error.exit_code)
     except SystemExit as end:
-        if end.code == 130:  # what typer makes of Ctrl-C, without a word
+        if end.code in (129, 130, 143):  # what typer makes of Ctrl-C, without a word
             errors.print("interrupted")
         raise
     except OSError as error:

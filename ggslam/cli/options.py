@@ -21,10 +21,11 @@ Settings = Annotated[
 ]
 Columns = Annotated[int, typer.Option(help="Numbers that a .bin scan stores for each point.", min=3)]
 LivePath = Annotated[
-    Path,
+    Path | None,
     typer.Argument(
         metavar="SEQUENCE|LIVE",
-        help="Folder or file of the recording, or a camera: realsense:[SERIAL], python:MODULE:CALLABLE.",
+        help="Folder or file of the recording, or a camera: realsense:[SERIAL], python:MODULE:CALLABLE. With --resume: "
+        "where the recording is now, if it was moved.",
     ),
 ]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `ggslam run` wrote.")]

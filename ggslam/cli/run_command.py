@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -42,7 +44,12 @@ EPILOG = """
   ggslam run --help-settings
 
   ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
+
+  ggslam run --resume runs/kitchen
 """
+
+_WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host", "port", "evaluate"}
+"""Options that change nothing of what a run computes."""
 
 
 class DeviceName(str, Enum):
@@ -91,11 +98,23 @@ Log = Annotated[
 ]
 ShowPage = Annotated[bool, typer.Option("--view", help="Show the map in a browser while it grows, and afterwards.")]
 Evaluate = Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")]
+Resume = Annotated[
+    Path | None,
+    typer.Option(metavar="RUN", help="Go on with a run that was cut off. Settings and recording are those it had."),
+]
+CheckpointEvery = Annotated[
+    int | None,
+    typer.Option(
+        metavar="FRAMES", min=0,
+        help="Save what it takes to go on after so many frames; 0: never. Default: as often as takes 1 % of the time.",
+    ),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in the output folder.")]
 
 
 def run(
-    sequence: options.LivePath,
+    context: typer.Context,
+    sequence: options.LivePath = None,
     out: Out = None,
     config: options.ConfigName = None,
     settings: options.Settings = None,
@@ -128,12 +147,20 @@ def run(
     port: options.Port = 8080,
     evaluate: Evaluate = True,
     overwrite: Overwrite = False,
+    resume: Resume = None,
+    checkpoint_every: CheckpointEvery = None,
     help_settings: settings_help.HelpSettings = False,
     help_setting: settings_help.HelpSetting = None,
 ) -> None:
     """Track the camera, build the map, write a run folder and score it."""
+    from ggslam.jobs.run.pipeline import execute
     from ggslam.runs.recordings import SequenceRequest
 
+    watched = _Watched(log, (host, port) if view else None)
+    if resume is not None:
+        return _go_on(context, resume, sequence, checkpoint_every, evaluate, watched)
+    if sequence is None:
+        raise ConfigError("expected a recording (SEQUENCE), or --resume with a run")
     reading = SequenceRequest(
         sequence, format_name, start, stop, stride, scale, masks, depth_scale, "skip" if skip_bad_frames else "error",
         depth_camera, min_confidence, tuple(topics or ()), pose_convention,
@@ -143,13 +170,39 @@ def run(
         "threads": threads, "seed": seed, "loops.enabled": loops,
         "tracker": None if tracker is None else tracker.value, "device": None if device is None else device.value,
     }  # fmt: skip
-    overrides = [*(settings or []), *(f"{name}={value}" for name, value in shortcuts.items() if value is not None)]
-    request = _request(reading, record)
+    given = [*(settings or []), *(f"{name}={value}" for name, value in shortcuts.items() if value is not None)]
     request = replace(
-        request, out=out, config=config, overrides=overrides, evaluate=evaluate, overwrite=overwrite, map=earlier,
-        localize_only=localize_only,
+        _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
+        map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every,
     )  # fmt: skip
-    _run_and_show(request, log, (host, port) if view else None)
+    _run_and_show(partial(execute, request), sequence.resolve().name, watched)
+
+
+def _go_on(
+    context: typer.Context, run: Path, recording: Path | None, checkpoint_every: int | None, evaluate: bool,
+    watched: _Watched,
+) -> None:  # fmt: skip
+    """Goes on with a run that was cut off."""
+    from ggslam.jobs.run.pipeline import resume
+
+    given = refuse_other_options(context)
+    again = partial(resume, run, recording=recording, checkpoint_every=checkpoint_every)
+    again = partial(again, evaluate=evaluate) if "evaluate" in given else again
+    _run_and_show(again, run.resolve().name, watched)
+
+
+def refuse_other_options(context: typer.Context) -> set[str]:
+    """With --resume only options that do not change the result are taken; returns the parameters that were given.
+
+    Raises:
+        ConfigError: another one was given; it is named.
+    """
+    options_of = {parameter.name or "": parameter.opts[0] for parameter in context.command.params}
+    sources = {name: context.get_parameter_source(name) for name in options_of}
+    given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+    for name in sorted(given - _WITH_RESUME):
+        raise ConfigError(f"--resume: {options_of[name]} does not go with it: the run goes on as it was begun")
+    return given
 
 
 def _request(reading: SequenceRequest, record: Path | None) -> RunRequest:
@@ -169,18 +222,25 @@ def _request(reading: SequenceRequest, record: Path | None) -> RunRequest:
     return RunRequest(reading)
 
 
-def _run_and_show(request: RunRequest, log: str | None, address: tuple[str, int] | None) -> None:
+@dataclass(frozen=True)
+class _Watched:
+    """Where a run is logged, and the host and port of the page that shows it; None: not."""
+
+    log: str | None
+    address: tuple[str, int] | None
+
+
+def _run_and_show(run: Callable[..., RunOutcome], name: str, watched: _Watched) -> None:
     """Runs, logged and shown on a page as asked; the page stays until Ctrl-C."""
-    from ggslam.jobs.run.pipeline import execute
     from ggslam.jobs.view.serve import wait_for_interrupt
     from ggslam.jobs.watch.watchers import watch_run
 
-    with watch_run(log, address, request.sequence.path.resolve().name) as watchers:
+    with watch_run(watched.log, watched.address, name) as watchers:
         page = watchers.page
         if page is not None:
             console.print(f"the map as it grows: {page.address}", highlight=False, markup=False)
         with progress_bar() as bar:
-            outcome = execute(request, ProgressObserver(bar), watchers.follower)
+            outcome = run(observer=ProgressObserver(bar), follower=watchers.follower)
         _print(outcome)
         watchers.finish(outcome)
         if page is not None and outcome.error is None:

@@ -54,13 +54,20 @@ def write_spz(path: str | Path, gaussians: GaussianMap, version: int = 3) -> Non
         raise FormatError(f"{path}: SPZ holds positions up to {SPZ_REACH:g} m, found {farthest:g} m; write a PLY")
     columns = SplatColumns.of(path, gaussians)
     columns.turn_upright()
-    data = _pack(gaussforge, path, columns, gaussians.sh_degree)
-    write_bytes(path, data if zstandard is None else _version_4(zstandard, data))
+    payload = _fine_harmonics(gzip.decompress(_pack(gaussforge, path, columns, gaussians.sh_degree)), columns.sh)
+    data = gzip.compress(payload, 6, mtime=0) if zstandard is None else _version_4(zstandard, payload)
+    write_bytes(path, data)
 
 
-def _version_4(zstandard: ModuleType, version_3: bytes) -> bytes:
-    """The same numbers as version 4: each attribute is a zstd frame of its own behind a table of their sizes."""
-    payload = gzip.decompress(version_3)
+def _fine_harmonics(payload: bytes, sh: np.ndarray) -> bytes:
+    """The same with higher spherical harmonics, which come last, in whole bytes, -1 to 1 in steps of 1/128. The package
+    keeps 5 bits of them at degree 1 and 4 above, where those of trained maps are mostly zero."""
+    higher = np.rint(128 + 128 * sh[:, 1:].clip(-1, 1)).clip(0, 255).astype(np.uint8)
+    return payload[: len(payload) - higher.size] + higher.tobytes()
+
+
+def _version_4(zstandard: ModuleType, payload: bytes) -> bytes:
+    """Version 4 of what version 3 holds: each attribute is a zstd frame of its own behind a table of their sizes."""
     count, degree, fraction, flags = struct.unpack_from("<8xIBBB", payload)
     widths = [9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)]  # bytes a Gaussian: positions, opacities, colours, ...
     frames, table, start = [], b"", 16

@@ -51,7 +51,9 @@ class SplatColumns:
             bad = ~np.isfinite(values).all(tuple(range(1, values.ndim)))
             if bad.any():
                 raise FormatError(f"{path}: the {name} of Gaussian {int(bad.argmax())} is not a finite number")
-        return SplatColumns(*arrays, gaussians.object_id.cpu().numpy().copy())
+        means, log_scales, quaternions, logits, sh = arrays
+        object_id = gaussians.object_id.cpu().numpy().copy()
+        return SplatColumns(means, log_scales, quaternions, logits, sh, object_id)
 
     @staticmethod
     def join(parts: Sequence[SplatColumns]) -> SplatColumns:

@@ -1,66 +1,103 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Levels of detail of a Gaussian map: fewer, larger Gaussians that look the same from farther away."""
+"""Levels of detail of a Gaussian map: fewer, larger Gaussians that look the same from farther away.
+
+Neighbours are merged in pairs, those first that differ least: in the manner of Ward (1963), a pair costs what a
+weighted variance grows by, of positions in units of the Gaussians' own size and of colours. The weight of a Gaussian
+is the area that it hides. In a round each Gaussian is merged with one other at most, so that levels get coarser
+everywhere. `scripts/bench_levels.py` compares this with other ways.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ggslam.formats.splat_columns import SplatColumns
+from ggslam.scene.gaussian_map import SH_C0
 from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix
 
+_NEIGHBOURS = 8
+"""Nearest Gaussians that one may be merged with."""
+_COLOR_WEIGHT = 10.0
+"""Of a squared difference of colours (0 to 1), against one of positions in units of the pair's size."""
+_MATCHINGS = 6
+_SPREAD = 1.6
+"""By this the distance of merged Gaussians counts more in their variance than a sum of both would have it: Gaussians of
+the right variance fall off too fast to leave no gaps to the next. Chosen by `scripts/bench_levels.py`."""
 _MOST_OPAQUE = 0.99
-_SEARCH_STEPS = 24
 _LEAST_VARIANCE = 1e-12
 """Square metres."""
 
 
 def coarser(columns: SplatColumns, count: int) -> SplatColumns:
-    """At most so many Gaussians that stand for all: those in a voxel become one, of a size of voxels that fits.
+    """So many Gaussians that stand for all; the same ones if there are no more.
 
     Args:
-        columns: at least one Gaussian.
+        columns: Gaussians.
         count: wanted, at least 1.
     """
-    if len(columns) <= count:
-        return columns
-    low = columns.means.min(0).astype(np.float64)
-    small, large = 0.0, max(float((columns.means - low).max()), 1e-6) * 2
-    groups = np.zeros(len(columns), np.int64)
-    for _ in range(_SEARCH_STEPS):
-        edge = (small + large) / 2
-        tried = _voxels(columns.means - low, edge)
-        if tried.max() < count:
-            large, groups = edge, tried
-            if tried.max() + 1 > 0.98 * count:
-                break
-        else:
-            small = edge
-    return merge(columns, groups)
+    while len(columns) > count:
+        one, other, cost = _neighbours(columns)
+        first, second = _cheapest_pairs(one, other, cost, len(columns))
+        first, second = first[: len(columns) - count], second[: len(columns) - count]
+        alone = np.ones(len(columns), bool)
+        alone[first] = alone[second] = False
+        groups = np.tile(np.arange(len(first)), 2)
+        merged = merge(columns.take(np.concatenate([first, second])), groups)
+        columns = SplatColumns.join([columns.take(np.flatnonzero(alone)), merged])
+    return columns
 
 
-def _voxels(offsets: np.ndarray, edge: float) -> np.ndarray:
-    """Numbers from 0 of the voxels that points [N, 3] lie in, int64 [N]."""
-    cells = np.floor(offsets / edge).astype(np.int64)
-    sizes = cells.max(0) + 1
-    keys = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
-    return np.unique(keys, return_inverse=True)[1].reshape(-1)
+def _neighbours(columns: SplatColumns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of Gaussians near each other, each once, int64 [P] twice, and what it costs to merge them, float64 [P]."""
+    count = len(columns)
+    _, near = cKDTree(columns.means).query(columns.means, k=min(_NEIGHBOURS + 1, count))
+    own = np.repeat(np.arange(count), near.shape[1])
+    low, high = np.minimum(own, near.reshape(-1)), np.maximum(own, near.reshape(-1))
+    keys = np.unique((low * count + high)[low != high])
+    one, other = keys // count, keys % count
+    area = _area(columns.log_scales)
+    weight = -np.expm1(-_optical_depth(columns.logits)) * area
+    apart = np.square(columns.means[one].astype(np.float64) - columns.means[other]).sum(1) / (area[one] + area[other])
+    color = np.square(SH_C0 * (columns.sh[one, 0].astype(np.float64) - columns.sh[other, 0])).sum(1)
+    cost = weight[one] * weight[other] / (weight[one] + weight[other]) * (apart + _COLOR_WEIGHT * color)
+    return one, other, cost
+
+
+def _cheapest_pairs(
+    one: np.ndarray, other: np.ndarray, cost: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Some of the pairs, the cheapest first, in which none of `count` Gaussians is twice: pairs cheaper than all others
+    of both, then likewise among the rest."""
+    order = np.argsort(cost, kind="stable")
+    one, other, rank = one[order], other[order], np.arange(len(order))
+    free, chosen = np.ones(count, bool), []
+    for _ in range(_MATCHINGS):
+        still = free[one] & free[other]
+        one, other, rank = one[still], other[still], rank[still]
+        best = np.full(count, len(order))
+        np.minimum.at(best, one, rank)
+        np.minimum.at(best, other, rank)
+        taken = (best[one] == rank) & (best[other] == rank)
+        free[one[taken]] = free[other[taken]] = False
+        chosen.append(np.stack([rank[taken], one[taken], other[taken]]))
+    _, first, second = np.concatenate(chosen, 1)[:, np.argsort(np.concatenate([c[0] for c in chosen]), kind="stable")]
+    return first, second
 
 
 def merge(columns: SplatColumns, groups: np.ndarray) -> SplatColumns:
-    """One Gaussian for each group, with the mean and covariance of all in it; what each hides (its optical depth times
-    its area) is its weight and is kept. An object id is that of the heaviest.
+    """One Gaussian for each group, with the mean and covariance of all in it, a little wider; what each hides (its
+    optical depth times its area) is its weight and is kept. An object id is that of the heaviest.
 
     Args:
         columns: Gaussians.
         groups: int64 [N], numbers from 0 without gaps.
     """
-    count = int(groups.max()) + 1
     order = np.argsort(groups, kind="stable")
-    starts = np.searchsorted(groups[order], np.arange(count))
+    starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
     sizes = np.diff(starts, append=len(order))
     ordered = columns.take(order)
-    area = _area(ordered.log_scales)
-    weight = _optical_depth(ordered.logits) * area
+    weight = _optical_depth(ordered.logits) * _area(ordered.log_scales)
     total = np.add.reduceat(weight, starts)
     share = weight / total.repeat(sizes)
 
@@ -69,31 +106,16 @@ def merge(columns: SplatColumns, groups: np.ndarray) -> SplatColumns:
 
     means = mean(ordered.means.astype(np.float64))
     offsets = ordered.means - means.repeat(sizes, 0)
-    spread = _covariances(ordered) + offsets[:, :, None] * offsets[:, None, :]
+    spread = _covariances(ordered) + _SPREAD * offsets[:, :, None] * offsets[:, None, :]
     variances, axes = np.linalg.eigh(mean(spread))
     log_scales = 0.5 * np.log(variances.clip(_LEAST_VARIANCE))
     opacity = (-np.expm1(-total / _area(log_scales))).clip(1e-6, _MOST_OPAQUE)
     heaviest = np.lexsort([-weight, groups[order]])[starts]
-    merged = SplatColumns(
+    return SplatColumns(
         means.astype(np.float32), log_scales.astype(np.float32), _quaternions(axes).astype(np.float32),
         np.log(opacity / (1 - opacity)).astype(np.float32), mean(ordered.sh.astype(np.float64)).astype(np.float32),
         ordered.object_id[heaviest],
     )  # fmt: skip
-    alone = np.flatnonzero(sizes == 1)
-    for name in ("log_scales", "quaternions", "logits"):
-        getattr(merged, name)[alone] = getattr(ordered, name)[starts[alone]]
-    return merged
-
-
-def most_important(columns: SplatColumns, count: int) -> SplatColumns:
-    """So many of the Gaussians, those that hide most, enlarged to hide together what all did."""
-    if len(columns) <= count:
-        return columns
-    hidden = -np.expm1(-_optical_depth(columns.logits)) * _area(columns.log_scales)
-    kept = np.sort(np.argpartition(-hidden, count)[:count])
-    out = columns.take(kept)
-    out.log_scales += np.float32(0.5 * np.log(hidden.sum() / hidden[kept].sum()))
-    return out
 
 
 def _optical_depth(logits: np.ndarray) -> np.ndarray:

@@ -60,7 +60,8 @@ def write_streamed_sog(
         done: told how many parts are written.
 
     Raises:
-        FormatError: there is no Gaussian, a number is not finite, or an object id is too large.
+        FormatError: there is no Gaussian, a number is not finite, an object id is too large, or parts have spherical
+            harmonics of different degrees.
         RunFolderError: a file cannot be written.
     """
     folder = Path(folder)
@@ -103,9 +104,11 @@ class _Writer:
         self.filenames: list[str] = []
         self.bytes = 0
         self._folder = folder
-        self._objects = None if objects is None else {}
+        self._objects: dict[int, str] | None = None if objects is None else {}
         self._done = done
         self._parts = 0
+        self._coefficients = 0
+        """Of spherical harmonics of a Gaussian, once known."""
 
     def tree_of_parts(self, parts: list[MapPart]) -> dict[str, Any] | None:
         """Writes parts; returns their tree, None if there is no Gaussian in them."""
@@ -117,19 +120,29 @@ class _Writer:
         tree = None
         for part in parts:
             columns = SplatColumns.of(self._folder, part.load())
-            tree = self._tree(columns) if len(columns) else None
+            tree = self._tree(self._of_one_degree(columns)) if len(columns) else None
             self._parts += 1
             self._done(self._parts)
         return tree
+
+    def _of_one_degree(self, columns: SplatColumns) -> SplatColumns:
+        """The same; raises FormatError where a part before had spherical harmonics of another degree."""
+        found = columns.sh.shape[1]
+        if found != (self._coefficients or found):
+            raise FormatError(
+                f"{self._folder}: streamed SOG holds spherical harmonics of one degree, parts of the map have "
+                f"{math.isqrt(self._coefficients) - 1} and {math.isqrt(found) - 1}"
+            )
+        self._coefficients = found
+        return columns
 
     def _tree(self, columns: SplatColumns) -> dict[str, Any]:
         extent = float(np.ptp(columns.means, axis=0).max())
         if len(columns) > LEAF or (extent > LEAF_EXTENT and len(columns) > LEAF_LEAST):
             return _above([self._tree(columns.take(half)) for half in _halves(columns.means)])
-        lods, bounds, whole = {}, [], columns
+        lods, bounds, whole = {}, [], len(columns)
         for number in range(len(self.levels)):
-            if number:
-                columns = coarser(whole, math.ceil(len(whole) / LEVEL_RATIO**number))
+            columns = coarser(columns, math.ceil(whole / LEVEL_RATIO**number))
             lods[str(number)] = self._put(number, columns)
             bounds.append(_box_of(columns))
         return {"bound": _union(bounds), "lods": lods}

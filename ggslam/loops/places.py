@@ -165,6 +165,12 @@ class PlaceIndex:
             index.add(number, Place(landmarks, index._words(of_descriptors), codes.copy()))
         return index
 
+    def list_again(self) -> None:
+        """Makes the lists of words from the landmarks of the places."""
+        self._lists = WordLists(self.settings.tables << self.settings.bits)
+        for position, place in enumerate(self._places):
+            self._lists.add(self._words(place.landmarks.descriptors), position)
+
     # --- parts -------------------------------------------------------------------------------------------------------
 
     def _words(self, descriptors: np.ndarray) -> np.ndarray:

@@ -299,15 +299,16 @@ class Mapper(ABC):
             pose_rate: size of the pose's step, metres and radians; 0: it stays.
         """
 
-    def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None) -> None:
-        """Final refinement: learning rates fall exponentially, for each part of a map that is in memory by turns."""
+    def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None, begin: int = 0) -> None:
+        """Final refinement: learning rates fall exponentially, for each part of a map that is in memory by turns. The
+        first `begin` steps were made before; between steps `progress` is told how many of how many are."""
         done = 0
         for numbers, steps in self._stages(iterations):
             for i in range(steps):
-                factor = self.settings.refine_decay ** (i / max(1, steps - 1))
-                self.iterate(self._draw(numbers), factor)
                 done += 1
-                if progress is not None and (done % 20 == 0 or done == iterations):
+                if done > begin:
+                    self.iterate(self._draw(numbers), self.settings.refine_decay ** (i / max(1, steps - 1)))
+                if progress is not None and done > begin and (done % 20 == 0 or done == iterations):
                     progress(done, iterations)
 
     def finish_identity(self) -> None:

@@ -19,47 +19,43 @@ of a run with objects, whose map.ply also holds each Gaussian's object id and id
 
 from __future__ import annotations
 
+import logging
 import os
-import shutil
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from ggslam import __version__
 from ggslam.errors import RunFolderError
-from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
-from ggslam.runs.environment import environment
+from ggslam.runs.checkpoints import has_checkpoints
+from ggslam.runs.manifest import refuse_mixed
 from ggslam.runs.map_index import MAP_INDEX, MapIndex, MapInParts
+from ggslam.runs.publishing import change_files, publish_run
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
-from ggslam.runs.saving_parts import save_map_in_parts, save_points
+from ggslam.runs.writing import RUN_FILES, RunToWrite
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
-from ggslam.slam.config import Config, config_from_dict, save_config
+from ggslam.slam.config import Config, config_from_dict
 from ggslam.slam.result import SlamResult
-from ggslam.slam.saved_places import PLACES_FILE
-from ggslam.slam.step_log import STEPS_FILE
-from ggslam.system.atomic import write_bytes, write_text
-from ggslam.system.foreign import read_foreign_text, refuse_links
+from ggslam.system.folder_lock import LOCK_FILE, folder_lock, refuse_other_writers
+from ggslam.system.foreign import printable, read_foreign_text, refuse_links
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
-from ggslam.system.staging import finish_saving, leftovers
+from ggslam.system.staging import finish_saving, is_being_saved, leftovers
 
 MARKER = RunRecord.FILE
 """Is there if and only if a folder is a run of ggslam."""
-TRUTH_FILE = "ground_truth.txt"
-"""True poses of the frames that have both, with the times of trajectory.txt; written by the report."""
-REPORT_FILE = "report.html"
-OBJECT_FILES = ("objects.json", "classifier.npz", "votes.npz")
-"""Files of a run with objects, in the order in which they are removed; they are written in the opposite one."""
+_log = logging.getLogger(__name__)
 
 
 class RunFolder:
@@ -81,10 +77,13 @@ class RunFolder:
             RunFolderError: it holds something else, or a run that was not to be replaced, or cannot be written to.
         """
         folder = RunFolder(path)
+        refuse_other_writers(folder.path)
         try:
             refuse_links(folder.path, RunFolderError)
-            if folder.path.is_dir() and set(folder.path.iterdir()) - set(leftovers(folder.path)):
-                if not (folder.path / MARKER).exists():
+            if folder.path.is_dir() and folder._content():
+                if not overwrite and has_checkpoints(folder.path):
+                    raise RunFolderError(f"{path}: there is a run that was cut off; use `resume` or `overwrite`")
+                if not (folder.path / MARKER).exists() and not has_checkpoints(folder.path):
                     raise RunFolderError(f"{path}: not empty and not a run of ggslam; choose another folder with `out`")
                 if not overwrite:
                     raise RunFolderError(f"{path}: there is a run already; use `overwrite` or another `out`")
@@ -101,14 +100,52 @@ class RunFolder:
         """A run that is there. If saving it was interrupted while files changed places, that is finished.
 
         Raises:
-            RunFolderError: no such folder, or not a run, or one whose saving cannot be finished.
+            RunFolderError: no such folder, or not a run, or one whose saving cannot be finished, or files of several.
         """
         if not (Path(path) / MARKER).is_file():
+            if has_checkpoints(Path(path)):
+                raise RunFolderError(f"{path}: the run was cut off before it was saved; go on with it: `resume`")
             reason = "is not a run of ggslam (no run.json)" if Path(path).is_dir() else "no such folder"
             raise RunFolderError(f"{path}: {reason}")
         refuse_links(path, RunFolderError)
-        finish_saving(Path(path), MARKER)
-        return RunFolder(path)
+        if is_being_saved(Path(path), MARKER):
+            with folder_lock(Path(path), wait_s=5):
+                finish_saving(Path(path), MARKER)
+        folder = RunFolder(path)
+        folder.warn()
+        return folder
+
+    def warn(self) -> None:
+        """Says aloud (to the log) what is wrong with the run, as far as it can be read all the same.
+
+        Raises:
+            RunFolderError: its files are not of one run.
+        """
+        mark = self.mark()
+        problems = [str(problem) for problem in refuse_mixed(self.path, mark)]
+        reason = mark.stopped_by or (f"lacks {', '.join(mark.missing)}" if mark.missing else "saving did not finish")
+        problems += [] if mark.complete else [f"the run is incomplete: {reason}"]
+        for problem in problems:
+            _log.warning("warning: %s", printable(f"{self.path}: {problem}"))
+
+    @staticmethod
+    def open_unfinished(path: Path) -> RunFolder:
+        """A run that was cut off, and left checkpoints.
+
+        Raises:
+            RunFolderError: no such folder, or there is nothing to go on from.
+        """
+        refuse_other_writers(Path(path))
+        if has_checkpoints(Path(path)):
+            return RunFolder(path)
+        folder = RunFolder.open(path)
+        whole = folder.mark().complete
+        reason = "the run is complete" if whole else "it has no checkpoints"
+        raise RunFolderError(f"{path}: there is nothing to resume: {reason}")
+
+    def _content(self) -> set[Path]:
+        """What is in the folder, but for what killed programs left and the lock."""
+        return set(self.path.iterdir()) - {*leftovers(self.path), self.path / LOCK_FILE}
 
     def check_writable(self) -> None:
         """Raises RunFolderError if files cannot be written to the folder."""
@@ -127,16 +164,17 @@ class RunFolder:
 
     def discard(self) -> None:
         """Removes the folder if it was made by `create` and is still empty."""
-        if self._made_here and not any(self.path.iterdir()):
+        if self._made_here and not self._content():
+            (self.path / LOCK_FILE).unlink(missing_ok=True)
             self.path.rmdir()
 
     # --- writing -----------------------------------------------------------------------------------------------------
 
     def save(
         self, config: Config, sequence: SequenceRecord, result: SlamResult, error: str | None = None,
-        names: Mapping[int, str] | None = None,
+        names: Mapping[int, str] | None = None, wanted: Collection[str] = (),
     ) -> None:  # fmt: skip
-        """Writes everything but scores and pictures.
+        """Writes everything but scores and pictures. What an earlier run left there goes when all of it is on the disk.
 
         Args:
             config: all settings.
@@ -144,37 +182,19 @@ class RunFolder:
             result: of the run.
             error: why the run stopped early, if it did.
             names: of object ids, as far as the recording knows them.
+            wanted: names of files that are to be made yet; until then the run is not complete.
+
+        Raises:
+            RunFolderError: a file cannot be written. If it is one of the clouds, everything else is there.
         """
-        mark = RunRecord(
-            ggslam=__version__, complete=False, stopped_by="saving did not finish",
-            environment={**environment(config.threads), "device": result.device},
-        )  # fmt: skip
-        mark.write(self.path)  # before any file of an earlier run is replaced
-        stale_files = ("metrics.json", "frames.csv", "points.ply", "points_grid.ply", PLACES_FILE, MAP_INDEX,
-                       STEPS_FILE, TRUTH_FILE, REPORT_FILE)  # fmt: skip
-        for stale in (*stale_files, *OBJECT_FILES):
-            (self.path / stale).unlink(missing_ok=True)
-        for stale in ("renders", "volumes", "plots"):
-            shutil.rmtree(self.path / stale, ignore_errors=True)
-        save_config(config, self.path / "config.yaml")
-        for record in (sequence, TimingRecord.of_result(result), KeyframesRecord.of_result(result),
-                       LoopsRecord.of_result(result)):  # fmt: skip
-            record.write(self.path)
-        write_tum(self.path / "trajectory.txt", result.timestamps(), result.trajectory())
-        if result.steps is not None:
-            write_text(self.path / STEPS_FILE, result.steps)
-        if result.cells is not None:
-            save_map_in_parts(self.path, result, names)
-        elif result.objects is None:
-            write_gaussian_ply(self.path / "map.ply", result.gaussians)
-        else:
-            self.save_objects(segment_map(result, names))
-        if result.places is not None:
-            write_bytes(self.path / PLACES_FILE, result.places)
-        mark.model_copy(update={"complete": error is None, "stopped_by": error}).write(self.path)
-        # Last and largest; `ggslam export --format points` makes them again from the map.
-        save_points(self.path, result)
-        TimingRecord.of_result(result).write(self.path)  # once more: peak memory is that of the whole run
+        self.write(RunToWrite(config, sequence, result, error, names or {}, tuple(wanted)))
+
+    def write(self, run: RunToWrite, least: bool = False) -> None:
+        """As `save`; with `least` only what a run cannot do without."""
+        write = run.write_least if least else run.write
+        publish_run(self.path, write, RUN_FILES, f"{self.path}: the run cannot be written")
+        if run.failure is not None:
+            raise run.failure
 
     def save_trajectory(self, timestamps: np.ndarray, poses: np.ndarray, error: str) -> None:
         """Writes what is left of a run whose map is lost: trajectory.txt, and why it stopped.
@@ -184,20 +204,16 @@ class RunFolder:
             poses: T_world_camera [n, 4, 4], NaN where lost.
             error: why it stopped.
         """
-        for name in (*OBJECT_FILES, "map.ply", "metrics.json", REPORT_FILE):  # of a run that this one replaces
-            (self.path / name).unlink(missing_ok=True)
-        write_tum(self.path / "trajectory.txt", timestamps, poses)
-        RunRecord(ggslam=__version__, complete=False, stopped_by=error).write(self.path)
 
-    def save_objects(self, segmented: SegmentedMap) -> None:
-        """Writes a map with its objects: map.ply with object ids and identity vectors, and the files beside it."""
-        for stale in OBJECT_FILES:
-            (self.path / stale).unlink(missing_ok=True)
-        write_gaussian_ply(self.path / "map.ply", segmented.gaussians, extra=("object_id", "identity"))
-        if segmented.votes is not None:
-            write_bytes(self.path / "votes.npz", segmented.votes.to_bytes())
-        write_bytes(self.path / "classifier.npz", segmented.classifier.to_bytes())
-        segmented.table.save(self.path / "objects.json")
+        def write(folder: Path) -> RunRecord:
+            write_tum(folder / "trajectory.txt", timestamps, poses)
+            return RunRecord(ggslam=__version__, complete=False, stopped_by=error, missing=["map.ply"])
+
+        publish_run(self.path, write, RUN_FILES, f"{self.path}: the trajectory cannot be written")
+
+    def change_files(self, *names: str) -> AbstractContextManager[None]:
+        """Files (or folders of files) of the run are written within the block; see `publishing.change_files`."""
+        return change_files(self.path, names)
 
     # --- reading -----------------------------------------------------------------------------------------------------
 
@@ -315,12 +331,3 @@ def as_written(path: Path) -> Iterator[None]:
         yield
     except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         raise RunFolderError(f"{path}: not as ggslam writes it: {error!r}") from error
-
-
-def segment_map(result: SlamResult, names: Mapping[int, str] | None = None) -> SegmentedMap:
-    """A run's map with its objects. Names are taken only where ids are the masks' own."""
-    assert result.objects is not None
-    found = result.objects
-    known = names if found.supervision == "masks" else None
-    table = ObjectTable.build(result.gaussians, found.classifier, found.supervision, known, found.observations)
-    return SegmentedMap(result.gaussians, found.classifier, table, ObjectVotes.of(result.gaussians))

@@ -6,10 +6,13 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from ggslam.errors import RunFolderError, SequenceError
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.runs.records.sequence import OpenRecord, SequenceRecord
 from ggslam.sequences import Sequence, open_sequence
 from ggslam.sequences.live import LiveSequence, is_live, open_live
 from ggslam.system.json_files import json_ready
@@ -88,12 +91,32 @@ def describe(
     })  # fmt: skip
 
 
+def identity_of(sequence: Sequence) -> dict[str, Any]:
+    """Tells a recording from another one, wherever it lies: plain values for a record."""
+    times = hashlib.sha256(np.ascontiguousarray(sequence.timestamps).tobytes()).hexdigest()
+    file = sequence.path.stat().st_size if sequence.path.is_file() else None
+    return json_ready({
+        "format": sequence.format, "frames": len(sequence), "camera": asdict(sequence.camera), "times": times,
+        "file_size": file, "masks": sequence.has_masks,
+    })  # fmt: skip
+
+
 def fingerprint(folder: RunFolder) -> str:
     """Tells a run from another one in the same folder."""
     try:
         return hashlib.sha256((folder.path / "keyframes.json").read_bytes()).hexdigest()
     except OSError as error:
         raise RunFolderError(f"{folder.path / 'keyframes.json'}: cannot be read: {error.strerror}") from None
+
+
+def request_in(record: OpenRecord, path: Path | None = None, masks: Path | None = None) -> SequenceRequest:
+    """What a record says of how a recording is opened, with another place of recording or masks if one is given."""
+    used = masks if masks is not None else record.masks
+    return SequenceRequest(**{
+        **record.model_dump(), "path": Path(path if path is not None else record.path),
+        "masks": None if used is None else Path(used), "topics": tuple(record.topics),
+        "depth_camera": None if record.depth_camera is None else Path(record.depth_camera),
+    })  # fmt: skip
 
 
 def open_recording_of(
@@ -112,12 +135,7 @@ def open_recording_of(
         RunFolderError: the run does not say which it was.
     """
     record = folder.sequence()
-    used = masks if masks is not None else record.open.masks
-    request = SequenceRequest(**{
-        **record.open.model_dump(), "path": Path(path if path is not None else record.open.path),
-        "masks": None if used is None else Path(used), "topics": tuple(record.open.topics),
-        "depth_camera": None if record.open.depth_camera is None else Path(record.open.depth_camera),
-    })  # fmt: skip
+    request = request_in(record.open, path, masks)
     if is_live(request.path):
         raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (`record`)")
     sequence = replace(request, scale=request.scale if scale is None else scale).open()

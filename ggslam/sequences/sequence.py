@@ -8,7 +8,7 @@ import math
 import operator
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -199,6 +199,11 @@ class Sequence:
         """Damaged frames that `stream` has skipped so far, in order."""
         return [self._skipped[i] for i in sorted(self._skipped)]
 
+    def go_on_after(self, skipped: Iterable[SkippedFrame], mask_problems: Mapping[int, str]) -> None:
+        """What was met before, by another `stream` that came as far as the next one begins."""
+        self._skipped.update({frame.index: frame for frame in skipped})
+        self.mask_problems.update(mask_problems)
+
     def files(self, index: int) -> FrameFiles:
         """The files of frame `index` of the selection (0 to len - 1).
 
@@ -246,20 +251,21 @@ class Sequence:
             mask_loader=partial(self._mask, index) if masks == "lazy" and files.mask is not None else None,
         )
 
-    def stream(self, prefetch: int = 4, masks: ReadMasks = True) -> Iterator[Frame]:
+    def stream(self, prefetch: int = 4, masks: ReadMasks = True, begin: int = 0) -> Iterator[Frame]:
         """All frames in order, at most `prefetch` of them read ahead by one background thread (0: no thread).
-        Masks are read as `masks` says; leaving them saves a quarter of the time.
+        Masks are read as `masks` says; leaving them saves a quarter of the time. The first frame is `begin`.
 
         The thread ends when the iterator is used up, closed or garbage collected.
 
         Raises:
             SequenceError: at the place of a damaged frame, unless on_bad_frame="skip".
         """
+        numbers = range(begin, len(self))
         if prefetch < 1:
-            for index in range(len(self)):
+            for index in numbers:
                 yield from self._deliver(self._attempt(index, masks))
             return
-        with ReadAhead(partial(self._attempt, masks=masks), len(self), prefetch) as attempts:
+        with ReadAhead(lambda i: self._attempt(numbers[i], masks), len(numbers), prefetch) as attempts:
             for attempt in attempts:
                 yield from self._deliver(attempt)
 

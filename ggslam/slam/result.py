@@ -82,12 +82,16 @@ class SlamTimes:
         tracking_by_frame: the same, frame by frame, so that growth with the map shows.
         loops: spent looking for places, closing loops and finding lost frames; mostly part of `tracking` or mapping.
         refinement: spent on the final refinement, not part of `wall`.
+        checkpoints: spent on saving the state, part of `wall` or of `refinement`.
+        saved: how many times that was.
     """
 
     wall: float = 0.0
     tracking: float = 0.0
     loops: float = 0.0
     refinement: float = 0.0
+    checkpoints: float = 0.0
+    saved: int = 0
     tracking_by_frame: list[float] = field(default_factory=list)
     _started: float | None = None
 

@@ -163,12 +163,20 @@ class Slam:
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refine_iterations`), then the result. `progress(done, total)` is called now and then."""
-        start, before = time.perf_counter(), self.mapper.times.iterations
+        start, before = time.perf_counter() - self.times.refinement, self.mapper.times.iterations
+        begin = self.refine_iterations  # by a run that was cut off
+
+        def note(done: int, total: int) -> None:
+            self.refine_iterations = begin + self.mapper.times.iterations - before
+            self.times.refinement = time.perf_counter() - start
+            if progress is not None:
+                progress(done, total)
+
         try:
             if self.config.refine_iterations and self.mapper.keyframes and self.growing:
-                self.mapper.refine(self.config.refine_iterations, progress)
+                self.mapper.refine(self.config.refine_iterations, note, begin)
         finally:  # an interrupted refinement counts for what it did
-            self.refine_iterations = self.mapper.times.iterations - before
+            self.refine_iterations = begin + self.mapper.times.iterations - before
             self.times.refinement = time.perf_counter() - start
         return self.result()
 

@@ -102,10 +102,10 @@ class _Patches:
     def near(self, number: int, shape: Shape, reach: float) -> np.ndarray:
         """Numbers of the patches that look at a shape and may be within `reach` metres of it."""
         apart = _length(self._centre - shape.T_world_shape[:3, 3])
-        chosen = self._facing(number, shape, np.nonzero(apart < reach + shape.radius() + self._radius)[0])
+        chosen = self._in_view_of(number, shape, np.nonzero(apart < reach + shape.radius() + self._radius)[0])
         return chosen[shape.distance(self.position[chosen]) < reach]
 
-    def shaded(self, number: int, shape: Shape, light: np.ndarray) -> np.ndarray:
+    def shadow_candidates(self, number: int, shape: Shape, light: np.ndarray) -> np.ndarray:
         """Numbers of the patches that look at a shape which may hide some of the points [n, 3] of a light."""
         middle = light.mean(0)
         spread = float(_length(light - middle).max())
@@ -117,10 +117,10 @@ class _Patches:
         farthest = np.minimum(share + (shape.radius() + spread) / length, 1)
         near = np.nonzero(apart < shape.radius() + farthest * spread + self._radius)[0]
         near = near[~_beside(shape, light, self._centre[near], self._radius[near, None])]
-        chosen = self._facing(number, shape, near)
+        chosen = self._in_view_of(number, shape, near)
         return chosen[~_beside(shape, light, self.position[chosen])]
 
-    def _facing(self, number: int, shape: Shape, strips: np.ndarray) -> np.ndarray:
+    def _in_view_of(self, number: int, shape: Shape, strips: np.ndarray) -> np.ndarray:
         """Of the patches in some strips, those with some of the shape above their plane. A convex shape hides nothing
         from itself."""
         R, centre, bounds = shape.T_world_shape[:3, :3], shape.T_world_shape[:3, 3], shape.bounds()
@@ -219,7 +219,7 @@ def _direct(shapes: Sequence[Shape | None], light: Light, patches: _Patches) -> 
     visible, lit = np.ones(strength.shape, bool), patches.of(rows)
     for number, shape in enumerate(shapes):
         if shape is not None and shape.casts_shadow:
-            chosen = rows[lit.shaded(number, shape, light.points)]
+            chosen = rows[lit.shadow_candidates(number, shape, light.points)]
             visible[chosen] &= _first_hits(shape, patches.position[chosen], to_light[:, chosen]) > 1
     return (strength * visible).mean(1)[:, None] * np.array(light.power)
 

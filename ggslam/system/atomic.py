@@ -66,6 +66,16 @@ def write_text(path: str | Path, text: str, fsync: bool = False) -> None:
     write_bytes(path, text.encode("utf-8"), fsync)
 
 
+def sync_folder(path: str | Path) -> None:
+    """Waits until the names in a folder are on the disk, where the system can tell."""
+    with suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
 def make_folder(path: str | Path) -> None:
     """Makes a folder and those above it, if they are not there.
 

@@ -58,15 +58,22 @@ def publish(staged: Path, target: Path, marker: str, old: Sequence[str], before:
     _exchange(staged, target, marker, stale)
 
 
+def is_being_saved(target: Path, marker: str) -> bool:
+    """Whether files of a folder are changing places, or were when the program that did it was killed."""
+    return _read_saving(target / marker) is not None
+
+
 def finish_saving(target: Path, marker: str) -> None:
     """Finishes a `publish` that was interrupted; does nothing if there was none.
 
     Raises:
-        RunFolderError: the folder cannot be written to.
+        RunFolderError: the folder cannot be written to, or the files are gone.
     """
     record = _read_saving(target / marker)
-    if record is None or not (target / record["from"]).is_dir():
+    if record is None:
         return
+    if not (target / record["from"]).is_dir():
+        raise RunFolderError(f"{target}: saving was interrupted, and what was to be put into place is gone")
     try:
         _exchange(target / record["from"], target, marker, record["stale"])
     except OSError as error:

@@ -75,6 +75,9 @@ class MeasuredSurface:
         """Numbers of the keyframes that take part."""
         self.target: GicpTarget | None = None
         """What has been gathered so far; None before the first keyframe. Each change makes a new one."""
+        self._arranged: list[int] = []
+        self._arranged_of = 0
+        """The keyframes that were gathered together last, and how many there were then; later ones joined singly."""
 
     def __len__(self) -> int:
         return len(self._parts)
@@ -115,8 +118,16 @@ class MeasuredSurface:
                 part.T_world_camera = np.array(T, float)
         self.active = set(active)
         self.target = None  # frees it before the next one is made
-        self.target = self.of(sorted(self.active))
+        self._arranged, self._arranged_of = sorted(self.active), len(self._parts)
+        self.target = self.of(self._arranged)
         return self.target
+
+    def gather_again(self) -> None:
+        """Makes the target from the keyframes in the order in which it came to be, so that it is the same bit for
+        bit."""
+        self.target = self.of(self._arranged) if self._arranged_of else None
+        for part in self._parts[self._arranged_of :]:
+            self.target = self._gather([part], self.target)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Everything, for a file: points to 1/32767 of the farthest of a keyframe, normals to half a degree."""

@@ -212,6 +212,8 @@ def test_wrong_input_is_named_and_changes_nothing(run: Path, tmp_path: Path) -> 
     other = Path(shutil.copytree(run, tmp_path / "other"))
     one_error(ggslam("edit", run, "--remove", "sofa", "--out", other), "--overwrite")
     (run / "objects.json").unlink()
+    one_error(ggslam("edit", run, "--remove", "sofa", "--out", new), "objects.json: is missing")
+    done("verify", run, "--accept")
     one_error(ggslam("edit", run, "--remove", "sofa", "--out", new), "no objects")
     assert not new.exists() and contents(other) == before
 
@@ -232,6 +234,7 @@ def test_objects_that_the_map_lacks_are_refused(run: Path, tmp_path: Path) -> No
     table = json.loads((run / "objects.json").read_text())
     table["objects"].append({**table["objects"][0], "id": 4242, "name": "ghost"})
     (run / "objects.json").write_text(json.dumps(table))
+    done("verify", run, "--accept")
     for words in (["edit", run, "--remove", "ghost"], ["export", run, "--objects", "ghost"]):
         one_error(ggslam(*words, "--out", tmp_path / "new"), "map.ply", "object 4242")
 

@@ -17,8 +17,10 @@ from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.jobs.export.export_run import export_run
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.table import ObjectTable
-from ggslam.runs.folder import OBJECT_FILES, RunFolder
+from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
+from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.writing import OBJECT_FILES, write_objects
 from ggslam.scene.identity import IdentityClassifier
 
 NAMES = {1: "mug", 3: "chair \u00e4"}
@@ -46,15 +48,15 @@ def run_of(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Cal
         shutil.copytree(room_run.path, path)
         for name in (*OBJECT_FILES, MAP_INDEX):
             (path / name).unlink(missing_ok=True)
-        folder = RunFolder.open(path)
         if with_objects:
             classifier = IdentityClassifier.from_file(room_run.path / "classifier.npz")
             gaussians = small_map(degree, 500, -1.8, channels=room_run.gaussians().feature_channels)
             table = ObjectTable.build(gaussians, classifier, "masks", NAMES)
-            folder.save_objects(SegmentedMap(gaussians, classifier, table))
+            write_objects(path, SegmentedMap(gaussians, classifier, table))
         else:
             write_gaussian_ply(path / "map.ply", small_map(degree, 500, -1.8))
-        return folder
+        RunRecord.read(path).model_copy(update={"files": None}).write(path)  # the manifest knows the old map
+        return RunFolder.open(path)
 
     return make
 

@@ -111,8 +111,8 @@ SPLAT_FORMATS = {
         shape=0.008, opacity=0.51 / 255, color=(0.0012, 0.0045, 0.007, 0.0095),
     ),
     "spz": SplatFormat(
-        ".spz", from_spz, (47.7, 44.7, 36.5, 35.6), 53.0, position=0.51 / 4096, shape=0.075,
-        opacity=0.51 / 255, color=(0.0022, 0.0095, 0.0225, 0.034), upright=True, package="gaussforge",
+        ".spz", from_spz, (47.7, 47.3, 44.0, 46.8), 53.0, position=0.51 / 4096, shape=0.075,
+        opacity=0.51 / 255, color=(0.0022, 0.0026, 0.0028, 0.0034), upright=True, package="gaussforge",
     ),
     "splat": SplatFormat(
         ".splat", from_splat, (49.0, 49.0, 49.0, 49.0), 53.0, shape=0.04, opacity=0.51 / 255, color=(0.0015,) * 4,

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-import ggslam.runs.folder as run_folder
 from ggslam.errors import RunFolderError
+from ggslam.runs import writing
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.runs.verification import verify_run
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
 from ggslam.slam.result import SlamResult
@@ -34,18 +35,25 @@ def fail(*_: object, **__: object) -> None:
     raise RunFolderError("cannot write: No space left on device")
 
 
-@pytest.mark.parametrize(("broken", "complete"), [("write_gaussian_ply", False), ("save_points", True)])
+@pytest.mark.parametrize("broken", ["write_gaussian_ply", "save_points"])
 def test_a_disk_that_fills_up(
-    result: SlamResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, complete: bool
+    result: SlamResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
 ) -> None:
     folder = RunFolder.create(tmp_path / "run")
     folder.save(load_config(), RECORDING, result)
     assert folder.mark().complete is True
-    monkeypatch.setattr(run_folder, broken, fail)
+    assert verify_run(folder.path).good
+    (tmp_path / "run" / "metrics.json").write_text("{}")
+    before = (tmp_path / "run" / "map.ply").stat().st_ino
+    monkeypatch.setattr(writing, broken, fail)
     again = RunFolder.create(tmp_path / "run", overwrite=True)
     with pytest.raises(RunFolderError, match="No space"):
         again.save(load_config(), RECORDING, result)
-    assert again.mark().complete is complete  # without the clouds a run is still whole
+    if broken == "save_points":  # all but the clouds is there
+        assert again.mark().missing == ["points.ply", "points_grid.ply"] and not again.mark().complete
+        assert not (tmp_path / "run" / "metrics.json").exists() and not verify_run(folder.path).problems
+    else:  # the run of before
+        assert again.mark().complete and (tmp_path / "run" / "map.ply").stat().st_ino == before
     monkeypatch.undo()
     RunFolder.create(tmp_path / "run", overwrite=True).save(load_config(), RECORDING, result)  # it can be replaced
     assert RunFolder.open(tmp_path / "run").mark().complete is True

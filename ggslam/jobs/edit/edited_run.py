@@ -9,18 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import RunFolderError
 from ggslam.formats.point_ply import write_points_in_parts
 from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
-from ggslam.runs.folder import MARKER, OBJECT_FILES, REPORT_FILE, TRUTH_FILE, RunFolder
+from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
+from ggslam.runs.publishing import publish_run
+from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.writing import OBJECT_FILES, POINTS, REPORT_FILE, TRUTH_FILE, write_objects
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.atomic import make_folder
-from ggslam.system.staging import new_staging, publish
 
 RECORDS = (STEPS_FILE, TRUTH_FILE)
 """Files that stay true, too, but older runs have none."""
@@ -28,7 +29,6 @@ COPIED = ("trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "l
 """Files that stay true of an edited run."""
 SCORES = ("metrics.json", "frames.csv")
 """Files that do not, unless objects were only renamed. `ggslam eval` makes them anew."""
-POINTS = ("points.ply", "points_grid.ply")
 
 
 def save_edited(
@@ -55,47 +55,34 @@ def save_edited(
         RunFolderError: a file cannot be written; the target is as it was, or opening it finishes the work.
     """
     mark = source.mark()
-    staged = RunFolder(new_staging(target.path))
-    try:
+
+    def write(staged: Path) -> RunRecord:
         _stage(source, staged, scene, pictures, named_only)
         if sequence is not None:
             record = source.sequence()
             opened = record.open.model_copy(update={"path": str(sequence.absolute())})
-            record.model_copy(update={"open": opened}).write(staged.path)
-        note = {"edits": [*mark.edits, *edits], "displaced": displacement.to_json()}
-        mark.model_copy(update=note).write(staged.path)
-        meanwhile = mark.model_copy(update={"complete": False, "stopped_by": "saving did not finish"})
-    except BaseException as error:
-        shutil.rmtree(staged.path, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise RunFolderError(f"{target.path}: the edited run cannot be written: {error}") from None
-        raise
+            record.model_copy(update={"open": opened}).write(staged)
+        return mark.model_copy(update={"edits": [*mark.edits, *edits], "displaced": displacement.to_json()})
+
     old = (*SCORES, *POINTS, *OBJECT_FILES, *RECORDS, REPORT_FILE, PLACES_FILE, MAP_INDEX, "renders", "plots")
-    try:
-        publish(staged.path, target.path, MARKER, old, meanwhile.values())
-    except RunFolderError:
-        shutil.rmtree(staged.path, ignore_errors=True)
-        raise
-    except OSError as error:
-        text = f"{target.path}: not all files could be put into place; the next command on it will go on: {error}"
-        raise RunFolderError(text) from None
+    publish_run(target.path, write, old, f"{target.path}: the edited run cannot be written")
     return [target.path / "renders" / name for name in pictures]
 
 
 def _stage(
-    source: RunFolder, staged: RunFolder, scene: SegmentedMap, pictures: Mapping[str, np.ndarray], named_only: bool
+    source: RunFolder, staged: Path, scene: SegmentedMap, pictures: Mapping[str, np.ndarray], named_only: bool
 ) -> None:
-    make_folder(staged.path / "renders")
+    make_folder(staged / "renders")
     kept = (*COPIED, *SCORES, *POINTS, PLACES_FILE) if named_only else COPIED
     for name in kept:
         if (source.path / name).is_file():
-            shutil.copyfile(source.path / name, staged.path / name)
+            shutil.copyfile(source.path / name, staged / name)
     if named_only and (source.path / "renders").is_dir():
-        shutil.copytree(source.path / "renders", staged.path / "renders", dirs_exist_ok=True)
-    source.timing().model_copy(update={"gaussians": len(scene.gaussians)}).write(staged.path)
+        shutil.copytree(source.path / "renders", staged / "renders", dirs_exist_ok=True)
+    source.timing().model_copy(update={"gaussians": len(scene.gaussians)}).write(staged)
     for name, picture in pictures.items():
-        write_picture(staged.path / "renders" / name, picture)
+        write_picture(staged / "renders" / name, picture)
     if not named_only:
         parts = [MapPart.of(scene.gaussians)]
-        write_points_in_parts(staged.path, sample_parts(parts, with_object_id=True))
-    staged.save_objects(scene)
+        write_points_in_parts(staged, sample_parts(parts, with_object_id=True))
+    write_objects(staged, scene)

@@ -22,7 +22,10 @@ from ggslam.reporting.pictures import (
     write_picture,
 )
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.map_index import MapInParts
 from ggslam.runs.objects_in_parts import ObjectsInParts
+from ggslam.runs.publishing import change_in_run
+from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 from ggslam.system.atomic import make_folder
@@ -75,6 +78,14 @@ def render_frames(
     objects = ObjectsInParts.of(folder) if set(what) & set(OBJECT_KINDS) else None
     parts = folder.map_in_parts() if objects is None else objects.map
     make_folder(out)
+    with change_in_run(out):
+        return _render(folder, frames, what, out, camera, parts, objects, progress)
+
+
+def _render(
+    folder: RunFolder, frames: list[int], what: list[str], out: Path, camera: Camera, parts: MapInParts,
+    objects: ObjectsInParts | None, progress: Callable[[int], None],
+) -> list[Path]:  # fmt: skip
     rasterizer = CpuRasterizer()
     painters = _painters() if objects is None else {**_painters(), **_object_painters(objects, rasterizer, what)}
     poses = folder.keyframes().poses()

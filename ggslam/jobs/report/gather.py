@@ -11,7 +11,7 @@ from ggslam.errors import GgslamError, RunFolderError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points, associate
 from ggslam.formats.trajectory import read_tum, write_tum
 from ggslam.jobs.report.run_data import FrameView, LevelAxes, Path3D, RunData
-from ggslam.runs.folder import TRUTH_FILE, RunFolder
+from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
@@ -19,6 +19,7 @@ from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
+from ggslam.runs.writing import REPORT_FILE, TRUTH_FILE
 from ggslam.sequences import Sequence
 from ggslam.slam.config import Config, config_to_dict
 from ggslam.slam.step_log import STEPS_FILE, read_table
@@ -47,6 +48,8 @@ def load_run(folder: RunFolder, sequence: Sequence | None = None, views: list[Fr
 
 def _load(folder: RunFolder, sequence: Sequence | None, views: list[FrameView]) -> RunData:
     record, mark, metrics, loops = folder.keyframes(), folder.mark(), folder.metrics(), folder.loops()
+    lacking = [name for name in mark.missing if name != REPORT_FILE]  # which is about to be written
+    mark = mark.model_copy(update={"missing": lacking}) if mark.missing else mark
     timing, recording = TimingRecord.read_if_there(folder.path), SequenceRecord.read_if_there(folder.path)
     path = folder.path.absolute()
     return RunData(

@@ -17,8 +17,10 @@ from ggslam.jobs.report.run_page import run_page
 from ggslam.jobs.report.run_plots import all_plots
 from ggslam.jobs.report.views import RENDER, TRUTH, pick_frames, rendered_views, saved_views
 from ggslam.reporting.plot_files import write_plots
-from ggslam.runs.folder import REPORT_FILE, RunFolder, as_written
+from ggslam.runs.folder import RunFolder, as_written
+from ggslam.runs.publishing import change_in_run
 from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.writing import REPORT_FILE, TRUTH_FILE
 from ggslam.sequences import Sequence
 from ggslam.system.atomic import make_folder, write_text
 
@@ -37,6 +39,11 @@ def write_report(folder: RunFolder, sequence: Sequence | None = None, plots: Pat
     Raises:
         RunFolderError, FormatError: a file of the run is missing or damaged, or a file cannot be written.
     """
+    with folder.change_files(REPORT_FILE, TRUTH_FILE), change_in_run(plots):
+        return _write_report(folder, sequence, plots)
+
+
+def _write_report(folder: RunFolder, sequence: Sequence | None, plots: Path | None) -> Path:
     if sequence is not None:
         save_truth(folder, sequence)
     recording = sequence if sequence is not None else _recording(folder)

@@ -4,37 +4,39 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from ggslam.cuda.availability import kernels_to_compile
-from ggslam.errors import ConfigError, DeviceError, GgslamError, SequenceError
+from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.report.pages import write_report
+from ggslam.jobs.run.checkpointing import Checkpointing, start_record
+from ggslam.jobs.run.rescue import save_somewhere
+from ggslam.jobs.run.resuming import Resumption
+from ggslam.jobs.run.slam_loop import Follower, SlamLoop
 from ggslam.jobs.score.run import score_run
+from ggslam.runs.checkpoints import Checkpoints
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe, open_recording_of
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.metrics import MetricsRecord
-from ggslam.runs.starting import ancestors, start_in_map
-from ggslam.scene.frame import Frame
+from ggslam.runs.starting import ancestors
+from ggslam.runs.writing import REPORT_FILE, RunToWrite
 from ggslam.sequences import Sequence
 from ggslam.sequences.live import LiveSequence
 from ggslam.slam.config import Config, load_config
-from ggslam.slam.realtime import RealtimeSlam
-from ggslam.slam.result import SlamResult, StepReport, tracked_poses
-from ggslam.slam.slam import Slam
-from ggslam.system.interrupts import delay_interrupts
-from ggslam.system.staging import new_staging
+from ggslam.slam.result import SlamResult
+from ggslam.slam.saved_state import reason_against_saving
+from ggslam.system.folder_lock import folder_lock
+from ggslam.system.interrupts import StopRequest, stop_on_request
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """A whole run; with `map` in the map of an earlier one, which grows unless `localize_only`."""
+    """A whole run; with `map` in the map of an earlier one, which grows unless `localize_only`. Its state is saved
+    after every `checkpoint_every` frames: 0: never; None: as often as it hardly takes time."""
 
     sequence: SequenceRequest
     out: Path | None = None
@@ -44,16 +46,19 @@ class RunRequest:
     overwrite: bool = False
     map: Path | None = None
     localize_only: bool = False
+    checkpoint_every: int | None = None
 
 
 @dataclass
 class RunOutcome:
-    """A finished run, or what was saved of one that stopped early (`error` says why)."""
+    """A finished run, or what was saved of one that stopped early (`error` says why). If it could not be saved as it
+    should be, `failure` says so, and where it is."""
 
     folder: RunFolder
     result: SlamResult
     metrics: MetricsRecord | None = None
     error: BaseException | None = None
+    failure: GgslamError | None = None
 
     def headline(self) -> str:
         """One line for people."""
@@ -69,10 +74,6 @@ class RunOutcome:
         return ", ".join(parts)
 
 
-Follower = Callable[[Slam, Frame, StepReport], None]
-"""Is called after every frame, in the thread that tracks."""
-
-
 def execute(request: RunRequest, observer: Observer | None = None, follower: Follower | None = None) -> RunOutcome:
     """Runs a recording into a run folder. If it stops in the middle (damaged frame, interrupt), what was done is saved
     all the same and the outcome carries the error.
@@ -85,7 +86,6 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     Raises:
         GgslamError: nothing could be done at all: settings, recording or output folder at fault.
     """
-    observer = observer or SilentObserver()
     config, earlier = load_config(request.config, request.overrides), None
     if request.localize_only and request.map is None:
         raise ConfigError("`localize_only` needs `map`: the run in whose map to localize")
@@ -99,36 +99,138 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     if earlier is not None and out.resolve() in ancestors(earlier):
         raise ConfigError(f"`out` {out}: is the map to start in, or one that this comes from; choose another folder")
     folder = RunFolder.create(out, overwrite=request.overwrite)
-    for warning in sequence.warnings:
-        observer.note(warning)
-    try:
-        result, error = run_slam(sequence, config, observer, earlier, not request.localize_only, follower, folder)
-    except GgslamError:  # before the first frame: settings that do not fit the recording, a model that is none
-        folder.discard()
-        raise
-    if not result.keyframes:
-        folder.discard()
-        reason = result.frames[0].reason if result.frames else "no frame could be read"
-        raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
-    described = describe(request.sequence, sequence, earlier)
-    lacking = _objects_notes(sequence, result, config, earlier)
-    for text in [*LoopsRecord.of_result(result).notes(), *described.notes(), *lacking, *result.notes]:
-        observer.note(text)
-    with delay_interrupts():
-        names = {**_names(earlier), **sequence.instance_names}
+    with stop_on_request() as stop, folder_lock(folder.path):
+        return _Run(request, config, sequence, earlier, folder, observer or SilentObserver(), follower, stop).run(None)
+
+
+def resume(
+    run: Path, observer: Observer | None = None, follower: Follower | None = None, *, recording: Path | None = None,
+    evaluate: bool | None = None, checkpoint_every: int | None = None,
+) -> RunOutcome:  # fmt: skip
+    """Goes on with a run that was cut off, from its newest checkpoint. A synchronous run on the CPU becomes what it
+    would have become, bit for bit.
+
+    Args:
+        run: its folder.
+        observer: is told how it goes on.
+        follower: does more with each frame.
+        recording: where the recording is now, if it was moved.
+        evaluate: score the run; None: as it was asked to.
+        checkpoint_every: as of `RunRequest`.
+
+    Raises:
+        GgslamError: there is nothing to go on from; the recording is another one; the run was made with another
+            version.
+    """
+    folder = RunFolder.open_unfinished(run)
+    with stop_on_request() as stop, folder_lock(folder.path):
+        found = Resumption.of(folder, recording)
+        asked = RunRequest(
+            found.request, folder.path, evaluate=found.start.evaluate if evaluate is None else evaluate,
+            localize_only=found.start.localize_only, checkpoint_every=checkpoint_every,
+        )  # fmt: skip
+        observer = observer or SilentObserver()
+        return _Run(asked, found.config, found.sequence, found.earlier, folder, observer, follower, stop).run(found)
+
+
+@dataclass
+class _Run:
+    """A run about to be made; see `RunRequest`."""
+
+    request: RunRequest
+    config: Config
+    sequence: Sequence | LiveSequence
+    earlier: RunFolder | None
+    folder: RunFolder
+    observer: Observer
+    follower: Follower | None
+    stop: StopRequest
+
+    def run(self, resumption: Resumption | None) -> RunOutcome:
+        """From the first frame, or from where it was, to the report."""
+        folder, sequence, observer = self.folder, self.sequence, self.observer
+        for warning in sequence.warnings:
+            observer.note(warning)
+        checkpoints = Checkpoints(folder.path)
         try:
-            folder.save(config, described, result, None if error is None else repr(error), names)
+            checkpointing = self._make_checkpointing(checkpoints, resumption)
+            loop = SlamLoop(
+                sequence, self.config, observer, folder, self.earlier, not self.request.localize_only, self.follower,
+                checkpointing, self.stop,
+            )  # fmt: skip
+            if resumption is not None and checkpointing is not None:
+                loop.resume = lambda slam: resumption.restore(slam, checkpoints, checkpointing, observer)
+            result, error = loop.run()
+        except GgslamError:  # before the first frame: settings that do not fit the recording, a model that is none
+            if resumption is None:
+                checkpoints.remove()
+                folder.discard()
+            raise
+        if not result.keyframes:
+            checkpoints.remove()
+            folder.discard()
+            reason = result.frames[0].reason if result.frames else "no frame could be read"
+            raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
+        outcome = self._save(result, error)
+        if outcome.failure is None:
+            self._look_at(outcome)
+        if error is None and outcome.failure is None:
+            checkpoints.remove()
+        return outcome
+
+    def _make_checkpointing(self, checkpoints: Checkpoints, resumption: Resumption | None) -> Checkpointing | None:
+        """What saves the state; None: nothing does."""
+        every, sequence = self.request.checkpoint_every, self.sequence
+        reason = reason_against_saving(self.config)
+        if isinstance(sequence, LiveSequence):
+            reason = "its frames come from a camera"
+        elif self.config.realtime_fps:
+            reason = "it is made in real time"
+        if reason is not None and every != 0:
+            self.observer.note(f"no checkpoints are made, so the run cannot be resumed if it is cut off: {reason}")
+        if reason is not None or (every == 0 and resumption is None) or not isinstance(sequence, Sequence):
+            return None
+        if resumption is None:
+            request = self.request
+            checkpoints.begin(
+                start_record(
+                    request.sequence, sequence, self.config, self.earlier, request.localize_only, request.evaluate
+                )
+            )
+        return Checkpointing(checkpoints, every, sequence, self.observer)
+
+    def _save(self, result: SlamResult, error: BaseException | None) -> RunOutcome:
+        """Writes the folder, or if that cannot be, another one."""
+        described = describe(self.request.sequence, self.sequence, self.earlier)
+        lacking = _objects_notes(self.sequence, result, self.config, self.earlier)
+        for text in [*LoopsRecord.of_result(result).notes(), *described.notes(), *lacking, *result.notes]:
+            self.observer.note(text)
+        names = {**_names(self.earlier), **self.sequence.instance_names}
+        scored = self.request.evaluate and error is None and self._frames_stay()
+        wanted = (*((MetricsRecord.FILE, "frames.csv") if scored else ()), REPORT_FILE)
+        told = None if error is None else repr(error)
+        try:
+            folder, failure = save_somewhere(
+                self.folder, RunToWrite(self.config, described, result, told, names, wanted)
+            )
         finally:
             result.close()
-    outcome = RunOutcome(folder, result, error=error)
-    kept = sequence if isinstance(sequence, Sequence) else None if error else _kept_recording(folder, sequence)
-    if request.evaluate and error is None:
-        if kept is None:
-            observer.note("not scored: the frames of a live camera are kept with `record` only")
-        else:
-            outcome.metrics = score_run(folder, kept, observer)
-    write_report(folder, kept)
-    return outcome
+        return RunOutcome(folder, result, error=error or failure, failure=failure)
+
+    def _frames_stay(self) -> bool:
+        """Whether the frames of the run can be read again."""
+        return isinstance(self.sequence, Sequence) or self.sequence.record is not None
+
+    def _look_at(self, outcome: RunOutcome) -> None:
+        """Scores and report."""
+        sequence, error = self.sequence, outcome.error
+        kept = sequence if isinstance(sequence, Sequence) else None if error else _kept_recording(self.folder, sequence)
+        if self.request.evaluate and error is None:
+            if kept is None:
+                self.observer.note("not scored: the frames of a live camera are kept with `record` only")
+            else:
+                outcome.metrics = score_run(self.folder, kept, self.observer)
+        write_report(self.folder, kept)
 
 
 def _objects_notes(
@@ -153,80 +255,3 @@ def _names(earlier: RunFolder | None) -> dict[int, str]:
     if earlier is None or not earlier.has_objects():
         return {}
     return {o.id: o.name for o in earlier.object_table().objects if o.name is not None}
-
-
-def run_slam(
-    sequence: Sequence | LiveSequence, config: Config, observer: Observer, earlier: RunFolder | None = None,
-    growing: bool = True, follower: Follower | None = None, folder: RunFolder | None = None,
-) -> tuple[SlamResult, BaseException | None]:  # fmt: skip
-    """The loop over a recording, synchronous or in real time as the settings say; with `earlier` in that run's map,
-    which grows or stays as it is. What does not fit into a limit of memory goes to a hidden folder in `folder`.
-
-    Raises:
-        GgslamError: settings or map do not fit the recording; or the disk is full of what does not fit into memory:
-            then the trajectory is in `folder`, and the map is lost.
-    """
-    error: BaseException | None = None
-    paging = new_staging(folder.path) if config.memory_limit_mb and folder is not None else None
-    if config.device != "cpu" and kernels_to_compile():
-        observer.note("compiling the CUDA kernels, once: about a minute")
-    slam = Slam(sequence.camera, config, sequence.has_masks, paging)
-    if earlier is not None:
-        start_in_map(slam, earlier, growing)
-    observer.begin("track + map" if growing else "localize", len(sequence))
-
-    def report(frame: Frame, step: StepReport) -> None:
-        observer.frame(step)
-        if follower is not None:
-            follower(slam, frame, step)
-
-    frames = sequence.stream(masks="lazy")  # only those of keyframes are read
-    try:
-        if config.realtime_fps > 0:
-            RealtimeSlam(slam, config.realtime_fps).run(frames, report)
-        else:
-            for frame in frames:
-                report(frame, slam.step(frame))
-        if config.refine_iterations:
-            observer.begin("refine", config.refine_iterations)
-        return slam.finish(observer.advance), None
-    except (Exception, KeyboardInterrupt) as stopped:  # whatever it is: finished work is saved, then it is raised
-        error = _for_people(stopped)
-    try:
-        with delay_interrupts():
-            result = _what_there_is(slam)
-    except KeyboardInterrupt as again:  # by now there is the result
-        error = again
-    except Exception as failure:  # the disk is full, and what is there goes to make room
-        slam.close()
-        if folder is not None and slam.frames:
-            stamps = np.array([frame.timestamp for frame in slam.frames])
-            folder.save_trajectory(stamps, _last_poses(slam), repr(failure))
-            observer.note(f"the map is lost; the trajectory of {len(stamps)} frames is in {folder.path}")
-        raise
-    return result, error
-
-
-def _for_people(stopped: BaseException) -> BaseException:
-    """The error as it is told to people."""
-    if isinstance(stopped, torch.cuda.OutOfMemoryError):
-        return DeviceError(f"the GPU's memory is full: {str(stopped).partition('. GPU')[0]}")
-    return stopped
-
-
-def _what_there_is(slam: Slam) -> SlamResult:
-    """Where the memory of a GPU is full there is none for the last identity steps either: then without them."""
-    try:
-        return slam.result()
-    except torch.cuda.OutOfMemoryError:
-        torch.cuda.empty_cache()
-        return slam.result()
-
-
-def _last_poses(slam: Slam) -> np.ndarray:
-    """T_world_camera of all frames; of keyframes that a GPU which failed will not tell, as they were tracked."""
-    try:
-        poses = [keyframe.T_world_camera for keyframe in slam.mapper.keyframes]
-    except Exception:
-        poses = list(slam.surface.poses)
-    return tracked_poses(slam.frames, poses)

@@ -53,6 +53,13 @@ def score_run(
     Returns:
         What `metrics.json` holds.
     """
+    with folder.change_files(MetricsRecord.FILE, "frames.csv", "renders"):
+        return _score(folder, sequence, observer, lpips, every, masks)
+
+
+def _score(
+    folder: RunFolder, sequence: Sequence, observer: Observer, lpips: bool, every: int, masks: Path | None
+) -> MetricsRecord:
     notes: list[str] = []
     metric = _lpips(notes) if lpips else None
     record = folder.keyframes()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -20,14 +21,13 @@ from ggslam.localization.surface import NORMAL
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import fingerprint
-from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays, read_array
+from ggslam.scene.arrays import arrays_of, arrays_to_bytes, read_all_arrays, read_array
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.submaps.cell_keys import CellKey, partition
 from ggslam.submaps.cell_records import CellWrite
-from ggslam.submaps.gaussian_rows import decode_rows
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
@@ -121,8 +121,9 @@ def gaussians_of_cell(store: GridStore, key: CellKey) -> GaussianMap:
     Raises:
         FormatError: their file is missing or damaged.
     """
-    source = f"{store.path}: cell {key}"
-    rows = decode_rows(store.get(key, GAUSSIANS), source)
+    what = f"{store.path}: cell {key}: no Gaussians written by ggslam"
+    file = io.BytesIO(store.get(key, GAUSSIANS))
+    rows = arrays_of(file, what, lambda held: {name: torch.from_numpy(held[name]) for name in _GAUSSIAN_ARRAYS})
     try:
         means, sh, features = rows["means"], rows["sh"], rows["features"]
         out = GaussianMap(math.isqrt(sh.shape[1]) - 1, features.shape[1], with_moments=False)
@@ -130,7 +131,7 @@ def gaussians_of_cell(store: GridStore, key: CellKey) -> GaussianMap:
                    features=features, object_id=rows["object_id"])  # fmt: skip
         out.sh[:] = sh
     except (KeyError, ValueError, IndexError, RuntimeError, TypeError) as error:
-        raise FormatError(f"{source}: no Gaussians written by ggslam: {error}") from None
+        raise FormatError(f"{what}: {error}") from None
     return out
 
 

@@ -27,6 +27,7 @@ from ggslam.jobs.progress import Observer
 from ggslam.jobs.volumes.pictures import mesh_picture, occupancy_picture
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.publishing import change_in_run
 from ggslam.system.atomic import make_folder
 from ggslam.system.foreign import is_plain_name
 from ggslam.system.json_files import read_json, write_json
@@ -231,7 +232,8 @@ def write_outputs(
     except BaseException:
         shutil.rmtree(writer.staged, ignore_errors=True)
         raise
-    publish(writer.staged, out, RECORD, earlier, {"complete": False})
+    with change_in_run(out):
+        publish(writer.staged, out, RECORD, earlier, {"complete": False})
     return writer.outputs
 
 

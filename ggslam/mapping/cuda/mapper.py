@@ -99,9 +99,9 @@ class CudaMapper(Mapper):
         self._overflows.send()
         self._pace.piece_ends()
 
-    def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None) -> None:
+    def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None, begin: int = 0) -> None:
         self._repeated = int(download(self._rasterizer.overflows)[0][0])
-        super().refine(iterations, progress)
+        super().refine(iterations, progress, begin)
         numbers = self._trainable()
         for _ in range(self._count_missed(int(download(self._rasterizer.overflows)[0][0]))):
             self.iterate(self._draw(numbers), self.settings.refine_decay)

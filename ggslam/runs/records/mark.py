@@ -8,7 +8,14 @@ from typing import Any, ClassVar
 import pydantic
 
 from ggslam.objects.displacement import Displacement
-from ggslam.runs.records.record import RecordFile
+from ggslam.runs.records.record import Record, RecordFile
+
+
+class FileRecord(Record):
+    """A file of a run: its number of bytes and their SHA-256."""
+
+    bytes: int
+    sha256: str
 
 
 class RunRecord(RecordFile):
@@ -16,8 +23,10 @@ class RunRecord(RecordFile):
 
     Attributes:
         ggslam: version that the run was made with.
-        complete: whether it ended well and is whole.
+        complete: whether it ended well and all that was asked for is there.
         stopped_by: why it is not.
+        missing: names of files that were asked for and are not there (yet).
+        files: the manifest: all files of the run but this one, by name; None: of before there was one.
         environment: versions and machine, see `runs.environment`; older runs have none.
         edits: what was done to the map since, as sentences.
         displaced: objects that edits moved, as `Displacement.to_json` gives them.
@@ -27,6 +36,8 @@ class RunRecord(RecordFile):
     ggslam: str = "unknown"
     complete: bool = False
     stopped_by: str | None = None
+    missing: list[str] = []
+    files: dict[str, FileRecord] | None = None
     environment: dict[str, str | int | float | None] | None = None
     edits: list[str] = []
     displaced: dict[str, list[list[float]] | None] = {}
@@ -40,6 +51,12 @@ class RunRecord(RecordFile):
             raise ValueError(str(error)) from None
         return values
 
+    def with_files(self, files: dict[str, FileRecord]) -> RunRecord:
+        """The same with another manifest; what is in it is not missing any more."""
+        missing = [name for name in self.missing if name not in files]
+        whole = {"files": files, "missing": missing, "complete": self.stopped_by is None and not missing}
+        return self.model_copy(update=whole)
+
     def displacement(self) -> Displacement:
         """Where earlier edits moved objects to."""
         return Displacement.from_json(self.displaced)
@@ -51,4 +68,5 @@ class RunRecord(RecordFile):
     def notes(self) -> list[str]:
         """What a user should know, a line each."""
         notes = [f"the run stopped early: {self.stopped_by}"] if self.stopped_by else []
+        notes += [f"asked for, but not there: {', '.join(self.missing)}"] if self.missing else []
         return notes + ([f"the map was edited: {'; '.join(self.edits)}"] if self.edits else [])

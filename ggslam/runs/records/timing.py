@@ -35,6 +35,8 @@ class TimingRecord(RecordFile):
     tracking_s: Number = 0.0
     loops_s: Number = 0.0
     refinement_s: Number = 0.0
+    checkpoints_s: Number = 0.0
+    checkpoints: int = 0
     tracking_ms_per_frame: NumberOrNone = None
     tracking_ms_per_100_frames: list[NumberOrNone] = []
     mapping_ms_per_iteration: NumberOrNone = None
@@ -52,6 +54,7 @@ class TimingRecord(RecordFile):
             "frames": len(result.frames), "dropped_frames": result.dropped_frames,
             "frames_per_s": result.frames_per_second(),
             "wall_s": t.wall, "tracking_s": t.tracking, "loops_s": t.loops, "refinement_s": t.refinement,
+            "checkpoints_s": t.checkpoints, "checkpoints": t.saved,
             "tracking_ms_per_frame": 1e3 * t.tracking / frames,
             "tracking_ms_per_100_frames": t.tracking_ms_by_window(), "mapping_ms_per_iteration": m.iteration_ms,
             "refine_iterations": result.refine_iterations, "mapping": asdict(m), "gaussians": result.gaussian_count,

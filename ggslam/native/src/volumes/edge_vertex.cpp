@@ -16,9 +16,7 @@ constexpr float kMargin = 1.0f / 128;
 
 EdgeVertex::EdgeVertex(const SurfaceBlock& block, uint16_t min_weight, int axis, int i, int j, int k)
     : block_(block), min_weight_(min_weight), axis_(axis), at_{{i, j, k}} {
-  Vec3i end = at_;
-  ++end[axis];
-  ends_[0] = voxel(at_), ends_[1] = voxel(end);
+  ends_[0] = voxel(at_), ends_[1] = voxel(at_ + Vec3i{{axis == 0, axis == 1, axis == 2}});
   const float a = static_cast<float>(ends_[0].value()), b = static_cast<float>(ends_[1].value());
   share_ = std::min(std::max(a / (a - b), kMargin), 1 - kMargin);
 }

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Saving a run although its folder cannot be written to any more: the disk is full, the folder read-only or gone."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+from ggslam.errors import GgslamError, RunFolderError
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.writing import RunToWrite
+
+
+def save_somewhere(folder: RunFolder, run: RunToWrite) -> tuple[RunFolder, GgslamError | None]:
+    """Saves a run in its folder, or where there is room for it: if possible all of it, else at least map, poses and
+    settings.
+
+    Returns:
+        Where it is, and, if that is not its folder or if not all of it could be saved, what to tell.
+
+    Raises:
+        RunFolderError: it could be saved nowhere.
+    """
+    try:
+        folder.write(run)
+        return folder, None
+    except (GgslamError, OSError) as error:
+        failure = error
+    if run.failure is not None:  # all but the clouds is there
+        text = f"{failure}; all but the point clouds was saved (`ggslam export` makes them)"
+        return folder, _machine_error(text)
+    refusals = [str(failure)]
+    for least in (False, True):
+        for place in places():
+            other = RunFolder(_new_folder(place, folder.path.resolve().name))
+            run.failure = None
+            try:
+                other.write(run, least)
+            except (GgslamError, OSError) as error:
+                if run.failure is None:
+                    shutil.rmtree(other.path, ignore_errors=True)
+                    refusals.append(str(error))
+                    continue
+            part = "its map, poses and settings were" if least else "the run was"
+            return other, _machine_error(f"{failure}; {part} saved to {other.path} instead")
+    raise _machine_error("; ".join(["the run could not be saved anywhere", *refusals[:3]]))
+
+
+def places() -> list[Path]:
+    """Folders to save to if the run's own cannot be used, the one with the most room first."""
+    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    found: dict[Path, int] = {}
+    for place in (Path(tempfile.gettempdir()), Path(state) / "ggslam", Path("/var/tmp"), Path.cwd()):
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            found[place.resolve()] = shutil.disk_usage(place).free
+        except OSError:
+            continue
+    return sorted(found, key=lambda place: -found[place])
+
+
+def _new_folder(place: Path, name: str) -> Path:
+    """A name for a folder that nobody can have made before."""
+    safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:64]
+    return place / f"ggslam-{safe}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}"
+
+
+def _machine_error(text: str) -> RunFolderError:
+    error = RunFolderError(text)
+    error.exit_code = 1
+    return error

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop over a recording: frame after frame into `Slam`, with checkpoints on the way, until it ends or is ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from ggslam.cuda.availability import kernels_to_compile
+from ggslam.errors import DeviceError
+from ggslam.jobs.progress import Observer
+from ggslam.jobs.run.checkpointing import Checkpointing
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.starting import start_in_map
+from ggslam.scene.frame import Frame
+from ggslam.sequences import Sequence
+from ggslam.sequences.live import LiveSequence
+from ggslam.slam.config import Config
+from ggslam.slam.realtime import RealtimeSlam
+from ggslam.slam.result import SlamResult, StepReport, tracked_poses
+from ggslam.slam.slam import Slam
+from ggslam.system.interrupts import StopRequest
+from ggslam.system.staging import new_staging
+
+Follower = Callable[[Slam, Frame, StepReport], None]
+"""Is called after every frame, in the thread that tracks."""
+
+
+@dataclass
+class SlamLoop:
+    """What the loop works with.
+
+    Attributes:
+        sequence: the recording.
+        config: all settings.
+        observer: is told how it goes on.
+        folder: of the run.
+        earlier: run whose map this one begins with.
+        growing: whether that map grows.
+        follower: does more with each frame.
+        checkpointing: saves the state; None: never.
+        stop: says when to end early.
+        resume: brings a fresh `Slam` to where it was, and tells which frame comes next, None if it was nowhere yet.
+    """
+
+    sequence: Sequence | LiveSequence
+    config: Config
+    observer: Observer
+    folder: RunFolder | None = None
+    earlier: RunFolder | None = None
+    growing: bool = True
+    follower: Follower | None = None
+    checkpointing: Checkpointing | None = None
+    stop: StopRequest = field(default_factory=StopRequest)
+    resume: Callable[[Slam], int | None] | None = None
+    _between_steps: bool = False
+
+    def run(self) -> tuple[SlamResult, BaseException | None]:
+        """All frames, the refinement, the result; and what ended the run early, if something did: what there was until
+        then is the result.
+
+        Raises:
+            GgslamError: settings or map do not fit the recording; or the disk is full of what does not fit into
+                memory: then the trajectory is in `folder`, and the map is lost.
+        """
+        if self.config.device != "cpu" and kernels_to_compile():
+            self.observer.note("compiling the CUDA kernels, once: about a minute")
+        folder = self.folder
+        paging = new_staging(folder.path) if self.config.memory_limit_mb and folder is not None else None
+        slam = Slam(self.sequence.camera, self.config, self.sequence.has_masks, paging)
+        begin = None if self.resume is None else self.resume(slam)
+        if begin is None and self.earlier is not None:
+            start_in_map(slam, self.earlier, self.growing)
+        try:
+            self._frames(slam, begin or 0)
+            return self._refine(slam), None
+        except (Exception, KeyboardInterrupt) as stopped:  # whatever it is: finished work is saved, then it is raised
+            error = _for_people(stopped)
+        if self._between_steps and self.checkpointing is not None:
+            self.checkpointing.save(slam)
+        return self._what_there_is(slam), error
+
+    def _frames(self, slam: Slam, begin: int) -> None:
+        sequence, observer = self.sequence, self.observer
+        observer.begin("track + map" if slam.growing else "localize", len(sequence) - begin)
+        if isinstance(sequence, Sequence):
+            frames = sequence.stream(masks="lazy", begin=begin)  # only those of keyframes are read
+        else:
+            frames = sequence.stream(masks="lazy")
+        self._between_steps = self.config.realtime_fps == 0
+        if self.config.realtime_fps > 0:
+            RealtimeSlam(slam, self.config.realtime_fps).run(frames, lambda *step: self._report(slam, *step))
+            return
+        for frame in frames:
+            self._between_steps = False
+            self._report(slam, frame, slam.step(frame))
+
+    def _report(self, slam: Slam, frame: Frame, step: StepReport) -> None:
+        """After every frame."""
+        self.observer.frame(step)
+        if self.follower is not None:
+            self.follower(slam, frame, step)
+        if self.config.realtime_fps == 0:
+            self._between_steps = True
+            if self.checkpointing is not None:
+                self.checkpointing.after(slam, frame)
+        self.stop.raise_if_any()
+
+    def _refine(self, slam: Slam) -> SlamResult:
+        wanted = self.config.refine_iterations
+        if wanted:
+            self.observer.begin("refine", wanted)
+
+        def note(done: int, total: int) -> None:
+            self._between_steps = True
+            self.observer.advance(done, total)
+            if self.checkpointing is not None:
+                self.checkpointing.after(slam, None)
+            self.stop.raise_if_any()
+            self._between_steps = False
+
+        self._between_steps = False
+        return slam.finish(note)
+
+    def _what_there_is(self, slam: Slam) -> SlamResult:
+        try:
+            return _result_of(slam)
+        except Exception as failure:  # the disk is full, and what is there goes to make room
+            slam.close()
+            if self.folder is not None and slam.frames:
+                stamps = np.array([frame.timestamp for frame in slam.frames])
+                self.folder.save_trajectory(stamps, _last_poses(slam), repr(failure))
+                self.observer.note(f"the map is lost; the trajectory of {len(stamps)} frames is in {self.folder.path}")
+            raise
+
+
+def _for_people(stopped: BaseException) -> BaseException:
+    """The error as it is told to people."""
+    if isinstance(stopped, torch.cuda.OutOfMemoryError):
+        return DeviceError(f"the GPU's memory is full: {str(stopped).partition('. GPU')[0]}")
+    return stopped
+
+
+def _result_of(slam: Slam) -> SlamResult:
+    """Where the memory of a GPU is full there is none for the last identity steps either: then without them."""
+    try:
+        return slam.result()
+    except torch.cuda.OutOfMemoryError:
+        torch.cuda.empty_cache()
+        return slam.result()
+
+
+def _last_poses(slam: Slam) -> np.ndarray:
+    """T_world_camera of all frames; of keyframes that a GPU which failed will not tell, as they were tracked."""
+    try:
+        poses = [keyframe.T_world_camera for keyframe in slam.mapper.keyframes]
+    except Exception:
+        poses = list(slam.surface.poses)
+    return tracked_poses(slam.frames, poses)

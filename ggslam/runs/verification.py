@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a run's folder is whole, and all of it of one run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ggslam.errors import RunFolderError
+from ggslam.runs.checkpoints import has_checkpoints
+from ggslam.runs.manifest import Problem, files_in, names_in, sum_problems
+from ggslam.runs.records.mark import RunRecord
+from ggslam.system.folder_lock import folder_lock, writer_of
+from ggslam.system.staging import finish_saving
+
+
+@dataclass
+class Verification:
+    """What was found.
+
+    Attributes:
+        path: of the run.
+        mark: its run.json.
+        problems: files that are not as the manifest says.
+        others: files that the manifest does not know.
+        resumable: whether there are checkpoints to go on from.
+    """
+
+    path: Path
+    mark: RunRecord
+    problems: list[Problem] = field(default_factory=list)
+    others: list[str] = field(default_factory=list)
+    resumable: bool = False
+
+    @property
+    def good(self) -> bool:
+        """Whether every file is what the run wrote, and it is complete."""
+        return not self.problems and self.mark.complete
+
+    def lines(self) -> list[str]:
+        """For people."""
+        mark, files = self.mark, self.mark.files
+        if files is None:
+            lines = [f"{self.path}: no manifest: it was made before there were any; its files cannot be checked"]
+        else:
+            total = sum(record.bytes for record in files.values()) / 1e6
+            lines = [f"{self.path}: {len(files)} files, {total:.1f} MB"]
+        lines += [f"  {problem}" for problem in self.problems]
+        lines += [f"  {name}: not in the manifest" for name in self.others]
+        lines += [f"  incomplete: {note}" for note in mark.notes() if not mark.complete and "edited" not in note]
+        lines += ["  it can be gone on with: ggslam run --resume"] if self.resumable else []
+        return [*lines, "all as it was written" if self.good else "not as it was written, or not complete"]
+
+
+def verify_run(path: Path) -> Verification:
+    """Compares all files of a run with its manifest. A saving that was interrupted is finished first.
+
+    Raises:
+        RunFolderError: it is no run, or one is being written there.
+    """
+    path = Path(path)
+    if not (path / RunRecord.FILE).is_file():
+        more = "; it was cut off before it was saved: `ggslam run --resume`" if has_checkpoints(path) else ""
+        raise RunFolderError(f"{path}: is not a run of ggslam (no run.json){more}")
+    if writer_of(path) is None:
+        finish_saving(path, RunRecord.FILE)
+    mark = RunRecord.read(path)
+    if mark.files is None:
+        return Verification(path, mark, resumable=has_checkpoints(path))
+    problems = sum_problems(path, mark.files)
+    seen = {*mark.files, *(problem.name for problem in problems)}
+    others = [name for name in names_in(path) if name not in seen]
+    return Verification(path, mark, problems, others, has_checkpoints(path))
+
+
+def accept_files(path: Path) -> Verification:
+    """Writes the manifest of a run anew, of the files as they are now.
+
+    Raises:
+        RunFolderError: it is no run, or cannot be written to.
+    """
+    path = Path(path)
+    if not (path / RunRecord.FILE).is_file():
+        raise RunFolderError(f"{path}: is not a run of ggslam (no run.json)")
+    with folder_lock(path):
+        finish_saving(path, RunRecord.FILE)
+        RunRecord.read(path).with_files(files_in(path)).write(path)
+    return verify_run(path)

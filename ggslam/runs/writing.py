@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of a run, written into a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ggslam import __version__
+from ggslam.errors import GgslamError
+from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.formats.trajectory import write_tum
+from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
+from ggslam.objects.table import ObjectTable
+from ggslam.runs.environment import environment
+from ggslam.runs.map_index import MAP_INDEX
+from ggslam.runs.records.keyframes import KeyframesRecord
+from ggslam.runs.records.loops import LoopsRecord
+from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.runs.records.timing import TimingRecord
+from ggslam.runs.saving_parts import save_map_in_parts, save_points
+from ggslam.slam.config import Config, save_config
+from ggslam.slam.result import SlamResult
+from ggslam.slam.saved_places import PLACES_FILE
+from ggslam.slam.step_log import STEPS_FILE
+from ggslam.system.atomic import write_bytes, write_text
+
+OBJECT_FILES = ("objects.json", "classifier.npz", "votes.npz")
+"""Files of a run with objects, in the order in which they are removed; they are written in the opposite one."""
+TRUTH_FILE = "ground_truth.txt"
+"""True poses of the frames that have both, with the times of trajectory.txt; written by the report."""
+REPORT_FILE = "report.html"
+POINTS = ("points.ply", "points_grid.ply")
+RUN_FILES = (
+    *OBJECT_FILES, "map.ply", MAP_INDEX, "trajectory.txt", KeyframesRecord.FILE, LoopsRecord.FILE, SequenceRecord.FILE,
+    TimingRecord.FILE, "config.yaml", "metrics.json", "frames.csv", *POINTS, PLACES_FILE, STEPS_FILE, TRUTH_FILE,
+    REPORT_FILE, "renders", "volumes", "plots",
+)  # fmt: skip
+"""Files and folders that a run may have besides run.json."""
+
+
+@dataclass
+class RunToWrite:
+    """A run, as `RunFolder.save` is given it.
+
+    Attributes:
+        wanted: names of files that are to be made yet.
+        failure: why the clouds could not be written.
+    """
+
+    config: Config
+    sequence: SequenceRecord
+    result: SlamResult
+    error: str | None
+    names: Mapping[int, str]
+    wanted: tuple[str, ...]
+    failure: GgslamError | OSError | None = None
+
+    def write(self, folder: Path) -> RunRecord:
+        """Writes everything but run.json; returns what that is to say.
+
+        Raises:
+            GgslamError, OSError: a file cannot be written; of the clouds, `failure` says it.
+        """
+        self._write_map(folder)
+        result = self.result
+        for record in (TimingRecord.of_result(result), LoopsRecord.of_result(result)):
+            record.write(folder)
+        if result.steps is not None:
+            write_text(folder / STEPS_FILE, result.steps)
+        if result.places is not None:
+            write_bytes(folder / PLACES_FILE, result.places)
+        try:  # last and largest; `ggslam export --format points` makes them again from the map
+            save_points(folder, result)
+        except (GgslamError, OSError) as failure:
+            self.failure = failure
+            for name in POINTS:
+                (folder / name).unlink(missing_ok=True)
+        else:
+            TimingRecord.of_result(result).write(folder)  # once more: peak memory is that of the whole run
+        return self._mark((*self.wanted, *(POINTS if self.failure is not None else ())))
+
+    def write_least(self, folder: Path) -> RunRecord:
+        """As `write`, but only the map with its objects, poses, settings: what a run cannot do without."""
+        self._write_map(folder)
+        TimingRecord.of_result(self.result).write(folder)
+        return self._mark((*self.wanted, *POINTS))
+
+    def _write_map(self, folder: Path) -> None:
+        result = self.result
+        save_config(self.config, folder / "config.yaml")
+        for record in (self.sequence, KeyframesRecord.of_result(result)):
+            record.write(folder)
+        write_tum(folder / "trajectory.txt", result.timestamps(), result.trajectory())
+        if result.cells is not None:
+            save_map_in_parts(folder, result, self.names)
+        elif result.objects is None:
+            write_gaussian_ply(folder / "map.ply", result.gaussians)
+        else:
+            write_objects(folder, segment_map(result, self.names))
+
+    def _mark(self, missing: tuple[str, ...]) -> RunRecord:
+        """run.json of the run without these files."""
+        return RunRecord(
+            ggslam=__version__, complete=self.error is None and not missing, stopped_by=self.error,
+            missing=list(missing),
+            environment={**environment(self.config.threads), "device": self.result.device},
+        )  # fmt: skip
+
+
+def write_objects(folder: Path, segmented: SegmentedMap) -> None:
+    """Writes a map with its objects: map.ply with object ids and identity vectors, and the files beside it."""
+    for stale in OBJECT_FILES:
+        (folder / stale).unlink(missing_ok=True)
+    write_gaussian_ply(folder / "map.ply", segmented.gaussians, extra=("object_id", "identity"))
+    if segmented.votes is not None:
+        write_bytes(folder / "votes.npz", segmented.votes.to_bytes())
+    write_bytes(folder / "classifier.npz", segmented.classifier.to_bytes())
+    segmented.table.save(folder / "objects.json")
+
+
+def segment_map(result: SlamResult, names: Mapping[int, str] | None = None) -> SegmentedMap:
+    """A run's map with its objects. Names are taken only where ids are the masks' own."""
+    assert result.objects is not None
+    found = result.objects
+    known = names if found.supervision == "masks" else None
+    table = ObjectTable.build(result.gaussians, found.classifier, found.supervision, known, found.observations)
+    return SegmentedMap(result.gaussians, found.classifier, table, ObjectVotes.of(result.gaussians))

@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Objects as trees of plain values and arrays, and back: data, never code.
+
+    tree = describe(slam, rules, keeper)           # {"o": ["Slam", {...}]}, ready for JSON; arrays beside it
+    restore(tree, rules, arrays, kept, into=slam)  # fills objects that exist and makes those that do not
+
+Only classes that there is a rule for are made, without calling them; their attributes get what was saved. Whatever else
+an object holds (threads, native handles, settings of its own) stays as its constructor made it. Objects, lists and
+arrays that two places share are shared again. Floats keep every bit, arrays their type and order in memory.
+
+Tree: None, true, false, whole numbers, floats, text and lists stand for themselves; everything else is an object with
+one letter: see `_Describer` and `_Restorer`, which mirror each other.
+"""
+
+from __future__ import annotations
+
+import enum
+from array import array as FlatArray
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from ggslam.errors import FormatError
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How objects of a class are saved.
+
+    Attributes:
+        made: attributes that the constructor, or `after`, makes: not saved.
+        fixed: attributes that hold arrays (or lists of arrays) which never change once they are there.
+        growing: attributes that hold lists which only grow, of values that never change.
+        save: gives what is saved by name, instead of the attributes.
+        take: gets that for an object to be filled, instead of its attributes being set.
+        after: called for every object when all of them are there.
+        checked: made by calling the class with its fields, which checks them; for settings.
+    """
+
+    made: frozenset[str] = frozenset()
+    fixed: frozenset[str] = frozenset()
+    growing: frozenset[str] = frozenset()
+    save: Callable[[Any], dict[str, Any]] | None = None
+    take: Callable[[Any, dict[str, Any]], None] | None = None
+    after: Callable[[Any], None] | None = None
+    checked: bool = False
+
+
+Rules = Mapping[type, Rule]
+
+
+class Keeper(Protocol):
+    """Writes what never changes once, somewhere else."""
+
+    def place(self, array: np.ndarray) -> list[int]:
+        """Where an array is kept: numbers of file and array."""
+
+    def find(self, array: np.ndarray) -> list[int] | None:
+        """The same, None if it is not kept."""
+
+    def parts(self, items: list[Any], describe: Callable[[Any, Callable[[np.ndarray], int]], Any]) -> list[list[int]]:
+        """Where the parts of a list that grows are kept, numbers of file and part; `describe` makes an item's tree and
+        is told how to place an array in the same file."""
+
+
+class Kept(Protocol):
+    """Reads what a `Keeper` wrote."""
+
+    def array(self, file: int, number: int) -> np.ndarray:
+        """An array; each time the same one."""
+
+    def part(self, file: int, number: int) -> tuple[Any, Sequence[np.ndarray]]:
+        """The trees of a part's items, and the arrays that they name."""
+
+    def grew(self, items: list[Any], parts: list[list[int]]) -> None:
+        """The items of these parts are this list now."""
+
+
+def class_names(rules: Rules) -> dict[str, type]:
+    """Classes by the names that trees have for them."""
+    return {f"{kind.__module__}.{kind.__qualname__}": kind for kind in rules}
+
+
+def describe(value: Any, rules: Rules, keeper: Keeper | None) -> tuple[Any, list[np.ndarray]]:
+    """The tree of a value, and the arrays that it names.
+
+    Raises:
+        TypeError: there is no rule for something in it; the message says where it is.
+    """
+    describer = _Describer(rules, keeper)
+    return describer.describe(value, "state"), describer.arrays
+
+
+def restore(tree: Any, rules: Rules, arrays: Sequence[np.ndarray], kept: Kept | None, into: Any = None) -> Any:
+    """What `describe` was given; if `into` is of its class, that object is filled.
+
+    Raises:
+        FormatError: the tree does not fit the rules.
+    """
+    restorer = _Restorer(rules, arrays, kept)
+    try:
+        value = restorer.restore(tree, into)
+        for call in restorer.pending:
+            call()
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, RuntimeError) as error:
+        raise FormatError(f"not a state of this program: {error!r}") from error
+    return value
+
+
+class _Describer:
+    def __init__(self, rules: Rules, keeper: Keeper | None) -> None:
+        self.arrays: list[np.ndarray] = []
+        self._rules, self._keeper = rules, keeper
+        self._names = {kind: name for name, kind in class_names(rules).items()}
+        self._seen: dict[int, int] = {}
+        self._held: list[Any] = []
+        """Keeps what was made on the way alive: numbers of `_seen` are addresses."""
+
+    def describe(self, value: Any, where: str, fixed: bool = False) -> Any:
+        if value is None or value is True or value is False:
+            return value
+        kind = type(value)
+        if kind in (int, float, str):
+            return value
+        if kind is tuple:
+            return {"t": [self.describe(item, where) for item in value]}
+        if isinstance(value, np.generic):
+            return {"n": [value.dtype.str, value.item()]}
+        if isinstance(value, enum.Enum):
+            return {"e": [self._name(kind, where), value.name]}
+        number = self._seen.get(id(value))
+        if number is not None:
+            return {"r": number}
+        self._seen[id(value)] = len(self._seen)
+        if kind is list:
+            return [self.describe(item, where, fixed) for item in value]
+        if kind is dict:
+            return {"d": [[self.describe(k, where), self.describe(v, where, fixed)] for k, v in value.items()]}
+        if kind in (set, frozenset):
+            return {"s" if kind is set else "z": [self.describe(item, where) for item in sorted(value)]}
+        if kind is np.ndarray:
+            return {"a": self._array(value, fixed)}
+        if isinstance(value, torch.Tensor):
+            return {"T": self._array(value.detach().cpu().numpy(), False)}
+        if kind is FlatArray:
+            return {"y": [value.typecode, self._array(np.array(value), False)]}
+        if kind is np.random.Generator:
+            return {"g": _plain(value.bit_generator.state)}
+        return self._object(value, where)
+
+    def _object(self, value: Any, where: str) -> Any:
+        kind = type(value)
+        name, rule = self._name(kind, where), self._rules[kind]
+        attributes, found = {}, vars(value) if rule.save is None else rule.save(value)
+        self._held.append(found)
+        for attribute, content in found.items():
+            if attribute in rule.made:
+                continue
+            place = f"{where}.{attribute}"
+            if attribute in rule.growing and self._keeper is not None:
+                attributes[attribute] = self._list_in_parts(content, place)
+            else:
+                attributes[attribute] = self.describe(content, place, attribute in rule.fixed)
+        return {"o": [name, attributes]}
+
+    def _name(self, kind: type, where: str) -> str:
+        if kind not in self._names:
+            raise TypeError(f"{where}: there is no rule for saving {kind.__module__}.{kind.__qualname__}")
+        return self._names[kind]
+
+    def _list_in_parts(self, items: list[Any], where: str) -> Any:
+        assert self._keeper is not None
+        self._seen[id(items)] = len(self._seen)
+
+        def part(item: Any, place: Callable[[np.ndarray], int]) -> Any:
+            inner = _Describer(self._rules, None)
+            inner._array = lambda array, fixed: _place_of(place(array), array)  # type: ignore[method-assign]
+            return inner.describe(item, where)
+
+        return {"l": self._keeper.parts(items, part)}
+
+    def _array(self, array: np.ndarray, fixed: bool) -> Any:
+        place = None
+        if self._keeper is not None:
+            place = self._keeper.place(array) if fixed else self._keeper.find(array)
+        if place is not None:
+            return _place_of(place, array)
+        self.arrays.append(array)
+        return _place_of(len(self.arrays) - 1, array)
+
+
+def _place_of(place: Any, array: np.ndarray) -> Any:
+    """Place of an array, and of one that is not in C order its strides: the last bits of products go with them."""
+    return place if array.flags.c_contiguous else {"p": place, "strides": list(array.strides)}
+
+
+def _plain(state: Any) -> Any:
+    """State of a bit generator in what JSON can say."""
+    if isinstance(state, dict):
+        return {name: _plain(value) for name, value in state.items()}
+    return state.tolist() if isinstance(state, np.ndarray) else state
+
+
+class _Restorer:
+    def __init__(self, rules: Rules, arrays: Sequence[np.ndarray], kept: Kept | None) -> None:
+        self.pending: list[Callable[[], None]] = []
+        self._rules, self._arrays, self._kept = rules, arrays, kept
+        self._classes = class_names(rules)
+        self._known: list[Any] = []
+
+    def restore(self, tree: Any, there: Any) -> Any:
+        if isinstance(tree, list):
+            return self._list(tree, there)
+        if not isinstance(tree, dict):
+            return tree
+        ((letter, content),) = tree.items()
+        if letter == "r":
+            return self._known[content]
+        if letter == "t":
+            return tuple(self.restore(item, None) for item in content)
+        if letter == "n":
+            return np.dtype(content[0]).type(content[1])
+        if letter == "e":
+            return self._classes[content[0]][content[1]]  # type: ignore[index]
+        return self._object_or_array(letter, content, there)
+
+    def _object_or_array(self, letter: str, content: Any, there: Any) -> Any:
+        """What may be in more than one place."""
+        if letter == "o":
+            return self._object(content, there)
+        if letter == "d":
+            return self._dictionary(content, there)
+        number = len(self._known)
+        self._known.append(None)
+        if letter in ("s", "z"):
+            items = [self.restore(item, None) for item in content]
+            value: Any = frozenset(items) if letter == "z" else set(items)
+            if letter == "s" and type(there) is set:
+                there.clear()
+                there.update(value)
+                value = there
+        elif letter == "a":
+            value = self._array(content)
+        elif letter == "T":
+            value = torch.from_numpy(self._array(content))
+            value = value.to(there.device) if isinstance(there, torch.Tensor) else value
+        elif letter == "y":
+            value = FlatArray(content[0], self._array(content[1]).tobytes())
+        elif letter == "g":
+            value = _generator(content, there)
+        elif letter == "l":
+            value = self._list_in_parts(content, there)
+        else:
+            raise ValueError(f"unknown kind of value: {letter}")
+        self._known[number] = value
+        return value
+
+    def _list(self, tree: list[Any], there: Any) -> list[Any]:
+        """A list that exists is filled, and so are its objects, as far as both go."""
+        value: list[Any] = there if type(there) is list else []
+        before = list(value)
+        value.clear()
+        self._known.append(value)
+        for number, item in enumerate(tree):
+            value.append(self.restore(item, before[number] if number < len(before) else None))
+        return value
+
+    def _dictionary(self, content: Any, there: Any) -> dict[Any, Any]:
+        value: dict[Any, Any] = there if type(there) is dict else {}
+        before = dict(value)
+        value.clear()
+        self._known.append(value)
+        for key_tree, item in content:
+            key = self.restore(key_tree, None)
+            value[key] = self.restore(item, before.get(key))
+        return value
+
+    def _object(self, content: Any, there: Any) -> Any:
+        name, attributes = content
+        kind = self._classes[name]
+        rule = self._rules[kind]
+        if rule.checked:
+            number = len(self._known)
+            self._known.append(None)
+            self._known[number] = kind(**{k: self.restore(v, None) for k, v in attributes.items()})
+            return self._known[number]
+        fill = type(there) is kind
+        value = there if fill else object.__new__(kind)
+        self._known.append(value)
+        if not fill and rule.made - attributes.keys() - set(_class_defaults(kind)):
+            raise ValueError(f"{name}: there is none to fill")
+        found = {}
+        for attribute, tree in attributes.items():
+            if attribute in rule.made:
+                raise ValueError(f"{name}.{attribute}: is not saved")
+            found[attribute] = self.restore(tree, vars(value).get(attribute))
+            if rule.take is None:
+                object.__setattr__(value, attribute, found[attribute])
+        if rule.take is not None:
+            rule.take(value, found)
+        if rule.after is not None:
+            after = rule.after
+            self.pending.append(lambda: after(value))
+        return value
+
+    def _list_in_parts(self, content: Any, there: Any) -> list[Any]:
+        assert self._kept is not None
+        value: list[Any] = there if type(there) is list else []
+        value.clear()
+        for file, number in content:
+            trees, arrays = self._kept.part(file, number)
+            for tree in trees:
+                value.append(_Restorer(self._rules, arrays, None).restore(tree, None))
+        self._kept.grew(value, content)
+        return value
+
+    def _array(self, content: Any) -> np.ndarray:
+        strides = None
+        if isinstance(content, dict):
+            content, strides = content["p"], content["strides"]
+        if isinstance(content, list):
+            assert self._kept is not None
+            array = self._kept.array(*content)
+        else:
+            array = self._arrays[content]
+        return array if strides is None else _with_strides(array, strides)
+
+
+def _class_defaults(kind: type) -> dict[str, Any]:
+    return {name: value for base in kind.__mro__ for name, value in vars(base).items()}
+
+
+def _generator(state: Any, there: Any) -> np.random.Generator:
+    value: np.random.Generator = there if type(there) is np.random.Generator else np.random.default_rng(0)
+    value.bit_generator.state = state
+    return value
+
+
+def _with_strides(array: np.ndarray, strides: list[int]) -> np.ndarray:
+    """The array laid out in memory as it was."""
+    span = array.itemsize + sum((n - 1) * s for n, s in zip(array.shape, strides, strict=True) if n)
+    if min([0, *strides]) < 0 or span > 64 * array.nbytes + 4096:
+        raise ValueError("strides that no array of this program has")
+    out = np.ndarray(array.shape, array.dtype, np.empty(span, np.uint8), strides=strides)
+    out[...] = array
+    return out
