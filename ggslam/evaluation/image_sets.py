@@ -5,16 +5,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Container, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from ggslam.evaluation.images import ImageScores, score_image
+from ggslam.evaluation.images import ImageScores, psnr, score_image, unit_range
 from ggslam.evaluation.lpips import Lpips
 from ggslam.scene.frame import Frame
 
-Render = Callable[[Frame], "tuple[np.ndarray, np.ndarray | None] | None"]
-"""Gives (colour [H, W, 3], depth [H, W] or None) as the map shows the frame's view; None if its pose is unknown."""
+
+@dataclass(frozen=True)
+class RenderedView:
+    """What a map shows of a frame's view.
+
+    Attributes:
+        color: [H, W, 3], see `score_image`.
+        depth: [H, W] metres or None.
+        color_3dgs: the colour by the rules of 3D Gaussian Splatting, [H, W, 3], or None.
+    """
+
+    color: np.ndarray
+    depth: np.ndarray | None = None
+    color_3dgs: np.ndarray | None = None
+
+    def score(self, frame: Frame, lpips: Lpips | None = None) -> ImageScores:
+        """Scores the view against the recorded frame."""
+        scores = score_image(self.color, self.depth, frame.color, frame.depth, lpips)
+        if self.color_3dgs is None:
+            return scores
+        valid = np.isfinite(frame.depth) & (frame.depth > 0)
+        return replace(scores, psnr_3dgs=psnr(unit_range(self.color_3dgs), unit_range(frame.color), valid))
+
+
+Render = Callable[[Frame], "RenderedView | None"]
+"""Gives what the map shows of a frame's view; None if its pose is unknown."""
 
 
 @dataclass
@@ -76,7 +100,7 @@ def score_images(
         if not names:
             continue
         view = render(frame)
-        scores = None if view is None else score_image(view[0], view[1], frame.color, frame.depth, lpips)
+        scores = None if view is None else view.score(frame, lpips)
         for name in names:
             means[name].add(scores)
         if on_frame is not None:

@@ -19,9 +19,9 @@ class InsertionSettings:
     """A pixel whose measured depth lies this much in front of the rendered depth is not explained either..."""
     depth_tolerance_relative: float = setting(0.03, 0, 1)
     """...or this share of the depth, whichever is larger."""
-    opacity: float = setting(0.5, 1e-3, 0.999)
+    opacity: float = setting(0.4, 1e-3, 0.999)
     """Opacity at birth."""
-    scale_pixels: float = setting(0.5, 1e-2, 100, "px")
+    scale_pixels: float = setting(0.7, 1e-2, 100, "px")
     """Standard deviation at birth along the surface, in pixels of the frame that inserts it (times the stride)."""
     flatness: float = setting(1.0, 1e-3, 1)
     """Standard deviation along the surface normal as a share of that along the surface. Flat discs (0.2) cost 0.5 dB

@@ -24,7 +24,15 @@ from ggslam.rendering.arguments import (
     posed_view,
 )
 from ggslam.rendering.pixel_terms import CpuPixelTerms
-from ggslam.rendering.types import LOW_PASS, PARAMETERS, Gaussians, GaussianTensors, Gradients, RenderBuffers
+from ggslam.rendering.types import (
+    LOW_PASS,
+    LOW_PASS_3DGS,
+    PARAMETERS,
+    Gaussians,
+    GaussianTensors,
+    Gradients,
+    RenderBuffers,
+)
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -106,6 +114,7 @@ class CpuRasterizer:
         features: bool = True,
         median_depth: bool = False,
         active_sh_degree: int | None = None,
+        as_3dgs: bool = False,
     ) -> RenderBuffers:
         """Renders.
 
@@ -116,28 +125,33 @@ class CpuRasterizer:
             features: render the feature channels, if there are any.
             median_depth: render the median depth, too.
             active_sh_degree: highest spherical-harmonic degree to evaluate; None: all.
+            as_3dgs: draw as 3D Gaussian Splatting does: with its low-pass filter, alpha at most 0.99, and without the
+                Gaussian that would take a pixel's transmittance below 1e-4. No features, no median depth, no backward.
 
         Returns:
             Images that belong to the rasterizer and are overwritten by its next call of `forward`.
 
         Raises:
-            RenderError: wrong shapes, dtypes or devices; an impossible pose or degree; out of memory.
+            RenderError: wrong shapes, dtypes or devices; an impossible pose or degree; out of memory; features or median
+                depth with `as_3dgs`.
         """
         self._last = None
         self.rendering += 1
         parameters = checked_parameters(gaussians, _CPU)
         arrays = gaussian_arrays(parameters, features, active_sh_degree)
-        view = posed_view(camera, T_camera_world, self.near_plane, self.low_pass)
+        view = posed_view(camera, T_camera_world, self.near_plane, LOW_PASS_3DGS if as_3dgs else self.low_pass)
         channels = arrays.feature_channels if arrays.render_features else 0
+        if as_3dgs and (channels or median_depth):
+            raise RenderError("as_3dgs: neither features nor median depth can be rendered by the rules of 3DGS")
         buffers = image_buffers(self._images, camera, channels, median_depth, _CPU)
         targets = structures.RenderTargets(
             **{field[0]: address(getattr(buffers, field[0])) for field in structures.RenderTargets._fields_}
         )
         status = self._library.ggslam_rasterizer_forward(
-            self._handle, ctypes.byref(arrays), ctypes.byref(view), ctypes.byref(targets)
+            self._handle, ctypes.byref(arrays), ctypes.byref(view), ctypes.byref(targets), int(as_3dgs)
         )
         self._check(status)
-        self._last = _LastForward(parameters, arrays, buffers)
+        self._last = None if as_3dgs else _LastForward(parameters, arrays, buffers)
         return buffers
 
     def statistics(self) -> dict[str, int]:

@@ -59,7 +59,7 @@ def render_gsplat(
     rows = renderable(gaussians, z, near_plane)
 
     means = gaussians.means[rows]
-    # Colours are evaluated here: gsplat would clamp them at 0.
+    # Colours are evaluated here: they are cut off at black, but not with their gradient as gsplat does.
     channels = view_colours(gaussians.sh[rows][:, :coefficients], means, view)
     with_features = features and gaussians.features.shape[1] > 0
     if with_features:

@@ -11,7 +11,8 @@ This file is the contract; the other backends are tested against it.
     Sigma = R diag(exp(log_scale))^2 R^T. In the Jacobian J, x/z and y/z are clamped to the image enlarged by 15 % of
     its size on each side; the clamp passes no gradient.
 3.  Colour = 0.5 + sum_k Y_k(d) sh_k with d the direction from the camera centre to the mean, in the world frame, and Y
-    the real spherical harmonics of 3D Gaussian Splatting. It is not clamped.
+    the real spherical harmonics of 3D Gaussian Splatting, cut off at black (0, as 3DGS does; there is no upper limit).
+    What is cut off passes only gradients whose descent brightens it, so that no Gaussian stays black for good.
 4.  Gaussians are composited in the order of z; equal depths in the order of their rows.
 5.  alpha = sigmoid(opacity_logit) * exp(-d^T cov^-1 d / 2). A contribution with alpha < 1/255 (before the next rule) is
     skipped; alpha is limited to 0.999, and there passes no gradient.
@@ -24,6 +25,7 @@ This file is the contract; the other backends are tested against it.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 
@@ -158,11 +160,25 @@ def _weights(
     return weights, before.detach(), after.detach()
 
 
+class _CutAtBlack(torch.autograd.Function):
+    """max(0, colour), with the gradient of rule 3."""
+
+    @staticmethod
+    def forward(ctx: Any, colour: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(colour < 0)
+        return colour.clamp_min(0)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        (cut,) = ctx.saved_tensors
+        return torch.where(cut, gradient.clamp_max(0), gradient)
+
+
 def view_colours(sh: torch.Tensor, means: torch.Tensor, T_camera_world: torch.Tensor) -> torch.Tensor:
     """View-dependent colours [N, 3] of coefficients sh [N, K, 3] (rule 3)."""
     centre = -T_camera_world[:3, :3].T @ T_camera_world[:3, 3]
     basis = spherical_harmonics(torch.nn.functional.normalize(means - centre, dim=-1), sh.shape[1])
-    return 0.5 + (basis[:, :, None] * sh).sum(1)
+    return _CutAtBlack.apply(0.5 + (basis[:, :, None] * sh).sum(1))
 
 
 def spherical_harmonics(directions: torch.Tensor, count: int) -> torch.Tensor:

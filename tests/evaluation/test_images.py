@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from ggslam.evaluation.image_sets import ImageScoreMean, score_images
+from ggslam.evaluation.image_sets import ImageScoreMean, RenderedView, score_images
 from ggslam.evaluation.images import ImageScores, depth_errors, fit_colors, psnr, score_image, ssim_map
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -165,12 +165,14 @@ def test_sets_are_scored_from_a_stream() -> None:
     held: list[weakref.ref] = []
     most_alive, seen = 0, []
 
-    def render(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
+    def render(frame: Frame) -> RenderedView | None:
         nonlocal most_alive
         most_alive = max(most_alive, sum(ref() is not None for ref in held))
         if frame.index == 3:
             return None
-        return np.clip(frame.color / 255 + 0.01 * (1 + frame.index), 0, 1), frame.depth + 0.01 * frame.index
+        shown = np.clip(frame.color / 255 + 0.01 * (1 + frame.index), 0, 1)
+        elsewhere = np.clip(frame.color / 255 + 0.1, 0, 1) if frame.index else None
+        return RenderedView(shown, frame.depth + 0.01 * frame.index, elsewhere)
 
     found = score_images(
         render, frames(8, held), {"keyframes": {0, 2}, "held_out": range(1, 8, 2)},
@@ -181,6 +183,7 @@ def test_sets_are_scored_from_a_stream() -> None:
     assert (keyframes.frames, keyframes.frames_without_pose) == (2, 0)
     assert (held_out.frames, held_out.frames_without_pose) == (3, 1)
     assert keyframes.mean().psnr == pytest.approx((40 - 20 * math.log10(3) + 40) / 2, abs=1e-3)
+    assert keyframes.mean().psnr_3dgs == pytest.approx(20, abs=1e-3)  # of the frame that has one
     assert held_out.mean().depth_l1_m == pytest.approx((0.01 + 0.05 + 0.07) / 3, abs=1e-6)
     everything = score_images(render, frames(8, []), {"all": None})
     assert everything["all"].frames == 7

@@ -141,7 +141,7 @@ def test_a_library_without_a_version_is_refused() -> None:
 
 def test_functions_take_the_arguments_of_the_headers() -> None:
     library = load_library()
-    with pytest.raises(TypeError, match="at least 4"):
+    with pytest.raises(TypeError, match="at least 5"):
         library.ggslam_rasterizer_forward(None, None, None)
     with pytest.raises(ctypes.ArgumentError):
-        library.ggslam_rasterizer_forward(None, rendering.CameraView(), None, None)
+        library.ggslam_rasterizer_forward(None, rendering.CameraView(), None, None, 0)

@@ -50,6 +50,14 @@ def test_spherical_harmonics(rasterizer: CudaRasterizer, coefficients: int) -> N
     check_against_cpu(rasterizer, make_scene(coefficients=coefficients))
 
 
+@pytest.mark.parametrize("coefficients", [1, 9])
+def test_colours_end_at_black(rasterizer: CudaRasterizer, coefficients: int) -> None:
+    scene = make_scene(coefficients=coefficients)
+    scene.sh[:, 0] = 3 * scene.sh[:, 0] - 1.8
+    found = check_against_cpu(rasterizer, scene)
+    assert found["rendered_image"].min() >= 0 and (found["sh"][:, 0] < 0).any()
+
+
 @pytest.mark.parametrize("active", [0, 1, 2])
 def test_lower_active_degree_leaves_the_other_coefficients_alone(rasterizer: CudaRasterizer, active: int) -> None:
     found = check_against_cpu(rasterizer, make_scene(coefficients=16), active_sh_degree=active)

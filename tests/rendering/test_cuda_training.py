@@ -29,9 +29,10 @@ from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import PARAMETERS, RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 
-STEP_TOLERANCE = {"cpu": 2e-5, "cuda": 3e-4}
+STEP_TOLERANCE = {"cpu": 1e-4, "cuda": 3e-4}
 """Relative, of several steps; by the type of device. Parameters near one that move by a thousandth are rounded by about
-1e-5 of their way, one way or the other by the processor. On a GPU sums over a Gaussian's pixels change
+1e-5 of their way, one way or the other by the processor, and Adam makes steps of full size of gradients so small that
+their last digits count. On a GPU sums over a Gaussian's pixels change
 their order."""
 EXPOSURE = np.array([[1.1, 0.02], [0.9, -0.03], [1.05, 0.01]])
 LOSSES = {

@@ -96,9 +96,11 @@ struct MeshPictureInput {
 GGSLAM_EXPORT void* ggslam_rasterizer_create(void* context);
 GGSLAM_EXPORT void ggslam_rasterizer_destroy(void* rasterizer);
 
-// Renders. Returns 0, 1 (out of memory) or 2 (more than 2^31 pairs of a Gaussian and a tile).
+// Renders. Returns 0, 1 (out of memory) or 2 (more than 2^31 pairs of a Gaussian and a tile). as_3dgs: with 3DGS's limit of
+// alpha and its end of a pixel, without features and median depth; there is no backward then.
 GGSLAM_EXPORT int ggslam_rasterizer_forward(void* rasterizer, const ggslam::GaussianArrays* gaussians,
-                                            const ggslam::CameraView* view, const ggslam::RenderTargets* targets);
+                                            const ggslam::CameraView* view, const ggslam::RenderTargets* targets,
+                                            int as_3dgs);
 
 // Differentiates the last forward, whose arrays must still be there and unchanged. With `adam`, updates the Gaussians
 // that were touched instead of writing their gradients.

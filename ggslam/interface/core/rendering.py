@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_float, c_int, c_int32, c_int64, c_void_
 from typing import Any
 
 HEADER = "core/rendering.hpp"
-HEADER_SHA256 = "80a5db24b3f37b6248c013862c5d2186791dc08806425da3cb98731d34ac14f5"
+HEADER_SHA256 = "1562603aa91299fcbaaae4830f8857ee0dfc55612076a1c201f3912693226c9c"
 
 
 class GaussianArrays(Structure):
@@ -112,7 +112,7 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_rasterizer_create": (c_void_p, [c_void_p]),
     "ggslam_rasterizer_destroy": (None, [c_void_p]),
     "ggslam_rasterizer_forward": (c_int, [
-        c_void_p, POINTER(GaussianArrays), POINTER(CameraView), POINTER(RenderTargets),
+        c_void_p, POINTER(GaussianArrays), POINTER(CameraView), POINTER(RenderTargets), c_int,
     ]),
     "ggslam_rasterizer_backward": (c_int, [
         c_void_p, POINTER(ImageGradients), POINTER(GaussianGradients), POINTER(AdamArguments),

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import MissingDependency
-from ggslam.evaluation.image_sets import score_images
+from ggslam.evaluation.image_sets import RenderedView, score_images
 from ggslam.evaluation.images import ImageScores
 from ggslam.evaluation.lpips import Lpips
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.score.objects import ObjectScorer
 from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.types import RenderBuffers
 from ggslam.reporting.pictures import color_to_uint8, compare_pictures, write_picture
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.objects_in_parts import ObjectsInParts
@@ -181,18 +182,18 @@ def _up_to(last: int, sequence: Sequence, masks: bool) -> Iterator[Frame]:
 
 def _shower(
     folder: RunFolder, poses: dict[int, np.ndarray], pictured: set[int], scorer: ObjectScorer | None
-) -> Callable[[Frame], tuple[np.ndarray, np.ndarray] | None]:
+) -> Callable[[Frame], RenderedView | None]:
     """A function that renders the map as a frame's camera sees it, and keeps some of the pictures."""
     parts = folder.map_in_parts() if scorer is None else scorer.map
     rasterizer = CpuRasterizer()
 
-    def show(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
+    def show(frame: Frame) -> RenderedView | None:
         if frame.index not in poses:
             return None
         T_camera_world = inverse(poses[frame.index])
         gaussians = parts.in_view(frame.camera, T_camera_world)
+        by_3dgs = _picture(rasterizer.forward(gaussians, frame.camera, T_camera_world, features=False, as_3dgs=True))
         view = rasterizer.forward(gaussians, frame.camera, T_camera_world, features=scorer is not None)
-        color = np.clip(view.image.numpy(), 0, 1).transpose(1, 2, 0)
         depth = np.where(view.alpha.numpy() > 0.5, view.expected_depth.numpy(), 0)
         row = None
         if scorer is not None:
@@ -200,9 +201,13 @@ def _shower(
         if frame.index in pictured:
             picture = compare_pictures(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth, row)
             write_picture(folder.path / "renders" / f"compare{frame.index:06d}.png", picture)
-        return color, depth
+        return RenderedView(_picture(view), depth, by_3dgs)
 
     return show
+
+
+def _picture(view: RenderBuffers) -> np.ndarray:
+    return np.clip(view.image.numpy(), 0, 1).transpose(1, 2, 0)
 
 
 def _write_rows(folder: RunFolder, rows: list[dict[str, Any]]) -> None:

@@ -29,6 +29,7 @@ class ImageScoresRecord(Record):
     """Means over a set of frames, see `evaluation.images.ImageScores`; `frames` were scored."""
 
     psnr: NumberOrNone = None
+    psnr_3dgs: NumberOrNone = None
     psnr_unmasked: NumberOrNone = None
     psnr_affine: NumberOrNone = None
     ssim: NumberOrNone = None

@@ -2,7 +2,7 @@
 // Draws Gaussian splats with WebGL 2, sorted by depth in a worker, after EWA splatting (Zwicker et al. 2001) with the
 // projection of 3D Gaussian splatting (Kerbl et al. 2023). Coordinates: x right, y down, z forward.
 
-const LOW_PASS = 0.1; // pixels squared, as ggslam's own renderer adds
+const LOW_PASS = 0.3; // pixels squared, as ggslam's own renderer and 3DGS add
 const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
 uniform usampler2D splats; uniform sampler2D states;

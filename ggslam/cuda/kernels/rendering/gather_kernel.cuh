@@ -134,6 +134,7 @@ gather_kernel(GaussianArrays arrays, ViewConstants view, const float* pose, Grad
       const SplatGradients splat = load_row(in, row);
       float direction_gradient[3];
       for (int k = 0; k < 3; ++k) colour[k] = splat.colour[k];
+      differentiate_cut_at_black(arrays, c, row, p.position, colour);
       differentiate_view_colour(arrays, c, row, p.position, colour, basis, direction_gradient);
       g = differentiate_projection(c, raw, p, splat, direction_gradient);
     }

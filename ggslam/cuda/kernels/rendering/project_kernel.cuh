@@ -37,7 +37,7 @@ __device__ inline bool make_splat(const GaussianArrays& arrays, const ViewConsta
   float colour[3];
   view_colour(arrays, c, row, p.position, colour);
   if (!(fabsf(colour[0]) + fabsf(colour[1]) + fabsf(colour[2]) <= kFinite)) return false;
-  splat.red = colour[0], splat.green = colour[1], splat.blue = colour[2];
+  splat.red = fmaxf(colour[0], 0.0f), splat.green = fmaxf(colour[1], 0.0f), splat.blue = fmaxf(colour[2], 0.0f);
   splat.conic_r = -0.5f * kLog2E * p.conic_r, splat.conic_y = -0.5f * kLog2E * p.conic_y;
   splat.slope_x = p.slope, splat.slope_y = p.cov_xy / p.cov_xx;
   splat.depth = p.position[2];

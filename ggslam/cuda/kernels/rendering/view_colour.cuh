@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Colour of a Gaussian as seen from the camera, and its derivatives. Colours are not clamped.
+// Colour of a Gaussian as seen from the camera, and its derivatives. Whoever uses a colour cuts it off at black.
 #pragma once
 #include "rendering/projection.cuh"
 #include "rendering/spherical_harmonics.cuh"
@@ -31,6 +31,16 @@ __device__ inline void view_colour(const GaussianArrays& arrays, const ViewConst
   for (int k = 0; k < 16; ++k)
     if (k < arrays.active_sh_coefficients)
       for (int channel = 0; channel < 3; ++channel) colour[channel] += basis[k] * sh[3 * k + channel];
+}
+
+// The gradient of the colour before it was cut off at black, from that after it: what is cut off can only brighten.
+__device__ inline void differentiate_cut_at_black(const GaussianArrays& arrays, const ViewConstants& c,
+                                                  std::int64_t row, const float position[3],
+                                                  float colour_gradient[3]) {
+  float colour[3];
+  view_colour(arrays, c, row, position, colour);
+  for (int channel = 0; channel < 3; ++channel)
+    if (colour[channel] < 0.0f) colour_gradient[channel] = fminf(colour_gradient[channel], 0.0f);
 }
 
 // From the gradient of the colour: that of the coefficients is basis[k] * colour_gradient[channel]; returns in

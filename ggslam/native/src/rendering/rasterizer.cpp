@@ -118,8 +118,9 @@ GGSLAM_EXPORT void* ggslam_rasterizer_create(void* context) { return new Rasteri
 GGSLAM_EXPORT void ggslam_rasterizer_destroy(void* rasterizer) { delete static_cast<Rasterizer*>(rasterizer); }
 
 GGSLAM_EXPORT int ggslam_rasterizer_forward(void* rasterizer, const GaussianArrays* gaussians, const CameraView* view,
-                                            const RenderTargets* targets) {
+                                            const RenderTargets* targets, int as_3dgs) {
   try {
+    static_cast<Rasterizer*>(rasterizer)->as_3dgs = as_3dgs != 0;
     return forward(*static_cast<Rasterizer*>(rasterizer), *gaussians, *view, *targets);
   } catch (const std::bad_alloc&) {
     return kOutOfMemory;

@@ -22,6 +22,7 @@ namespace ggslam {
 // --- the rendering rules: one contract for all backends, stated in ggslam/rendering/reference.py ---------------------
 constexpr float kLog2MinAlpha = -7.99435344f;   // log2(1 / 255): weaker contributions are skipped
 constexpr float kMaxAlpha = 0.999f;
+constexpr float kMaxAlphaOf3dgs = 0.99f;        // in pictures by the rules of 3DGS
 constexpr float kMinTransmittance = 1e-4f;      // a pixel takes no further Gaussian once its transmittance is below
 constexpr float kFrustumMargin = 0.15f;         // of the image size: slopes beyond are clamped in the Jacobian
 constexpr float kMaxDepth = 1e6f;               // metres; Gaussians farther away are skipped
@@ -87,6 +88,7 @@ struct Rasterizer {
 
   GaussianArrays gaussians{};
   CameraView view{};
+  bool as_3dgs = false;     // the last forward was by the rules of 3DGS
   int padded_features = 0;  // rendered feature channels, rounded up to a multiple of 4
   int tile_height = 0, tiles_x = 0, tiles_y = 0;
 

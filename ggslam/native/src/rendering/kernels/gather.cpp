@@ -44,7 +44,8 @@ void differentiate_group(const Rasterizer& r, const ViewConstants& c, const Grou
   const GaussianArrays& arrays = r.gaussians;
   const RawGaussians raw = load_gaussians(arrays, group.rows, group.n);
   const Projection p = project(c, raw);
-  const SplatGradients g = splat_gradients(group);
+  SplatGradients g = splat_gradients(group);
+  differentiate_cut_at_black(arrays, c, group.rows, group.n, p.position, g.colour);
   Float basis[16], direction_gradient[3];
   differentiate_view_colour(arrays, c, group.rows, group.n, p.position, g.colour, basis, direction_gradient);
   const ParameterGradients grad = differentiate_projection(c, raw, p, g, direction_gradient);

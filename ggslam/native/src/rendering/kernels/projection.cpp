@@ -30,6 +30,8 @@ inline Mask tile_range(Float centre, Float extent, int size, int tile_size, std:
   return both(inside, greater_equal_int(last_pixel, first_pixel));
 }
 
+inline Float black_or_more(Float colour) { return maximum(colour, Float{}); }
+
 inline void make_splats(const Rasterizer& r, const ViewConstants& c, const std::int32_t* rows, int n,
                         SplatVectors& out) {
   const RawGaussians g = load_gaussians(r.gaussians, rows, n);
@@ -51,7 +53,7 @@ inline void make_splats(const Rasterizer& r, const ViewConstants& c, const std::
 
   const Float values[SplatVectors::kFields] = {
       mean_x, mean_y, p.slope, -0.5f * kLog2E * p.conic_r, -0.5f * kLog2E * p.conic_y, log2_opacity,
-      colour[0], colour[1], colour[2], p.position[2], p.cov_xy / p.cov_xx};
+      black_or_more(colour[0]), black_or_more(colour[1]), black_or_more(colour[2]), p.position[2], p.cov_xy / p.cov_xx};
   for (int k = 0; k < SplatVectors::kFields; ++k) store(out.fields[k], values[k]);
 }
 

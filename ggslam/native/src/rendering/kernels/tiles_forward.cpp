@@ -58,7 +58,9 @@ void load_chunk(const Rasterizer& r, const Tile& tile, std::uint32_t begin, int 
   transpose_masks(masks, chunk.covering);
 }
 
-template <bool kWithFeatures, bool kWithMedian>
+// With k3dgs the Gaussian that would take a pixel below kMinTransmittance is left out, as 3DGS does, and the pixel is
+// closed by the sign of its transmittance.
+template <bool kWithFeatures, bool kWithMedian, bool k3dgs>
 inline void composite(const Tile& tile, Chunk& chunk, int s, TileState& state, WeightList& list) {
   const Float x = tile.x[s], y = tile.y[s];
   Float t = state.transmittance[s], median = state.median_depth[s];
@@ -74,10 +76,16 @@ inline void composite(const Tile& tile, Chunk& chunk, int s, TileState& state, W
     const Float exponent = log2_alpha(g, shear(g, x - g.mean_x, dy), dy);
     const Mask taken = both(greater_equal(exponent, broadcast(kLog2MinAlpha)),
                             greater_equal(t, broadcast(kMinTransmittance)));
-    const Float alpha = zero_unless(taken, minimum(exp2_unchecked(exponent), broadcast(kMaxAlpha)));
-    const Float weight = alpha * t;
+    const Float alpha =
+        zero_unless(taken, minimum(exp2_unchecked(exponent), broadcast(k3dgs ? kMaxAlphaOf3dgs : kMaxAlpha)));
+    Float weight = alpha * t;
     const Float before = t;
     t = t - weight;
+    if (k3dgs) {
+      const Mask closed = greater(broadcast(kMinTransmittance), t);
+      weight = select(closed, Float{}, weight);
+      t = select(closed, -absolute(before), t);
+    }
     red += weight * g.red;
     green += weight * g.green;
     blue += weight * g.blue;
@@ -125,7 +133,7 @@ inline void add_features(const WeightList& list, const float* features, int chan
   if (q < channels) add_feature_group<4>(list, features + q, channels, sums + q * kLanes);
 }
 
-template <bool kWithFeatures, bool kWithMedian>
+template <bool kWithFeatures, bool kWithMedian, bool k3dgs = false>
 void composite_tile(Rasterizer& r, const Tile& tile, TileState& state, ThreadScratch& scratch) {
   Chunk chunk;
   WeightList list;
@@ -138,7 +146,7 @@ void composite_tile(Rasterizer& r, const Tile& tile, TileState& state, ThreadScr
     for (int s = 0; s < kSubBlocks; ++s) {
       chunk.contributing[s] = 0;
       if (chunk.covering[s] == 0) continue;
-      composite<kWithFeatures, kWithMedian>(tile, chunk, s, state, list);
+      composite<kWithFeatures, kWithMedian, k3dgs>(tile, chunk, s, state, list);
       if (kWithFeatures)
         add_features(list, scratch.gaussian_features.data(), channels,
                      scratch.pixel_features.data() + s * channels * kLanes);
@@ -177,7 +185,7 @@ void finish_tile(Rasterizer& r, int index, const Tile& tile, const TileState& st
     if (outside(r.view, x0, y0)) continue;
     for (int k = 0; k < 3; ++k) store_sub_block(targets.image + k * pixels, r.view, x0, y0, state.channels[s][k]);
     store_sub_block(targets.depth, r.view, x0, y0, state.channels[s][kDepth]);
-    store_sub_block(targets.alpha, r.view, x0, y0, 1.0f - state.transmittance[s]);
+    store_sub_block(targets.alpha, r.view, x0, y0, 1.0f - absolute(state.transmittance[s]));
     if (targets.median_depth != nullptr)
       store_sub_block(targets.median_depth, r.view, x0, y0, state.median_depth[s]);
     if (r.padded_features == 0) continue;
@@ -195,10 +203,11 @@ void forward_tile(Rasterizer& r, int index, const RenderTargets& targets, Thread
   start_tile(r, tile, scratch, state);
   sort_by_depth(r.entries.data() + tile.begin, scratch.sorting.data(), tile.end - tile.begin);
   const bool features = r.padded_features > 0, median = targets.median_depth != nullptr;
-  if (features && median) composite_tile<true, true>(r, tile, state, scratch);
-  if (features && !median) composite_tile<true, false>(r, tile, state, scratch);
-  if (!features && median) composite_tile<false, true>(r, tile, state, scratch);
-  if (!features && !median) composite_tile<false, false>(r, tile, state, scratch);
+  if (r.as_3dgs) composite_tile<false, false, true>(r, tile, state, scratch);
+  if (!r.as_3dgs && features && median) composite_tile<true, true>(r, tile, state, scratch);
+  if (!r.as_3dgs && features && !median) composite_tile<true, false>(r, tile, state, scratch);
+  if (!r.as_3dgs && !features && median) composite_tile<false, true>(r, tile, state, scratch);
+  if (!r.as_3dgs && !features && !median) composite_tile<false, false>(r, tile, state, scratch);
   finish_tile(r, index, tile, state, scratch, targets);
 }
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Colour of Gaussians as seen from the camera, and its derivatives. Colours are not clamped.
+// Colour of Gaussians as seen from the camera, and its derivatives. Whoever uses a colour cuts it off at black.
 #pragma once
 #include "rendering/kernels/projection_math.hpp"
 #include "rendering/kernels/spherical_harmonics.hpp"
@@ -40,6 +40,17 @@ static inline void view_colour(const GaussianArrays& arrays, const ViewConstants
     for (int k = 0; k < arrays.active_sh_coefficients; ++k)
       colour[channel] += basis[k] * load_sh(arrays, rows, n, k, channel);
   }
+}
+
+// The gradient of the colour before it was cut off at black, from that after it: what is cut off can only brighten.
+static inline void differentiate_cut_at_black(const GaussianArrays& arrays, const ViewConstants& c,
+                                              const std::int32_t* rows, int n, const Float position[3],
+                                              Float colour_gradient[3]) {
+  Float colour[3];
+  view_colour(arrays, c, rows, n, position, colour);
+  for (int channel = 0; channel < 3; ++channel)
+    colour_gradient[channel] = select(greater(Float{}, colour[channel]), minimum(colour_gradient[channel], Float{}),
+                                      colour_gradient[channel]);
 }
 
 // From the gradient of the colour: that of the coefficients is basis[k] * colour_gradient[channel]; returns in
