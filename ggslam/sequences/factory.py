@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -118,7 +119,7 @@ def _read_recording(
         raise SequenceError(f"{folder}: no such folder or file")
     found = _find_format(folder, format)
     if folder.is_dir():
-        refuse_links(folder, SequenceError)
+        refuse_links(folder, SequenceError, links=True)  # people share images between recordings by links
     recording = found.read(folder, options)
     if not recording.files:
         raise SequenceError(f"{folder}: holds no frames")
@@ -145,13 +146,12 @@ def _check_places(recording: Recording) -> None:
     what is there."""
     root = recording.path if recording.path.is_dir() else recording.path.parent
     inside: dict[Path, bool] = {}
-    resolved = root.resolve()
     for entry in recording.files:
         for path in (entry.color, entry.depth, entry.mask, entry.confidence):
             if not isinstance(path, Path):
                 continue
             if path.parent not in inside:
-                inside[path.parent] = path.parent.resolve().is_relative_to(resolved)
+                inside[path.parent] = Path(os.path.normpath(path.parent)).is_relative_to(os.path.normpath(root))
             if not inside[path.parent]:
                 raise SequenceError(
                     f"{path}: lies outside the recording {root}; copy it there, or give the folder that holds both"

@@ -103,12 +103,13 @@ def member(folder: str | Path, name: str, error: type[GgslamError] = FormatError
     return path
 
 
-def refuse_links(folder: str | Path, error: type[GgslamError] = FormatError) -> None:
+def refuse_links(folder: str | Path, error: type[GgslamError] = FormatError, links: bool = False) -> None:
     """Looks through a folder, and those in it, for links that lead out of it, pipes, sockets and devices.
 
     Args:
         folder: may be a link itself: whoever names it has chosen so.
         error: class of the error to raise.
+        links: links that lead out are no fault, and not followed.
 
     Raises:
         error: there is one; names it and, of a link, where it leads.
@@ -119,6 +120,8 @@ def refuse_links(folder: str | Path, error: type[GgslamError] = FormatError) -> 
         with suppress(OSError), os.scandir(waiting.pop()) as entries:
             for entry in entries:
                 if entry.is_symlink():
+                    if links:
+                        continue
                     target = Path(entry.path).resolve()
                     if not target.is_relative_to(root):
                         inner = Path(entry.path).relative_to(root)

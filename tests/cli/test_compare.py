@@ -17,6 +17,7 @@ from ggslam.errors import GgslamError
 from ggslam.formats.ply import write_ply
 from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
 from ggslam.formats.trajectory import read_tum, write_tum
+from ggslam.runs.verification import accept_files
 from ggslam.scene.poses import se3_exp
 
 T_SHIFT = se3_exp(np.array([0.03, -0.01, 0.02, 0.01, 0.02, -0.01]))
@@ -46,6 +47,7 @@ def run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert ggslam("eval", out, "--no-lpips", "--every", 4).exception is None
     cloud = read_point_cloud(out / "points.ply")
     write_point_cloud(out / "points.ply", cloud.points[:: len(cloud) // 20_000], {})
+    accept_files(out)
     return out
 
 
@@ -57,6 +59,7 @@ def shifted(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     cloud, trajectory = read_point_cloud(run / "points.ply"), read_tum(run / "trajectory.txt")
     write_point_cloud(other / "points.ply", cloud.points @ T_SHIFT[:3, :3].T + T_SHIFT[:3, 3], {})
     write_tum(other / "trajectory.txt", trajectory.timestamps, T_SHIFT @ trajectory.T_world_camera)
+    accept_files(other)
     return other
 
 

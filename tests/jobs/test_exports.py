@@ -20,6 +20,7 @@ from ggslam.jobs.export.splats import ENDINGS, export_packed
 from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe
+from ggslam.runs.verification import accept_files
 from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam
 
@@ -124,6 +125,7 @@ def test_a_map_on_disk_is_written_cell_by_cell(
     cells = [{"cell": [0, 0, 0], "start": 0, "count": first, **box},
              {"cell": [1, 0, 0], "start": first, "count": len(run.gaussians()) - first, **box}]  # fmt: skip
     (copy / "map_cells.json").write_text(json.dumps({"version": 1, "cells": cells}))
+    accept_files(copy)
     monkeypatch.setattr(RunFolder, "gaussians", None)  # the whole map is not asked for
     export_packed(RunFolder.open(copy), tmp_path / "parts.splat", "splat")
     assert (tmp_path / "parts.splat").read_bytes() == whole.read_bytes()

@@ -19,6 +19,7 @@ from ggslam.jobs.export.export_run import export_run
 from ggslam.jobs.export.formats import ExportFormat, choose_format
 from ggslam.jobs.submaps.stores import GAUSSIANS
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.verification import accept_files
 
 
 def meta_of(path: Path) -> dict[str, Any]:
@@ -81,6 +82,7 @@ def test_streamed_cell_by_cell(room_run: RunFolder, tmp_path: Path, monkeypatch:
     cells = [{"cell": [0, 0, 0], "start": 0, "count": first, **box},
              {"cell": [1, 0, 0], "start": first, "count": count - first, **box}]  # fmt: skip
     (copy / "map_cells.json").write_text(json.dumps({"version": 1, "cells": cells}))
+    accept_files(copy)
     monkeypatch.setattr(RunFolder, "gaussians", None)
     line = succeed("export", copy, "--out", tmp_path / "web" / "lod-meta.json")
     index = json.loads((tmp_path / "web" / "lod-meta.json").read_text())

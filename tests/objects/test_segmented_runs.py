@@ -24,6 +24,7 @@ from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe
+from ggslam.runs.writing import OBJECT_FILES, write_objects
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
@@ -52,6 +53,11 @@ def result_of(room: Any) -> SlamResult:
     return SlamResult(room.gaussians, keyframes, frames, SlamTimes(wall=1.0), times)
 
 
+def save_objects(folder: RunFolder, segmented: SegmentedMap) -> None:
+    with folder.change_files("map.ply", *OBJECT_FILES):
+        write_objects(folder.path, segmented)
+
+
 def write_run(room: Any, path: Path, supervision: Any = "masks", objects: bool = True, votes: bool = True) -> RunFolder:
     folder = RunFolder.create(path)
     request = SequenceRequest(room.sequence.path)
@@ -59,7 +65,7 @@ def write_run(room: Any, path: Path, supervision: Any = "masks", objects: bool =
     if objects:
         table = ObjectTable.build(room.gaussians, room.classifier, supervision, room.sequence.instance_names)
         labels = room.gaussians.object_id.numpy().astype(np.uint16)
-        folder.save_objects(SegmentedMap(room.gaussians, room.classifier, table, votes_for(labels) if votes else None))
+        save_objects(folder, SegmentedMap(room.gaussians, room.classifier, table, votes_for(labels) if votes else None))
     return folder
 
 
@@ -130,7 +136,7 @@ def test_objects_of_an_earlier_run_do_not_stay(run: RunFolder, shared_segmented_
 def test_votes_of_an_earlier_save_do_not_stay(run: RunFolder) -> None:
     segmented = run.segmented_map()
     segmented.votes = None
-    run.save_objects(segmented)
+    save_objects(run, segmented)
     assert run.segmented_map().votes is None
 
 
@@ -139,9 +145,9 @@ def test_a_save_that_fails_leaves_a_map_without_objects(run: RunFolder, monkeypa
         raise RunFolderError("cannot write: No space left on device")
 
     segmented = run.segmented_map()
-    monkeypatch.setattr("ggslam.runs.folder.write_bytes", full)
+    monkeypatch.setattr("ggslam.runs.writing.write_bytes", full)
     with pytest.raises(RunFolderError, match="No space"):
-        run.save_objects(segmented)
+        save_objects(run, segmented)
     assert not run.has_objects() and len(run.gaussians()) == len(segmented.gaussians)
 
 
@@ -263,7 +269,7 @@ def test_a_classifier_without_classes_leaves_the_labels_of_the_gaussians(run: Ru
     segmented = run.segmented_map()
     done("render", run.path, "--what", "ids", "--frames", "8", "--out", tmp_path / "learned")
     segmented.classifier = IdentityClassifier.empty()
-    run.save_objects(segmented)
+    save_objects(run, segmented)
     done("render", run.path, "--what", "ids", "--frames", "8", "--out", tmp_path / "voted")
     learned, voted = (cv2.imread(str(tmp_path / name / "frame000008_ids.png")) for name in ("learned", "voted"))
     assert (learned == voted).all(-1).mean() > 0.9
@@ -311,7 +317,7 @@ def test_renamed_objects_are_matched(run: RunFolder) -> None:
     segmented.classifier.class_ids = other[segmented.classifier.class_ids]
     segmented.table = ObjectTable.build(segmented.gaussians, segmented.classifier, "geometry")
     segmented.votes = None
-    run.save_objects(segmented)
+    save_objects(run, segmented)
     after, notes, _ = scores_of(run, "--every", 4)
     assert after["matching"] == "assignment" and "did not supervise" in notes
     assert after["all"]["miou"] == pytest.approx(before["all"]["miou"])

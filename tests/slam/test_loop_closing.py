@@ -22,6 +22,7 @@ from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.records.loops import LoopsRecord
+from ggslam.runs.verification import accept_files
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
 from ggslam.sequences import open_sequence
@@ -242,6 +243,7 @@ def test_damaged_places_are_named(
     else:
         arrays[name] = arrays[name] + 1000 if isinstance(value, str) else value
     np.savez(tmp_path / "map" / "places.npz", **arrays)
+    accept_files(tmp_path / "map")
     with pytest.raises(RunFolderError, match="places.npz: not the places of this run"):
         played(room, tmp_path / "a", stop=2, map=tmp_path / "map", localize_only=True)
 

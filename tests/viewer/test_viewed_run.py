@@ -18,6 +18,7 @@ from ggslam.objects.segmented_rows import keep_rows
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import vote_label_image
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.writing import OBJECT_FILES, write_objects
 from ggslam.scene.poses import inverse, quaternion_to_matrix
 from ggslam.viewer.server import close_server
 
@@ -162,7 +163,8 @@ def test_a_run_all_of_whose_gaussians_were_removed_is_shown(run: RunFolder, tmp_
     scene = run.segmented_map()
     remove_objects(scene, scene.table.ids())
     keep_rows(scene, np.zeros(len(scene.gaussians), bool))
-    empty.save_objects(scene)
+    with empty.change_files("map.ply", *OBJECT_FILES):
+        write_objects(empty.path, scene)
     server, model = serve_run(empty, port=0)
     close_server(server)
     assert model.describe().startswith("0 Gaussians") and not model.objects()
