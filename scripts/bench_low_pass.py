@@ -4,10 +4,10 @@
 
     python scripts/bench_low_pass.py runs/kitchen runs/room [--every 1] [--recording FOLDER]
 
-Held-out frames and keyframes are rendered at half, once and twice the size that the run was trained at and compared with
-the recording read at that size, over pixels with measured depth. Twice the size needs a run at `--scale 0.5` or less.
-Which rules: see `LOW_PASS` in ggslam/rendering/types.py and `as_3dgs` of `CpuRasterizer.forward`. --low-pass adds a column
-with ours but for another filter.
+Held-out frames and keyframes are rendered at half, once and twice the size that the run was trained at and compared
+with the recording read at that size, over pixels with measured depth. Twice the size needs a run at `--scale 0.5` or
+less. Which rules: see `LOW_PASS` in ggslam/rendering/types.py and `as_3dgs` of `CpuRasterizer.forward`. --low-pass adds
+a column with ours but for another filter.
 """
 
 from __future__ import annotations

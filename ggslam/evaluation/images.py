@@ -29,7 +29,8 @@ class ImageScores:
     Attributes:
         psnr: dB over pixels with measured depth (mean square error over pixels and channels, data range 1).
         psnr_unmasked: dB over all pixels.
-        psnr_3dgs: dB over pixels with measured depth of the map as 3D Gaussian Splatting and viewers that follow it draw it.
+        psnr_3dgs: dB over pixels with measured depth, of the map as 3D Gaussian Splatting and viewers that follow it
+            draw it.
         psnr_affine: dB over pixels with measured depth after the best gain and offset of each colour channel of the
             rendering: what remains when exposure and white balance are forgiven.
         ssim: mean over pixels with measured depth of the SSIM map, which is computed on the unaltered images.

@@ -132,8 +132,8 @@ class CpuRasterizer:
             Images that belong to the rasterizer and are overwritten by its next call of `forward`.
 
         Raises:
-            RenderError: wrong shapes, dtypes or devices; an impossible pose or degree; out of memory; features or median
-                depth with `as_3dgs`.
+            RenderError: wrong shapes, dtypes or devices; an impossible pose or degree; out of memory; features or
+                median depth with `as_3dgs`.
         """
         self._last = None
         self.rendering += 1
