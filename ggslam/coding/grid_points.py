@@ -52,8 +52,9 @@ class GridPoints:
 
     def sample_cubes(self, cube_bits: int, one_in: int) -> np.ndarray:
         """Codes uint64 [M] of 21 bits a coordinate, x first, of the points in one of so many (a power of two) cubes of
-        an edge of 2^cube_bits voxels."""
-        codes, slabs = np.empty(len(self), np.uint64), min(one_in, 8)
+        an edge of 2^cube_bits voxels. Whole slabs across x are passed over, unless there are few."""
+        codes, cubes = np.empty(len(self), np.uint64), (self.size[0] - 1 >> cube_bits) + 1
+        slabs = min(one_in, 8, 1 << max(0, (cubes // 8).bit_length() - 1))
         count = load_library().ggslam_gpcc_sample_cubes(
             self._select(None), self._grid, cube_bits, slabs - 1, one_in // slabs - 1, codes.ctypes.data
         )

@@ -27,6 +27,21 @@ def test_colours_follow_bt709() -> None:
     assert np.abs(ycbcr_to_rgb(found).astype(int) - rgb).max() <= 2
 
 
+def test_colours_are_rounded_as_the_reference_encoder_rounds_them() -> None:
+    """Every luma that lies on a half, or a hair beside it, and all greys and corners: to the last bit of double."""
+    r, g, b = (axis.ravel() for axis in np.meshgrid(*[np.arange(256)] * 3, indexing="ij"))
+    ties = (2126 * r + 7152 * g + 722 * b) % 10000 == 5000
+    chroma = np.abs((500000 * r - 454153 * g - 45847 * b) % 1000000 - 500000) < 20
+    rgb = np.stack([r, g, b], 1)[ties | chroma | (r == g) & (g == b) | (r % 255 + g % 255 + b % 255 == 0)]
+    r, g, b = rgb.astype(np.float64).T
+    components = [0.2126 * r + 0.7152 * g + 0.0722 * b, -0.114572 * r - 0.385428 * g + 0.5 * b + 128.0,
+                  0.5 * r - 0.454153 * g - 0.045847 * b + 128.0]  # fmt: skip
+    expected = np.floor(np.stack(components, 1) + 0.5).clip(0, 255)
+    found = rgb_to_ycbcr(rgb.astype(np.uint8), np.arange(len(rgb), dtype=np.uint32))
+    assert len(rgb) > 3000
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_identity_keeps_colours_apart(surface: tuple) -> None:
     """Components are G, B, R: the chroma offset reaches blue and red alone."""
     points, colors = surface
