@@ -27,6 +27,7 @@ from ggslam.reporting.pictures import IdentityColors
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX, MapInParts, write_map_index
 from ggslam.runs.objects_in_parts import ObjectsInParts
+from ggslam.runs.verification import accept_files
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
@@ -48,6 +49,7 @@ def stored(shared_segmented_room: Any, tmp_path_factory: pytest.TempPathFactory)
     labels = folder.gaussians().object_id.numpy().astype(np.uint16)
     (folder.path / "votes.npz").write_bytes(votes_for(labels).to_bytes())
     cells.store.close()
+    accept_files(folder.path)
     return folder.path
 
 
@@ -57,6 +59,7 @@ def pair(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple
     for name in ("cells", "whole"):
         shutil.copytree(stored, tmp_path / name)
     (tmp_path / "whole" / MAP_INDEX).unlink()
+    accept_files(tmp_path / "whole")
     monkeypatch.setattr(gaussian_rows, "BLOCK", 700)
     monkeypatch.setattr(segmented_map, "_ROWS_AT_ONCE", 500)
     return RunFolder.open(tmp_path / "cells"), RunFolder.open(tmp_path / "whole")
