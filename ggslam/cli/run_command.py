@@ -10,7 +10,7 @@ from enum import Enum
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -165,17 +165,21 @@ def run(
         sequence, format_name, start, stop, stride, scale, masks, depth_scale, "skip" if skip_bad_frames else "error",
         depth_camera, min_confidence, tuple(topics or ()), pose_convention,
     )  # fmt: skip
-    shortcuts = {
+    given = _overrides(settings, {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
         "threads": threads, "seed": seed, "loops.enabled": loops,
         "tracker": None if tracker is None else tracker.value, "device": None if device is None else device.value,
-    }  # fmt: skip
-    given = [*(settings or []), *(f"{name}={value}" for name, value in shortcuts.items() if value is not None)]
+    })  # fmt: skip
     request = replace(
         _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
         map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every,
     )  # fmt: skip
     _run_and_show(partial(execute, request), sequence.resolve().name, watched)
+
+
+def _overrides(settings: list[str] | None, shortcuts: dict[str, Any]) -> list[str]:
+    """What `--set` says, and the options that stand for a setting."""
+    return [*(settings or []), *(f"{name}={value}" for name, value in shortcuts.items() if value is not None)]
 
 
 def _go_on(

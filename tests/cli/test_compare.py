@@ -46,7 +46,7 @@ def run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert ggslam("run", room, "--out", out, *part).exception is None
     assert ggslam("eval", out, "--no-lpips", "--every", 4).exception is None
     cloud = read_point_cloud(out / "points.ply")
-    write_point_cloud(out / "points.ply", cloud.points[:: len(cloud) // 20_000], {})
+    write_point_cloud(out / "points.ply", cloud.points[:: len(cloud) // 60_000], {})
     accept_files(out)
     return out
 

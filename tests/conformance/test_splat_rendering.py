@@ -16,7 +16,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 
 CAMERA = Pinhole.centred(33, 25, 40.0)
-OURS = Rules(near=0.05, max_alpha=0.999, draws_last=True, clamps_colors=False)
+OURS = Rules(near=0.05, max_alpha=0.999, draws_last=True)
 
 
 def ball(depth: float, color: tuple[float, float, float], opacity: float, size: float = 0.05) -> Splats:

@@ -186,7 +186,7 @@ def test_shapes_that_are_not_looked_at_hide_no_light(monkeypatch: pytest.MonkeyP
         return np.nonzero(patches.owner != number)[0]
 
     monkeypatch.setattr(lighting._Patches, "near", all_others)
-    monkeypatch.setattr(lighting._Patches, "shaded", all_others)
+    monkeypatch.setattr(lighting._Patches, "shadow_candidates", all_others)
     every = lighting.bake(b.scene).atlas
     assert found.tobytes() == every.tobytes() and len(np.unique(every)) > 1000
 
