@@ -226,7 +226,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--objects", action="store_true", help="learn objects, too")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="another setting")
     parser.add_argument(
-        "--processor-time", action="store_true", help="count processor time, not wall time: on a machine others use, too"
+        "--processor-time", action="store_true", help="count processor time, not wall time (where others work, too)"
     )
     parser.add_argument("--keep", type=Path, help="file (.npz) that the drawn round is kept in")
     parser.add_argument("--json", type=Path, help="write the rows there")
@@ -241,7 +241,8 @@ def main() -> None:
         time.perf_counter = time.process_time
     objects = [] if given.objects else ["identity.enabled=false"]
     soak = Soak(rounds, [f"mapping.iterations_per_frame={given.iterations}", *objects, *given.set], given.every)
-    print(f"{given.frames} frames of {given.width}x{given.width * 3 // 4}, {length} a round; load {os.getloadavg()[0]:.1f}")
+    size = f"{given.width}x{given.width * 3 // 4}"
+    print(f"{given.frames} frames of {size}, {length} a round; load {os.getloadavg()[0]:.1f}")
     print(Row.header(), flush=True)
     rows = soak.run(given.frames)
     for line in verdicts(rows):

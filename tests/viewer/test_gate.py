@@ -69,7 +69,7 @@ def test_another_page_is_refused(server: Any) -> None:
 def test_frames_and_images_of_another_page_get_nothing(server: Any, sender: str, status: int) -> None:
     more = {"Sec-Fetch-Site": sender}
     assert get(server, "/", Cookie=cookie_of(server), **more).status == status
-    assert get(server, "/?" + urlsplit(address(server)).query, **more).status == 200  # a link that was given to somebody
+    assert get(server, "/?" + urlsplit(address(server)).query, **more).status == 200  # a link that was given
 
 
 def connect(server: Any, message: bytes | None = None, **headers: str) -> str:
