@@ -16,12 +16,11 @@ from collections.abc import Callable, Iterable
 
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
+from ggslam.slam.frame_clock import FrameClock
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
 from ggslam.tracking.tracker import TrackingResult
 
-MAX_LAG_FRAMES = 3
-"""A frame that is this many frame times late is dropped: a live camera would have overwritten it."""
 MAX_WAITING = 8
 """While so many keyframes wait for the mapper no more are made, so that memory stays bounded."""
 
@@ -32,10 +31,11 @@ class RealtimeSlam:
     Args:
         slam: a fresh `Slam`; its parts are used from two threads.
         frames_per_second: rate at which frames arrive.
+        live: whether they come at a camera's own pace; else they are delivered at that rate.
     """
 
-    def __init__(self, slam: Slam, frames_per_second: float) -> None:
-        self.slam = slam
+    def __init__(self, slam: Slam, frames_per_second: float, live: bool = False) -> None:
+        self.slam, self.live = slam, live
         self.period = 1.0 / frames_per_second
         self._jobs: queue.Queue[tuple[Frame, TrackingResult, int] | None] = queue.Queue()
         self._mapper_error: BaseException | None = None
@@ -58,19 +58,12 @@ class RealtimeSlam:
     # --- tracker's thread --------------------------------------------------------------------------------------------
 
     def _track(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
-        slam, first_due = self.slam, 0.0
-        for frame in frames:
+        slam, clock = self.slam, FrameClock(self.period, self.live)
+        for frame in clock.paced(frames, lambda late: slam.dropped_frames.append(late.index)):
             if not slam.frames:
                 self._first(frame, report)
-                first_due = time.perf_counter() - frame.index * self.period
-                continue
-            late = time.perf_counter() - (first_due + frame.index * self.period)
-            if late > MAX_LAG_FRAMES * self.period:
-                slam.dropped_frames.append(frame.index)
-                continue
-            if late < 0:
-                time.sleep(-late)
-            report(frame, self._step(frame))
+            else:
+                report(frame, self._step(frame))
             if self._mapper_error is not None:
                 return
 

@@ -50,7 +50,13 @@ class Gate:
         origin = headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != host:
             return f"a page of {origin[:80]!r} may not use it"
-        if self._has_token(path) or self._has_cookie(headers.get("Cookie") or "", host):
+        if self._has_token(path):
+            return None
+        # A page of another port is of the same site: frames, images and links in it carry the cookie and no origin.
+        sender = headers.get("Sec-Fetch-Site")
+        if sender not in (None, "none", "same-origin"):
+            return f"a page of another origin ({sender[:20]!r}) may not use it"
+        if self._has_cookie(headers.get("Cookie") or "", host):
             return None
         return "without the token of the printed address"
 

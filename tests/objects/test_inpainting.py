@@ -94,7 +94,7 @@ def test_no_blot_stays_and_the_colour_is_that_of_the_table(filled: Filled) -> No
 def test_the_new_surface_lies_where_the_table_is(filled: Filled) -> None:
     covered = filled.table.images[filled.number].mask == CYLINDER
     error = np.abs(filled.depth - filled.table.truth[filled.number].depth)[covered]
-    assert np.median(error) < 0.03  # the map's own table is off by 0.015
+    assert np.median(error) < 0.036  # the map's own table is off by 0.017, and by 0.023 around the hole
 
 
 def test_nothing_changes_away_from_the_hole(filled: Filled) -> None:

@@ -21,8 +21,9 @@ LIBRARY_NOISE = "computeBoundingSphere(): Computed radius is NaN"
 a page of nothing but one splat says the same. It only keeps the mesh from being left out when it is out of sight."""
 
 
-def open_browser(width: int, height: int) -> Any:
-    """Chromium without a screen that draws in software; skips the test where it is not installed."""
+def open_browser(width: int, height: int, *more: str) -> Any:
+    """Chromium without a screen that draws in software, started with some `more` arguments; skips the test where it is
+    not installed."""
     selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     program = shutil.which("chromium") or shutil.which("google-chrome")
     driver = shutil.which("chromedriver")
@@ -33,6 +34,7 @@ def open_browser(width: int, height: int) -> Any:
     for argument in (
         "--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
         f"--window-size={width},{height}", "--disable-dev-shm-usage",
+        *more,
     ):  # fmt: skip
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})

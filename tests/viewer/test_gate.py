@@ -64,6 +64,14 @@ def test_another_page_is_refused(server: Any) -> None:
         assert get(server, "/", Cookie=cookie, Origin=origin).status == 403
 
 
+@pytest.mark.parametrize(("sender", "status"), [("same-site", 403), ("cross-site", 403), ("none", 200),
+                                                ("same-origin", 200)])  # fmt: skip
+def test_frames_and_images_of_another_page_get_nothing(server: Any, sender: str, status: int) -> None:
+    more = {"Sec-Fetch-Site": sender}
+    assert get(server, "/", Cookie=cookie_of(server), **more).status == status
+    assert get(server, "/?" + urlsplit(address(server)).query, **more).status == 200  # a link that was given
+
+
 def connect(server: Any, message: bytes | None = None, **headers: str) -> str:
     """What becomes of a websocket: `open`, the status of a refusal, or why it was closed after a message."""
     from websockets.asyncio.client import connect as websocket

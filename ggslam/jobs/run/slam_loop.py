@@ -92,7 +92,8 @@ class SlamLoop:
             frames = sequence.stream(masks="lazy")
         self._between_steps = self.config.realtime_fps == 0
         if self.config.realtime_fps > 0:
-            RealtimeSlam(slam, self.config.realtime_fps).run(frames, lambda *step: self._report(slam, *step))
+            paced = RealtimeSlam(slam, self.config.realtime_fps, live=isinstance(sequence, LiveSequence))
+            paced.run(frames, lambda *step: self._report(slam, *step))
             return
         for frame in frames:
             self._between_steps = False

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When frames are due, and which come too late: a camera's pace for the frames of a recording, a live camera's own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+
+from ggslam.scene.frame import Frame
+
+MAX_LAG_FRAMES = 3
+"""A frame that is this many frame times late is dropped: a live camera would have overwritten it."""
+WAITED_S = 1e-3
+"""Seconds; a frame that took longer to come was not there yet when it was asked for."""
+
+
+class FrameClock:
+    """Hands frames on at their time and drops those that come too late because the caller was busy.
+
+    A recording's frame is due by its index, a live camera's by its timestamp, and never waited for. Only the caller's
+    own delay makes frames late: where the source lets the caller wait (a camera that stalls, one slower than stated,
+    a slow disk), the clock starts anew with what comes then.
+
+    Args:
+        period: seconds from frame to frame, as stated.
+        live: whether the source keeps its own pace.
+        now: tells the time, seconds.
+        sleep: lets seconds pass.
+    """
+
+    def __init__(
+        self, period: float, live: bool = False, now: Callable[[], float] = time.perf_counter,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:  # fmt: skip
+        self.period, self.live = period, live
+        self._now, self._sleep = now, sleep
+        self._begin = 0.0
+        """When the frame of index or timestamp 0 is due."""
+        self._catching_up = False
+
+    def paced(self, frames: Iterable[Frame], drop: Callable[[Frame], None]) -> Iterator[Frame]:
+        """The frames in time; `drop` gets each that is too late. The first one is always in time, and the clock starts
+        when the caller is done with it."""
+        iterator, asked, first = iter(frames), self._now(), True
+        for frame in iterator:
+            waited = self._now() - asked
+            if first:
+                yield frame
+                self._begin, first = self._now() - self._offset(frame), False
+            elif self._is_late(frame, waited):
+                drop(frame)
+            else:
+                yield frame
+            asked = self._now()
+
+    def _offset(self, frame: Frame) -> float:
+        return frame.timestamp if self.live else frame.index * self.period
+
+    def _is_late(self, frame: Frame, waited: float) -> bool:
+        """Whether the frame is to be dropped; sleeps until it is due."""
+        late = self._now() - (self._begin + self._offset(frame))
+        if late > MAX_LAG_FRAMES * self.period:
+            # Behind its buffer a recording has to be read, which takes a part of a period: that is catching up still.
+            self._catching_up = waited <= (self.period / 2 if self._catching_up and not self.live else WAITED_S)
+            if self._catching_up:
+                return True
+            self._begin += late
+        elif late < 0 and self.live:
+            self._begin += late  # the shortest delay is the camera's own
+        elif late < 0:
+            self._sleep(-late)
+        self._catching_up = False
+        return False
