@@ -70,7 +70,7 @@ def _make_check(library: ctypes.CDLL) -> Callable[[Any, Any, tuple[Any, ...]], A
     function failed is then what `ggslam_last_error` says, of the same thread.
     """
     unsigned = {c_type: 2 ** (8 * ctypes.sizeof(c_type)) - 1 for c_type in (ctypes.c_uint32, ctypes.c_uint64)}
-    signs = {c_type: -1 for c_type in (ctypes.c_int32, ctypes.c_int64)}
+    signs = dict.fromkeys((ctypes.c_int32, ctypes.c_int64), -1)
     failures: dict[Any, int | None] = {**unsigned, **signs, ctypes.c_void_p: None, ctypes.c_char_p: None}
 
     def check(result: Any, function: Any, _arguments: tuple[Any, ...]) -> Any:

@@ -17,7 +17,7 @@ import pytest
 from ggslam.errors import CoreInputError, CoreMemoryError, GgslamError, NativeCoreError
 from ggslam.interface.binding import CORE
 from ggslam.interface.core.common import CoreFault
-from ggslam.interface.core.volumes import FusionInput, FusionSettings, FusionStats, InsertResult, InsertSettings
+from ggslam.interface.core.volumes import FusionInput, FusionSettings, FusionStats, InsertResult
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.volumes.esdf import DistanceField, FieldSettings
@@ -157,7 +157,8 @@ def test_blocks_beyond_what_can_be_numbered_are_refused(at: int) -> None:
 def test_the_farthest_blocks_have_a_distance_field() -> None:
     tsdf = TsdfMap()
     values = np.linspace(32767, -32767, 8).astype(np.int16).repeat(64)[None].repeat(2, 0)
-    tsdf.write(np.array([[2**27, -(2**27), 2**27], [-(2**27), 0, 5]]), value=values, weight=np.full((2, 512), 9, np.uint16))
+    at = np.array([[2**27, -(2**27), 2**27], [-(2**27), 0, 5]])
+    tsdf.write(at, value=values, weight=np.full((2, 512), 9, np.uint16))
     field = DistanceField(tsdf)
     stats = field.update()
     assert len(field) == 2 and stats.changed_sites == 128
