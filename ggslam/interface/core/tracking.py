@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/tracking.hpp"
-HEADER_SHA256 = "c3860866e1ad0e9f6562bfcac4aa46bf518fc55215fff6a7d51f87489a42e690"
+HEADER_SHA256 = "603bf6b29f57f00f4c27715be7ba552af2af00d0d199e0311ca4decf672ca96e"
 
 
 class DepthPointsSettings(Structure):
@@ -124,6 +124,9 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_gicp_target_create": (c_void_p, []),
     "ggslam_gicp_target_destroy": (None, [c_void_p]),
     "ggslam_gicp_target_build": (None, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
+    "ggslam_gicp_target_build_like": (None, [
+        c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings),
+    ]),
     "ggslam_gicp_target_gather": (None, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
     "ggslam_gicp_target_finish": (None, [c_void_p, c_void_p, POINTER(TargetSettings)]),
     "ggslam_gicp_target_size": (c_int, [c_void_p, c_int]),
