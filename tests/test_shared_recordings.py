@@ -35,7 +35,7 @@ def run(recording: Path, out: Path, overrides: list[str], **selection: Any) -> t
 
 @pytest.mark.long("a true recording shows what a generated one does not")
 def test_livingroom_begins_well(shared_data: Path, tmp_path: Path) -> None:
-    m, status = run(shared_data / "livingroom", tmp_path / "run", [], stop=30)
+    m, status = run(shared_data / "livingroom", tmp_path / "run", [], stop=20)
     assert "lost" not in status
     assert m.trajectory.ate_rmse_m < 0.0005
     assert m.images.held_out.psnr > 31 and m.images.all.depth_l1_m < 0.012
@@ -43,7 +43,7 @@ def test_livingroom_begins_well(shared_data: Path, tmp_path: Path) -> None:
 
 @pytest.mark.long("a true recording shows what a generated one does not")
 def test_redkitchen_begins_well(shared_data: Path, tmp_path: Path) -> None:
-    m, status = run(shared_data / "redkitchen", tmp_path / "run", [], stop=30)
+    m, status = run(shared_data / "redkitchen", tmp_path / "run", [], stop=20)
     assert "lost" not in status
     assert m.trajectory.ate_rmse_m < 0.02
     assert m.images.held_out.psnr > 21 and m.images.all.psnr_unmasked > 20

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from ggslam.cli import options, settings_help
 from ggslam.cli.console import console, progress_bar
@@ -48,8 +49,12 @@ EPILOG = """
   ggslam run --resume runs/kitchen
 """
 
-_WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host", "port", "evaluate"}
+_WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host", "port", "evaluate", "strict"}
 """Options that change nothing of what a run computes."""
+
+
+STRICT_EXIT_CODE = 3
+"""Of runs that came to an end, but with verdicts, under --strict."""
 
 
 class DeviceName(str, Enum):
@@ -109,6 +114,9 @@ CheckpointEvery = Annotated[
         help="Save what it takes to go on after so many frames; 0: never. Default: as often as takes 1 % of the time.",
     ),
 ]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="Exit with code 3 if something seems wrong with the recording or the run.")
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in the output folder.")]
 
 
@@ -147,6 +155,7 @@ def run(
     port: options.Port = 8080,
     evaluate: Evaluate = True,
     overwrite: Overwrite = False,
+    strict: Strict = False,
     resume: Resume = None,
     checkpoint_every: CheckpointEvery = None,
     help_settings: settings_help.HelpSettings = False,
@@ -156,7 +165,7 @@ def run(
     from ggslam.jobs.run.pipeline import execute
     from ggslam.runs.recordings import SequenceRequest
 
-    watched = _Watched(log, (host, port) if view else None)
+    watched = _Watched(log, (host, port) if view else None, strict)
     if resume is not None:
         return _go_on(context, resume, sequence, checkpoint_every, evaluate, watched)
     if sequence is None:
@@ -228,10 +237,12 @@ def _request(reading: SequenceRequest, record: Path | None) -> RunRequest:
 
 @dataclass(frozen=True)
 class _Watched:
-    """Where a run is logged, and the host and port of the page that shows it; None: not."""
+    """Where a run is logged, and the host and port of the page that shows it; None: not. Whether verdicts are
+    failures."""
 
     log: str | None
     address: tuple[str, int] | None
+    strict: bool
 
 
 def _run_and_show(run: Callable[..., RunOutcome], name: str, watched: _Watched) -> None:
@@ -252,12 +263,16 @@ def _run_and_show(run: Callable[..., RunOutcome], name: str, watched: _Watched) 
             wait_for_interrupt(lambda: console.print(text, highlight=False, markup=False))
     if outcome.error is not None:
         raise outcome.error
+    if watched.strict and outcome.verdicts:
+        raise typer.Exit(STRICT_EXIT_CODE)
 
 
 def _print(outcome: RunOutcome) -> None:
     console.print(f"{outcome.folder.path}: {outcome.headline()}", highlight=False, markup=False)
     if outcome.metrics is not None:
         print_scores(outcome.metrics)
+    for verdict in outcome.verdicts:
+        console.print(f"[yellow]{verdict.severity}:[/] {escape(verdict.text)}", highlight=False)
     if outcome.error is None:
         for hint in next_commands(outcome.folder.path):
             console.print(hint, highlight=False, markup=False, soft_wrap=True)  # commands are copied: no line breaks

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.formats.surface_discs import SurfaceDiscs, disc_samples
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import quaternion_to_matrix
 
 _CHUNK = 300_000
 """Samples held in memory at a time..."""
@@ -19,12 +20,10 @@ _FEW = 50_000
 """Voxels that are sampled, where Gaussians come in parts, before one looks which are finished."""
 _BLOCK_EDGE = 0.25
 """Metres: how finely it is known where parts to come reach."""
-_SECTION = 0.5
-"""Metres along the map that are sampled together where memory is scarce."""
-_SPACING = 0.7
-"""Distance of samples in voxels; below 1/sqrt(2) a lattice turned in its plane still meets every voxel of the plane."""
-_MOST_STEPS = 40
-"""Most samples from the centre outwards along one axis; larger Gaussians are sampled more thinly."""
+USUAL_VOXEL = 0.01
+"""Metres."""
+_MOST_SAMPLES = 250
+"""Of a Gaussian, on average, in voxels that go with the map; a room's has 40 to 120 in voxels of 1 cm."""
 _BITS = 21
 """Bits per axis of the packed voxel number."""
 
@@ -78,7 +77,7 @@ def sample_points(
     """
     if not voxel_size > 0 or not 0 < minimum_opacity < 1:
         raise ValueError(f"impossible voxel size {voxel_size} or minimum opacity {minimum_opacity}")
-    discs = _Discs.of(gaussians, minimum_opacity)
+    discs = SurfaceDiscs.of(gaussians, minimum_opacity)
     merged = _add_samples(_Sums.empty(), gaussians, discs, voxel_size, with_object_id)
     return _cloud(merged, voxel_size, with_object_id)
 
@@ -102,9 +101,11 @@ class MapPart:
 
 
 def sample_parts(
-    parts: Sequence[MapPart], voxel_size: float = 0.01, minimum_opacity: float = 0.3, with_object_id: bool = False
-) -> Iterator[VoxelCloud]:
+    parts: Sequence[MapPart], voxel_size: float | None = None, minimum_opacity: float = 0.3,
+    with_object_id: bool = False,
+) -> Iterator[VoxelCloud]:  # fmt: skip
     """Like `sample_points` of all parts together, in clouds one after the other, each with an origin of its own.
+    Without a voxel size it goes with the map, see `voxel_size_for`.
 
     Parts are read twice: at first to see which cubes of space each has samples in. Then they are swept along the
     longest side of the map, each cut in sections; voxels in cubes that no later section reaches are handed out. So no
@@ -113,17 +114,19 @@ def sample_parts(
     """
     if not parts:
         return
+    voxel_size = voxel_size_for(parts, minimum_opacity) if voxel_size is None else voxel_size
     lows, highs = np.stack([part.low for part in parts]), np.stack([part.high for part in parts])
     axis = int((highs.max(0) - lows.min(0)).argmax())
     order = np.argsort(lows[:, axis], kind="stable").tolist()
     sections: list[np.ndarray] = []
     for number in order:
-        sections += [_cubes(discs, voxel_size) for discs in _Discs.of(parts[number].load(), minimum_opacity).cut(axis)]
+        whole = SurfaceDiscs.of(parts[number].load(), minimum_opacity)
+        sections += [_cubes(discs, voxel_size) for discs in whole.cut(axis)]
     blocks, done = _Blocks(sections, voxel_size), 0
     waiting, pending, sampled = _Sums.empty(), [], 0
     for number in order:
         part = parts[number].load()
-        for discs in _Discs.of(part, minimum_opacity).cut(axis):
+        for discs in SurfaceDiscs.of(part, minimum_opacity).cut(axis):
             pending.append(_add_samples(_Sums.empty(), part, discs, voxel_size, with_object_id, _SMALL_CHUNK))
             blocks.is_done(done)
             done, sampled = done + 1, sampled + len(pending[-1].key)
@@ -136,12 +139,28 @@ def sample_parts(
                 waiting = waiting.of_rows(~finished)
 
 
+def voxel_size_for(parts: Sequence[MapPart], minimum_opacity: float = 0.3) -> float:
+    """Edge of voxels that suits a map, a whole number of centimetres: 1, and more where Gaussians are much larger than
+    a room's, in halls or where depth has a wrong unit. A cloud of those in voxels of 1 cm takes the time and the disk
+    of hundreds of rooms."""
+    size, mean = 0.0, 2.0 * _MOST_SAMPLES
+    while mean > _MOST_SAMPLES:
+        size = USUAL_VOXEL * max(1, math.ceil(size / USUAL_VOXEL * math.sqrt(mean / _MOST_SAMPLES)))
+        samples = gaussians = 0
+        for part in parts:
+            discs = SurfaceDiscs.of(part.load(), minimum_opacity)
+            samples += int(discs.counts(size).sum())
+            gaussians += len(discs.used)
+        mean = samples / max(1, gaussians)
+    return size
+
+
 def _cube_edge(voxel_size: float) -> int:
     """Of the cubes that finished space is counted in, voxels."""
     return max(1, round(_BLOCK_EDGE / voxel_size))
 
 
-def _cubes(discs: _Discs, voxel_size: float) -> np.ndarray:
+def _cubes(discs: SurfaceDiscs, voxel_size: float) -> np.ndarray:
     """The cubes that samples may fall into, packed, sorted."""
     # A disc reaches along an axis of the world as far as its two half axes do together, and samples are rounded.
     reach = np.sqrt(((discs.axes * discs.reach[:, None, :]) ** 2).sum(2)) + voxel_size
@@ -188,11 +207,12 @@ class _Blocks:
 
 
 def _add_samples(
-    merged: _Sums, gaussians: GaussianMap, discs: _Discs, voxel_size: float, with_object_id: bool, chunk: int = _CHUNK,
+    merged: _Sums, gaussians: GaussianMap, discs: SurfaceDiscs, voxel_size: float, with_object_id: bool,
+    chunk: int = _CHUNK,
 ) -> _Sums:  # fmt: skip
     """The sums with those of samples of a map, of which `chunk` are in memory at a time."""
     pending, waiting = [], 0
-    for position, weight, color, object_id in _samples(gaussians, discs, voxel_size, chunk):
+    for position, weight, color, object_id in disc_samples(gaussians, discs, voxel_size, chunk):
         lattice = np.rint(position / voxel_size)
         if np.abs(lattice).max(initial=0) >= 1 << (_BITS - 1):
             raise ValueError(f"the map spans more than 2^{_BITS} voxels of {voxel_size} m")
@@ -214,77 +234,6 @@ def _pack(lattice: np.ndarray) -> np.ndarray:
 def _unpack(key: np.ndarray) -> np.ndarray:
     limit = (1 << _BITS) - 1
     return np.stack([key >> 2 * _BITS, (key >> _BITS) & limit, key & limit], 1) - (1 << (_BITS - 1))
-
-
-@dataclass(frozen=True)
-class _Discs:
-    """What of a map is sampled: rows [N] that are opaque enough, float64 opacity [N], means [N, 3], the two longest
-    axes [N, 3, 2] with their scales [N, 2], and how far samples go along them [N, 2], metres."""
-
-    minimum_opacity: float
-    used: np.ndarray
-    opacity: np.ndarray
-    means: np.ndarray
-    scales: np.ndarray
-    axes: np.ndarray
-    reach: np.ndarray
-
-    @staticmethod
-    def of(gaussians: GaussianMap, minimum_opacity: float) -> _Discs:
-        opacity = gaussians.opacities.detach().cpu().numpy().astype(np.float64)
-        used = np.nonzero(opacity >= minimum_opacity)[0]
-        opacity = opacity[used]
-        means = gaussians.means.detach().cpu().numpy().astype(np.float64)[used]
-        scales = gaussians.scales.detach().cpu().numpy().astype(np.float64)[used]
-        axes = quaternion_to_matrix(gaussians.quaternions.detach().cpu().numpy().astype(np.float64)[used])
-        longest = np.argsort(-scales, axis=1, kind="stable")[:, :2]
-        scales = np.take_along_axis(scales, longest, 1)
-        axes = np.take_along_axis(axes, longest[:, None, :], 2)
-        reach = scales * np.sqrt(2 * np.log(opacity / minimum_opacity))[:, None]
-        return _Discs(minimum_opacity, used, opacity, means, scales, axes, reach)
-
-    def cut(self, axis: int) -> list[_Discs]:
-        """Their sections along an axis of the world, in its direction; at least one, perhaps empty."""
-        section = np.floor(self.means[:, axis] / _SECTION)
-        cut = []
-        for chosen in (section == number for number in np.unique(section)):
-            arrays = (self.used, self.opacity, self.means, self.scales, self.axes, self.reach)
-            cut.append(_Discs(self.minimum_opacity, *(array[chosen] for array in arrays)))
-        return cut or [self]
-
-
-def _samples(
-    gaussians: GaussianMap, discs: _Discs, voxel_size: float, chunk: int
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Chunks of (position [M, 3], weight [M], colour [M, 3] in [0, 1], object id [M]), float64 and int32."""
-    used, opacity, means, scales, axes, reach = (
-        discs.used, discs.opacity, discs.means, discs.scales, discs.axes, discs.reach
-    )  # fmt: skip
-    color = gaussians.rgb.detach().cpu().numpy().astype(np.float64)[used].clip(0, 1)
-    object_id = gaussians.object_id.cpu().numpy()[used]
-    step = np.maximum(_SPACING * voxel_size, reach / _MOST_STEPS)
-    steps = np.floor(reach / step).astype(np.int64)
-    per_gaussian = np.prod(2 * steps + 1, axis=1)
-    bounds = np.concatenate([[0], np.cumsum(per_gaussian)])
-    start = 0
-    while start < len(used):
-        stop = max(start + 1, int(np.searchsorted(bounds, bounds[start] + chunk, side="right")) - 1)
-        owner = np.repeat(np.arange(start, stop), per_gaussian[start:stop])
-        number = np.arange(bounds[start], bounds[stop]) - bounds[owner]
-        offset = _lattice_point(number, steps[owner]) * step[owner]
-        a, b = ((offset / scales[owner]) ** 2).T
-        alpha = opacity[owner] * np.exp(-0.5 * (a + b))
-        visible = alpha >= discs.minimum_opacity * (1 - 1e-9)
-        owner, offset = owner[visible], offset[visible]
-        first, second = np.moveaxis(axes[owner] * offset[:, None, :], 2, 0)
-        position = means[owner] + (first + second)
-        yield position, alpha[visible], color[owner], object_id[owner]
-        start = stop
-
-
-def _lattice_point(number: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Whole coordinates [N, 2], each in -steps..steps, of the number-th point of a rectangle."""
-    return np.stack(np.divmod(number, 2 * steps[:, 1] + 1), 1) - steps
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +17,11 @@ from ggslam.runs.environment import environment
 from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
-from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.mark import RunRecord, VerdictRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_map_in_parts, save_points
+from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.config import Config, save_config
 from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_places import PLACES_FILE
@@ -47,6 +48,7 @@ class RunToWrite:
 
     Attributes:
         wanted: names of files that are to be made yet.
+        verdicts: what seems wrong with the run.
         failure: why the clouds could not be written.
     """
 
@@ -56,6 +58,7 @@ class RunToWrite:
     error: str | None
     names: Mapping[int, str]
     wanted: tuple[str, ...]
+    verdicts: Sequence[Verdict] = ()
     failure: GgslamError | OSError | None = None
 
     def write(self, folder: Path) -> RunRecord:
@@ -105,7 +108,7 @@ class RunToWrite:
         """run.json of the run without these files."""
         return RunRecord(
             ggslam=__version__, complete=self.error is None and not missing, stopped_by=self.error,
-            missing=list(missing),
+            missing=list(missing), verdicts=[VerdictRecord(**vars(verdict)) for verdict in self.verdicts],
             environment={**environment(self.config.threads), "device": self.result.device},
         )  # fmt: skip
 

@@ -60,7 +60,7 @@ def measure_alignment(frames: list[Frame]) -> Alignment | None:
     reach = max(2, round(LARGEST_SHIFT * width))
     surfaces, weight = np.zeros((len(SCALES), 2 * reach + 1, 2 * reach + 1)), 0
     for frame in frames:
-        outlines, edges = _outlines(frame.depth), _edges(frame.color)
+        outlines, edges = outlines_of(frame.depth), edges_of(frame.color)
         if outlines.sum() < FEWEST_OUTLINES * outlines.size:
             continue
         # Each frame counts alike: one with a picture on the wall has many edges.
@@ -82,7 +82,7 @@ def _small_size(image: np.ndarray) -> tuple[int, int]:
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def _outlines(depth: np.ndarray) -> np.ndarray:
+def outlines_of(depth: np.ndarray) -> np.ndarray:
     """Pixels of surfaces at whose border farther ones were measured too, float32 [H, W] 0 or 1."""
     small = cv2.resize(depth, _small_size(depth), interpolation=cv2.INTER_NEAREST)
     kernel = np.ones((5, 5), np.uint8)
@@ -97,7 +97,7 @@ def _outlines(depth: np.ndarray) -> np.ndarray:
     return outlines.astype(np.float32)
 
 
-def _edges(color: np.ndarray) -> np.ndarray:
+def edges_of(color: np.ndarray) -> np.ndarray:
     """Strength of edges, float32 [H, W], of mean 0 and deviation 1."""
     grey = cv2.cvtColor(cv2.resize(color, _small_size(color), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 0.8)

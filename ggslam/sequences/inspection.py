@@ -12,12 +12,16 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences.alignment import Alignment, measure_alignment
+from ggslam.sequences.focal_doubts import doubt_focal_length
 from ggslam.sequences.pose_conventions import CONVENTIONS, OURS
 from ggslam.sequences.pose_doubts import PoseDoubt, doubt_poses, pairs_apart
 from ggslam.sequences.sequence import Sequence
+from ggslam.sequences.step_doubts import REACH as STEP_REACH
+from ggslam.sequences.step_doubts import doubt_steps
+from ggslam.sequences.verdicts import Verdict, judge_depth_scale, judge_intrinsics, judge_scale_by, judge_times
 
-SMALLEST_MEDIAN_DEPTH, LARGEST_MEDIAN_DEPTH = 0.1, 6.0
-"""Metres; a median depth outside suggests a wrong depth scale: RGB-D cameras see rooms."""
+APART = 12
+"""Frames from one to the other of those that are compared where no true pose tells how far the camera moved."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,8 @@ class SequenceReport:
         masked_frames: share of sampled frames with a mask; mask_ids: ids seen in them; labelled_share: of their pixels.
         named_ids: how many ids have names.
         damaged: reasons of sampled frames that could not be read.
-        warnings: everything that looks wrong or needs to be known.
+        verdicts: what seems wrong by the numbers.
+        warnings: everything that looks wrong or needs to be known, the texts of the verdicts among it.
     """
 
     name: str
@@ -84,11 +89,17 @@ class SequenceReport:
     labelled_share: float = 0.0
     named_ids: int = 0
     damaged: list[str] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
+    def judge(self, verdicts: list[Verdict]) -> None:
+        """Takes verdicts in."""
+        self.verdicts += verdicts
+        self.warnings += [verdict.text for verdict in verdicts]
 
-def inspect_sequence(sequence: Sequence, samples: int = 8) -> SequenceReport:
-    """Reads `samples` frames spread over the sequence and reports what they hold."""
+
+def inspect_sequence(sequence: Sequence, samples: int = 8, masks: bool = True) -> SequenceReport:
+    """Reads `samples` frames spread over the sequence, with or without their masks, and reports what they hold."""
     times = sequence.timestamps
     intervals = np.diff(times)
     report = SequenceReport(
@@ -98,25 +109,28 @@ def inspect_sequence(sequence: Sequence, samples: int = 8) -> SequenceReport:
         named_ids=len(sequence.instance_names), warnings=list(sequence.warnings),
     )  # fmt: skip
     chosen = np.unique(np.linspace(0, len(sequence) - 1, max(1, min(samples, len(sequence)))).round().astype(int))
-    frames = [frame for i in chosen if (frame := _try(sequence, int(i), report)) is not None]
+    frames = [frame for i in chosen if (frame := _try(sequence, int(i), report, masks)) is not None]
     _describe_images(report, frames)
     try:
-        report.mask_kinds = dict(sequence.mask_kinds())
+        report.mask_kinds = dict(sequence.mask_kinds()) if masks else {}
     except SequenceError as error:
         report.warnings.append(str(error))
+    pairs = _pairs(report, sequence, frames)
     if sequence.ground_truth is not None:
         report.posed_frames = int(np.isfinite(sequence.ground_truth).all((1, 2)).sum())
         report.motion = _motion(sequence.ground_truth)
-        _check_poses(report, doubt_poses(pairs_apart(sequence, frames)))
+        _check_poses(report, doubt_poses(pairs))
     report.alignment = measure_alignment(frames)
     _check_alignment(report)
-    _warn(report, intervals, frames)
+    _check_camera(report, pairs)
+    _check_steps(report, sequence)
+    _warn(report, times, frames)
     return report
 
 
-def _try(sequence: Sequence, index: int, report: SequenceReport) -> Frame | None:
+def _try(sequence: Sequence, index: int, report: SequenceReport, masks: bool) -> Frame | None:
     try:
-        return sequence.frame(index)
+        return sequence.frame(index, masks=masks)
     except SequenceError as error:
         report.damaged.append(str(error))
         return None
@@ -157,33 +171,62 @@ def _motion(poses: np.ndarray) -> Motion | None:
     return Motion(summary(distance), summary(turn), float(distance.sum()))
 
 
-USUAL_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10000.0, 512.0, 256.0, 1.0)
-"""Depth units per metre that cameras and data sets use."""
-
-
 def _check_poses(report: SequenceReport, doubt: PoseDoubt | None) -> None:
     """Tells what depth images of neighbouring frames say about poses and depth scale."""
     if doubt is None:
         return
     report.pose_depth_error = doubt.error
-    add = report.warnings.append
     if doubt.wrong_convention:
-        add(
+        text = (
             f"the true poses look like {CONVENTIONS[doubt.convention].description}: read so, neighbouring depth images "
             f"agree to {doubt.best:.2%}, as {CONVENTIONS[OURS].description} only to {doubt.error:.2%}; "
             f"try `pose_convention` {doubt.convention}"
         )
+        report.judge([Verdict("poses", "wrong", text)])
     elif doubt.wrong_scale:
-        found = report.depth_scale / doubt.ratio
-        usual = min(USUAL_SCALES, key=lambda scale: abs(np.log(scale / found)))
-        scale = usual if abs(np.log(usual / found)) < 0.1 else found
-        add(
-            f"depth scale {report.depth_scale:g} is suspicious: with about {scale:g} units a metre neighbouring "
-            f"depth images agree with the poses to {doubt.best:.2%}, so only to {doubt.error:.2%}; "
-            f"try `depth_scale` {scale:g}"
-        )
+        how = f"with another one neighbouring depth images agree with the poses to {doubt.best:.2%}, with this one "
+        report.judge(judge_scale_by(report.depth_scale, 1 / doubt.ratio, f"{how}only to {doubt.error:.2%}"))
     elif doubt.error > 0.05:
-        add(f"true poses and depth disagree by {doubt.error:.0%}: wrong depth scale or poses, or little seen twice")
+        text = f"true poses and depth disagree by {doubt.error:.0%}: wrong depth scale or poses, or little seen twice"
+        report.judge([Verdict("poses", "doubtful", text)])
+
+
+def _pairs(report: SequenceReport, sequence: Sequence, frames: list[Frame]) -> list[tuple[Frame, Frame]]:
+    """Frames with others that show much the same from another side."""
+    if sequence.ground_truth is not None:
+        return pairs_apart(sequence, frames)
+    last = len(sequence) - 1
+    later = [_try(sequence, min(frame.index + APART, last), report, masks=False) for frame in frames]
+    return [(a, b) for a, b in zip(frames, later, strict=True) if b is not None and b.index > a.index]
+
+
+def _check_camera(report: SequenceReport, pairs: list[tuple[Frame, Frame]]) -> None:
+    """Judges intrinsics by themselves, else by pairs of frames."""
+    found = judge_intrinsics(report.camera)
+    report.judge(found)
+    doubt = None if found else doubt_focal_length(pairs)
+    if doubt is not None and doubt.wrong:
+        text = (
+            f"intrinsics are suspicious: with fx {report.native_camera.fx * doubt.factor:.0f} instead of "
+            f"{report.native_camera.fx:.0f} distances of points seen twice agree to {doubt.best:.2%}, so only to "
+            f"{doubt.error:.2%}; check fx and fy, and whether they are of this size of images"
+        )
+        report.judge([Verdict("intrinsics", "wrong", text)])
+
+
+def _check_steps(report: SequenceReport, sequence: Sequence) -> None:
+    """Judges whether colour and depth are of the same moment."""
+    doubt = doubt_steps(sequence)
+    if doubt is None or not doubt.wrong:
+        return
+    steps = abs(doubt.behind)
+    count = f"{steps} or more frames" if steps == STEP_REACH else "1 frame"
+    side = "before" if doubt.behind > 0 else "after"
+    text = (
+        f"colour and depth are out of step: depth fits the colour of {count} {side} it better (strength of edges "
+        f"{doubt.best:.2f}, not {doubt.strength:.2f}); pair images of the same time"
+    )
+    report.judge([Verdict("step", "wrong", text)])
 
 
 def _check_alignment(report: SequenceReport) -> None:
@@ -193,33 +236,28 @@ def _check_alignment(report: SequenceReport) -> None:
     width = report.camera.width
     parts = [f"{axis} {share * width:+.0f} pixels" for axis, share in zip(("right", "down"), found.shift, strict=True)]
     size = "" if found.scale == 1 else f" and enlarged by {found.scale:g}"
-    report.warnings.append(
+    text = (
         "depth does not lie on colour: its outlines fit the edges of the colour images better when moved "
         f"{', '.join(parts)}{size}; wrong intrinsics, depth that is not registered (`depth_camera`), or images of "
         "different times"
     )
+    report.judge([Verdict("alignment", "doubtful", text)])
 
 
-def _warn(report: SequenceReport, intervals: np.ndarray, frames: list[Frame]) -> None:
+def _warn(report: SequenceReport, times: np.ndarray, frames: list[Frame]) -> None:
     add = report.warnings.append
     median = report.depth_m[1]
     if report.damaged:
         add(f"{len(report.damaged)} of the sampled frames are damaged; the first: {report.damaged[0]}")
     if frames and not report.valid_share:
         add("no depth at all in the sampled frames")
-    elif median < SMALLEST_MEDIAN_DEPTH or median > LARGEST_MEDIAN_DEPTH:
-        told = any(f"depth scale {report.depth_scale:g} is suspicious" in warning for warning in report.warnings)
-        if not told:  # the poses tell more
-            add(f"depth scale {report.depth_scale:g} is suspicious: the median depth is {median:.3g} m")
-    elif frames and report.valid_share < 0.2:
+    elif not any(verdict.code == "depth_scale" for verdict in report.verdicts):  # the poses tell more
+        report.judge(judge_depth_scale(report.depth_scale, median))
+    if frames and 0 < report.valid_share < 0.2:
         add(f"only {report.valid_share:.0%} of the pixels have depth")
-    if len(intervals) and intervals.min() <= 0:
-        add("timestamps do not increase from frame to frame")
+    report.judge(judge_times(times))
     if report.motion is not None and (report.motion.step_m[1] > 0.2 or report.motion.turn_deg[1] > 15):
         add(
             f"large motion between frames (90th percentile {report.motion.step_m[1]:.2f} m, "
             f"{report.motion.turn_deg[1]:.0f} degrees): tracking may be lost"
         )
-    angle = 2 * np.degrees(np.arctan(report.camera.width / (2 * report.camera.fx)))
-    if not 20 <= angle <= 120:
-        add(f"intrinsics are suspicious: horizontal angle of view {angle:.0f} degrees")

@@ -61,7 +61,7 @@ def pairs_apart(sequence: Sequence, frames: list[Frame]) -> list[tuple[Frame, Fr
         if frame.T_world_camera is None or later is None:
             continue
         try:
-            pairs.append((frame, sequence.frame(later)))
+            pairs.append((frame, sequence.frame(later, masks=False)))
         except SequenceError:
             continue
     return pairs
@@ -111,7 +111,8 @@ def _differences(frame: Frame, other: Frame, convention: PoseConvention, ratio: 
     """|seen - predicted| / predicted for pixels of `frame` that fall into `other`."""
     assert frame.T_world_camera is not None and other.T_world_camera is not None
     step = max(1, min(frame.depth.shape) // GRID)
-    points = frame.camera.back_project(frame.depth[::1, ::1])[::step, ::step].reshape(-1, 3) * np.float32(ratio)
+    points = frame.camera.rays()[::step, ::step] * frame.depth[::step, ::step, None].astype(np.float32)
+    points = points.reshape(-1, 3) * np.float32(ratio)
     points = points[points[:, 2] > 0]
     T_world_frame, T_world_other = map(convention.convert, (frame.T_world_camera, other.T_world_camera))
     points = transform_points(points, inverse(T_world_other) @ T_world_frame)

@@ -8,13 +8,16 @@ everywhere but in YAML 1.1.
 
 from __future__ import annotations
 
+import copy
 import re
+from functools import lru_cache
 from typing import Any
 
 import yaml
 
 MAX_DEPTH = 32
 MAX_CHARACTERS = 1 << 20
+_KEPT_CHARACTERS = 1 << 16
 
 
 class PlainYamlError(ValueError):
@@ -68,9 +71,17 @@ def parse_yaml(text: str) -> Any:
     """
     if len(text) > MAX_CHARACTERS:
         raise PlainYamlError(f"{len(text):,} characters; at most {MAX_CHARACTERS:,} are read")
+    # One command asks for a run's settings several times, and reading them takes 20 ms.
+    return copy.deepcopy(_parse_again(text)) if len(text) < _KEPT_CHARACTERS else _parse(text)
+
+
+def _parse(text: str) -> Any:
     try:
         return yaml.load(text, _Loader)  # a loader safer than the safe one
     except PlainYamlError:
         raise
     except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
         raise PlainYamlError(" ".join(str(error).split())) from None
+
+
+_parse_again = lru_cache(maxsize=16)(_parse)

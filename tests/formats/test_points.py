@@ -12,6 +12,7 @@ import torch
 from ggslam.errors import FormatError
 from ggslam.formats.ply import read_ply, write_ply
 from ggslam.formats.point_ply import read_points, sample_points, write_points
+from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.scene.gaussian_map import GaussianMap
 
 
@@ -94,6 +95,17 @@ def test_both_files_hold_the_same_points_and_are_read_back(tmp_path: Path) -> No
         np.testing.assert_array_equal(found.colors, cloud.colors)
         np.testing.assert_array_equal(found.object_id, cloud.object_id)
         np.testing.assert_array_equal(found.points, cloud.points)
+
+
+@pytest.mark.parametrize(("size", "voxel"), [(0.01, 0.01), (0.05, 0.02), (0.2, 0.06)])
+def test_voxels_go_with_large_gaussians(size: float, voxel: float) -> None:
+    """A room's are sampled in voxels of 1 cm; of a room five times as large there would be 25 times as many points."""
+    gaussians, generator = GaussianMap(), np.random.default_rng(0)
+    for mean in generator.random((20, 3)) * 100 * size:
+        add(gaussians, mean.tolist(), [size, size, 1e-4], 0.9, [0.5, 0.5, 0.5])
+    clouds = list(sample_parts([MapPart.of(gaussians)]))
+    assert len({cloud.voxel_size for cloud in clouds}) == 1 and clouds[0].voxel_size == pytest.approx(voxel)
+    assert sum(map(len, clouds)) < 20 * 250
 
 
 def test_the_size_of_the_chunks_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,6 +44,7 @@ def test_healthy(room: Path) -> None:
     assert report.alignment is not None and report.alignment.strength > 0.4
 
 
+@pytest.mark.long("four true recordings")
 def test_healthy_shared_recordings(shared_data: Path) -> None:
     for name in ("livingroom", "redkitchen", "rgbd_dataset_freiburg3_cabinet", "shelf"):
         assert warnings_of(shared_data / name, scale=0.5) == [], name

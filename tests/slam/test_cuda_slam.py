@@ -36,7 +36,7 @@ FRAMES = 3
 
 @pytest.fixture(scope="module")
 def frames(room: Path) -> list[Frame]:
-    return list(open_sequence(room, scale=0.5, stride=2).stream())[:FRAMES]
+    return list(open_sequence(room, scale=0.4, stride=2).stream())[:FRAMES]
 
 
 def config(*overrides: str) -> Config:
@@ -62,7 +62,7 @@ def test_same_run_as_on_the_cpu(frames: list[Frame], cuda_library: CudaLibrary) 
     assert np.abs(found.trajectory() - expected.trajectory()).max() < 1e-3
     assert abs(len(found.gaussians) / len(expected.gaussians) - 1) < 0.01
     assert slam.mapper.last_psnr == pytest.approx(expected_slam.mapper.last_psnr, abs=0.2)
-    assert slam.mapper.losses.total == pytest.approx(expected_slam.mapper.losses.total, rel=0.02)
+    assert slam.mapper.losses.total == pytest.approx(expected_slam.mapper.losses.total, rel=0.03)
     assert found.gaussians.means.device.type == "cpu"
 
 
@@ -132,6 +132,7 @@ def test_iterations_without_room_are_made_again(
     assert mapper.times.iterations == done + 7
 
 
+@pytest.mark.long("the whole loop under emulation")
 def test_a_keyframe_looks_again_if_its_rendering_found_no_room(
     frames: list[Frame], cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch
 ) -> None:

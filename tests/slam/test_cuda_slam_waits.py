@@ -17,10 +17,11 @@ SETTINGS = ["device=cuda", "mapping.iterations_per_frame=2", "mapping.first_fram
             "identity.final_passes=1", "evaluation.held_out_every=0", "keyframes.max_gap=3"]  # fmt: skip
 
 
+@pytest.mark.long("the whole loop under emulation")
 @pytest.mark.parametrize("schedule", ["sampled", "votes"])
 def test_the_host_waits_for_a_frame_once(room: Path, schedule: str) -> None:
     """For its pose; at a keyframe once more, for what the map shows of objects and the number of new Gaussians."""
-    frames = list(open_sequence(room, scale=0.5).stream())[:6]
+    frames = list(open_sequence(room, scale=0.42).stream())[:6]
     with DeviceWatch() as watch:
         slam = Slam(frames[0].camera, load_config(None, [*SETTINGS, f"identity.schedule={schedule}"]), has_masks=True)
         kinds = []

@@ -121,6 +121,7 @@ def test_a_view_of_the_cells_on_disk_is_the_view_of_the_map(limited: RunOutcome)
     assert np.abs(rasterizer.forward(seen, keyframe.camera, T_camera_world).image.numpy() - full).max() < 1e-5
 
 
+@pytest.mark.long("a whole run, with objects")
 def test_objects_of_a_map_on_disk(turning: Path, tmp_path: Path) -> None:
     """A row more than 100 bytes longer, so with the same budget more has to go."""
     objects = ["identity.enabled=true", "identity.final_passes=1"]
@@ -159,6 +160,7 @@ def test_gaussians_on_disk_follow_a_correction(turning: Path) -> None:
     slam.finish().close()
 
 
+@pytest.mark.long("a second whole run")
 def test_a_limited_run_repeats(turning: Path, limited: RunOutcome, tmp_path: Path) -> None:
     again = executed(turning, tmp_path / "again", REFINED, *SMALL)
     for name in ("map.ply", "trajectory.txt", "map_cells.json"):

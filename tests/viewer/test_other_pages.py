@@ -80,7 +80,9 @@ def other_port(server: Any) -> Iterator[int]:
         other.shutdown()
 
 
-@pytest.mark.parametrize("name", ["localhost", "127.0.0.1", BENT_NAME])
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("localhost", "127.0.0.1")), BENT_NAME]
+)
 def test_a_page_of_another_origin_gets_nothing(
     browser: Any, server: Any, other_port: int, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,6 +13,7 @@ from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.run.checkpointing import Checkpointing, start_record
+from ggslam.jobs.run.health import judge
 from ggslam.jobs.run.rescue import save_somewhere
 from ggslam.jobs.run.resuming import Resumption
 from ggslam.jobs.run.slam_loop import Follower, SlamLoop
@@ -26,6 +27,7 @@ from ggslam.runs.starting import ancestors
 from ggslam.runs.writing import REPORT_FILE, RunToWrite
 from ggslam.sequences import Sequence
 from ggslam.sequences.live import LiveSequence
+from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.config import Config, load_config
 from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_state import reason_against_saving
@@ -52,13 +54,14 @@ class RunRequest:
 @dataclass
 class RunOutcome:
     """A finished run, or what was saved of one that stopped early (`error` says why). If it could not be saved as it
-    should be, `failure` says so, and where it is."""
+    should be, `failure` says so, and where it is. `verdicts` tell what seems wrong with it or its recording."""
 
     folder: RunFolder
     result: SlamResult
     metrics: MetricsRecord | None = None
     error: BaseException | None = None
     failure: GgslamError | None = None
+    verdicts: list[Verdict] = field(default_factory=list)
 
     def headline(self) -> str:
         """One line for people."""
@@ -209,13 +212,14 @@ class _Run:
         scored = self.request.evaluate and error is None and self._frames_stay()
         wanted = (*((MetricsRecord.FILE, "frames.csv") if scored else ()), REPORT_FILE)
         told = None if error is None else repr(error)
+        verdicts = judge(self.sequence, result)
         try:
             folder, failure = save_somewhere(
-                self.folder, RunToWrite(self.config, described, result, told, names, wanted)
+                self.folder, RunToWrite(self.config, described, result, told, names, wanted, verdicts)
             )
         finally:
             result.close()
-        return RunOutcome(folder, result, error=error or failure, failure=failure)
+        return RunOutcome(folder, result, error=error or failure, failure=failure, verdicts=verdicts)
 
     def _frames_stay(self) -> bool:
         """Whether the frames of the run can be read again."""

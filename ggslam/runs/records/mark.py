@@ -18,6 +18,14 @@ class FileRecord(Record):
     sha256: str
 
 
+class VerdictRecord(Record):
+    """Something that seems wrong with the run; see `sequences.verdicts.Verdict`."""
+
+    code: str
+    severity: str = "doubtful"
+    text: str
+
+
 class RunRecord(RecordFile):
     """The mark of a run's folder.
 
@@ -26,6 +34,7 @@ class RunRecord(RecordFile):
         complete: whether it ended well and all that was asked for is there.
         stopped_by: why it is not.
         missing: names of files that were asked for and are not there (yet).
+        verdicts: what seems wrong with the recording or the run.
         files: the manifest: all files of the run but this one, by name; None: of before there was one.
         environment: versions and machine, see `runs.environment`; older runs have none.
         edits: what was done to the map since, as sentences.
@@ -37,6 +46,7 @@ class RunRecord(RecordFile):
     complete: bool = False
     stopped_by: str | None = None
     missing: list[str] = []
+    verdicts: list[VerdictRecord] = []
     files: dict[str, FileRecord] | None = None
     environment: dict[str, str | int | float | None] | None = None
     edits: list[str] = []
@@ -69,4 +79,5 @@ class RunRecord(RecordFile):
         """What a user should know, a line each."""
         notes = [f"the run stopped early: {self.stopped_by}"] if self.stopped_by else []
         notes += [f"asked for, but not there: {', '.join(self.missing)}"] if self.missing else []
+        notes += [f"{verdict.severity}: {verdict.text}" for verdict in self.verdicts]
         return notes + ([f"the map was edited: {'; '.join(self.edits)}"] if self.edits else [])

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Verdicts on recordings and runs: what seems wrong, with the number that says so, and what to do about it.
+
+Here are those that the numbers of a recording alone allow; `ggslam inspect` and runs tell them in the same words.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ggslam.scene.camera import Camera
+
+Severity = Literal["doubtful", "wrong"]
+
+SMALLEST_MEDIAN_DEPTH, LARGEST_MEDIAN_DEPTH = 0.1, 6.0
+"""Metres; a median depth outside suggests a wrong depth scale: RGB-D cameras see rooms."""
+USUAL_MEDIAN_DEPTH = 1.8
+"""Metres; of rooms."""
+USUAL_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10000.0, 512.0, 256.0, 1.0)
+"""Depth units per metre that cameras and data sets use."""
+LEAST_ANGLE, LARGEST_ANGLE = 20.0, 120.0
+"""Degrees: horizontal angles of view of usual lenses."""
+GAP = 2.5
+"""Intervals that are longer than so many usual ones lack frames."""
+MISSING_SHARE, MISSING_S = 0.05, 0.5
+"""Share of the frames that lack, and length of one gap in seconds, from which it is told."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Something that seems wrong.
+
+    Attributes:
+        code: which check says so.
+        severity: "wrong": results are; "doubtful": they may be.
+        text: one sentence with what was measured and what to do.
+    """
+
+    code: str
+    severity: Severity
+    text: str
+
+
+def usual_scale(scale: float) -> float:
+    """The depth scale in use that is nearest to one, or the power of ten, or that itself if none is near."""
+    power = float(10.0 ** round(np.log10(scale)))
+    nearest = min((*USUAL_SCALES, power), key=lambda known: abs(np.log(known / scale)))
+    return nearest if abs(np.log(nearest / scale)) < 0.15 else float(f"{scale:.3g}")
+
+
+def judge_depth_scale(scale: float, median_m: float) -> list[Verdict]:
+    """What the median depth in metres says of depth with `scale` units per metre."""
+    if not median_m > 0 or SMALLEST_MEDIAN_DEPTH <= median_m <= LARGEST_MEDIAN_DEPTH:
+        return []
+    candidates = {*USUAL_SCALES, *(scale * 10.0**power for power in range(-4, 5)), *(scale * f for f in (5, 1 / 5))}
+    likely = min(candidates, key=lambda known: abs(np.log(median_m * scale / known / USUAL_MEDIAN_DEPTH)))
+    text = f"depth scale {scale:g} is suspicious: the median depth is {median_m:.3g} m"
+    found = median_m * scale / likely
+    return [Verdict("depth_scale", "wrong", f"{text}; try `depth_scale` {likely:g}, with which it is {found:.2g} m")]
+
+
+def judge_scale_by(scale: float, ratio: float, how: str) -> list[Verdict]:
+    """That lengths come out `ratio` times too large with `scale` units per metre, as `how` says."""
+    likely = usual_scale(scale * ratio)
+    text = f"depth scale {scale:g} is suspicious: {how}; try `depth_scale` {likely:g}"
+    return [Verdict("depth_scale", "wrong", text)]
+
+
+def judge_intrinsics(camera: Camera) -> list[Verdict]:
+    """What is implausible of intrinsics by themselves."""
+    angle = 2 * np.degrees(np.arctan(camera.width / (2 * camera.fx)))
+    if not LEAST_ANGLE <= angle <= LARGEST_ANGLE:
+        text = f"intrinsics are suspicious: horizontal angle of view {angle:.0f} degrees; check fx"
+        return [Verdict("intrinsics", "wrong", text)]
+    wide = abs(camera.fy / camera.fx)
+    if not 0.8 <= wide <= 1.25:
+        text = f"fx {camera.fx:.1f} and fy {camera.fy:.1f} mean pixels {wide:.2f} times as wide as high; check both"
+        return [Verdict("intrinsics", "wrong", f"intrinsics are suspicious: {text}")]
+    off = max(abs((camera.cx + 0.5) / camera.width - 0.5), abs((camera.cy + 0.5) / camera.height - 0.5))
+    if off > 0.2:
+        text = f"the principal point lies {off:.0%} of the image away from its middle; check cx and cy"
+        return [Verdict("intrinsics", "wrong", f"intrinsics are suspicious: {text}")]
+    return []
+
+
+def judge_times(timestamps: np.ndarray) -> list[Verdict]:
+    """What timestamps [n] in seconds, in the order of the frames, say."""
+    intervals = np.diff(timestamps)
+    verdicts = []
+    back = np.flatnonzero(intervals <= 0)
+    if len(back):
+        where, step = int(back[0]) + 1, intervals[back[0]]
+        text = f"{len(back)} timestamps are not later than the one before (frame {where}: {step:+.3g} s)"
+        verdicts.append(
+            Verdict("time", "doubtful", f"timestamps do not increase from frame to frame: {text}; sort the recording")
+        )
+    usual = float(np.median(intervals[intervals > 0])) if (intervals > 0).any() else 0.0
+    gaps = np.flatnonzero(intervals > GAP * usual) if usual else np.zeros(0, int)
+    if len(gaps):
+        missing, longest = int(np.rint(intervals[gaps] / usual - 1).sum()), gaps[intervals[gaps].argmax()]
+        if missing > MISSING_SHARE * len(timestamps) or intervals[longest] > max(MISSING_S, 6 * usual):
+            text = f"about {missing} frames are missing in {len(gaps)} gaps of the timestamps"
+            text += f" (the longest: {intervals[longest]:.2f} s before frame {longest + 1})"
+            verdicts.append(Verdict("frames_missing", "doubtful", f"{text}; record to a faster disk, or fewer pixels"))
+    return verdicts

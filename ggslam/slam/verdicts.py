@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Verdicts on a run, from what it kept of its frames and keyframes: a fraction of a second at the end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.scene.poses import fit_similarity
+from ggslam.sequences.verdicts import Verdict, judge_scale_by
+from ggslam.slam.result import SlamResult
+from ggslam.tracking.gicp_tracker import MIN_TEXTURED
+from ggslam.tracking.photometric import GreyDepth, textured_points
+from ggslam.tracking.settings import PhotometricSettings
+from ggslam.tracking.tracker import TrackingStatus
+
+DEGENERATE_SHARE, BLIND_SHARE, LOST_SHARE, DROPPED_SHARE = 0.5, 0.1, 0.05, 0.02
+"""Shares of the frames from which it is told that they were of this kind."""
+FEWEST_FRAMES = 5
+"""And how many there have to be."""
+LONGER, LONGEST_ERROR, FEWEST_POSES = 1.4, 0.35, 10
+"""The true path differs in length by this factor and fits but for this share of its size; so many poses are needed."""
+
+
+def judge_run(result: SlamResult) -> list[Verdict]:
+    """What was measured while the run was made."""
+    return [*_judge_motion(result), *_judge_lost(result), *_judge_dropped(result)]
+
+
+def _judge_motion(result: SlamResult) -> list[Verdict]:
+    """Whether geometry told where the camera went, and, where it did not, grey values."""
+    open_ = [f for f in result.frames if f.status == TrackingStatus.DEGENERATE.value]
+    if len(open_) < FEWEST_FRAMES:
+        return []
+    bare = {k: _is_bare(result.keyframes[k]) for k in {f.keyframe for f in open_ if f.keyframe < len(result.keyframes)}}
+    blind = [f for f in open_ if bare.get(f.keyframe, False)]
+    total = len(result.frames)
+    if len(blind) >= max(FEWEST_FRAMES, BLIND_SHARE * total):
+        text = (
+            f"{len(blind)} of {total} frames (the first: {blind[0].frame_index}) show one bare surface and no "
+            "texture: nothing tells how the camera moved along it, and it seems to stand still; keep edges or texture "
+            "in view"
+        )
+        return [Verdict("textureless", "wrong", text)]
+    if len(open_) > DEGENERATE_SHARE * total:
+        text = (
+            f"in {len(open_)} of {total} frames ({len(open_) / total:.0%}) the surfaces in view leave a direction of "
+            "motion open, and grey values alone tell it; keep more than one wall or the floor in view"
+        )
+        return [Verdict("degenerate", "doubtful", text)]
+    return []
+
+
+def _is_bare(keyframe: Keyframe) -> bool:
+    """Whether it has too little texture to be tracked by."""
+    if keyframe.frame_index == ELSEWHERE:
+        return False
+    shrink = PhotometricSettings().shrink * max(1, round(keyframe.camera.width / 320))
+    view = GreyDepth.from_images(keyframe.color, keyframe.depth_m(), keyframe.camera, shrink)
+    return len(textured_points(view, PhotometricSettings())) < MIN_TEXTURED
+
+
+def _judge_lost(result: SlamResult) -> list[Verdict]:
+    lost = [f.frame_index for f in result.frames if f.status == TrackingStatus.LOST.value]
+    if len(lost) < max(FEWEST_FRAMES, LOST_SHARE * len(result.frames)):
+        return []
+    text = f"the camera was lost in {len(lost)} of {len(result.frames)} frames (the first: {lost[0]})"
+    return [Verdict("lost", "wrong", f"{text}; move slower, and back to where it was found last")]
+
+
+def _judge_dropped(result: SlamResult) -> list[Verdict]:
+    dropped, total = result.dropped_frames, len(result.frames) + len(result.dropped_frames)
+    if len(dropped) < max(FEWEST_FRAMES, DROPPED_SHARE * total):
+        return []
+    text = f"{len(dropped)} of {total} frames were dropped (the first: {dropped[0]}): they came faster than tracked"
+    return [Verdict("dropped", "doubtful", f"{text}; choose a lower rate, a smaller `scale` or a faster machine")]
+
+
+def judge_path(result: SlamResult, truth: np.ndarray | None, depth_scale: float) -> list[Verdict]:
+    """Whether the path is as long as the true one, which tells the unit of depth.
+
+    Args:
+        result: of the run.
+        truth: T_world_camera of the recording's frames [n, 4, 4], NaN where unknown; None: nothing is known.
+        depth_scale: units of depth images per metre.
+    """
+    if truth is None:
+        return []
+    inside = np.array([f.frame_index < len(truth) for f in result.frames], bool)
+    ours = result.trajectory()[inside, :3, 3]
+    true = truth[[f.frame_index for f in result.frames if f.frame_index < len(truth)], :3, 3]
+    known = np.isfinite(ours).all(1) & np.isfinite(true).all(1)
+    if known.sum() < FEWEST_POSES:
+        return []
+    ours, true = ours[known], true[known]
+    size = np.sqrt(((true - true.mean(0)) ** 2).sum(1).mean())
+    T, scale = fit_similarity(true, ours, with_scale=True)
+    ratio = float(scale)
+    if not (size > 0.02 and ratio > 0 and abs(np.log(ratio)) > np.log(LONGER)):
+        return []
+    error = np.sqrt(((ratio * true @ T[:3, :3].T + T[:3, 3] - ours) ** 2).sum(1).mean())
+    if error > LONGEST_ERROR * ratio * size:
+        return []
+    return judge_scale_by(depth_scale, ratio, f"the camera's path comes out {ratio:.3g} times as long as the true one")
