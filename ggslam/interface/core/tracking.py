@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/tracking.hpp"
-HEADER_SHA256 = "603bf6b29f57f00f4c27715be7ba552af2af00d0d199e0311ca4decf672ca96e"
+HEADER_SHA256 = "5808877624845db446b625e6e46bda69f88857bb1ab4827dd4007d25b40bc32e"
 
 
 class DepthPointsSettings(Structure):
@@ -122,22 +122,22 @@ STRUCTURES: tuple[type[Structure], ...] = (
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_depth_points": (c_int, [c_void_p, c_void_p, POINTER(DepthPointsSettings), POINTER(DepthPointsOutput)]),
     "ggslam_gicp_target_create": (c_void_p, []),
-    "ggslam_gicp_target_destroy": (None, [c_void_p]),
-    "ggslam_gicp_target_build": (None, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
-    "ggslam_gicp_target_build_like": (None, [
+    "ggslam_gicp_target_destroy": (c_int, [c_void_p]),
+    "ggslam_gicp_target_build": (c_int, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
+    "ggslam_gicp_target_build_like": (c_int, [
         c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings),
     ]),
-    "ggslam_gicp_target_gather": (None, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
-    "ggslam_gicp_target_finish": (None, [c_void_p, c_void_p, POINTER(TargetSettings)]),
+    "ggslam_gicp_target_gather": (c_int, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
+    "ggslam_gicp_target_finish": (c_int, [c_void_p, c_void_p, POINTER(TargetSettings)]),
     "ggslam_gicp_target_size": (c_int, [c_void_p, c_int]),
-    "ggslam_gicp_target_moments": (None, [c_void_p, c_int, c_void_p]),
-    "ggslam_gicp_target_voxels": (None, [c_void_p, c_int, c_void_p]),
+    "ggslam_gicp_target_moments": (c_int, [c_void_p, c_int, c_void_p]),
+    "ggslam_gicp_target_voxels": (c_int, [c_void_p, c_int, c_void_p]),
     "ggslam_gicp_target_blocks": (c_int, [c_void_p, c_int, c_void_p]),
     "ggslam_target_part_create": (c_void_p, [c_void_p, POINTER(TargetInput), POINTER(TargetSettings), c_uint64]),
-    "ggslam_target_part_destroy": (None, [c_void_p]),
+    "ggslam_target_part_destroy": (c_int, [c_void_p]),
     "ggslam_target_part_bytes": (c_int64, [c_void_p]),
-    "ggslam_gicp_target_compose": (None, [c_void_p, c_void_p, c_void_p, c_void_p, c_int, POINTER(TargetSettings)]),
-    "ggslam_gicp_align": (None, [
+    "ggslam_gicp_target_compose": (c_int, [c_void_p, c_void_p, c_void_p, c_void_p, c_int, POINTER(TargetSettings)]),
+    "ggslam_gicp_align": (c_int, [
         c_void_p, c_void_p, POINTER(AlignPoints), POINTER(AlignSettings), POINTER(PhotometricPoints),
         POINTER(PhotometricReferenceView), c_void_p, c_void_p, c_void_p, POINTER(AlignResult),
     ]),
