@@ -42,6 +42,14 @@ class MissingDependency(GgslamError):
 
 
 class NativeCoreError(GgslamError):
-    """The compiled core is missing or does not fit this version of the Python code."""
+    """The compiled core is missing, does not fit this version of the Python code, or failed."""
 
     exit_code = 1
+
+
+class CoreMemoryError(NativeCoreError, MemoryError):
+    """Memory ran out in the compiled core."""
+
+
+class CoreInputError(GgslamError, ValueError):
+    """The compiled core was given a size, a number or an array that cannot be."""

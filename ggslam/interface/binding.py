@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from types import ModuleType
+from typing import Any
 
-from ggslam.errors import NativeCoreError
+from ggslam.errors import CoreInputError, CoreMemoryError, NativeCoreError
 from ggslam.interface.core import codec, common, mapping, rendering, tracking, volumes
 from ggslam.interface.cuda import common as cuda_common
 from ggslam.interface.cuda import mapping as cuda_mapping
@@ -21,6 +23,8 @@ from ggslam.interface.cuda import tracking as cuda_tracking
 
 CORE = (codec, common, mapping, rendering, tracking, volumes)
 CUDA = (cuda_common, cuda_mapping, cuda_rendering, cuda_tracking)
+_FAULTS = {common.CoreFault.BAD_INPUT: CoreInputError, common.CoreFault.MEMORY_RAN_OUT: CoreMemoryError}
+_LONGEST_MESSAGE = 512
 _PREFIXES = {"core": "ggslam", "cuda": "ggslam_cuda"}
 
 
@@ -35,13 +39,19 @@ def cuda_hash() -> str:
 
 
 def bind_core(library: ctypes.CDLL) -> None:
-    """Declares the functions of the compiled core.
+    """Declares the functions of the compiled core, which raise from then on what they fail with: a `CoreInputError`, a
+    `CoreMemoryError` or another `NativeCoreError`.
 
     Raises:
         NativeCoreError: it was compiled from other headers, or lays structures out in another way.
     """
     remedy = "run `bash scripts/build_native.sh` in a checkout, else `pip install` ggslam anew"
     _bind(library, "ggslam_interface_hash", core_hash(), CORE, remedy)
+    check = _make_check(library)
+    for part in CORE:
+        for name in part.FUNCTIONS:
+            getattr(library, name).errcheck = check
+    del library.ggslam_last_error.errcheck
 
 
 def bind_cuda(library: ctypes.CDLL) -> None:
@@ -51,6 +61,29 @@ def bind_cuda(library: ctypes.CDLL) -> None:
         NativeCoreError: they were compiled from other headers, or lay structures out in another way.
     """
     _bind(library, "ggslam_cuda_interface_hash", cuda_hash(), CUDA, "remove the file, it will be compiled anew")
+
+
+def _make_check(library: ctypes.CDLL) -> Callable[[Any, Any, tuple[Any, ...]], Any]:
+    """What is called with the result of each function: raises if the function failed.
+
+    A result that stands for a failure may also be one of several others that a function documents: whether the
+    function failed is then what `ggslam_last_error` says, of the same thread.
+    """
+    unsigned = {c_type: 2 ** (8 * ctypes.sizeof(c_type)) - 1 for c_type in (ctypes.c_uint32, ctypes.c_uint64)}
+    signs = dict.fromkeys((ctypes.c_int32, ctypes.c_int64), -1)
+    failures: dict[Any, int | None] = {**unsigned, **signs, ctypes.c_void_p: None, ctypes.c_char_p: None}
+
+    def check(result: Any, function: Any, _arguments: tuple[Any, ...]) -> Any:
+        is_number = function.restype is ctypes.c_double
+        if not (math.isnan(result) if is_number else result == failures[function.restype]):
+            return result
+        message = ctypes.create_string_buffer(_LONGEST_MESSAGE)
+        fault = library.ggslam_last_error(message, _LONGEST_MESSAGE)
+        if fault == common.CoreFault.NO_FAULT:
+            return result
+        raise _FAULTS.get(fault, NativeCoreError)(f"{function.__name__}: {message.value.decode(errors='replace')}")
+
+    return check
 
 
 def check_layout(name: str, mirrors: Sequence[type[ctypes.Structure]], found: Sequence[int]) -> None:

@@ -97,7 +97,7 @@ struct Points {
 }  // namespace ggslam::gpcc
 
 GGSLAM_EXPORT void* ggslam_gpcc_slice_create();
-GGSLAM_EXPORT void ggslam_gpcc_slice_destroy(void* slice);
+GGSLAM_EXPORT int ggslam_gpcc_slice_destroy(void* slice);
 
 // Builds the octree of points [count, 3] in [0, 2^depth). `order` [count] receives their coding order.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_build(void* context, void* slice, const std::int32_t* points,
@@ -108,7 +108,7 @@ GGSLAM_EXPORT std::uint32_t ggslam_gpcc_leaves(void* slice);
 GGSLAM_EXPORT std::uint32_t ggslam_gpcc_nodes(void* slice, std::int32_t level);
 
 // Number of points in each leaf, `counts` [leaves].
-GGSLAM_EXPORT void ggslam_gpcc_leaf_points(void* slice, std::uint32_t* counts);
+GGSLAM_EXPORT int ggslam_gpcc_leaf_points(void* slice, std::uint32_t* counts);
 
 // Makes every leaf one point.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_merge(void* slice);
@@ -122,7 +122,7 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slic
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_attribute(void* context, void* slice,
                                                         const ggslam::gpcc::RahtSettings* settings,
                                                         std::int32_t* attributes);
-GGSLAM_EXPORT void ggslam_gpcc_take(void* slice, std::uint8_t* out);
+GGSLAM_EXPORT int ggslam_gpcc_take(void* slice, std::uint8_t* out);
 
 // Decodes a geometry payload that is said to hold `points` points.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_geometry(void* context, void* slice,
@@ -166,28 +166,28 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_details(void* context, void* slice
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_sort_values(void* slice, std::int32_t components, std::int32_t* values);
 
 // Y, Cb, Cr [count, 3] of the colours rgb[order[i]].
-GGSLAM_EXPORT void ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, const std::uint32_t* order,
-                                        std::uint32_t count, std::int32_t* out);
-GGSLAM_EXPORT void ggslam_gpcc_from_ycbcr(void* context, const std::int32_t* components, std::uint32_t count,
-                                          std::uint8_t* rgb);
+GGSLAM_EXPORT int ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, const std::uint32_t* order,
+                                       std::uint32_t count, std::int32_t* out);
+GGSLAM_EXPORT int ggslam_gpcc_from_ycbcr(void* context, const std::int32_t* components, std::uint32_t count,
+                                         std::uint8_t* rgb);
 
 // Grid positions [count, 3].
-GGSLAM_EXPORT void ggslam_gpcc_on_grid(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
-                                       std::int32_t* out);
+GGSLAM_EXPORT int ggslam_gpcc_on_grid(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
+                                      std::int32_t* out);
 
 // Grid coordinates [count] along one axis.
-GGSLAM_EXPORT void ggslam_gpcc_along_axis(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
-                                          std::int32_t axis, std::int32_t* out);
+GGSLAM_EXPORT int ggslam_gpcc_along_axis(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
+                                         std::int32_t axis, std::int32_t* out);
 
 // Adds to counts [planes] the number of points in each plane across an axis.
-GGSLAM_EXPORT void ggslam_gpcc_plane_counts(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
-                                            std::int32_t axis, std::uint32_t* counts);
+GGSLAM_EXPORT int ggslam_gpcc_plane_counts(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
+                                           std::int32_t axis, std::uint32_t* counts);
 
 // numbers [count] become number_of_plane[coordinate]. The indices of points in planes that are marked as cut are appended
 // to `inside`, which has room for them.
-GGSLAM_EXPORT void ggslam_gpcc_number_planes(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
-                                             std::int32_t axis, const std::uint16_t* number_of_plane,
-                                             const std::uint8_t* cut, std::uint16_t* numbers, std::int64_t* inside);
+GGSLAM_EXPORT int ggslam_gpcc_number_planes(const ggslam::gpcc::Points* points, const ggslam::gpcc::Grid* grid,
+                                            std::int32_t axis, const std::uint16_t* number_of_plane,
+                                            const std::uint8_t* cut, std::uint16_t* numbers, std::int64_t* inside);
 
 // Appends to `codes`, which has room for count of them, the points in cubes of an edge of 2^cube_bits voxels that a hash
 // chooses: one slab across x in slab_mask + 1, and of its cubes one in cube_mask + 1 (powers of two). Most points are

@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_int64, c_size_t, c_uint8, c_uint32, c_void_p
+from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int64, c_size_t, c_uint8, c_uint32, c_void_p
 from enum import IntEnum
 from typing import Any
 
 HEADER = "core/codec.hpp"
-HEADER_SHA256 = "750cfeb207e090467f341f8c7a1d2a3822f6303bbf717aa8a134611b7308b247"
+HEADER_SHA256 = "c17ae1ef05e7d4e214ca5b2d110018cf08879f0d29193efa254d888196f8ddbc"
 
 
 class Status(IntEnum):
@@ -96,15 +96,15 @@ STRUCTURES: tuple[type[Structure], ...] = (
 )
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_gpcc_slice_create": (c_void_p, []),
-    "ggslam_gpcc_slice_destroy": (None, [c_void_p]),
+    "ggslam_gpcc_slice_destroy": (c_int, [c_void_p]),
     "ggslam_gpcc_build": (c_int64, [c_void_p, c_void_p, c_void_p, c_uint32, c_int32, c_void_p]),
     "ggslam_gpcc_leaves": (c_uint32, [c_void_p]),
     "ggslam_gpcc_nodes": (c_uint32, [c_void_p, c_int32]),
-    "ggslam_gpcc_leaf_points": (None, [c_void_p, c_void_p]),
+    "ggslam_gpcc_leaf_points": (c_int, [c_void_p, c_void_p]),
     "ggslam_gpcc_merge": (c_int64, [c_void_p]),
     "ggslam_gpcc_encode_geometry": (c_int64, [c_void_p, c_void_p, POINTER(OctreeSettings)]),
     "ggslam_gpcc_encode_attribute": (c_int64, [c_void_p, c_void_p, POINTER(RahtSettings), c_void_p]),
-    "ggslam_gpcc_take": (None, [c_void_p, c_void_p]),
+    "ggslam_gpcc_take": (c_int, [c_void_p, c_void_p]),
     "ggslam_gpcc_decode_geometry": (c_int64, [
         c_void_p, c_void_p, POINTER(OctreeSettings), c_void_p, c_size_t, c_uint32,
     ]),
@@ -124,12 +124,12 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
         c_void_p, c_void_p, POINTER(DetailSettings), c_void_p, c_size_t, c_void_p,
     ]),
     "ggslam_gpcc_sort_values": (c_int64, [c_void_p, c_int32, c_void_p]),
-    "ggslam_gpcc_to_ycbcr": (None, [c_void_p, c_void_p, c_void_p, c_uint32, c_void_p]),
-    "ggslam_gpcc_from_ycbcr": (None, [c_void_p, c_void_p, c_uint32, c_void_p]),
-    "ggslam_gpcc_on_grid": (None, [POINTER(Points), POINTER(Grid), c_void_p]),
-    "ggslam_gpcc_along_axis": (None, [POINTER(Points), POINTER(Grid), c_int32, c_void_p]),
-    "ggslam_gpcc_plane_counts": (None, [POINTER(Points), POINTER(Grid), c_int32, c_void_p]),
-    "ggslam_gpcc_number_planes": (None, [
+    "ggslam_gpcc_to_ycbcr": (c_int, [c_void_p, c_void_p, c_void_p, c_uint32, c_void_p]),
+    "ggslam_gpcc_from_ycbcr": (c_int, [c_void_p, c_void_p, c_uint32, c_void_p]),
+    "ggslam_gpcc_on_grid": (c_int, [POINTER(Points), POINTER(Grid), c_void_p]),
+    "ggslam_gpcc_along_axis": (c_int, [POINTER(Points), POINTER(Grid), c_int32, c_void_p]),
+    "ggslam_gpcc_plane_counts": (c_int, [POINTER(Points), POINTER(Grid), c_int32, c_void_p]),
+    "ggslam_gpcc_number_planes": (c_int, [
         POINTER(Points), POINTER(Grid), c_int32, c_void_p, c_void_p, c_void_p, c_void_p,
     ]),
     "ggslam_gpcc_sample_cubes": (c_int64, [POINTER(Points), POINTER(Grid), c_int32, c_uint32, c_uint32, c_void_p]),

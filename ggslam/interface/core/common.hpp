@@ -6,6 +6,23 @@
 
 #include "interface/export.hpp"
 
+namespace ggslam {
+
+// Whose fault it is that a function of the core failed.
+enum CoreFault : int {
+  kNoFault = 0,
+  kBadInput = 1,      // the caller's: a size, a number or a pointer that cannot be
+  kMemoryRanOut = 2,
+  kCoreFailed = 3,
+};
+
+}  // namespace ggslam
+
+// A function that fails returns a null pointer, -1, the largest unsigned number or NaN, by its type; one that has
+// nothing to return but that it did not fail, 0. This one returns the CoreFault of the calling thread's last failure,
+// copies its message into `message` [room], and forgets it.
+GGSLAM_EXPORT int ggslam_last_error(char* message, std::size_t room);
+
 // SHA-256 of the headers in interface/core; the loader refuses a library whose headers are not its own.
 GGSLAM_EXPORT const char* ggslam_interface_hash();
 
@@ -18,4 +35,4 @@ GGSLAM_EXPORT int ggslam_best_isa();
 
 // Threads and instruction set for the functions that take a context, which serves one caller at a time.
 GGSLAM_EXPORT void* ggslam_context_create(int threads, int isa);
-GGSLAM_EXPORT void ggslam_context_destroy(void* context);
+GGSLAM_EXPORT int ggslam_context_destroy(void* context);

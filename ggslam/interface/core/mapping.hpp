@@ -39,7 +39,7 @@ struct ImageLossJob {
 }  // namespace ggslam
 
 GGSLAM_EXPORT void* ggslam_image_loss_create();
-GGSLAM_EXPORT void ggslam_image_loss_destroy(void* workspace);
+GGSLAM_EXPORT int ggslam_image_loss_destroy(void* workspace);
 
 // Returns 0, or 1 when memory ran out. The caller has checked sizes and pointers.
 GGSLAM_EXPORT int ggslam_image_loss_evaluate(void* context, void* workspace, ggslam::ImageLossJob* job);

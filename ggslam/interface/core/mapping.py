@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_void
 from typing import Any
 
 HEADER = "core/mapping.hpp"
-HEADER_SHA256 = "0971d33ed5fceab9852673affbce81876812af71b3b3f6ebaeb5896912b03210"
+HEADER_SHA256 = "9896fce84a21308a6e3dff32a347c27aafdce5d46b0002c0a001f4b38889ca30"
 
 
 class ImageLossJob(Structure):
@@ -29,7 +29,7 @@ class ImageLossJob(Structure):
 STRUCTURES: tuple[type[Structure], ...] = (ImageLossJob,)
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_image_loss_create": (c_void_p, []),
-    "ggslam_image_loss_destroy": (None, [c_void_p]),
+    "ggslam_image_loss_destroy": (c_int, [c_void_p]),
     "ggslam_image_loss_evaluate": (c_int, [c_void_p, c_void_p, POINTER(ImageLossJob)]),
 }
 """Result and arguments of each."""

@@ -94,7 +94,7 @@ struct MeshPictureInput {
 
 // The context must live as long as the rasterizer.
 GGSLAM_EXPORT void* ggslam_rasterizer_create(void* context);
-GGSLAM_EXPORT void ggslam_rasterizer_destroy(void* rasterizer);
+GGSLAM_EXPORT int ggslam_rasterizer_destroy(void* rasterizer);
 
 // Renders. Returns 0, 1 (out of memory) or 2 (more than 2^31 pairs of a Gaussian and a tile). as_3dgs: with 3DGS's limit of
 // alpha and its end of a pixel, without features and median depth; there is no backward then.
@@ -109,7 +109,7 @@ GGSLAM_EXPORT int ggslam_rasterizer_backward(void* rasterizer, const ggslam::Ima
                                              const ggslam::AdamArguments* adam);
 
 // Numbers of the last forward: visible Gaussians, pairs of a Gaussian and a tile.
-GGSLAM_EXPORT void ggslam_rasterizer_statistics(void* rasterizer, std::int64_t* out);
+GGSLAM_EXPORT int ggslam_rasterizer_statistics(void* rasterizer, std::int64_t* out);
 
 // Fills `out` for pixels (row * width + column, each within the image) of the last forward, leaving out contributions
 // below min_weight and those for which a row has no room. Returns 0 or 1 (out of memory).
@@ -136,5 +136,5 @@ GGSLAM_EXPORT int ggslam_terms_label(void* context, const ggslam::PixelTerms* te
                                      std::uint16_t* ids, float* shares);
 
 // Draws on what stands in `picture` [height, width, 3]; `inverse_z` [height, width] must be 0 at first.
-GGSLAM_EXPORT void ggslam_draw_mesh(void* context, const ggslam::MeshPictureInput* in, float* inverse_z,
-                                    uint8_t* picture);
+GGSLAM_EXPORT int ggslam_draw_mesh(void* context, const ggslam::MeshPictureInput* in, float* inverse_z,
+                                   uint8_t* picture);

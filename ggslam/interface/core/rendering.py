@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_float, c_int, c_int32, c_int64, c_void_
 from typing import Any
 
 HEADER = "core/rendering.hpp"
-HEADER_SHA256 = "1562603aa91299fcbaaae4830f8857ee0dfc55612076a1c201f3912693226c9c"
+HEADER_SHA256 = "e0e807edc197855cbfdddb7afff7a29cf0775b046cc70f899d9665fbf1cbf070"
 
 
 class GaussianArrays(Structure):
@@ -110,14 +110,14 @@ STRUCTURES: tuple[type[Structure], ...] = (
 )
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_rasterizer_create": (c_void_p, [c_void_p]),
-    "ggslam_rasterizer_destroy": (None, [c_void_p]),
+    "ggslam_rasterizer_destroy": (c_int, [c_void_p]),
     "ggslam_rasterizer_forward": (c_int, [
         c_void_p, POINTER(GaussianArrays), POINTER(CameraView), POINTER(RenderTargets), c_int,
     ]),
     "ggslam_rasterizer_backward": (c_int, [
         c_void_p, POINTER(ImageGradients), POINTER(GaussianGradients), POINTER(AdamArguments),
     ]),
-    "ggslam_rasterizer_statistics": (None, [c_void_p, c_void_p]),
+    "ggslam_rasterizer_statistics": (c_int, [c_void_p, c_void_p]),
     "ggslam_rasterizer_pixel_terms": (c_int, [c_void_p, c_void_p, c_float, POINTER(PixelTerms)]),
     "ggslam_terms_blend": (c_int, [c_void_p, POINTER(PixelTerms), c_void_p, c_int, c_void_p]),
     "ggslam_terms_step": (c_int, [c_void_p, POINTER(PixelTerms), c_void_p, POINTER(FeatureAdam)]),
@@ -125,6 +125,6 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
         c_void_p, POINTER(PixelTerms), c_void_p, c_void_p, c_int64, c_int, c_void_p, c_void_p,
     ]),
     "ggslam_terms_label": (c_int, [c_void_p, POINTER(PixelTerms), c_void_p, c_void_p, c_void_p]),
-    "ggslam_draw_mesh": (None, [c_void_p, POINTER(MeshPictureInput), c_void_p, c_void_p]),
+    "ggslam_draw_mesh": (c_int, [c_void_p, POINTER(MeshPictureInput), c_void_p, c_void_p]),
 }
 """Result and arguments of each."""

@@ -127,24 +127,24 @@ struct AlignResult {
 GGSLAM_EXPORT int ggslam_depth_points(void* context, const float* depth, const ggslam::DepthPointsSettings* settings,
                                       const ggslam::DepthPointsOutput* out);
 GGSLAM_EXPORT void* ggslam_gicp_target_create();
-GGSLAM_EXPORT void ggslam_gicp_target_destroy(void* target);
-GGSLAM_EXPORT void ggslam_gicp_target_build(void* context, void* target, const void* base,
-                                            const ggslam::TargetInput* input, const ggslam::TargetSettings* settings);
+GGSLAM_EXPORT int ggslam_gicp_target_destroy(void* target);
+GGSLAM_EXPORT int ggslam_gicp_target_build(void* context, void* target, const void* base,
+                                           const ggslam::TargetInput* input, const ggslam::TargetSettings* settings);
 
 // As ggslam_gicp_target_build, but leaves the voxels without shapes. Until ggslam_gicp_target_finish has been called, the
 // target may be a base, and be asked for its size, its moments and its blocks.
-GGSLAM_EXPORT void ggslam_gicp_target_gather(void* context, void* target, const void* base,
-                                             const ggslam::TargetInput* input, const ggslam::TargetSettings* settings);
-GGSLAM_EXPORT void ggslam_gicp_target_finish(void* context, void* target, const ggslam::TargetSettings* settings);
+GGSLAM_EXPORT int ggslam_gicp_target_gather(void* context, void* target, const void* base,
+                                            const ggslam::TargetInput* input, const ggslam::TargetSettings* settings);
+GGSLAM_EXPORT int ggslam_gicp_target_finish(void* context, void* target, const ggslam::TargetSettings* settings);
 
 // Number of voxels of a level (0 fine, 1 coarse).
 GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target, int level);
 
 // Copies the moments of a level's voxels, [n, 22] in the order of struct VoxelMoments.
-GGSLAM_EXPORT void ggslam_gicp_target_moments(const void* target, int level, float* out);
+GGSLAM_EXPORT int ggslam_gicp_target_moments(const void* target, int level, float* out);
 
 // Copies a level's voxels, [n, 16] in the order of struct Voxel.
-GGSLAM_EXPORT void ggslam_gicp_target_voxels(const void* target, int level, float* out);
+GGSLAM_EXPORT int ggslam_gicp_target_voxels(const void* target, int level, float* out);
 
 // Number of blocks of a level. Copies them unless `out` is null: [n, 3] key, occupied, first.
 GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target, int level, uint64_t* out);
@@ -152,20 +152,20 @@ GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target, int level, uint6
 // Uses no thread but the caller's.
 GGSLAM_EXPORT void* ggslam_target_part_create(const void* context, const ggslam::TargetInput* input,
                                               const ggslam::TargetSettings* settings, uint64_t rank);
-GGSLAM_EXPORT void ggslam_target_part_destroy(void* part);
+GGSLAM_EXPORT int ggslam_target_part_destroy(void* part);
 GGSLAM_EXPORT int64_t ggslam_target_part_bytes(const void* part);
 
 // `before` may be null; `target` is neither it nor in use.
-GGSLAM_EXPORT void ggslam_gicp_target_compose(void* context, void* target, const void* before, const void* const* parts,
-                                              int count, const ggslam::TargetSettings* settings);
+GGSLAM_EXPORT int ggslam_gicp_target_compose(void* context, void* target, const void* before, const void* const* parts,
+                                             int count, const ggslam::TargetSettings* settings);
 
 // Aligns points to a target from the guess `pose` (T_world_camera, row by row). `photometric_points` and `reference`
 // may be null. `match` and `squared_distance` have room for one entry per point.
-GGSLAM_EXPORT void ggslam_gicp_align(void* context, const void* target, const ggslam::AlignPoints* points,
-                                     const ggslam::AlignSettings* settings,
-                                     const ggslam::PhotometricPoints* photometric_points,
-                                     const ggslam::PhotometricReferenceView* reference, const double* pose_guess,
-                                     int32_t* match, float* squared_distance, ggslam::AlignResult* result);
+GGSLAM_EXPORT int ggslam_gicp_align(void* context, const void* target, const ggslam::AlignPoints* points,
+                                    const ggslam::AlignSettings* settings,
+                                    const ggslam::PhotometricPoints* photometric_points,
+                                    const ggslam::PhotometricReferenceView* reference, const double* pose_guess,
+                                    int32_t* match, float* squared_distance, ggslam::AlignResult* result);
 
 // One linearisation at a pose, for tests: level 0 fine, 1 coarse. h [36], b [6] in sums over points, twist about the
 // camera centre; returns the cost.

@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/tracking.hpp"
-HEADER_SHA256 = "c3860866e1ad0e9f6562bfcac4aa46bf518fc55215fff6a7d51f87489a42e690"
+HEADER_SHA256 = "0811102702916581ef06f94c1c74c56cc964e13f419c37c433954454cbb90a07"
 
 
 class DepthPointsSettings(Structure):
@@ -122,19 +122,19 @@ STRUCTURES: tuple[type[Structure], ...] = (
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_depth_points": (c_int, [c_void_p, c_void_p, POINTER(DepthPointsSettings), POINTER(DepthPointsOutput)]),
     "ggslam_gicp_target_create": (c_void_p, []),
-    "ggslam_gicp_target_destroy": (None, [c_void_p]),
-    "ggslam_gicp_target_build": (None, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
-    "ggslam_gicp_target_gather": (None, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
-    "ggslam_gicp_target_finish": (None, [c_void_p, c_void_p, POINTER(TargetSettings)]),
+    "ggslam_gicp_target_destroy": (c_int, [c_void_p]),
+    "ggslam_gicp_target_build": (c_int, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
+    "ggslam_gicp_target_gather": (c_int, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
+    "ggslam_gicp_target_finish": (c_int, [c_void_p, c_void_p, POINTER(TargetSettings)]),
     "ggslam_gicp_target_size": (c_int, [c_void_p, c_int]),
-    "ggslam_gicp_target_moments": (None, [c_void_p, c_int, c_void_p]),
-    "ggslam_gicp_target_voxels": (None, [c_void_p, c_int, c_void_p]),
+    "ggslam_gicp_target_moments": (c_int, [c_void_p, c_int, c_void_p]),
+    "ggslam_gicp_target_voxels": (c_int, [c_void_p, c_int, c_void_p]),
     "ggslam_gicp_target_blocks": (c_int, [c_void_p, c_int, c_void_p]),
     "ggslam_target_part_create": (c_void_p, [c_void_p, POINTER(TargetInput), POINTER(TargetSettings), c_uint64]),
-    "ggslam_target_part_destroy": (None, [c_void_p]),
+    "ggslam_target_part_destroy": (c_int, [c_void_p]),
     "ggslam_target_part_bytes": (c_int64, [c_void_p]),
-    "ggslam_gicp_target_compose": (None, [c_void_p, c_void_p, c_void_p, c_void_p, c_int, POINTER(TargetSettings)]),
-    "ggslam_gicp_align": (None, [
+    "ggslam_gicp_target_compose": (c_int, [c_void_p, c_void_p, c_void_p, c_void_p, c_int, POINTER(TargetSettings)]),
+    "ggslam_gicp_align": (c_int, [
         c_void_p, c_void_p, POINTER(AlignPoints), POINTER(AlignSettings), POINTER(PhotometricPoints),
         POINTER(PhotometricReferenceView), c_void_p, c_void_p, c_void_p, POINTER(AlignResult),
     ]),

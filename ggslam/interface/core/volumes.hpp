@@ -116,8 +116,8 @@ struct OccupancySummary {
 }  // namespace ggslam
 
 GGSLAM_EXPORT void* ggslam_tsdf_create(float voxel, float truncation, float max_weight);
-GGSLAM_EXPORT void ggslam_tsdf_destroy(void* handle);
-GGSLAM_EXPORT void ggslam_tsdf_clear(void* handle);
+GGSLAM_EXPORT int ggslam_tsdf_destroy(void* handle);
+GGSLAM_EXPORT int ggslam_tsdf_clear(void* handle);
 GGSLAM_EXPORT int64_t ggslam_tsdf_size(void* handle);
 GGSLAM_EXPORT int64_t ggslam_tsdf_dense(void* handle);
 GGSLAM_EXPORT int64_t ggslam_tsdf_bytes(void* handle);
@@ -125,31 +125,31 @@ GGSLAM_EXPORT uint32_t ggslam_tsdf_revision(void* handle);
 
 // All blocks by row: coordinates [n, 3], whether they have voxels [n], weights of those that are free [n], whether
 // they are frozen [n], revisions [n].
-GGSLAM_EXPORT void ggslam_tsdf_list(void* handle, int32_t* at, uint8_t* dense, uint16_t* free_weight, uint8_t* frozen,
-                                    uint32_t* revision);
+GGSLAM_EXPORT int ggslam_tsdf_list(void* handle, int32_t* at, uint8_t* dense, uint16_t* free_weight, uint8_t* frozen,
+                                   uint32_t* revision);
 
 // Voxels of the blocks at coordinates [n, 3]; those that are free throughout are written out, too. Blocks that are not
 // there come out as never seen.
-GGSLAM_EXPORT void ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at,
-                                    const ggslam::volumes::VoxelArrays* out);
+GGSLAM_EXPORT int ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at,
+                                   const ggslam::volumes::VoxelArrays* out);
 
 // Writes voxels of the blocks at coordinates [n, 3], made where there are none. What `in` lacks stays as it is.
-GGSLAM_EXPORT void ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at,
-                                     const ggslam::volumes::VoxelArrays* in);
+GGSLAM_EXPORT int ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at,
+                                    const ggslam::volumes::VoxelArrays* in);
 
 // Makes the blocks at coordinates [n, 3] free throughout, with weights [n].
-GGSLAM_EXPORT void ggslam_tsdf_write_free(void* handle, int64_t n, const int32_t* at, const uint16_t* weight);
+GGSLAM_EXPORT int ggslam_tsdf_write_free(void* handle, int64_t n, const int32_t* at, const uint16_t* weight);
 
 // Removes the blocks at coordinates [n, 3], where there are any.
-GGSLAM_EXPORT void ggslam_tsdf_erase(void* handle, int64_t n, const int32_t* at);
+GGSLAM_EXPORT int ggslam_tsdf_erase(void* handle, int64_t n, const int32_t* at);
 
 // From now on decay leaves all blocks that are there alone (frozen = 1), or no longer (0).
-GGSLAM_EXPORT void ggslam_tsdf_freeze(void* handle, int frozen);
+GGSLAM_EXPORT int ggslam_tsdf_freeze(void* handle, int frozen);
 
 // Fuses a view; see FusionInput.
-GGSLAM_EXPORT void ggslam_tsdf_integrate(void* handle, void* context, const ggslam::volumes::FusionInput* input,
-                                         const ggslam::volumes::FusionSettings* settings,
-                                         ggslam::volumes::FusionStats* stats);
+GGSLAM_EXPORT int ggslam_tsdf_integrate(void* handle, void* context, const ggslam::volumes::FusionInput* input,
+                                        const ggslam::volumes::FusionSettings* settings,
+                                        ggslam::volumes::FusionStats* stats);
 
 // Multiplies the weights of blocks that are not frozen; voxels whose weight falls below `least` are forgotten. Returns
 // the number of blocks forgotten.
@@ -157,48 +157,48 @@ GGSLAM_EXPORT int64_t ggslam_tsdf_decay(void* handle, void* context, float facto
 
 // Where the surface runs, of voxels with at least `min_weight` (65535ths of the largest). Good until the map changes.
 GGSLAM_EXPORT void* ggslam_surface_cells_create(void* context, void* tsdf, uint16_t min_weight);
-GGSLAM_EXPORT void ggslam_surface_cells_destroy(void* cells);
+GGSLAM_EXPORT int ggslam_surface_cells_destroy(void* cells);
 
 // Counts the mesh's vertices and triangles (`sizes` [2]); `cells` must outlive what is returned.
 GGSLAM_EXPORT void* ggslam_mesher_create(void* context, void* cells, int64_t* sizes);
-GGSLAM_EXPORT void ggslam_mesher_write(void* context, void* mesher, const ggslam::volumes::MeshArrays* out);
-GGSLAM_EXPORT void ggslam_mesher_destroy(void* mesher);
-GGSLAM_EXPORT void ggslam_raycast(void* context, void* cells, const ggslam::volumes::RaycastView* view,
-                                  const ggslam::volumes::SurfaceImages* out);
+GGSLAM_EXPORT int ggslam_mesher_write(void* context, void* mesher, const ggslam::volumes::MeshArrays* out);
+GGSLAM_EXPORT int ggslam_mesher_destroy(void* mesher);
+GGSLAM_EXPORT int ggslam_raycast(void* context, void* cells, const ggslam::volumes::RaycastView* view,
+                                 const ggslam::volumes::SurfaceImages* out);
 
 // The TSDF must live as long as the field.
 GGSLAM_EXPORT void* ggslam_esdf_create(void* tsdf, float max_distance);
-GGSLAM_EXPORT void ggslam_esdf_destroy(void* handle);
-GGSLAM_EXPORT void ggslam_esdf_clear(void* handle);
+GGSLAM_EXPORT int ggslam_esdf_destroy(void* handle);
+GGSLAM_EXPORT int ggslam_esdf_clear(void* handle);
 GGSLAM_EXPORT int64_t ggslam_esdf_size(void* handle);
 GGSLAM_EXPORT int64_t ggslam_esdf_bytes(void* handle);
-GGSLAM_EXPORT void ggslam_esdf_update(void* handle, void* context, ggslam::volumes::FieldStats* stats);
+GGSLAM_EXPORT int ggslam_esdf_update(void* handle, void* context, ggslam::volumes::FieldStats* stats);
 
 // Coordinates [n, 3] of all blocks.
-GGSLAM_EXPORT void ggslam_esdf_list(void* handle, int32_t* at);
+GGSLAM_EXPORT int ggslam_esdf_list(void* handle, int32_t* at);
 
 // Distances [n, 512] of the blocks at coordinates [n, 3]; NaN: unknown.
-GGSLAM_EXPORT void ggslam_esdf_read(void* handle, int64_t n, const int32_t* at, float* distance);
+GGSLAM_EXPORT int ggslam_esdf_read(void* handle, int64_t n, const int32_t* at, float* distance);
 
 // Number of surface points of all blocks; their positions [n, 3] (metres) and normals [n, 3], unless null.
 GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* normals);
 
 // At points [n, 3] in metres: distances [n] (metres), gradients [n, 3] and whether they are known [n].
-GGSLAM_EXPORT void ggslam_esdf_query(void* handle, void* context, int64_t n, const double* points, float* distance,
-                                     float* gradient, uint8_t* known);
+GGSLAM_EXPORT int ggslam_esdf_query(void* handle, void* context, int64_t n, const double* points, float* distance,
+                                    float* gradient, uint8_t* known);
 GGSLAM_EXPORT void* ggslam_occupancy_create(double resolution);
-GGSLAM_EXPORT void ggslam_occupancy_destroy(void* map);
+GGSLAM_EXPORT int ggslam_occupancy_destroy(void* map);
 
 // 0: the origin is outside the grid, nothing was done.
 GGSLAM_EXPORT int ggslam_occupancy_insert(void* context, void* map, const float* points, std::uint64_t n,
                                           const ggslam::InsertSettings* settings, ggslam::InsertResult* result);
 GGSLAM_EXPORT int ggslam_occupancy_insert_depth(void* context, void* map, const ggslam::DepthImage* image,
                                                 const ggslam::InsertSettings* settings, ggslam::InsertResult* result);
-GGSLAM_EXPORT void ggslam_occupancy_look_up(void* context, void* map, const float* points, std::uint64_t n,
-                                            float threshold, std::int8_t* states, float* log_odds);
-GGSLAM_EXPORT void ggslam_occupancy_summary(void* map, float threshold, ggslam::OccupancySummary* summary);
-GGSLAM_EXPORT void ggslam_occupancy_compare(void* one, void* other, float threshold_one, float threshold_other,
-                                            std::uint64_t* counts);
+GGSLAM_EXPORT int ggslam_occupancy_look_up(void* context, void* map, const float* points, std::uint64_t n,
+                                           float threshold, std::int8_t* states, float* log_odds);
+GGSLAM_EXPORT int ggslam_occupancy_summary(void* map, float threshold, ggslam::OccupancySummary* summary);
+GGSLAM_EXPORT int ggslam_occupancy_compare(void* one, void* other, float threshold_one, float threshold_other,
+                                           std::uint64_t* counts);
 
 // The following make an output, kept until the next of them is called, and return its size in bytes.
 GGSLAM_EXPORT const void* ggslam_occupancy_output(void* map);

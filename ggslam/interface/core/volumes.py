@@ -20,7 +20,7 @@ from ctypes import (
 from typing import Any
 
 HEADER = "core/volumes.hpp"
-HEADER_SHA256 = "9df81bfa87d17bb4903ae28663a40cf6d106e1ca64e2025b201923ff618bcb97"
+HEADER_SHA256 = "a935f68511659094b2ed9fd538875cf97014c9e21e9b25b5b64193d0f03dfb1c"
 
 
 class VoxelArrays(Structure):
@@ -139,49 +139,49 @@ STRUCTURES: tuple[type[Structure], ...] = (
 )
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_tsdf_create": (c_void_p, [c_float, c_float, c_float]),
-    "ggslam_tsdf_destroy": (None, [c_void_p]),
-    "ggslam_tsdf_clear": (None, [c_void_p]),
+    "ggslam_tsdf_destroy": (c_int, [c_void_p]),
+    "ggslam_tsdf_clear": (c_int, [c_void_p]),
     "ggslam_tsdf_size": (c_int64, [c_void_p]),
     "ggslam_tsdf_dense": (c_int64, [c_void_p]),
     "ggslam_tsdf_bytes": (c_int64, [c_void_p]),
     "ggslam_tsdf_revision": (c_uint32, [c_void_p]),
-    "ggslam_tsdf_list": (None, [c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p]),
-    "ggslam_tsdf_read": (None, [c_void_p, c_int64, c_void_p, POINTER(VoxelArrays)]),
-    "ggslam_tsdf_write": (None, [c_void_p, c_int64, c_void_p, POINTER(VoxelArrays)]),
-    "ggslam_tsdf_write_free": (None, [c_void_p, c_int64, c_void_p, c_void_p]),
-    "ggslam_tsdf_erase": (None, [c_void_p, c_int64, c_void_p]),
-    "ggslam_tsdf_freeze": (None, [c_void_p, c_int]),
-    "ggslam_tsdf_integrate": (None, [
+    "ggslam_tsdf_list": (c_int, [c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p]),
+    "ggslam_tsdf_read": (c_int, [c_void_p, c_int64, c_void_p, POINTER(VoxelArrays)]),
+    "ggslam_tsdf_write": (c_int, [c_void_p, c_int64, c_void_p, POINTER(VoxelArrays)]),
+    "ggslam_tsdf_write_free": (c_int, [c_void_p, c_int64, c_void_p, c_void_p]),
+    "ggslam_tsdf_erase": (c_int, [c_void_p, c_int64, c_void_p]),
+    "ggslam_tsdf_freeze": (c_int, [c_void_p, c_int]),
+    "ggslam_tsdf_integrate": (c_int, [
         c_void_p, c_void_p, POINTER(FusionInput), POINTER(FusionSettings), POINTER(FusionStats),
     ]),
     "ggslam_tsdf_decay": (c_int64, [c_void_p, c_void_p, c_float, c_int, c_int]),
     "ggslam_surface_cells_create": (c_void_p, [c_void_p, c_void_p, c_uint16]),
-    "ggslam_surface_cells_destroy": (None, [c_void_p]),
+    "ggslam_surface_cells_destroy": (c_int, [c_void_p]),
     "ggslam_mesher_create": (c_void_p, [c_void_p, c_void_p, c_void_p]),
-    "ggslam_mesher_write": (None, [c_void_p, c_void_p, POINTER(MeshArrays)]),
-    "ggslam_mesher_destroy": (None, [c_void_p]),
-    "ggslam_raycast": (None, [c_void_p, c_void_p, POINTER(RaycastView), POINTER(SurfaceImages)]),
+    "ggslam_mesher_write": (c_int, [c_void_p, c_void_p, POINTER(MeshArrays)]),
+    "ggslam_mesher_destroy": (c_int, [c_void_p]),
+    "ggslam_raycast": (c_int, [c_void_p, c_void_p, POINTER(RaycastView), POINTER(SurfaceImages)]),
     "ggslam_esdf_create": (c_void_p, [c_void_p, c_float]),
-    "ggslam_esdf_destroy": (None, [c_void_p]),
-    "ggslam_esdf_clear": (None, [c_void_p]),
+    "ggslam_esdf_destroy": (c_int, [c_void_p]),
+    "ggslam_esdf_clear": (c_int, [c_void_p]),
     "ggslam_esdf_size": (c_int64, [c_void_p]),
     "ggslam_esdf_bytes": (c_int64, [c_void_p]),
-    "ggslam_esdf_update": (None, [c_void_p, c_void_p, POINTER(FieldStats)]),
-    "ggslam_esdf_list": (None, [c_void_p, c_void_p]),
-    "ggslam_esdf_read": (None, [c_void_p, c_int64, c_void_p, c_void_p]),
+    "ggslam_esdf_update": (c_int, [c_void_p, c_void_p, POINTER(FieldStats)]),
+    "ggslam_esdf_list": (c_int, [c_void_p, c_void_p]),
+    "ggslam_esdf_read": (c_int, [c_void_p, c_int64, c_void_p, c_void_p]),
     "ggslam_esdf_sites": (c_int64, [c_void_p, c_void_p, c_void_p]),
-    "ggslam_esdf_query": (None, [c_void_p, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p]),
+    "ggslam_esdf_query": (c_int, [c_void_p, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p]),
     "ggslam_occupancy_create": (c_void_p, [c_double]),
-    "ggslam_occupancy_destroy": (None, [c_void_p]),
+    "ggslam_occupancy_destroy": (c_int, [c_void_p]),
     "ggslam_occupancy_insert": (c_int, [
         c_void_p, c_void_p, c_void_p, c_uint64, POINTER(InsertSettings), POINTER(InsertResult),
     ]),
     "ggslam_occupancy_insert_depth": (c_int, [
         c_void_p, c_void_p, POINTER(DepthImage), POINTER(InsertSettings), POINTER(InsertResult),
     ]),
-    "ggslam_occupancy_look_up": (None, [c_void_p, c_void_p, c_void_p, c_uint64, c_float, c_void_p, c_void_p]),
-    "ggslam_occupancy_summary": (None, [c_void_p, c_float, POINTER(OccupancySummary)]),
-    "ggslam_occupancy_compare": (None, [c_void_p, c_void_p, c_float, c_float, c_void_p]),
+    "ggslam_occupancy_look_up": (c_int, [c_void_p, c_void_p, c_void_p, c_uint64, c_float, c_void_p, c_void_p]),
+    "ggslam_occupancy_summary": (c_int, [c_void_p, c_float, POINTER(OccupancySummary)]),
+    "ggslam_occupancy_compare": (c_int, [c_void_p, c_void_p, c_float, c_float, c_void_p]),
     "ggslam_occupancy_output": (c_void_p, [c_void_p]),
     "ggslam_occupancy_leaves": (c_uint64, [c_void_p, c_float, c_int]),
     "ggslam_occupancy_write": (c_uint64, [c_void_p, c_int, c_float, c_void_p]),

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "common/context.hpp"
+#include "common/guard.hpp"
 #include "interface/core/codec.hpp"
 
 namespace {
@@ -44,8 +45,11 @@ uint8_t* put_match(uint8_t* out, int64_t length, int64_t distance) {
 
 }  // namespace
 
-GGSLAM_EXPORT int64_t ggslam_lzf_compress(const uint8_t* data, int64_t size, uint8_t* out, int64_t capacity) {
+GGSLAM_EXPORT int64_t ggslam_lzf_compress(const uint8_t* data, int64_t size, uint8_t* out, int64_t capacity) try {
+  ggslam::check_array("data", data, size);
+  ggslam::elements(size);
   if (capacity < size + size / kMaxLiterals + 1) return kNoRoom;
+  ggslam::check_array("out", out, capacity);
   std::vector<int64_t> last(size_t{1} << kHashBits, -kMaxDistance - 1);
   uint8_t* const begin = out;
   int64_t at = 0, literals = 0;  // literals: where the bytes not yet written begin
@@ -65,9 +69,10 @@ GGSLAM_EXPORT int64_t ggslam_lzf_compress(const uint8_t* data, int64_t size, uin
     literals = at;
   }
   return put_literals(out, data + literals, data + size) - begin;
-}
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int64_t ggslam_lzf_decompress(const uint8_t* data, int64_t packed, uint8_t* out, int64_t size) {
+GGSLAM_EXPORT int64_t ggslam_lzf_decompress(const uint8_t* data, int64_t packed, uint8_t* out, int64_t size) try {
+  ggslam::check_array("data", data, packed), ggslam::check_array("out", out, size);
   int64_t at = 0, done = 0;
   while (at < packed) {
     const int64_t control = data[at++];
@@ -89,4 +94,4 @@ GGSLAM_EXPORT int64_t ggslam_lzf_decompress(const uint8_t* data, int64_t packed,
     done += length;
   }
   return done == size ? 0 : kWrongSize;
-}
+} GGSLAM_CATCH_ALL

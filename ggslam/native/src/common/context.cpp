@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/context.hpp"
+#include "common/guard.hpp"
 #include "interface/core/common.hpp"
 
 #define GGSLAM_TEXT(macro) GGSLAM_TEXT_OF(macro)
@@ -8,7 +9,9 @@
 namespace ggslam {
 
 bool isa_available(Isa isa) {
-#if defined(__x86_64__)
+#if defined(GGSLAM_ONLY)
+  return isa == Isa::GGSLAM_ONLY;
+#elif defined(__x86_64__)
   __builtin_cpu_init();
   switch (isa) {
     case Isa::baseline: return true;
@@ -36,14 +39,21 @@ GGSLAM_EXPORT const char* ggslam_interface_hash() { return GGSLAM_TEXT(GGSLAM_IN
 
 GGSLAM_EXPORT const char* ggslam_source_hash() { return GGSLAM_TEXT(GGSLAM_SOURCE_HASH); }
 
-GGSLAM_EXPORT int ggslam_isa_available(int isa) {
+GGSLAM_EXPORT int ggslam_isa_available(int isa) try {
   return isa >= 0 && isa <= 2 && ggslam::isa_available(static_cast<ggslam::Isa>(isa)) ? 1 : 0;
-}
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int ggslam_best_isa() { return static_cast<int>(ggslam::best_isa()); }
+GGSLAM_EXPORT int ggslam_best_isa() try {
+  return static_cast<int>(ggslam::best_isa());
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void* ggslam_context_create(int threads, int isa) {
+GGSLAM_EXPORT void* ggslam_context_create(int threads, int isa) try {
+  ggslam::check_range("threads", threads, 1, 4096);
+  if (!ggslam_isa_available(isa)) ggslam::refuse("instruction set %d is not available here", isa);
   return new ggslam::Context(threads, static_cast<ggslam::Isa>(isa));
-}
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_context_destroy(void* context) { delete static_cast<ggslam::Context*>(context); }
+GGSLAM_EXPORT int ggslam_context_destroy(void* context) try {
+  delete static_cast<ggslam::Context*>(context);
+  return 0;
+} GGSLAM_CATCH_ALL

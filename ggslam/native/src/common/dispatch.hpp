@@ -12,8 +12,12 @@ bool isa_available(Isa isa);    // compiled in and supported by this processor
 
 }  // namespace ggslam
 
-// GGSLAM_DECLARE_KERNEL(int f(float)) declares f in each namespace.
-#if defined(__x86_64__)
+// GGSLAM_DECLARE_KERNEL(int f(float)) declares f in each namespace. GGSLAM_ONLY names the one instruction set of a build
+// that has no other, as those with sanitizers.
+#if defined(GGSLAM_ONLY)
+#define GGSLAM_DECLARE_KERNEL(...) namespace ggslam::GGSLAM_ONLY { __VA_ARGS__; }
+#define GGSLAM_DISPATCH(isa, function) (&::ggslam::GGSLAM_ONLY::function)
+#elif defined(__x86_64__)
 #define GGSLAM_DECLARE_KERNEL(...)       \
   namespace ggslam::baseline { __VA_ARGS__; } \
   namespace ggslam::avx2 { __VA_ARGS__; }     \

@@ -2,6 +2,7 @@
 #include "common/thread_pool.hpp"
 
 #include <algorithm>
+#include <utility>
 
 namespace ggslam {
 namespace {
@@ -18,10 +19,18 @@ constexpr int kSpins = 2000;
 }  // namespace
 
 ThreadPool::ThreadPool(int size) : size_(std::max(1, size)) {
-  for (int t = 1; t < size_; ++t) threads_.emplace_back([this, t] { worker(t); });
+  threads_.reserve(size_);
+  try {
+    for (int t = 1; t < size_; ++t) threads_.emplace_back([this, t] { worker(t); });
+  } catch (...) {  // there are no more threads to be had
+    stop();
+    throw;
+  }
 }
 
-ThreadPool::~ThreadPool() {
+ThreadPool::~ThreadPool() { stop(); }
+
+void ThreadPool::stop() noexcept {
   {
     std::lock_guard<std::mutex> lock(mutex_);
     stop_ = true;
@@ -29,6 +38,15 @@ ThreadPool::~ThreadPool() {
   }
   wake_.notify_all();
   for (auto& thread : threads_) thread.join();
+}
+
+void ThreadPool::work(const std::function<void(int)>& job, int index) noexcept {
+  try {
+    job(index);
+  } catch (...) {
+    std::lock_guard<std::mutex> lock(failure_mutex_);
+    if (!failure_) failure_ = std::current_exception();
+  }
 }
 
 void ThreadPool::worker(int index) {
@@ -41,7 +59,7 @@ void ThreadPool::worker(int index) {
     }
     seen = generation_.load(std::memory_order_acquire);
     if (stop_) return;
-    (*job_)(index);
+    work(*job_, index);
     pending_.fetch_sub(1, std::memory_order_acq_rel);
   }
 }
@@ -59,11 +77,12 @@ void ThreadPool::run(const std::function<void(int)>& job) {
     generation_.fetch_add(1);
   }
   wake_.notify_all();
-  job(0);
+  work(job, 0);
   for (int spin = 0; pending_.load(std::memory_order_acquire) > 0; ++spin) {
     if (spin > kSpins) std::this_thread::yield();
     cpu_relax();
   }
+  if (failure_) std::rethrow_exception(std::exchange(failure_, nullptr));
 }
 
 void ThreadPool::parallel_for(std::size_t count, std::size_t chunk,
@@ -73,7 +92,12 @@ void ThreadPool::parallel_for(std::size_t count, std::size_t chunk,
     for (;;) {
       const std::size_t begin = next.fetch_add(chunk);
       if (begin >= count) break;
-      f(begin, std::min(count, begin + chunk), thread);
+      try {
+        f(begin, std::min(count, begin + chunk), thread);
+      } catch (...) {
+        next.store(count);  // nobody needs to begin with the rest
+        throw;
+      }
     }
   });
 }

@@ -1,10 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // A small pool of threads. run(f) calls f(t) once for each t in [0, size): the caller's thread is t = 0.
-// Several host threads may share a pool: calls of run() are serialised by a lock.
+// Several host threads may share a pool: calls of run() are serialised by a lock. What f throws reaches the caller once
+// all threads are done; of several exceptions, one.
 #pragma once
 #include <atomic>
 #include <condition_variable>
 #include <cstddef>
+#include <exception>
 #include <functional>
 #include <mutex>
 #include <thread>
@@ -29,12 +31,16 @@ class ThreadPool {
 
  private:
   void worker(int index);
+  void work(const std::function<void(int)>& job, int index) noexcept;
+  void stop() noexcept;
   int size_;
   std::vector<std::thread> threads_;
   std::mutex run_mutex_, mutex_;
   std::condition_variable wake_;
   const std::function<void(int)>* job_ = nullptr;
   std::atomic<int> generation_{0}, pending_{0};
+  std::mutex failure_mutex_;
+  std::exception_ptr failure_;  // of the job that runs
   bool stop_ = false;
 };
 

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "common/context.hpp"
+#include "common/guard.hpp"
 #include "mapping/image_loss.hpp"
 
 namespace ggslam {
@@ -100,17 +101,23 @@ class ImageLossWorkspace {
 }  // namespace
 }  // namespace ggslam
 
-GGSLAM_EXPORT void* ggslam_image_loss_create() { return new (std::nothrow) ggslam::ImageLossWorkspace; }
+GGSLAM_EXPORT void* ggslam_image_loss_create() try {
+  return new (std::nothrow) ggslam::ImageLossWorkspace;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_image_loss_destroy(void* workspace) {
+GGSLAM_EXPORT int ggslam_image_loss_destroy(void* workspace) try {
   delete static_cast<ggslam::ImageLossWorkspace*>(workspace);
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int ggslam_image_loss_evaluate(void* context, void* workspace, ggslam::ImageLossJob* job) {
-  try {
-    static_cast<ggslam::ImageLossWorkspace*>(workspace)->evaluate(*static_cast<ggslam::Context*>(context), *job);
-    return 0;
-  } catch (const std::bad_alloc&) {
-    return 1;
-  }
-}
+GGSLAM_EXPORT int ggslam_image_loss_evaluate(void* context, void* workspace, ggslam::ImageLossJob* job) try {
+  using namespace ggslam;
+  ImageLossJob& all = object_of<ImageLossJob>(job);
+  check_range("height", all.height, 1, kMostPixelsAlong);
+  check_range("width", all.width, 1, kMostPixelsAlong);
+  const void* const images[] = {all.image,        all.depth,   all.alpha,   all.target_color,
+                                all.target_depth, all.d_image, all.d_depth, all.d_alpha};
+  for (const void* image : images) check_array("images", image, 1);
+  object_of<ImageLossWorkspace>(workspace).evaluate(object_of<Context>(context), all);
+  return 0;
+} GGSLAM_CATCH_ALL

@@ -4,12 +4,13 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <vector>
+
+#include "common/guard.hpp"
 
 namespace ggslam {
 namespace {
-
-enum Status { kDone = 0, kOutOfMemory = 1 };
 
 // Places the pixels in the order of tiles and, within a tile, of sub-blocks: lanes that lie together walk together.
 struct SortedPixels {
@@ -36,14 +37,33 @@ SortedPixels sort_pixels(const Rasterizer& r, const std::int32_t* pixels, std::i
   return sorted;
 }
 
+// Room for the terms of each pixel, and no more of them.
+const PixelTerms& check_terms(const PixelTerms* pointer) {
+  const PixelTerms& terms = object_of<PixelTerms>(pointer);
+  const std::int64_t most = static_cast<std::int64_t>(elements(terms.pixels, terms.capacity));
+  if (terms.pixels > std::numeric_limits<std::int32_t>::max()) refuse("pixels: too many to number");
+  check_array("gaussians", terms.gaussians, most), check_array("weights", terms.weights, most);
+  check_array("counts", terms.counts, terms.pixels);
+  return terms;
+}
+
+void check_counts(const PixelTerms& terms) {
+  for (std::int64_t p = 0; p < terms.pixels; ++p) check_range("counts", terms.counts[p], 0, terms.capacity);
+}
+
 // The transposed terms. Counting sort, so that the order within a Gaussian is that of the pixels.
 class Transposed {
  public:
-  Transposed(const PixelTerms& terms, std::int64_t gaussians) : first_(gaussians + 1, 0) {
+  Transposed(const PixelTerms& terms, std::int64_t gaussians) : first_(elements(gaussians) + 1, 0) {
+    check_counts(terms);
     std::int64_t total = 0;
     for (std::int64_t p = 0; p < terms.pixels; ++p) {
       total += terms.counts[p];
-      for (int i = 0; i < terms.counts[p]; ++i) ++first_[terms.gaussians[p * terms.capacity + i]];
+      for (int i = 0; i < terms.counts[p]; ++i) {
+        const std::int32_t g = terms.gaussians[p * terms.capacity + i];
+        if (g < 0 || g >= gaussians) refuse("terms: expected Gaussians below %lld, found %d", static_cast<long long>(gaussians), g);
+        ++first_[g];
+      }
     }
     rows_.resize(total);
     weights_.resize(total);
@@ -92,6 +112,7 @@ void add_vote(std::int32_t* ids, float* weights, int slots, std::int32_t label, 
 }
 
 constexpr int kDistinct = 16;
+constexpr int kMostChannels = 1 << 16;
 
 // The label with the largest sum of weights among a pixel's terms, and its share of the whole.
 void label_pixel(const PixelTerms& terms, std::int64_t p, const std::uint16_t* labels, std::uint16_t& id, float& share) {
@@ -113,81 +134,85 @@ void label_pixel(const PixelTerms& terms, std::int64_t p, const std::uint16_t* l
   share = distinct == 0 ? 0 : sums[best] / whole;
 }
 
-template <class Function>
-int guarded(const Function& function) {
-  try {
-    function();
-    return kDone;
-  } catch (const std::bad_alloc&) {
-    return kOutOfMemory;
-  }
-}
-
 }  // namespace
 }  // namespace ggslam
 
 using namespace ggslam;
 
 GGSLAM_EXPORT int ggslam_rasterizer_pixel_terms(void* rasterizer, const std::int32_t* pixels, float min_weight,
-                                                const PixelTerms* out) {
-  return guarded([&] {
-    const Rasterizer& r = *static_cast<Rasterizer*>(rasterizer);
-    const SortedPixels sorted = sort_pixels(r, pixels, out->pixels);
-    const auto collect = GGSLAM_DISPATCH(r.context.isa, collect_terms);
-    r.context.pool.parallel_for(r.tiles(), 1, [&](std::size_t tile, std::size_t, int) {
-      const std::int32_t first = sorted.tile_start[tile], count = sorted.tile_start[tile + 1] - first;
-      if (count > 0) collect(r, static_cast<int>(tile), sorted.pixels.data() + first, count, min_weight, *out);
-    });
+                                                const PixelTerms* out) try {
+  const Rasterizer& r = object_of<Rasterizer>(rasterizer);
+  const std::int64_t count = check_terms(out).pixels, size = std::int64_t{r.view.width} * r.view.height;
+  check_array("pixels", pixels, count);
+  for (std::int64_t i = 0; i < count; ++i)
+    if (pixels[i] < 0 || pixels[i] >= size)
+      refuse("pixels: expected those of the last picture, below %lld, found %d", static_cast<long long>(size), pixels[i]);
+  const SortedPixels sorted = sort_pixels(r, pixels, out->pixels);
+  const auto collect = GGSLAM_DISPATCH(r.context.isa, collect_terms);
+  r.context.pool.parallel_for(r.tiles(), 1, [&](std::size_t tile, std::size_t, int) {
+    const std::int32_t first = sorted.tile_start[tile], count = sorted.tile_start[tile + 1] - first;
+    if (count > 0) collect(r, static_cast<int>(tile), sorted.pixels.data() + first, count, min_weight, *out);
   });
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_terms_blend(void* context, const PixelTerms* terms, const float* features, int channels,
-                                     float* out) {
-  Context& c = *static_cast<Context*>(context);
+                                     float* out) try {
+  Context& c = object_of<Context>(context);
+  check_counts(check_terms(terms));
+  check_range("channels", channels, 0, kMostChannels);
+  check_array("features", features, 1), check_array("out", out, terms->pixels);
   const auto blend = GGSLAM_DISPATCH(c.isa, blend_terms);
   c.pool.parallel_for(terms->pixels, 256, [&](std::size_t begin, std::size_t end, int) {
     blend(*terms, features, channels, static_cast<std::int64_t>(begin), static_cast<std::int64_t>(end), out);
   });
-  return kDone;
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_terms_step(void* context, const PixelTerms* terms, const float* gradient,
-                                    const FeatureAdam* adam) {
-  return guarded([&] {
-    Context& c = *static_cast<Context*>(context);
-    const Transposed transposed(*terms, adam->gaussians);
-    const TermsByGaussian view = transposed.view();
-    const auto step = GGSLAM_DISPATCH(c.isa, step_term_rows);
-    c.pool.parallel_for(transposed.size(), 512, [&](std::size_t begin, std::size_t end, int) {
-      step(view, gradient, *adam, static_cast<std::int64_t>(begin), static_cast<std::int64_t>(end));
-    });
+                                    const FeatureAdam* adam) try {
+  Context& c = object_of<Context>(context);
+  const Transposed transposed(check_terms(terms), object_of<FeatureAdam>(adam).gaussians);
+  check_range("channels", adam->channels, 0, kMostChannels);
+  check_range("schedule_rows", adam->schedule_rows, 1, std::numeric_limits<std::int32_t>::max());
+  const void* const arrays[] = {adam->features, adam->first_moments, adam->second_moments, adam->updates, adam->schedule};
+  for (const void* array : arrays) check_array("features and moments", array, adam->gaussians);
+  check_array("gradient", gradient, terms->pixels);
+  const TermsByGaussian view = transposed.view();
+  const auto step = GGSLAM_DISPATCH(c.isa, step_term_rows);
+  c.pool.parallel_for(transposed.size(), 512, [&](std::size_t begin, std::size_t end, int) {
+    step(view, gradient, *adam, static_cast<std::int64_t>(begin), static_cast<std::int64_t>(end));
   });
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_terms_vote(void* context, const PixelTerms* terms, const std::uint16_t* labels,
-                                    const float* pixel_weights, std::int64_t gaussians, int slots, std::int32_t* ids, float* weights) {
-  return guarded([&] {
-    Context& c = *static_cast<Context*>(context);
-    const Transposed transposed(*terms, gaussians);
-    const TermsByGaussian view = transposed.view();
-    c.pool.parallel_for(transposed.size(), 512, [&](std::size_t begin, std::size_t end, int) {
-      for (std::size_t i = begin; i < end; ++i) {
-        const std::size_t at = static_cast<std::size_t>(view.touched[i]) * slots;
-        for (std::int64_t k = view.starts[i]; k < view.starts[i + 1]; ++k) {
-          const std::int32_t row = view.rows[k];
-          const float factor = pixel_weights != nullptr ? pixel_weights[row] : 1.0f;
-          if (labels[row] != 0) add_vote(ids + at, weights + at, slots, labels[row], factor * view.weights[k]);
-        }
+                                    const float* pixel_weights, std::int64_t gaussians, int slots, std::int32_t* ids, float* weights) try {
+  Context& c = object_of<Context>(context);
+  const Transposed transposed(check_terms(terms), gaussians);
+  check_range("slots", slots, 1, kMostChannels);
+  check_array("labels", labels, terms->pixels), check_array("ids", ids, gaussians), check_array("weights", weights, gaussians);
+  const TermsByGaussian view = transposed.view();
+  c.pool.parallel_for(transposed.size(), 512, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t i = begin; i < end; ++i) {
+      const std::size_t at = static_cast<std::size_t>(view.touched[i]) * slots;
+      for (std::int64_t k = view.starts[i]; k < view.starts[i + 1]; ++k) {
+        const std::int32_t row = view.rows[k];
+        const float factor = pixel_weights != nullptr ? pixel_weights[row] : 1.0f;
+        if (labels[row] != 0) add_vote(ids + at, weights + at, slots, labels[row], factor * view.weights[k]);
       }
-    });
+    }
   });
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_terms_label(void* context, const PixelTerms* terms, const std::uint16_t* labels,
-                                     std::uint16_t* ids, float* shares) {
-  Context& c = *static_cast<Context*>(context);
+                                     std::uint16_t* ids, float* shares) try {
+  Context& c = object_of<Context>(context);
+  check_counts(check_terms(terms));
+  check_array("labels", labels, 1), check_array("ids", ids, terms->pixels), check_array("shares", shares, terms->pixels);
   c.pool.parallel_for(terms->pixels, 1024, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t p = begin; p < end; ++p) label_pixel(*terms, static_cast<std::int64_t>(p), labels, ids[p], shares[p]);
   });
-  return kDone;
-}
+  return 0;
+} GGSLAM_CATCH_ALL

@@ -5,10 +5,29 @@
 #include <algorithm>
 #include <cstring>
 
+#include "common/guard.hpp"
+
 namespace ggslam {
 namespace {
 
-enum Status { kDone = 0, kOutOfMemory = 1, kTooManyPairs = 2 };
+enum Status { kDone = 0, kTooManyPairs = 2 };
+
+void check_input(const GaussianArrays& g, const CameraView& view, const RenderTargets& targets) {
+  check_range<std::int64_t>("gaussians", g.count, 0, std::int64_t{1} << 30);
+  const void* const arrays[] = {g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh};
+  for (const void* array : arrays) check_array("gaussians", array, g.count);
+  check_range("sh_coefficients", g.sh_coefficients, 1, 16);
+  check_range("active_sh_coefficients", g.active_sh_coefficients, 1, g.sh_coefficients);
+  check_range("width", view.width, 1, kMostPixelsAlong);
+  check_range("height", view.height, 1, kMostPixelsAlong);
+  const float numbers[] = {view.fx, view.fy, view.cx, view.cy, view.near_plane, view.low_pass};
+  check_within("camera", numbers, 6, 1e9);
+  check_within("camera's pose", view.camera_world, 12, 1e12);
+  check_array("image", targets.image, 1), check_array("depth", targets.depth, 1), check_array("alpha", targets.alpha, 1);
+  if (!g.render_features) return;
+  check_range("feature_channels", g.feature_channels, 1, 1 << 12);
+  check_array("features", g.features, g.count), check_array("rendered features", targets.features, 1);
+}
 
 void prepare(Rasterizer& r, const GaussianArrays& gaussians, const CameraView& view) {
   r.gaussians = gaussians;
@@ -31,7 +50,7 @@ void prepare(Rasterizer& r, const GaussianArrays& gaussians, const CameraView& v
   r.tile_start.reserve(tiles + 1);
   r.transmittance.reserve(pixels);
   r.last_entry.reserve(pixels);
-  // Scratch is reserved here, never in a kernel: an exception in a worker thread would end the process.
+  // Scratch is reserved here, never in a kernel.
   for (int t = 0; t < r.context.pool.size(); ++t) {
     r.scratch[t].pixel_features.reserve(std::size_t{kSubBlocks} * r.tile_height * r.padded_features);
     r.scratch[t].gaussian_features.reserve(std::size_t{kChunk} * r.padded_features);
@@ -113,32 +132,34 @@ Status backward(Rasterizer& r, const ImageGradients& image_gradients, const Gaus
 
 using namespace ggslam;
 
-GGSLAM_EXPORT void* ggslam_rasterizer_create(void* context) { return new Rasterizer(*static_cast<Context*>(context)); }
+GGSLAM_EXPORT void* ggslam_rasterizer_create(void* context) try {
+  return new Rasterizer(object_of<Context>(context));
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_rasterizer_destroy(void* rasterizer) { delete static_cast<Rasterizer*>(rasterizer); }
+GGSLAM_EXPORT int ggslam_rasterizer_destroy(void* rasterizer) try {
+  delete static_cast<Rasterizer*>(rasterizer);
+  return 0;
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_rasterizer_forward(void* rasterizer, const GaussianArrays* gaussians, const CameraView* view,
-                                            const RenderTargets* targets, int as_3dgs) {
-  try {
-    static_cast<Rasterizer*>(rasterizer)->as_3dgs = as_3dgs != 0;
-    return forward(*static_cast<Rasterizer*>(rasterizer), *gaussians, *view, *targets);
-  } catch (const std::bad_alloc&) {
-    return kOutOfMemory;
-  }
-}
+                                            const RenderTargets* targets, int as_3dgs) try {
+  Rasterizer& r = object_of<Rasterizer>(rasterizer);
+  check_input(object_of<GaussianArrays>(gaussians), object_of<CameraView>(view), object_of<RenderTargets>(targets));
+  r.as_3dgs = as_3dgs != 0;
+  return forward(r, *gaussians, *view, *targets);
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_rasterizer_backward(void* rasterizer, const ImageGradients* image_gradients,
-                                             const GaussianGradients* gradients, const AdamArguments* adam) {
-  try {
-    return backward(*static_cast<Rasterizer*>(rasterizer), *image_gradients, *gradients, adam);
-  } catch (const std::bad_alloc&) {
-    return kOutOfMemory;
-  }
-}
+                                             const GaussianGradients* gradients, const AdamArguments* adam) try {
+  check_array("twist", object_of<GaussianGradients>(gradients).twist, 6);
+  return backward(object_of<Rasterizer>(rasterizer), object_of<ImageGradients>(image_gradients), *gradients, adam);
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_rasterizer_statistics(void* rasterizer, std::int64_t* out) {
-  const Rasterizer& r = *static_cast<Rasterizer*>(rasterizer);
+GGSLAM_EXPORT int ggslam_rasterizer_statistics(void* rasterizer, std::int64_t* out) try {
+  const Rasterizer& r = object_of<Rasterizer>(rasterizer);
+  check_array("out", out, 2);
   out[0] = 0;
   for (int b = 0; b < r.blocks; ++b) out[0] += r.visible[b];
   out[1] = static_cast<std::int64_t>(r.pair_count);
-}
+  return 0;
+} GGSLAM_CATCH_ALL

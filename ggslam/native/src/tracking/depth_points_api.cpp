@@ -3,6 +3,7 @@
 #include <vector>
 
 #include "common/context.hpp"
+#include "common/guard.hpp"
 #include "tracking/tracking_types.hpp"
 
 GGSLAM_DECLARE_KERNEL(int depth_points_row(const float* depth, const DepthPointsSettings& settings, int v,
@@ -27,10 +28,17 @@ void move_rows(const DepthPointsOutput& to, const DepthPointsOutput& from, std::
 }  // namespace ggslam
 
 GGSLAM_EXPORT int ggslam_depth_points(void* context_, const float* depth, const ggslam::DepthPointsSettings* settings,
-                                      const ggslam::DepthPointsOutput* out) {
+                                      const ggslam::DepthPointsOutput* out) try {
   using namespace ggslam;
-  Context& context = *static_cast<Context*>(context_);
-  const DepthPointsSettings& s = *settings;
+  Context& context = object_of<Context>(context_);
+  const DepthPointsSettings& s = object_of<DepthPointsSettings>(settings);
+  check_range("width", s.width, 1, kMostPixelsAlong), check_range("height", s.height, 1, kMostPixelsAlong);
+  check_range("stride", s.stride, 1, kMostPixelsAlong);
+  check_range("window", s.window, 0, 1 << 10), check_range("window_step", s.window_step, 1, 1 << 10);
+  check_array("depth", depth, 1);
+  const DepthPointsOutput& to = object_of<DepthPointsOutput>(out);
+  const void* const arrays[] = {to.points, to.normals, to.covariances, to.pixels, to.weights};
+  for (const void* array : arrays) check_array("out", array, 1);
   const auto row_kernel = GGSLAM_DISPATCH(context.isa, depth_points_row);
   const int border = s.window * s.window_step, first = border + s.stride / 2;
   const int rows = first < s.height - border ? (s.height - border - first + s.stride - 1) / s.stride : 0;
@@ -46,4 +54,4 @@ GGSLAM_EXPORT int ggslam_depth_points(void* context_, const float* depth, const 
     total += counts[r];
   }
   return static_cast<int>(total);
-}
+} GGSLAM_CATCH_ALL

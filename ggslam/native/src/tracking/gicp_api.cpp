@@ -6,6 +6,7 @@
 #include <cmath>
 #include <cstring>
 
+#include "common/guard.hpp"
 #include "common/vector.hpp"
 #include "tracking/gicp_target.hpp"
 
@@ -287,15 +288,41 @@ class Aligner {
 }  // namespace
 }  // namespace ggslam
 
-GGSLAM_EXPORT void ggslam_gicp_align(void* context, const void* target, const ggslam::AlignPoints* points,
-                                     const ggslam::AlignSettings* settings,
-                                     const ggslam::PhotometricPoints* photometric_points,
-                                     const ggslam::PhotometricReferenceView* reference, const double* pose_guess,
-                                     int32_t* match, float* squared_distance, ggslam::AlignResult* result) {
+namespace {
+
+void check_points(const ggslam::AlignPoints* pointer, const ggslam::AlignSettings* settings, const int32_t* match,
+                  const float* squared_distance) {
   using namespace ggslam;
+  const AlignPoints& points = object_of<AlignPoints>(pointer);
+  const void* const arrays[] = {points.points, points.normals, points.covariances, points.weights, match, squared_distance};
+  for (const void* array : arrays) check_array("points", array, points.count);
+  object_of<AlignSettings>(settings);
+}
+
+void check_reference(const ggslam::PhotometricPoints* points, const ggslam::PhotometricReferenceView* reference) {
+  using namespace ggslam;
+  if (points == nullptr || reference == nullptr) return;
+  check_array("photometric points", points->points, points->count);
+  check_array("photometric points", points->intensity, points->count);
+  check_range("reference width", reference->width, 1, kMostPixelsAlong);
+  check_range("reference height", reference->height, 1, kMostPixelsAlong);
+  check_array("reference", reference->pixels, 1);
+}
+
+}  // namespace
+
+GGSLAM_EXPORT int ggslam_gicp_align(void* context, const void* target, const ggslam::AlignPoints* points,
+                                    const ggslam::AlignSettings* settings,
+                                    const ggslam::PhotometricPoints* photometric_points,
+                                    const ggslam::PhotometricReferenceView* reference, const double* pose_guess,
+                                    int32_t* match, float* squared_distance, ggslam::AlignResult* result) try {
+  using namespace ggslam;
+  check_points(points, settings, match, squared_distance);
+  check_reference(photometric_points, reference);
+  check_within("pose", pose_guess, 12, 1e9);
   RigidPose pose = pose_of(pose_guess);
-  *result = AlignResult{};
-  Aligner(*static_cast<Context*>(context), *points, *static_cast<const GicpTarget*>(target), *settings,
+  object_of<AlignResult>(result) = AlignResult{};
+  Aligner(object_of<Context>(context), *points, object_of<GicpTarget>(target), *settings,
           photometric_points, reference, match, squared_distance)
       .run(pose, *result);
   for (int i = 0; i < 3; ++i) {
@@ -303,14 +330,18 @@ GGSLAM_EXPORT void ggslam_gicp_align(void* context, const void* target, const gg
     result->pose[4 * i + 3] = pose.translation[i];
   }
   result->pose[15] = 1;
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT double ggslam_gicp_linearize(void* context_, const void* target_, const ggslam::AlignPoints* points,
                                            const ggslam::AlignSettings* settings, int level, const double* pose,
-                                           int32_t* match, float* squared_distance, double* h, double* b) {
+                                           int32_t* match, float* squared_distance, double* h, double* b) try {
   using namespace ggslam;
-  const auto& context = *static_cast<Context*>(context_);
-  const auto& target = *static_cast<const GicpTarget*>(target_);
+  const auto& context = object_of<Context>(context_);
+  const auto& target = object_of<GicpTarget>(target_);
+  check_points(points, settings, match, squared_distance);
+  check_within("pose", pose, 12, 1e9);
+  check_array("h", h, 36), check_array("b", b, 6);
   LinearizeArgs args{};
   args.points = *points;
   args.level = (level ? target.coarse : target.fine).view();
@@ -325,4 +356,4 @@ GGSLAM_EXPORT double ggslam_gicp_linearize(void* context_, const void* target_, 
   unpack(sums.h, 6, h);
   std::copy_n(sums.b, 6, b);
   return sums.cost;
-}
+} GGSLAM_CATCH_ALL

@@ -7,6 +7,7 @@
 #include <memory>
 #include <numeric>
 
+#include "common/guard.hpp"
 #include "tracking/target_kernels.hpp"
 
 namespace ggslam {
@@ -241,51 +242,78 @@ void GicpTarget::finish(Context& context, const TargetSettings& settings) {
 
 // --- C interface ------------------------------------------------------------------------------------------------------
 
-GGSLAM_EXPORT void* ggslam_gicp_target_create() { return new ggslam::GicpTarget; }
+namespace ggslam {
 
-GGSLAM_EXPORT void ggslam_gicp_target_destroy(void* target) { delete static_cast<ggslam::GicpTarget*>(target); }
+void check_target(const TargetInput* input, const TargetSettings* settings) {
+  const TargetInput& in = object_of<TargetInput>(input);
+  const void* const arrays[] = {in.means, in.quaternions, in.log_scales, in.opacity_logits};
+  for (const void* array : arrays) check_array("gaussians", array, in.count);
+  check_array("camera_positions", in.birth == nullptr ? in.means : in.camera_positions, in.cameras);
+  check_range("voxel", object_of<TargetSettings>(settings).voxel, 1e-6f, 1e6f);
+}
 
-GGSLAM_EXPORT void ggslam_gicp_target_build(void* context, void* target, const void* base,
+}  // namespace ggslam
+
+GGSLAM_EXPORT void* ggslam_gicp_target_create() try {
+  return new ggslam::GicpTarget;
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_gicp_target_destroy(void* target) try {
+  delete static_cast<ggslam::GicpTarget*>(target);
+  return 0;
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_gicp_target_build(void* context, void* target, const void* base,
+                                           const ggslam::TargetInput* input,
+                                           const ggslam::TargetSettings* settings) try {
+  ggslam::check_target(input, settings);
+  ggslam::object_of<ggslam::GicpTarget>(target).build(ggslam::object_of<ggslam::Context>(context),
+      static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
+  return 0;
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_gicp_target_gather(void* context, void* target, const void* base,
                                             const ggslam::TargetInput* input,
-                                            const ggslam::TargetSettings* settings) {
-  static_cast<ggslam::GicpTarget*>(target)->build(*static_cast<ggslam::Context*>(context),
-                                                  static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
-}
+                                            const ggslam::TargetSettings* settings) try {
+  ggslam::check_target(input, settings);
+  ggslam::object_of<ggslam::GicpTarget>(target).gather(ggslam::object_of<ggslam::Context>(context),
+      static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_gicp_target_gather(void* context, void* target, const void* base,
-                                             const ggslam::TargetInput* input,
-                                             const ggslam::TargetSettings* settings) {
-  static_cast<ggslam::GicpTarget*>(target)->gather(*static_cast<ggslam::Context*>(context),
-                                                   static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
-}
+GGSLAM_EXPORT int ggslam_gicp_target_finish(void* context, void* target, const ggslam::TargetSettings* settings) try {
+  ggslam::check_range("voxel", ggslam::object_of<ggslam::TargetSettings>(settings).voxel, 1e-6f, 1e6f);
+  ggslam::object_of<ggslam::GicpTarget>(target).finish(ggslam::object_of<ggslam::Context>(context), *settings);
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_gicp_target_finish(void* context, void* target, const ggslam::TargetSettings* settings) {
-  static_cast<ggslam::GicpTarget*>(target)->finish(*static_cast<ggslam::Context*>(context), *settings);
-}
-
-GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target_, int level_) {
-  const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
+GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target_, int level_) try {
+  const auto& target = ggslam::object_of<ggslam::GicpTarget>(target_);
   const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;
   return static_cast<int>(std::max(level.voxels.size(), level.moments.size()));
-}
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_gicp_target_moments(const void* target_, int level, float* out) {
-  const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
+GGSLAM_EXPORT int ggslam_gicp_target_moments(const void* target_, int level, float* out) try {
+  const auto& target = ggslam::object_of<ggslam::GicpTarget>(target_);
   const auto& moments = (level ? target.coarse : target.fine).moments;
   static_assert(sizeof(ggslam::VoxelMoments) == 22 * sizeof(float), "moments are floats and nothing else");
+  ggslam::check_array("out", out, static_cast<std::int64_t>(moments.size()));
   std::copy_n(reinterpret_cast<const float*>(moments.data()), moments.size() * 22, out);
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_gicp_target_voxels(const void* target_, int level, float* out) {
-  const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
+GGSLAM_EXPORT int ggslam_gicp_target_voxels(const void* target_, int level, float* out) try {
+  const auto& target = ggslam::object_of<ggslam::GicpTarget>(target_);
   const auto& voxels = (level ? target.coarse : target.fine).voxels;
+  ggslam::check_array("out", out, static_cast<std::int64_t>(voxels.size()));
   std::copy_n(reinterpret_cast<const float*>(voxels.data()), voxels.size() * 16, out);
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target_, int level_, uint64_t* out) {
-  const auto& target = *static_cast<const ggslam::GicpTarget*>(target_);
+GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target_, int level_, uint64_t* out) try {
+  const auto& target = ggslam::object_of<ggslam::GicpTarget>(target_);
   const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;
   for (std::size_t b = 0; out && b < level.blocks.size(); ++b, out += 3)
     out[0] = level.block_keys[b], out[1] = level.blocks[b].occupied, out[2] = level.blocks[b].first;
   return static_cast<int>(level.blocks.size());
-}
+} GGSLAM_CATCH_ALL

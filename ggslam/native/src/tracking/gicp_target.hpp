@@ -56,4 +56,7 @@ struct GicpTarget {
                const TargetSettings& settings);
 };
 
+// Throws an InputError for what cannot be.
+void check_target(const TargetInput* input, const TargetSettings* settings);
+
 }  // namespace ggslam

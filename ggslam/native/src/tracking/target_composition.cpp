@@ -3,6 +3,7 @@
 // and finished again (and those beside them, where a voxel's shape depends on its neighbours).
 #include <algorithm>
 
+#include "common/guard.hpp"
 #include "tracking/gicp_target.hpp"
 
 GGSLAM_DECLARE_KERNEL(void merge_moments(const VoxelMoments* parts, std::size_t count, VoxelMoments* sum))
@@ -283,24 +284,31 @@ void GicpTarget::compose(Context& context, const GicpTarget* before, Parts parts
 using PartHandle = std::shared_ptr<const ggslam::TargetPart>;
 
 GGSLAM_EXPORT void* ggslam_target_part_create(const void* context, const ggslam::TargetInput* input,
-                                              const ggslam::TargetSettings* settings, uint64_t rank) {
+                                              const ggslam::TargetSettings* settings, uint64_t rank) try {
+  ggslam::check_target(input, settings);
   auto part = std::make_shared<ggslam::TargetPart>();
   part->rank = rank;
-  part->build(static_cast<const ggslam::Context*>(context)->isa, *input, *settings);
+  part->build(ggslam::object_of<ggslam::Context>(context).isa, *input, *settings);
   return new PartHandle(std::move(part));
-}
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_target_part_destroy(void* part) { delete static_cast<PartHandle*>(part); }
+GGSLAM_EXPORT int ggslam_target_part_destroy(void* part) try {
+  delete static_cast<PartHandle*>(part);
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int64_t ggslam_target_part_bytes(const void* part) {
-  return static_cast<int64_t>((*static_cast<const PartHandle*>(part))->bytes());
-}
+GGSLAM_EXPORT int64_t ggslam_target_part_bytes(const void* part) try {
+  return static_cast<int64_t>((ggslam::object_of<PartHandle>(part))->bytes());
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_gicp_target_compose(void* context, void* target, const void* before, const void* const* parts,
-                                              int count, const ggslam::TargetSettings* settings) {
+GGSLAM_EXPORT int ggslam_gicp_target_compose(void* context, void* target, const void* before, const void* const* parts,
+                                             int count, const ggslam::TargetSettings* settings) try {
+  ggslam::check_array("parts", parts, count);
+  ggslam::check_range("voxel", ggslam::object_of<ggslam::TargetSettings>(settings).voxel, 1e-6f, 1e6f);
   std::vector<PartHandle> own;
-  for (int i = 0; i < count; ++i) own.push_back(*static_cast<const PartHandle*>(parts[i]));
-  static_cast<ggslam::GicpTarget*>(target)->compose(*static_cast<ggslam::Context*>(context),
+  for (int i = 0; i < count; ++i) own.push_back(ggslam::object_of<PartHandle>(parts[i]));
+  ggslam::object_of<ggslam::GicpTarget>(target).compose(ggslam::object_of<ggslam::Context>(context),
                                                     static_cast<const ggslam::GicpTarget*>(before), std::move(own),
                                                     *settings);
-}
+  return 0;
+} GGSLAM_CATCH_ALL

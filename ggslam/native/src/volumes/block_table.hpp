@@ -13,6 +13,9 @@ struct BlockCoordinates {
   int32_t x, y, z;
 };
 
+// Coordinates of blocks lie within this: those of their voxels, and of what is around them, are integers of 32 bits.
+constexpr int32_t kFarthestBlock = 1 << 27;
+
 static inline Vec3i vector_of(BlockCoordinates at) { return {{at.x, at.y, at.z}}; }
 static inline Box3i box_of(BlockCoordinates at) { return Box3i::at(vector_of(at)); }
 

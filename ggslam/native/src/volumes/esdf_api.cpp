@@ -4,52 +4,77 @@
 #include <limits>
 
 #include "common/context.hpp"
+#include "common/guard.hpp"
 #include "volumes/esdf.hpp"
 
 GGSLAM_DECLARE_KERNEL(void esdf_query(const ggslam::volumes::QueryInput& in, std::size_t begin, std::size_t end,
                                       float* distance, float* gradient, uint8_t* known))
 
+using namespace ggslam;
 using namespace ggslam::volumes;
 
 namespace {
 
-Esdf& field(void* handle) { return *static_cast<Esdf*>(handle); }
+constexpr float kMostDistance = 2001;  // voxels; the core counts them in 16 bits
+
+Esdf& field(void* handle) { return object_of<Esdf>(handle); }
 
 }  // namespace
 
-GGSLAM_EXPORT void* ggslam_esdf_create(void* tsdf, float max_distance) {
-  return new Esdf(*static_cast<Tsdf*>(tsdf), max_distance);
-}
+GGSLAM_EXPORT void* ggslam_esdf_create(void* tsdf, float max_distance) try {
+  const Tsdf& map = object_of<Tsdf>(tsdf);
+  check_range("max_distance", max_distance / map.voxel, 1e-6f, kMostDistance);
+  return new Esdf(map, max_distance);
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_esdf_destroy(void* handle) { delete static_cast<Esdf*>(handle); }
-GGSLAM_EXPORT void ggslam_esdf_clear(void* handle) { field(handle).clear(); }
-GGSLAM_EXPORT int64_t ggslam_esdf_size(void* handle) { return static_cast<int64_t>(field(handle).size()); }
-GGSLAM_EXPORT int64_t ggslam_esdf_bytes(void* handle) { return static_cast<int64_t>(field(handle).bytes()); }
+GGSLAM_EXPORT int ggslam_esdf_destroy(void* handle) try {
+  delete static_cast<Esdf*>(handle);
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_esdf_update(void* handle, void* context, FieldStats* stats) {
-  *stats = field(handle).update(*static_cast<ggslam::Context*>(context));
-}
+GGSLAM_EXPORT int ggslam_esdf_clear(void* handle) try {
+  field(handle).clear();
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_esdf_list(void* handle, int32_t* at) {
+GGSLAM_EXPORT int64_t ggslam_esdf_size(void* handle) try {
+  return static_cast<int64_t>(field(handle).size());
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int64_t ggslam_esdf_bytes(void* handle) try {
+  return static_cast<int64_t>(field(handle).bytes());
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_esdf_update(void* handle, void* context, FieldStats* stats) try {
+  object_of<FieldStats>(stats) = field(handle).update(object_of<ggslam::Context>(context));
+  return 0;
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_esdf_list(void* handle, int32_t* at) try {
   const BlockTable& table = field(handle).table();
+  check_array("coordinates", at, static_cast<int64_t>(table.size()));
   for (std::size_t row = 0; row < table.size(); ++row) {
     const BlockCoordinates b = table.at(row);
     at[3 * row] = b.x, at[3 * row + 1] = b.y, at[3 * row + 2] = b.z;
   }
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_esdf_read(void* handle, int64_t n, const int32_t* at, float* distance) {
+GGSLAM_EXPORT int ggslam_esdf_read(void* handle, int64_t n, const int32_t* at, float* distance) try {
   const Esdf& f = field(handle);
+  check_array("coordinates", at, n), check_array("distance", distance, n);
   for (int64_t i = 0; i < n; ++i) {
     const int32_t row = f.table().find({at[3 * i], at[3 * i + 1], at[3 * i + 2]});
     const FieldVoxels* voxels = row < 0 ? nullptr : f.block(row).voxels.get();
     for (int v = 0; v < kVoxels; ++v)
       distance[i * kVoxels + v] = voxels ? voxels->distance[v] : std::numeric_limits<float>::quiet_NaN();
   }
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* normals) {
+GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* normals) try {
   const Esdf& f = field(handle);
+  check_array("normals", points == nullptr ? &f : static_cast<const void*>(normals), 1);
   int64_t n = 0;
   for (std::size_t row = 0; row < f.size(); ++row) {
     const BlockCoordinates b = f.table().at(row);
@@ -63,12 +88,14 @@ GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* norm
     }
   }
   return n;
-}
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_esdf_query(void* handle, void* context_, int64_t n, const double* points, float* distance,
-                                     float* gradient, uint8_t* known) {
-  ggslam::Context& context = *static_cast<ggslam::Context*>(context_);
+GGSLAM_EXPORT int ggslam_esdf_query(void* handle, void* context_, int64_t n, const double* points, float* distance,
+                                    float* gradient, uint8_t* known) try {
+  ggslam::Context& context = object_of<ggslam::Context>(context_);
   const Esdf& f = field(handle);
+  const void* const arrays[] = {points, distance, gradient, known};
+  for (const void* array : arrays) check_array("points", array, n);
   std::vector<const FieldVoxels*> voxels(f.size());
   for (std::size_t row = 0; row < f.size(); ++row) voxels[row] = f.block(row).voxels.get();
   const QueryInput in{f.table().view(), voxels.data(), f.voxel(), points};
@@ -76,4 +103,5 @@ GGSLAM_EXPORT void ggslam_esdf_query(void* handle, void* context_, int64_t n, co
   context.pool.parallel_for(static_cast<std::size_t>(n), 4096, [&](std::size_t begin, std::size_t end, int) {
     kernel(in, begin, end, distance, gradient, known);
   });
-}
+  return 0;
+} GGSLAM_CATCH_ALL

@@ -36,7 +36,7 @@ struct Splitter {
     const double x = kSide * static_cast<double>(box.size(0)), y = kSide * static_cast<double>(box.size(1)),
                  z = kSide * static_cast<double>(box.size(2));
     const double py = static_cast<double>(p.size(1)), pz = static_cast<double>(p.size(2));
-    largest = static_cast<int64_t>(x * std::max(py, y) * std::max(pz, z));
+    largest = static_cast<int64_t>(std::min(x * std::max(py, y) * std::max(pz, z), 1e18));
     return 0.3 * x * py * pz + x * (py + y) * pz + x * y * (pz + z) + 20000;
   }
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
+#include <numeric>
 
 #include "volumes/esdf.hpp"
 
@@ -18,13 +19,13 @@ double milliseconds(Clock::time_point since) {
   return std::chrono::duration<double, std::milli>(Clock::now() - since).count();
 }
 
-// Squared gap between a block and the nearest of `sources`, in voxels; of blocks up to `window` away.
+// Squared gap between a block and the nearest of `sources`, in voxels; of blocks up to `window` away, in `range`.
 class BlockGaps {
  public:
-  BlockGaps(const std::vector<BlockCoordinates>& sources, int window) : window_(window) {
-    for (const BlockCoordinates& at : sources) range_.include(box_of(at).grow(window));
-    size_ = cast<std::size_t>(range_.high - range_.low);
-    gap_.assign(size_[0] * size_[1] * size_[2], kFar);
+  // `range` encloses the sources.
+  BlockGaps(const std::vector<BlockCoordinates>& sources, const Box3i& range, int window)
+      : window_(window), range_(range), size_(cast<std::size_t>(range.high - range.low)),
+        gap_(size_[0] * size_[1] * size_[2], kFar) {
     for (const BlockCoordinates& at : sources) gap_[index(at)] = 0;
   }
 
@@ -47,8 +48,8 @@ class BlockGaps {
  private:
   static constexpr int kFar = 1 << 29;
   const int window_;
-  Box3i range_ = Box3i::empty();
-  Vec3<std::size_t> size_;
+  const Box3i range_;
+  const Vec3<std::size_t> size_;
   std::vector<int> gap_;
 
   std::size_t index(BlockCoordinates at) const {
@@ -68,6 +69,50 @@ class BlockGaps {
       }
     }
     for (int i = 0; i < n; ++i) values[i * stride] = line[i];
+  }
+};
+
+// Calls found(row, gap) for blocks with the gap to the nearest of `sources`, if that is up to `window` blocks away. Where
+// the blocks lie far apart they are halved until what lies around each part fits the memory that is meant for it: the
+// space between them costs nothing. Gaps do not depend on the parts.
+class GapSearch {
+ public:
+  GapSearch(ThreadPool& pool, const BlockTable& table, int window) : pool_(pool), table_(table), window_(window) {}
+
+  template <class Found>
+  void search(std::vector<int32_t> rows, const std::vector<BlockCoordinates>& sources, const Found& found) const {
+    Box3i box = Box3i::empty();
+    for (const int32_t row : rows) box.include(box_of(table_.at(row)));
+    const Box3i around = box.is_empty() ? box : box.grow(window_);
+    std::vector<BlockCoordinates> near;
+    Box3i range = Box3i::empty();
+    for (const BlockCoordinates& at : sources)
+      if (around.contains(box_of(at))) near.push_back(at), range.include(box_of(at).grow(window_));
+    if (near.empty()) return;
+    range = intersection(range, around);
+    const int axis = longest_axis(box);
+    if (1.0 * range.size(0) * range.size(1) * range.size(2) > kMostBlocks && box.size(axis) > 1) {
+      const int middle = box.low[axis] + static_cast<int>(box.size(axis) / 2);
+      const auto upper = std::partition(
+          rows.begin(), rows.end(), [&](int32_t row) { return vector_of(table_.at(row))[axis] < middle; });
+      search({rows.begin(), upper}, near, found);
+      search({upper, rows.end()}, near, found);
+      return;
+    }
+    BlockGaps gaps(near, range, window_);
+    gaps.spread(pool_);
+    for (const int32_t row : rows) found(row, gaps.gap(table_.at(row)));
+  }
+
+ private:
+  static constexpr double kMostBlocks = 1 << 25;
+  ThreadPool& pool_;
+  const BlockTable& table_;
+  const int window_;
+
+  static int longest_axis(const Box3i& box) {
+    const int a = box.size(1) > box.size(0) ? 1 : 0;
+    return box.size(2) > box.size(a) ? 2 : a;
   }
 };
 
@@ -95,12 +140,13 @@ std::vector<Task> Esdf::affected(Context& context, const std::vector<int32_t>& c
   std::vector<Task> tasks;
   for (int32_t row : changed) listed[row] = 1;
   if (!site_changes_.empty()) {
-    BlockGaps gaps(site_changes_, static_cast<int>((max_distance_ + kCentreSlack + kReading) / kSide) + 1);
-    gaps.spread(context.pool);
-    for (std::size_t row = 0; row < blocks_.size(); ++row) {
+    const int window = static_cast<int>((max_distance_ + kCentreSlack + kReading) / kSide) + 1;
+    std::vector<int32_t> rows(blocks_.size());
+    std::iota(rows.begin(), rows.end(), 0);
+    GapSearch(context.pool, table_, window).search(std::move(rows), site_changes_, [&](int32_t row, int gap) {
       const float reading = blocks_[row].required;
-      if (static_cast<float>(gaps.gap(table_.at(row))) <= reading * reading) listed[row] = 1;
-    }
+      if (static_cast<float>(gap) <= reading * reading) listed[row] = 1;
+    });
   }
   for (std::size_t row = 0; row < blocks_.size(); ++row)
     if (listed[row]) tasks.push_back({static_cast<int32_t>(row), first_pad(static_cast<int32_t>(row))});

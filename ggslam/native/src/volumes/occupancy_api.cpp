@@ -4,6 +4,7 @@
 
 #include "common/buffer.hpp"
 #include "common/context.hpp"
+#include "common/guard.hpp"
 #include "volumes/occupancy_files.hpp"
 #include "volumes/occupancy_queries.hpp"
 #include "volumes/occupancy_update.hpp"
@@ -22,7 +23,7 @@ struct OccupancyMap {
   explicit OccupancyMap(double resolution) : tree(resolution) {}
 };
 
-OccupancyMap& map_of(void* handle) { return *static_cast<OccupancyMap*>(handle); }
+OccupancyMap& map_of(void* handle) { return object_of<OccupancyMap>(handle); }
 
 // How many voxels a scan saw free that it did not see occupied.
 std::size_t free_voxels(const Scan& scan) {
@@ -44,6 +45,17 @@ bool insert(Context& context, OccupancyMap& map, const float* points, std::size_
   return true;
 }
 
+void check_scan(const float* points, std::uint64_t n, const InsertSettings* pointer, const InsertResult* result) {
+  check_array("points", points, static_cast<std::int64_t>(elements(static_cast<std::int64_t>(n), 3)));
+  const InsertSettings& s = object_of<InsertSettings>(pointer);
+  object_of<InsertResult>(result);
+  if (std::isnan(s.max_range)) refuse("max_range: expected a number");
+  const float log_odds[] = {s.hit, s.miss, s.minimum, s.maximum};
+  check_within("log-odds", log_odds, 4, 1e6);
+}
+
+void check_resolution(double resolution) { check_range("resolution", resolution, 1e-6, 1e6); }
+
 void put_keys(std::uint16_t*& out, std::uint64_t code) {
   cast<std::uint16_t>(keys_of_morton(code)).to(out);
   out += 3;
@@ -54,18 +66,29 @@ void put_keys(std::uint16_t*& out, std::uint64_t code) {
 
 using namespace ggslam;
 
-GGSLAM_EXPORT void* ggslam_occupancy_create(double resolution) { return new OccupancyMap(resolution); }
-GGSLAM_EXPORT void ggslam_occupancy_destroy(void* map) { delete static_cast<OccupancyMap*>(map); }
+GGSLAM_EXPORT void* ggslam_occupancy_create(double resolution) try {
+  check_resolution(resolution);
+  return new OccupancyMap(resolution);
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_occupancy_destroy(void* map) try {
+  delete static_cast<OccupancyMap*>(map);
+  return 0;
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_occupancy_insert(void* context, void* map, const float* points, std::uint64_t n,
-                                          const InsertSettings* settings, InsertResult* result) {
-  return insert(*static_cast<Context*>(context), map_of(map), points, n, *settings, *result) ? 1 : 0;
-}
+                                          const InsertSettings* settings, InsertResult* result) try {
+  check_scan(points, n, settings, result);
+  return insert(object_of<Context>(context), map_of(map), points, n, *settings, *result) ? 1 : 0;
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_occupancy_insert_depth(void* context_, void* map_, const DepthImage* image,
-                                                const InsertSettings* settings, InsertResult* result) {
-  Context& context = *static_cast<Context*>(context_);
+                                                const InsertSettings* settings, InsertResult* result) try {
+  Context& context = object_of<Context>(context_);
   OccupancyMap& map = map_of(map_);
+  const DepthImage& in = object_of<DepthImage>(image);
+  check_scan(in.depth, 1, settings, result);
+  check_camera(in.width, in.height, in.fx, in.fy, in.cx, in.cy);
   const std::size_t width = image->width, pixels = width * image->height;
   map.points.reserve(3 * pixels);
   const auto kernel = GGSLAM_DISPATCH(context.isa, depth_row_to_world);
@@ -75,53 +98,64 @@ GGSLAM_EXPORT int ggslam_occupancy_insert_depth(void* context_, void* map_, cons
              image->T_world_camera, image->low, image->high, map.points.data() + 3 * v * width);
   });
   return insert(context, map, map.points.data(), pixels, *settings, *result) ? 1 : 0;
-}
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_occupancy_look_up(void* context, void* map, const float* points, std::uint64_t n,
-                                            float threshold, std::int8_t* states, float* log_odds) {
-  look_up(*static_cast<Context*>(context), map_of(map).tree, points, n, threshold, states, log_odds);
-}
+GGSLAM_EXPORT int ggslam_occupancy_look_up(void* context, void* map, const float* points, std::uint64_t n,
+                                           float threshold, std::int8_t* states, float* log_odds) try {
+  check_array("points", points, static_cast<std::int64_t>(elements(static_cast<std::int64_t>(n), 3)));
+  look_up(object_of<Context>(context), map_of(map).tree, points, n, threshold, states, log_odds);
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_occupancy_summary(void* map, float threshold, OccupancySummary* summary) {
-  *summary = summarize(map_of(map).tree, threshold);
-}
+GGSLAM_EXPORT int ggslam_occupancy_summary(void* map, float threshold, OccupancySummary* summary) try {
+  object_of<OccupancySummary>(summary) = summarize(map_of(map).tree, threshold);
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_occupancy_compare(void* one, void* other, float threshold_one, float threshold_other,
-                                            std::uint64_t counts[9]) {
+GGSLAM_EXPORT int ggslam_occupancy_compare(void* one, void* other, float threshold_one, float threshold_other,
+                                           std::uint64_t counts[9]) try {
+  check_array("counts", counts, 9);
   count_states(map_of(one).tree, map_of(other).tree, threshold_one, threshold_other, counts);
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT const void* ggslam_occupancy_output(void* map) { return map_of(map).output.data(); }
+GGSLAM_EXPORT const void* ggslam_occupancy_output(void* map) try {
+  return map_of(map).output.data();
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT std::uint64_t ggslam_occupancy_leaves(void* map_, float threshold, int which) {
+GGSLAM_EXPORT std::uint64_t ggslam_occupancy_leaves(void* map_, float threshold, int which) try {
   OccupancyMap& map = map_of(map_);
   const std::vector<OccupancyLeaf> leaves = list_leaves(map.tree, threshold, which);
   const auto* bytes = reinterpret_cast<const std::uint8_t*>(leaves.data());
   map.output.assign(bytes, bytes + leaves.size() * sizeof(OccupancyLeaf));
   return map.output.size();
-}
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT std::uint64_t ggslam_occupancy_write(void* map_, int format, float threshold, std::uint64_t* nodes) {
+GGSLAM_EXPORT std::uint64_t ggslam_occupancy_write(void* map_, int format, float threshold, std::uint64_t* nodes) try {
   OccupancyMap& map = map_of(map_);
+  check_range("format", format, 0, 1), check_array("nodes", nodes, 1);
   OctomapText text = write_octomap(map.tree, static_cast<OctomapFormat>(format), threshold);
   map.output.swap(text.data);
   *nodes = text.nodes;
   return map.output.size();
-}
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_occupancy_read(void* map, int format, const std::uint8_t* data, std::uint64_t size, float free,
-                                        float occupied, std::uint64_t maximum_blocks, std::uint64_t* nodes) {
+                                        float occupied, std::uint64_t maximum_blocks, std::uint64_t* nodes) try {
+  check_range("format", format, 0, 1), check_array("nodes", nodes, 1);
+  check_array("data", data, static_cast<std::int64_t>(elements(static_cast<std::int64_t>(size))));
   const OctomapReading reading =
       read_octomap(map_of(map).tree, static_cast<OctomapFormat>(format), data, size, free, occupied, maximum_blocks);
   *nodes = reading.nodes;
   return static_cast<int>(reading.fault);
-}
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT std::int64_t ggslam_occupancy_scan_keys(void* context, void* map_, const float* points, std::uint64_t n,
-                                                      const InsertSettings* s, InsertResult* result) {
+                                                      const InsertSettings* s, InsertResult* result) try {
   OccupancyMap& map = map_of(map_);
+  check_scan(points, n, s, result);
   ScanSettings settings{{s->origin[0], s->origin[1], s->origin[2]}, s->max_range, s->quantize != 0};
-  if (!map.scan.cast(*static_cast<Context*>(context), map.tree.grid, settings, points, n)) return -1;
+  if (!map.scan.cast(object_of<Context>(context), map.tree.grid, settings, points, n)) return -1;
   *result = {map.scan.rays(), free_voxels(map.scan), map.scan.occupied().voxels()};
   map.output.resize((result->free + result->occupied) * 3 * sizeof(std::uint16_t));
   auto* out = reinterpret_cast<std::uint16_t*>(map.output.data());
@@ -133,15 +167,18 @@ GGSLAM_EXPORT std::int64_t ggslam_occupancy_scan_keys(void* context, void* map_,
   });
   for_each_voxel(map.scan.occupied(), [&](std::uint64_t code) { put_keys(out, code); });
   return static_cast<std::int64_t>(map.output.size());
-}
+} GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT std::uint64_t ggslam_quantize(void* context, double resolution, const float* points, std::uint64_t n,
-                                            std::uint16_t* keys, std::int32_t* counts) {
+                                            std::uint16_t* keys, std::int32_t* counts) try {
+  check_resolution(resolution);
+  check_array("points", points, static_cast<std::int64_t>(elements(static_cast<std::int64_t>(n), 3)));
+  check_array("keys", keys, static_cast<std::int64_t>(n));
   std::vector<std::int64_t> codes;
   VoxelMasks voxels;
-  quantize(*static_cast<Context*>(context), KeyGrid(resolution), points, n, codes, voxels);
+  quantize(object_of<Context>(context), KeyGrid(resolution), points, n, codes, voxels);
   std::uint16_t* out = keys;
   for_each_voxel(voxels, [&](std::uint64_t code) { put_keys(out, code); });
   if (counts != nullptr) count_points(codes, voxels, counts);
   return static_cast<std::uint64_t>(out - keys) / 3;
-}
+} GGSLAM_CATCH_ALL

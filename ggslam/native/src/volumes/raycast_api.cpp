@@ -5,6 +5,7 @@
 #include <cmath>
 
 #include "common/context.hpp"
+#include "common/guard.hpp"
 #include "common/vector.hpp"
 
 GGSLAM_DECLARE_KERNEL(void raycast_tile(const volumes::RaycastScene& scene, const volumes::RaycastView& view,
@@ -89,16 +90,26 @@ class TileRanges {
 }  // namespace
 }  // namespace ggslam::volumes
 
-GGSLAM_EXPORT void ggslam_raycast(void* context_, void* cells_, const ggslam::volumes::RaycastView* view,
-                                  const ggslam::volumes::SurfaceImages* out) {
+GGSLAM_EXPORT int ggslam_raycast(void* context_, void* cells_, const ggslam::volumes::RaycastView* view,
+                                 const ggslam::volumes::SurfaceImages* out) try {
+  using namespace ggslam;
   using namespace ggslam::volumes;
-  ggslam::Context& context = *static_cast<ggslam::Context*>(context_);
-  const SurfaceCells& cells = *static_cast<SurfaceCells*>(cells_);
+  ggslam::Context& context = object_of<ggslam::Context>(context_);
+  const SurfaceCells& cells = object_of<SurfaceCells>(cells_);
   const auto kernel = GGSLAM_DISPATCH(context.isa, raycast_tile);
+  const RaycastView& v = object_of<RaycastView>(view);
+  check_camera(v.width, v.height, v.fx, v.fy, v.cx, v.cy);
+  check_range("near", v.near, 1e-6f, 1e9f), check_range("far", v.far, v.near, 1e9f);
+  check_within("rotation", v.rotation, 9, 2);
+  check_within("position", v.position, 3, 1.0 * kSide * kFarthestBlock * cells.map.voxel);
+  const SurfaceImages& images = object_of<SurfaceImages>(out);
+  const void* const arrays[] = {images.depth, images.normals, images.colors, images.labels};
+  for (const void* array : arrays) check_array("images", array, 1);
   const TileRanges ranges(cells, *view);
   const RaycastScene scene{cells.blocks.data(), cells.table.number.data(),
                            static_cast<uint32_t>(cells.table.number.size() - 1), cells.map.voxel};
   context.pool.parallel_for(ranges.tiles().size(), 16, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t t = begin; t < end; ++t) kernel(scene, *view, ranges.tiles()[t], *out);
   });
-}
+  return 0;
+} GGSLAM_CATCH_ALL

@@ -13,6 +13,9 @@ GGSLAM_DECLARE_KERNEL(void walk_rays(const RayBatch& batch, std::uint64_t start,
 namespace ggslam {
 namespace {
 
+// Free blocks of a scan: those of rays that cross the whole grid would fill all memory.
+constexpr std::size_t kMostFreeBlocks = std::size_t{1} << 22;
+
 constexpr std::size_t kRayChunk = 1024, kPointChunk = 8192;
 
 struct Origin {
@@ -101,8 +104,11 @@ bool Scan::cast(Context& context, const KeyGrid& grid, const ScanSettings& setti
   Origin origin{Vec3f::from(settings.origin), {}, 0};
   if (!key_of_point(grid, origin.point, origin.key)) return false;
   origin.code = morton_code(origin.key);
-  while (workers_.size() < static_cast<std::size_t>(context.pool.size())) workers_.emplace_back(new Worker);
-  for (auto& worker : workers_) worker->free.clear(), worker->occupied.clear(), worker->rays = 0;
+  while (workers_.size() < static_cast<std::size_t>(context.pool.size())) {
+    workers_.emplace_back(new Worker);
+    workers_.back()->free.limit(kMostFreeBlocks);
+  }
+  for (auto& worker : workers_) worker->free.clear(), worker->occupied.clear(), worker->rays = worker->batch.count = 0;
   if (settings.quantize) {
     quantize(context, grid, points, n, codes_, voxels_);
     list_centres(grid, voxels_, centres_);

@@ -4,11 +4,13 @@
 #include <cstring>
 
 #include "common/context.hpp"
+#include "common/guard.hpp"
 #include "interface/core/volumes.hpp"
 #include "volumes/tsdf.hpp"
 
 using ggslam::volumes::Block;
 using ggslam::volumes::BlockCoordinates;
+using ggslam::volumes::kFarthestBlock;
 using ggslam::volumes::kVoxels;
 using ggslam::volumes::Tsdf;
 using ggslam::volumes::VoxelArrays;
@@ -26,35 +28,69 @@ void copy_in(T* to, std::size_t row, const T* from) {
   if (from != nullptr) std::memcpy(to, from + row * kVoxels, kVoxels * sizeof(T));
 }
 
-Tsdf& tsdf(void* handle) { return *static_cast<Tsdf*>(handle); }
+// How many blocks are meant; coordinates of those to be made must be possible.
+int64_t check_blocks(int64_t n, const int32_t* at, bool to_make) {
+  ggslam::check_array("coordinates", at, n);
+  for (int64_t i = 0; to_make && i < 3 * n; ++i)
+    ggslam::check_range("coordinates", at[i], -kFarthestBlock, kFarthestBlock);
+  return n;
+}
+
+Tsdf& tsdf(void* handle) { return ggslam::object_of<Tsdf>(handle); }
 
 }  // namespace
 
-GGSLAM_EXPORT void* ggslam_tsdf_create(float voxel, float truncation, float max_weight) {
+GGSLAM_EXPORT void* ggslam_tsdf_create(float voxel, float truncation, float max_weight) try {
+  ggslam::check_range("voxel", voxel, 1e-6f, 1e6f);
+  ggslam::check_range("truncation", truncation, 1.01f * voxel, 1e6f);
+  ggslam::check_range("max_weight", max_weight, 1e-6f, 1e6f);
   return new Tsdf(voxel, truncation, max_weight);
-}
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_tsdf_destroy(void* handle) { delete static_cast<Tsdf*>(handle); }
+GGSLAM_EXPORT int ggslam_tsdf_destroy(void* handle) try {
+  delete static_cast<Tsdf*>(handle);
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_tsdf_clear(void* handle) { tsdf(handle).clear(); }
+GGSLAM_EXPORT int ggslam_tsdf_clear(void* handle) try {
+  tsdf(handle).clear();
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int64_t ggslam_tsdf_size(void* handle) { return tsdf(handle).size(); }
-GGSLAM_EXPORT int64_t ggslam_tsdf_dense(void* handle) { return tsdf(handle).dense(); }
-GGSLAM_EXPORT int64_t ggslam_tsdf_bytes(void* handle) { return tsdf(handle).bytes(); }
-GGSLAM_EXPORT uint32_t ggslam_tsdf_revision(void* handle) { return tsdf(handle).revision; }
+GGSLAM_EXPORT int64_t ggslam_tsdf_size(void* handle) try {
+  return tsdf(handle).size();
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_tsdf_list(void* handle, int32_t* at, uint8_t* dense, uint16_t* free_weight, uint8_t* frozen,
-                                    uint32_t* revision) {
+GGSLAM_EXPORT int64_t ggslam_tsdf_dense(void* handle) try {
+  return tsdf(handle).dense();
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int64_t ggslam_tsdf_bytes(void* handle) try {
+  return tsdf(handle).bytes();
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT uint32_t ggslam_tsdf_revision(void* handle) try {
+  return tsdf(handle).revision;
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_tsdf_list(void* handle, int32_t* at, uint8_t* dense, uint16_t* free_weight, uint8_t* frozen,
+                                   uint32_t* revision) try {
   const Tsdf& map = tsdf(handle);
+  const auto n = static_cast<int64_t>(map.size());
+  const void* const arrays[] = {at, dense, free_weight, frozen, revision};
+  for (const void* array : arrays) ggslam::check_array("blocks", array, n);
   for (std::size_t row = 0; row < map.size(); ++row) {
     const Block& b = map.block(row);
     at[3 * row] = b.at.x, at[3 * row + 1] = b.at.y, at[3 * row + 2] = b.at.z;
     dense[row] = b.slot >= 0, free_weight[row] = b.free_weight, frozen[row] = b.frozen, revision[row] = b.revision;
   }
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at, const VoxelArrays* out) {
+GGSLAM_EXPORT int ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at, const VoxelArrays* out) try {
   const Tsdf& map = tsdf(handle);
+  check_blocks(n, at, false);
+  ggslam::object_of<VoxelArrays>(out);
   VoxelBlock plain{};
   std::fill_n(plain.value, kVoxels, ggslam::volumes::kFreeValue);
   for (int64_t i = 0; i < n; ++i) {
@@ -73,10 +109,13 @@ GGSLAM_EXPORT void ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at, 
     for (int k = 0; k < kVoxels; ++k)
       color[3 * k] = v->red[k], color[3 * k + 1] = v->green[k], color[3 * k + 2] = v->blue[k];
   }
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at, const VoxelArrays* in) {
+GGSLAM_EXPORT int ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at, const VoxelArrays* in) try {
   Tsdf& map = tsdf(handle);
+  check_blocks(n, at, true);
+  ggslam::object_of<VoxelArrays>(in);
   ++map.revision;
   for (int64_t i = 0; i < n; ++i) {
     Block& block = map.block(map.insert({at[3 * i], at[3 * i + 1], at[3 * i + 2]}));
@@ -91,28 +130,34 @@ GGSLAM_EXPORT void ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at,
     for (int k = 0; k < kVoxels; ++k)
       v->red[k] = color[3 * k], v->green[k] = color[3 * k + 1], v->blue[k] = color[3 * k + 2];
   }
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_tsdf_write_free(void* handle, int64_t n, const int32_t* at, const uint16_t* weight) {
+GGSLAM_EXPORT int ggslam_tsdf_write_free(void* handle, int64_t n, const int32_t* at, const uint16_t* weight) try {
   Tsdf& map = tsdf(handle);
+  ggslam::check_array("weight", weight, check_blocks(n, at, true));
   ++map.revision;
   for (int64_t i = 0; i < n; ++i) {
     Block& block = map.block(map.insert({at[3 * i], at[3 * i + 1], at[3 * i + 2]}));
     block.revision = map.revision;
     map.collapse(block, weight[i]);
   }
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_tsdf_erase(void* handle, int64_t n, const int32_t* at) {
+GGSLAM_EXPORT int ggslam_tsdf_erase(void* handle, int64_t n, const int32_t* at) try {
   Tsdf& map = tsdf(handle);
+  check_blocks(n, at, false);
   ++map.revision;
   for (int64_t i = 0; i < n; ++i) {
     const int64_t row = map.find({at[3 * i], at[3 * i + 1], at[3 * i + 2]});
     if (row >= 0) map.erase(row);
   }
-}
+  return 0;
+} GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT void ggslam_tsdf_freeze(void* handle, int frozen) {
+GGSLAM_EXPORT int ggslam_tsdf_freeze(void* handle, int frozen) try {
   Tsdf& map = tsdf(handle);
   for (std::size_t row = 0; row < map.size(); ++row) map.block(row).frozen = frozen != 0;
-}
+  return 0;
+} GGSLAM_CATCH_ALL

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "common/guard.hpp"
 #include "volumes/tsdf_fusion.hpp"
 
 namespace ggslam::volumes {
@@ -14,7 +15,19 @@ namespace {
 // truncation). Once there is depth at it, the others are no longer looked for.
 enum : unsigned { kBehind = 1, kInFront = 2, kAt = 4 };
 
+// The corners of what is in view must have coordinates.
+void check_extent(const Vec3d& low, const Vec3d& high, double block) {
+  const double most = block * kFarthestBlock;
+  for (int a = 0; a < 3; ++a)
+    if (!(low[a] > -most && high[a] < most))
+      refuse("view: expected one within %g m of the origin, found %g to %g m along axis %d", most, low[a], high[a], a);
+}
+
 }  // namespace
+
+void CandidateCount::refuse_view(std::size_t most, const char* what) {
+  refuse("view: it shows more than %zu %s: the camera, the range of depth and the voxel do not go together", most, what);
+}
 
 CandidateSearch::CandidateSearch(const Tsdf& map, const FusionInput& input, const FusionSettings& settings,
                                  const FusionImages& images)
@@ -38,6 +51,7 @@ CandidateSearch::CandidateSearch(const Tsdf& map, const FusionInput& input, cons
     low = corner < 0 ? x : min(low, x);
     high = corner < 0 ? x : max(high, x);
   }
+  check_extent(low, high, block_);
   do {
     cell_ *= 2;
     first_ = floor(low / (cell_ * block_));
@@ -45,14 +59,15 @@ CandidateSearch::CandidateSearch(const Tsdf& map, const FusionInput& input, cons
   } while (static_cast<double>(count_[0]) * count_[1] * count_[2] > kMostCells);
 }
 
-void CandidateSearch::search(std::size_t cell, std::vector<Candidate>& out) const {
+void CandidateSearch::search(std::size_t cell, CandidateCount& count, std::vector<Candidate>& out) const {
   const int32_t n = static_cast<int32_t>(cell);
   const int32_t x = first_[0] + n % count_[0], y = first_[1] + n / count_[0] % count_[1],
                 z = first_[2] + n / count_[0] / count_[1];
-  descend({x * cell_, y * cell_, z * cell_}, cell_, out);
+  descend({x * cell_, y * cell_, z * cell_}, cell_, count, out);
 }
 
-void CandidateSearch::descend(BlockCoordinates at, int side, std::vector<Candidate>& out) const {
+void CandidateSearch::descend(BlockCoordinates at, int side, CandidateCount& count,
+                              std::vector<Candidate>& out) const {
   const Cube cube = this->cube(at, side);
   Footprint area;
   if (!footprint(cube, side, area)) return;
@@ -68,22 +83,25 @@ void CandidateSearch::descend(BlockCoordinates at, int side, std::vector<Candida
   const bool is_free = seen == kBehind && area.whole;
   if (side == 1) {
     const bool enough = is_free && valid_share(area) >= settings_.free_share;
-    return emit(at, seen & kAt ? Sight::surface : enough ? Sight::free : Sight::partial, out);
+    return emit(at, seen & kAt ? Sight::surface : enough ? Sight::free : Sight::partial, count, out);
   }
-  if (is_free && valid_share(area) == 1.0f) return emit_free(at, side, out);
+  if (is_free && valid_share(area) == 1.0f) return emit_free(at, side, count, out);
   const int half = side / 2;
   for (int child = 0; child < 8; ++child)
-    descend({at.x + half * (child & 1), at.y + half * (child >> 1 & 1), at.z + half * (child >> 2)}, half, out);
+    descend({at.x + half * (child & 1), at.y + half * (child >> 1 & 1), at.z + half * (child >> 2)}, half, count, out);
 }
 
-void CandidateSearch::emit(BlockCoordinates at, Sight sight, std::vector<Candidate>& out) const {
-  out.push_back({at, sight, cube(at, 1).centre[2], static_cast<int32_t>(map_.find(at))});
+void CandidateSearch::emit(BlockCoordinates at, Sight sight, CandidateCount& count, std::vector<Candidate>& out) const {
+  const auto row = static_cast<int32_t>(map_.find(at));
+  count.add(1, sight == Sight::surface || (sight == Sight::partial && row < 0));
+  out.push_back({at, sight, cube(at, 1).centre[2], row});
 }
 
-void CandidateSearch::emit_free(BlockCoordinates at, int side, std::vector<Candidate>& out) const {
+void CandidateSearch::emit_free(BlockCoordinates at, int side, CandidateCount& count,
+                                std::vector<Candidate>& out) const {
   for (int z = 0; z < side; ++z)
     for (int y = 0; y < side; ++y)
-      for (int x = 0; x < side; ++x) emit({at.x + x, at.y + y, at.z + z}, Sight::free, out);
+      for (int x = 0; x < side; ++x) emit({at.x + x, at.y + y, at.z + z}, Sight::free, count, out);
 }
 
 // A cube of side^3 blocks.

@@ -103,14 +103,17 @@ void select(const Tsdf& map, const FusionInput& in, const FusionSettings& settin
   scratch.parts.resize(threads);
   for (auto& part : scratch.parts) part.clear();
   scratch.cells.assign(search.cells(), {});
+  std::vector<CandidateCount> counts(threads);
   context.pool.parallel_for(search.cells(), 4, [&](std::size_t begin, std::size_t end, int thread) {
     std::vector<Candidate>& part = scratch.parts[thread];
     for (std::size_t cell = begin; cell < end; ++cell) {
       const std::size_t first = part.size();
-      search.search(cell, part);
+      search.search(cell, counts[thread], part);
       scratch.cells[cell] = {thread, first, part.size()};
     }
   });
+  CandidateCount total;
+  for (const CandidateCount& count : counts) total.add(count.all, count.with_voxels);
   for (const auto& cell : scratch.cells) {
     const auto from = scratch.parts[cell.thread].begin();
     scratch.candidates.insert(scratch.candidates.end(), from + cell.begin, from + cell.end);
@@ -119,7 +122,7 @@ void select(const Tsdf& map, const FusionInput& in, const FusionSettings& settin
 
 uint16_t grown(uint16_t weight, float measured, float most) {
   const float total = std::min(weight + std::floor(measured + 0.5f), std::max(most, static_cast<float>(weight)));
-  return static_cast<uint16_t>(total);
+  return static_cast<uint16_t>(std::min(total, static_cast<float>(kFullWeight)));
 }
 
 // Notes free blocks, makes the blocks of surfaces, and lists the blocks whose voxels are to be updated.
@@ -201,11 +204,11 @@ void finish_blocks(Tsdf& map, FusionScratch& scratch, FusionStats& stats) {
 FusionStats integrate(Tsdf& map, FusionScratch& scratch, Context& context, const FusionInput& in,
                       const FusionSettings& settings) {
   FusionStats stats{};
-  ++map.revision, ++map.views;
   const auto start = Clock::now();
   prepare(in, settings, context, scratch.images);
   const auto prepared = Clock::now();
   select(map, in, settings, context, scratch);
+  ++map.revision, ++map.views;
   make_blocks(map, settings, scratch, stats);
   const auto selected = Clock::now();
   update_blocks(map, in, settings, context, scratch);

@@ -55,6 +55,23 @@ struct Candidate {
   int32_t row;  // in the map; -1: none yet
 };
 
+// How many candidates a thread has found. A view may not have any number: a camera that does not belong to the images, or
+// voxels far too small for the range, would fill all memory.
+struct CandidateCount {
+  std::size_t all = 0, with_voxels = 0;
+
+  // Throws an InputError when there are too many.
+  void add(std::size_t more, std::size_t more_with_voxels) {
+    all += more, with_voxels += more_with_voxels;
+    if (all > kMost) refuse_view(kMost, "blocks");
+    if (with_voxels > kMostWithVoxels) refuse_view(kMostWithVoxels, "blocks that need voxels");
+  }
+
+ private:
+  static constexpr std::size_t kMost = std::size_t{1} << 23, kMostWithVoxels = std::size_t{1} << 20;
+  [[noreturn]] static void refuse_view(std::size_t most, const char* what);
+};
+
 // Blocks that the view tells about: those with a surface, those that are free, and those of which parts are, unless
 // they are known to be free.
 class CandidateSearch {
@@ -65,7 +82,7 @@ class CandidateSearch {
   // Cubes of many blocks that enclose what is in view.
   std::size_t cells() const { return static_cast<std::size_t>(count_[0]) * count_[1] * count_[2]; }
   // Appends the candidates of a cell.
-  void search(std::size_t cell, std::vector<Candidate>& out) const;
+  void search(std::size_t cell, CandidateCount& count, std::vector<Candidate>& out) const;
 
  private:
   static constexpr int kMostCells = 4096;
@@ -93,9 +110,9 @@ class CandidateSearch {
   float spread_[3];      // along the map's axes at z = 1, of one pixel
   Vec3i first_, count_;
 
-  void descend(BlockCoordinates at, int side, std::vector<Candidate>& out) const;
-  void emit(BlockCoordinates at, Sight sight, std::vector<Candidate>& out) const;
-  void emit_free(BlockCoordinates at, int side, std::vector<Candidate>& out) const;
+  void descend(BlockCoordinates at, int side, CandidateCount& count, std::vector<Candidate>& out) const;
+  void emit(BlockCoordinates at, Sight sight, CandidateCount& count, std::vector<Candidate>& out) const;
+  void emit_free(BlockCoordinates at, int side, CandidateCount& count, std::vector<Candidate>& out) const;
   Cube cube(BlockCoordinates at, int side) const;
   bool footprint(const Cube& cube, int side, Footprint& out) const;
   bool meets(int level, int u, int v, const Cube& cube, float& z0, float& z1) const;

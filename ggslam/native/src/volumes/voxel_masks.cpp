@@ -3,6 +3,8 @@
 
 #include <cstring>
 
+#include "common/guard.hpp"
+
 namespace ggslam {
 namespace {
 constexpr int kFirstBits = 12;
@@ -27,14 +29,15 @@ std::size_t VoxelMasks::place(std::uint64_t code) const {
 std::uint64_t* VoxelMasks::block(std::uint64_t code) {
   const std::size_t i = place(code);
   if (table_[i] >= 0) return const_cast<std::uint64_t*>(words(table_[i]));
+  if (codes_.size() >= most_) refuse("scan: it passes more than %zu blocks of 8^3 voxels; limit its range", most_);
   if (2 * (codes_.size() + 1) > table_.size()) {
     grow();
     return block(code);
   }
-  table_[i] = static_cast<std::int32_t>(codes_.size());
-  codes_.push_back(code);
-  const std::size_t index = codes_.size() - 1;
+  const std::size_t index = codes_.size();
   if (index / kChunk == chunks_.size()) chunks_.emplace_back(new std::uint64_t[kChunk * kMaskWords]);
+  codes_.push_back(code);
+  table_[i] = static_cast<std::int32_t>(index);
   auto* fresh = const_cast<std::uint64_t*>(words(index));
   std::memset(fresh, 0, kMaskWords * sizeof(std::uint64_t));
   return fresh;

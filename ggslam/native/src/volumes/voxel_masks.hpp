@@ -15,6 +15,8 @@ class VoxelMasks {
  public:
   VoxelMasks();
   void clear();
+  // From now on a block beyond so many is refused by an InputError.
+  void limit(std::size_t most_blocks) { most_ = most_blocks; }
 
   // Words of a block, all zero when it is new. The pointer stays good until clear().
   std::uint64_t* block(std::uint64_t code);
@@ -41,6 +43,7 @@ class VoxelMasks {
 
   std::vector<std::int32_t> table_;  // open addressing, index of a block or -1
   int shift_;
+  std::size_t most_ = ~std::size_t{0};
   std::vector<std::uint64_t> codes_;
   std::vector<std::unique_ptr<std::uint64_t[]>> chunks_;
   std::uint64_t last_code_ = kNone;

@@ -25,8 +25,9 @@ static inline int find_block(const VoxelLevelView& level, uint64_t key) {
   }
 }
 
+// Far outside of any voxel where x is no number or too large.
 static inline int voxel_coordinate(float x, float inverse_size) {
-  return static_cast<int>(std::floor(x * inverse_size));
+  return static_cast<int>(std::floor(std::min(std::max(-1e9f, x * inverse_size), 1e9f)));
 }
 
 // The voxel of coordinates (x, y, z), or -1.
