@@ -15,6 +15,8 @@ ggslam's own rules. "ids": whether every Gaussian has the object id that it has 
 Pictures come from ggslam's rasterizer with that low-pass, which differs from 3DGS in two rules (it draws the Gaussian
 that makes a pixel opaque, and lets one cover 0.999 of it, not 0.99); --check prints how far it is from the tests' own
 renderer, which keeps all of them, on the first view, which takes seconds to minutes.
+
+At the end, the runs' maps at half, once and twice their size, as `scripts/bench_low_pass.py` prints them.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(1, str(Path(__file__).parents[1] / "tests" / "conformance"))
 
 import numpy as np
+from bench_low_pass import OURS, THREE_DGS, print_rows, print_titles, psnr_at_sizes
 from foreign_readers import by_usd_core
 from held_out import held_out_poses
 from scipy.spatial import cKDTree
@@ -161,6 +164,14 @@ def main() -> None:
     arguments = parser.parse_args()
     for run in arguments.runs:
         bench(run, arguments)
+    print("\nPSNR against the recording at other sizes than the run's, dB:\n")
+    print_titles((OURS, THREE_DGS))
+    for folder in (RunFolder.open(run) for run in arguments.runs):
+        sizes = (0.5, 1.0, 2.0) if folder.sequence().open.scale <= 0.5 else (0.5, 1.0)
+        found = psnr_at_sizes(
+            folder, folder.gaussians(), every=arguments.every, recording=arguments.recording, sizes=sizes
+        )
+        print_rows(folder.path.name, found, (OURS, THREE_DGS))
 
 
 if __name__ == "__main__":

@@ -92,6 +92,12 @@ def _psnr(
     return psnr(view.image.numpy().clip(0, 1).transpose(1, 2, 0), unit_range(frame.color), frame.depth > 0)
 
 
+def print_titles(drawings: tuple[Drawing, ...]) -> None:
+    """The first two lines of the table."""
+    titles = [f"{group}, {drawing.name}" for group in SETS for drawing in drawings]
+    print("| " + " | ".join(["run", "size", *titles]) + " |\n|" + " --- |" * (2 + len(titles)))
+
+
 def print_rows(name: str, found: dict[tuple[float, str, str], float], drawings: tuple[Drawing, ...]) -> None:
     """Lines of the table."""
     for size in dict.fromkeys(key[0] for key in found):
@@ -108,8 +114,7 @@ def main() -> None:
     options = parser.parse_args()
     other = options.low_pass
     drawings = (OURS, THREE_DGS, *([] if other is None else [Drawing(f"{other:g} px^2", low_pass=other)]))
-    titles = [f"{group}, {drawing.name}" for group in SETS for drawing in drawings]
-    print("| " + " | ".join(["run", "size", *titles]) + " |\n|" + " --- |" * (2 + len(titles)))
+    print_titles(drawings)
     for run in options.runs:
         folder = RunFolder.open(run)
         found = psnr_at_sizes(folder, folder.gaussians(), drawings, options.every, options.recording)

@@ -39,6 +39,10 @@ def print_scores(metrics: MetricsRecord) -> None:
         [name.replace("_", " "), *_cells(scores, _IMAGE_COLUMNS)] for name, scores in metrics.images.sets().items()
     ]
     columns = ["scores", *(title for title, *_ in _IMAGE_COLUMNS)]
+    for name, scores in metrics.images.sets().items():
+        if scores.psnr_exposed is not None:
+            text = f"{name.replace('_', ' ')}: PSNR {scores.psnr_exposed:.2f} of frames brought to the map's exposure"
+            console.print(text, highlight=False)
     console.print(table("images; all but 'unmasked' over pixels with measured depth", columns, rows))
     if metrics.segmentation is not None:
         _print_segmentation(metrics.segmentation)

@@ -22,18 +22,23 @@ class RenderedView:
         color: [H, W, 3], see `score_image`.
         depth: [H, W] metres or None.
         color_3dgs: the colour by the rules of 3D Gaussian Splatting, [H, W, 3], or None.
+        exposure: gain and offset of each channel that the frame's exposure has against the map's, [3, 2], or None.
     """
 
     color: np.ndarray
     depth: np.ndarray | None = None
     color_3dgs: np.ndarray | None = None
+    exposure: np.ndarray | None = None
 
     def score(self, frame: Frame, lpips: Lpips | None = None) -> ImageScores:
         """Scores the view against the recorded frame."""
         scores = score_image(self.color, self.depth, frame.color, frame.depth, lpips)
+        valid = np.isfinite(frame.depth) & (frame.depth > 0)
+        if self.exposure is not None:
+            brought = unit_range((unit_range(frame.color) - self.exposure[:, 1]) / self.exposure[:, 0])
+            scores = replace(scores, psnr_exposed=psnr(unit_range(self.color), brought, valid))
         if self.color_3dgs is None:
             return scores
-        valid = np.isfinite(frame.depth) & (frame.depth > 0)
         return replace(scores, psnr_3dgs=psnr(unit_range(self.color_3dgs), unit_range(frame.color), valid))
 
 

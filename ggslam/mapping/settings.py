@@ -100,14 +100,19 @@ class PoseRefinementSettings:
 
 @settings_class(frozen=True)
 class ExposureSettings:
-    """Per-keyframe affine colour (gain and offset per channel), pulled towards the identity."""
+    """Per-keyframe affine colour (gain and offset per channel). Scores are those of renders without it, but for
+    `psnr_exposed`."""
 
     enabled: bool = setting(False, basic=True)
-    """Whether keyframes get an exposure of their own; scores are those of renders without it."""
+    """Whether all keyframes get an exposure of their own."""
+    compensate: bool = setting(True, basic=True)
+    """Whether keyframes that the camera saw with another exposure than the map get one of their own; on the CPU."""
+    change: float = setting(0.12, 0.01, 10)
+    """Change of the gains, as a natural logarithm, from which the exposure counts as another."""
     rate: float = setting(2e-3, 0, 1)
     """Learning rate of gains and offsets."""
     regularization: float = setting(1e-2, 0, 1e6)
-    """Weight of half the squared distance from the identity in the loss."""
+    """Weight of half the squared distance from the identity, or from what was measured, in the loss."""
 
 
 @settings_class(frozen=True)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.rendering.exposure import change_of
 from ggslam.scene.poses import fit_similarity
 from ggslam.sequences.verdicts import Verdict, judge_scale_by
 from ggslam.slam.result import SlamResult
@@ -18,13 +19,15 @@ DEGENERATE_SHARE, BLIND_SHARE, LOST_SHARE, DROPPED_SHARE = 0.5, 0.1, 0.05, 0.02
 """Shares of the frames from which it is told that they were of this kind."""
 FEWEST_FRAMES = 5
 """And how many there have to be."""
+EXPOSURE_CHANGE = 0.1
+"""Natural logarithm of a keyframe's gain from which it is told."""
 LONGER, LONGEST_ERROR, FEWEST_POSES = 1.4, 0.35, 10
 """The true path differs in length by this factor and fits but for this share of its size; so many poses are needed."""
 
 
 def judge_run(result: SlamResult) -> list[Verdict]:
     """What was measured while the run was made."""
-    return [*_judge_motion(result), *_judge_lost(result), *_judge_dropped(result)]
+    return [*_judge_motion(result), *_judge_exposure(result), *_judge_lost(result), *_judge_dropped(result)]
 
 
 def _judge_motion(result: SlamResult) -> list[Verdict]:
@@ -58,6 +61,22 @@ def _is_bare(keyframe: Keyframe) -> bool:
     shrink = PhotometricSettings().shrink * max(1, round(keyframe.camera.width / 320))
     view = GreyDepth.from_images(keyframe.color, keyframe.depth_m(), keyframe.camera, shrink)
     return len(textured_points(view, PhotometricSettings())) < MIN_TEXTURED
+
+
+def _judge_exposure(result: SlamResult) -> list[Verdict]:
+    """Whether the camera's exposure changed against that of the map, which is the first keyframe's."""
+    ours = [k for k in result.keyframes if k.frame_index != ELSEWHERE]
+    changes = {k.frame_index: change_of(k.exposure) for k in ours}
+    changed = {frame: gain for frame, gain in changes.items() if abs(np.log(gain)) > EXPOSURE_CHANGE}
+    if not changed:
+        return []
+    frame, gain = max(changed.items(), key=lambda item: abs(np.log(item[1])))
+    text = (
+        f"the exposure changed: from frame {min(changed)} on {len(changed)} of {len(ours)} keyframes are darker or "
+        f"brighter than the map, frame {frame} {gain:.2f} times as bright; the map was trained with that compensated; "
+        "fix exposure and white balance if the camera lets you"
+    )
+    return [Verdict("exposure", "doubtful", text)]
 
 
 def _judge_lost(result: SlamResult) -> list[Verdict]:

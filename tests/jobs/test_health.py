@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from command_line import ggslam
 from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
+from ggslam.runs.records.metrics import ImageScoresRecord
 from ggslam.sequences import inspect_sequence, open_sequence
 from ggslam.sequences.verdicts import judge_intrinsics, judge_times, usual_scale
 from ggslam.slam.result import SlamResult
@@ -160,3 +162,40 @@ def test_a_bare_wall_is_told_and_strict_runs_fail(tmp_path: Path) -> None:
     told = run.mark().verdicts
     assert [v.code for v in told] == ["textureless"] and run.mark().complete
     assert told[0].text in (run.path / "report.html").read_text()
+
+
+def dimmed(room: Path, folder: Path, gain: Callable[[int], float]) -> Path:
+    """The recording with the colours of each frame times a gain."""
+    shutil.copytree(room, folder)
+    for k, path in enumerate(sorted((folder / "rgb").iterdir())):
+        image = cv2.imread(str(path)).astype(np.float32) * gain(k)
+        cv2.imwrite(str(path), np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    return folder
+
+
+STEPS = ["mapping.iterations_per_frame=8"]
+
+
+@pytest.fixture(scope="module")
+def scores_of_the_room(room: Path, tmp_path_factory: pytest.TempPathFactory) -> ImageScoresRecord:
+    out = tmp_path_factory.mktemp("scored") / "run"
+    outcome = execute(RunRequest(SequenceRequest(room), out=out, overrides=STEPS))
+    assert outcome.verdicts == [] and outcome.metrics is not None and outcome.metrics.images.all is not None
+    assert all((k.exposure == [1.0, 0.0]).all() for k in outcome.result.keyframes)
+    return outcome.metrics.images.all
+
+
+@pytest.mark.long("runs a recording and scores it")
+@pytest.mark.parametrize("gain", [lambda k: 0.4 if k >= 12 else 1.0, lambda k: 1 - 0.6 * k / 23], ids=["jump", "drift"])
+def test_changes_of_exposure_are_compensated(
+    room: Path, scores_of_the_room: ImageScoresRecord, tmp_path: Path, gain: Callable[[int], float]
+) -> None:
+    recording = dimmed(room, tmp_path / "recording", gain)
+    outcome = execute(RunRequest(SequenceRequest(recording), out=tmp_path / "run", overrides=STEPS))
+    assert [verdict.code for verdict in outcome.verdicts] == ["exposure"]
+    assert outcome.metrics is not None and outcome.metrics.images.all is not None
+    dim, well = outcome.metrics.images.all, scores_of_the_room
+    assert well.psnr is not None and well.psnr_exposed is None
+    assert dim.psnr is not None and dim.psnr_exposed is not None
+    assert dim.psnr_exposed > well.psnr - 1
+    assert dim.psnr < well.psnr - 5  # as recorded

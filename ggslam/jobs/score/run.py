@@ -21,6 +21,7 @@ from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.score.objects import ObjectScorer
 from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.exposure import identity_exposure, measure_exposure
 from ggslam.rendering.types import RenderBuffers
 from ggslam.reporting.pictures import color_to_uint8, compare_pictures, write_picture
 from ggslam.runs.folder import RunFolder
@@ -153,7 +154,7 @@ def _images(
     spread = np.linspace(0, len(poses) - 1, min(PICTURES, len(poses))).round().astype(int)
     pictured = set(np.array(sorted(poses))[spread].tolist())
     make_folder(folder.path / "renders")
-    show = _shower(folder, poses, pictured, scorer)
+    show = _shower(folder, poses, pictured, scorer, any(k.is_exposed for k in record.keyframes))
     rows: list[dict[str, Any]] = []
     observer.begin("score", len(sequence))
 
@@ -181,9 +182,10 @@ def _up_to(last: int, sequence: Sequence, masks: bool) -> Iterator[Frame]:
 
 
 def _shower(
-    folder: RunFolder, poses: dict[int, np.ndarray], pictured: set[int], scorer: ObjectScorer | None
+    folder: RunFolder, poses: dict[int, np.ndarray], pictured: set[int], scorer: ObjectScorer | None, exposed: bool
 ) -> Callable[[Frame], RenderedView | None]:
-    """A function that renders the map as a frame's camera sees it, and keeps some of the pictures."""
+    """A function that renders the map as a frame's camera sees it, and keeps some of the pictures. If the exposure
+    changed it measures that of each frame."""
     parts = folder.map_in_parts() if scorer is None else scorer.map
     rasterizer = CpuRasterizer()
 
@@ -201,7 +203,11 @@ def _shower(
         if frame.index in pictured:
             picture = compare_pictures(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth, row)
             write_picture(folder.path / "renders" / f"compare{frame.index:06d}.png", picture)
-        return RenderedView(_picture(view), depth, by_3dgs)
+        exposure = None
+        if exposed:
+            measured = measure_exposure(frame.color, frame.depth, view.image.numpy(), view.alpha.numpy(), depth)
+            exposure = identity_exposure() if measured is None else measured
+        return RenderedView(_picture(view), depth, by_3dgs, exposure)
 
     return show
 

@@ -7,22 +7,21 @@ import numpy as np
 
 from ggslam.errors import RenderError
 from ggslam.mapping.settings import ExposureSettings
-
-
-def identity_exposure() -> np.ndarray:
-    """Gain 1 and offset 0 for each channel, float64 [3, 2]."""
-    return np.tile([1.0, 0.0], (3, 1))
+from ggslam.rendering.exposure import identity_exposure
 
 
 class ExposureAdam:
     """Adam (Kingma and Ba 2015) on gain and offset of one keyframe.
 
-    It descends loss + regularization / 2 |exposure - identity|^2: without the second term map and exposures could
-    drift together, all keyframes darker and the map brighter, at no cost in the loss.
+    It descends loss + regularization / 2 |exposure - anchor|^2: without the second term map and exposures could
+    drift together, all keyframes darker and the map brighter, at no cost in the loss. The anchor is the identity, or
+    what was measured when the keyframe was made, from where it starts: a step is at most 0.002 long and a keyframe is
+    trained on some ten times, so that a change by half would never be reached.
     """
 
     def __init__(self, settings: ExposureSettings, beta1: float = 0.9, beta2: float = 0.99) -> None:
         self.settings, self.beta1, self.beta2 = settings, beta1, beta2
+        self.anchor = identity_exposure()
         self.first, self.second, self.steps = np.zeros((3, 2)), np.zeros((3, 2)), 0
 
     def step(self, exposure: np.ndarray, gradient: np.ndarray, rate_factor: float = 1.0) -> np.ndarray:
@@ -43,7 +42,7 @@ class ExposureAdam:
                 raise RenderError(f"{name}: expected [3, 2], found {list(np.shape(array))}")
         if not np.isfinite(gradient).all():
             return exposure
-        gradient = gradient + self.settings.regularization * (exposure - identity_exposure())
+        gradient = gradient + self.settings.regularization * (exposure - self.anchor)
         self.steps += 1
         self.first += (1 - self.beta1) * (gradient - self.first)
         self.second += (1 - self.beta2) * (gradient**2 - self.second)

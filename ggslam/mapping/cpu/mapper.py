@@ -20,6 +20,7 @@ from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.exposure import identity_exposure, measure_exposure, without_exposure
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
@@ -75,16 +76,18 @@ class CpuMapper(Mapper):
         depth, s = keyframe.depth_m(), self.settings.insertion
         where, alpha = np.ones(depth.shape, bool), np.zeros(depth.shape, np.float32)
         show: Callable[[], MapLabels] | None = None
+        color = keyframe.color
         if self.map.count:
             view = self._render(keyframe, features=False)
             alpha, rendered = view.alpha.numpy(), view.expected_depth.numpy()
             where = find_unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
+            color = self._compensate(keyframe, depth, view)
         if self.identity is not None and labeller is not None:
             self._take_labels(keyframe, labeller(keyframe, show))
-        parts = [new_gaussians(keyframe.color, depth, keyframe.camera, T_world_camera, where, s)]
+        parts = [new_gaussians(color, depth, keyframe.camera, T_world_camera, where, s)]
         if s.fill_stride:
-            parts.append(fill_gaussians(keyframe.color, depth, alpha, keyframe.camera, T_world_camera, s))
+            parts.append(fill_gaussians(color, depth, alpha, keyframe.camera, T_world_camera, s))
         logit = float(np.log(s.opacity / (1 - s.opacity)))
         for new in parts:
             rows = self.map.insert(
@@ -95,6 +98,23 @@ class CpuMapper(Mapper):
                 mask = keyframe.mask
                 labels = np.zeros(len(new.pixels), np.uint16) if mask is None else mask.reshape(-1)[new.pixels]
                 self.identity.begin(self.map, rows, labels)
+
+    def _compensate(self, keyframe: Keyframe, depth: np.ndarray, view: RenderBuffers) -> np.ndarray:
+        """A keyframe seen with another exposure than the map gets what is measured; its colours [H, W, 3] as the map's
+        exposure would have shown them."""
+        if not self.settings.exposure.compensate:
+            return keyframe.color
+        images = (view.image.numpy(), view.alpha.numpy(), view.expected_depth.numpy())
+        found = measure_exposure(keyframe.color, depth, *images)
+        if found is None or np.abs(np.log(found[:, 0])).max() < self.settings.exposure.change:
+            return keyframe.color
+        keyframe.exposure, self._exposure_optimizers[keyframe.index].anchor = found, found.copy()
+        return without_exposure(keyframe.color, found)
+
+    def _is_exposed(self, keyframe: Keyframe) -> bool:
+        """Whether it has an exposure of its own."""
+        anchor = self._exposure_optimizers[keyframe.index].anchor
+        return self.settings.exposure.enabled or bool((anchor != identity_exposure()).any())
 
     def _show_labels(self, alpha: np.ndarray, depth: np.ndarray, stride: int = 2) -> MapLabels:
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""
@@ -109,7 +129,7 @@ class CpuMapper(Mapper):
         return self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=features)
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> CpuLossResult:
-        exposure = keyframe.exposure if self.settings.exposure.enabled else None
+        exposure = keyframe.exposure if self._is_exposed(keyframe) else None
         target = LossTarget(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
         return self._loss.evaluate(view, target, self.settings.loss)
 
@@ -117,7 +137,7 @@ class CpuMapper(Mapper):
         if pose_rate:
             optimizer = self._pose_optimizers[keyframe.index]
             keyframe.T_camera_world = optimizer.step(keyframe.T_camera_world, twist, pose_rate)
-        if self.settings.exposure.enabled and keyframe.index > 0:
+        if keyframe.index > 0 and self._is_exposed(keyframe):
             optimizer_of_exposure = self._exposure_optimizers[keyframe.index]
             keyframe.exposure = optimizer_of_exposure.step(keyframe.exposure, loss.exposure_gradient)
         self._last_psnr = loss.psnr

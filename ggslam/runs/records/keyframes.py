@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from ggslam.errors import RunFolderError
+from ggslam.rendering.exposure import identity_exposure
 from ggslam.runs.records.record import Array, NumberOrNone, Record, RecordFile
 from ggslam.slam.result import SlamResult
 
@@ -30,6 +31,11 @@ class KeyframeRecord(Record):
     T_world_camera: Array
     exposure: Array | None = None
     iterations: int = 0
+
+    @property
+    def is_exposed(self) -> bool:
+        """Whether it has another exposure than the map."""
+        return self.exposure is not None and bool((self.exposure != identity_exposure()).any())
 
 
 class FrameRecord(Record):

@@ -31,6 +31,7 @@ class ImageScoresRecord(Record):
     psnr: NumberOrNone = None
     psnr_3dgs: NumberOrNone = None
     psnr_unmasked: NumberOrNone = None
+    psnr_exposed: NumberOrNone = None
     psnr_affine: NumberOrNone = None
     ssim: NumberOrNone = None
     ssim_unmasked: NumberOrNone = None

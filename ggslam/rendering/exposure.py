@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exposure of an image against a rendering of the same view: corrected = gain * rendered + offset per channel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+OPAQUE, SAME_DEPTH = 0.9, 0.05
+"""Pixels count whose rendering is so opaque, at the measured depth but for this share."""
+DARK, BRIGHT = 0.04, 0.98
+"""Values outside are not compared: they are black level, or saturated."""
+FEWEST_SHARE = 0.02
+"""Of the pixels have to be left."""
+STEP = 2
+"""Every so many rows and columns are looked at."""
+
+
+def identity_exposure() -> np.ndarray:
+    """Gain 1 and offset 0 for each channel, float64 [3, 2]."""
+    return np.tile([1.0, 0.0], (3, 1))
+
+
+def change_of(exposure: np.ndarray) -> float:
+    """How bright an exposure [3, 2] is against the map: the geometric mean of its gains."""
+    return float(np.exp(np.log(np.maximum(exposure[:, 0], 1e-6)).mean()))
+
+
+def measure_exposure(
+    color: np.ndarray, depth: np.ndarray, image: np.ndarray, alpha: np.ndarray, rendered_depth: np.ndarray
+) -> np.ndarray | None:
+    """Gain of each channel, with offset 0, that turns a rendering into what a camera saw; float64 [3, 2], None if too
+    little is seen by both.
+
+    It is the median of the ratios of pixels, which a few new or moved things and reflections do not disturb. With
+    images encoded by a power law a change of exposure is a gain of the encoded values too.
+
+    Args:
+        color: uint8 [H, W, 3], what the camera saw.
+        depth: [H, W], metres, 0 = none.
+        image: rendered colour [3, H, W].
+        alpha, rendered_depth: of the rendering [H, W].
+    """
+    some = (slice(None, None, STEP), slice(None, None, STEP))
+    depth, rendered_depth = depth[some], rendered_depth[some]
+    seen = color[some].astype(np.float32) / 255
+    shown = np.moveaxis(image[(slice(None), *some)], 0, 2)
+    near = np.abs(rendered_depth - depth) < SAME_DEPTH * depth
+    known = (depth > 0) & (alpha[some] > OPAQUE) & near
+    exposure = identity_exposure()
+    for channel in range(3):
+        x, y = shown[..., channel], seen[..., channel]
+        used = known & (x > DARK) & (x < BRIGHT) & (y < BRIGHT)
+        if used.sum() < FEWEST_SHARE * known.size:
+            return None
+        exposure[channel, 0] = float(np.median(y[used] / x[used]))
+    return exposure if (exposure[:, 0] > 0).all() else None
+
+
+def without_exposure(color: np.ndarray, exposure: np.ndarray) -> np.ndarray:
+    """The colours uint8 [H, W, 3] as they would have been seen with the map's own exposure."""
+    gain, offset = exposure.astype(np.float32).T
+    restored = (color.astype(np.float32) - np.float32(255) * offset) / gain
+    return np.clip(restored + np.float32(0.5), 0, 255).astype(np.uint8)
