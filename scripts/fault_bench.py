@@ -22,7 +22,7 @@ MEMORY_BYTES = 4 << 30
 SECONDS = 120
 FEW = ("--set", "mapping.iterations_per_frame=1", "--set", "mapping.first_frame_iterations=4", "--no-eval")
 
-Hook = Callable[[int], None]
+Hook = Callable[[int], object]
 
 
 @dataclass
