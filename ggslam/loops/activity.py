@@ -31,6 +31,9 @@ class ActivitySettings:
     spread: int = setting(3, 0, 10**6)
     """A keyframe near the camera is taken back if one of so many before or after it is active: neighbours in time lie
     right to each other."""
+    most: int = setting(400, 8, 10**6)
+    """So many keyframes are active at most, and an eighth more until some are put aside together: a camera that walks
+    the same way again and again needs no more of them, and gathering their surface takes no longer in a long run."""
 
 
 class ActiveKeyframes:
@@ -43,6 +46,8 @@ class ActiveKeyframes:
     def __init__(self, settings: ActivitySettings | None = None) -> None:
         self.settings = settings or ActivitySettings()
         self.active: set[int] = set()
+        self.spare: set[int] = set()
+        """Put aside only because there are enough: they lie right to the active ones, and no loop leads to them."""
         self._depths = np.empty(0)
         self._cameras = np.empty((0, 3))
         self._middles = np.empty((0, 3))
@@ -61,8 +66,8 @@ class ActiveKeyframes:
         self._cameras = np.vstack([self._cameras, T_world_camera[:3, 3]])
         self._middles = np.vstack([self._middles, T_world_camera[:3, 3] + median_depth_m * T_world_camera[:3, 2]])
         self._seen = np.append(self._seen, self._path)
-        active = np.array(sorted(self.active))
-        self._seen[active[self._near(-1)[active]]] = self._path
+        known = np.array(sorted(self.active | self.spare))
+        self._seen[known[self._near(-1)[known]]] = self._path
 
     def move(self, T_world_camera: np.ndarray) -> None:
         """Keyframes were given new poses [K, 4, 4]."""
@@ -76,15 +81,39 @@ class ActiveKeyframes:
         stale = {k for k in self.active if self._path - self._seen[k] > limit}
         if len(stale) >= s.batch:
             self.active -= stale
-        near = set(np.flatnonzero(self._near(-1)).tolist()) - self.active
-        while found := near & {k + d for k in self.active for d in range(-s.spread, s.spread + 1)}:
-            self._take_back(found)
-            near -= found
+        if self.spare:
+            self.spare = {k for k in self.spare if self._path - self._seen[k] <= limit}
+        around = set(np.flatnonzero(self._near(-1)).tolist())
+        near = around - self.active
+        if len(self.active) < s.most or len(around) - len(near) < s.most // 4:
+            while found := self._around(near):
+                self._take_back(found)
+                near -= found
+        self._put_aside_spare(near)
         return self.active != before
+
+    def _around(self, numbers: set[int]) -> set[int]:
+        """Those of some numbers that have an active (or spare) keyframe among their neighbours in time."""
+        reach = range(-self.settings.spread, self.settings.spread + 1)
+        return {k for k in numbers if any(k + d in self.active or k + d in self.spare for d in reach)}
+
+    def _put_aside_spare(self, near: set[int]) -> None:
+        """Where more than enough are active, those go that were seen longest ago, and among equals the newer ones,
+        which map again what older ones did; but not the newest of all. Those `near` that were not taken back for the
+        same reason lie right as well."""
+        most = self.settings.most
+        if len(self.active) >= most:
+            self.spare |= self._around(near)
+        if len(self.active) > most + most // 8:
+            newest = len(self) - most // 4
+            order = sorted(self.active, key=lambda k: (k >= newest, self._seen[k], -k))
+            aside = set(order[: len(self.active) - most])
+            self.active -= aside
+            self.spare |= aside
 
     def restart(self, number: int) -> None:
         """After a jump to where keyframe `number` looks: what lies there is active, everything else put aside."""
-        self.active = set()
+        self.active, self.spare = set(), set()
         self.activate_around(number)
 
     def activate_around(self, number: int) -> None:
@@ -103,11 +132,12 @@ class ActiveKeyframes:
         return self._depths.copy()
 
     def inactive(self) -> set[int]:
-        """Numbers of the keyframes put aside."""
-        return set(range(len(self))) - self.active
+        """Numbers of the keyframes put aside for being out of sight."""
+        return set(range(len(self))) - self.active - self.spare
 
     def _take_back(self, numbers: set[int]) -> None:
         self.active |= numbers
+        self.spare -= numbers
         self._seen[sorted(numbers)] = self._path
 
     def _near(self, number: int) -> np.ndarray:

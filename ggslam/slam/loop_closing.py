@@ -206,9 +206,10 @@ class LoopCloser:
 
     def _look_back(self, frame: Frame, place: Place, tracking: TrackingResult) -> Correction | None:
         number, s = len(self.poses) - 1, self.settings
-        if len(self.activity.active) == len(self.poses):
+        known = self.activity.active | self.activity.spare
+        if len(known) == len(self.poses):
             return None  # everything is in view of the tracker: there is nothing to come back to
-        for match in self.places.query(place, s.candidates, self.activity.active.__contains__):
+        for match in self.places.query(place, s.candidates, known.__contains__):
             found, _ = self._verify(tracking.points, place, match.number)
             if not found.accepted:
                 if found.inliers >= s.verification.min_inliers:  # others were never likely
@@ -265,7 +266,7 @@ class LoopCloser:
             return None
         poses = result.poses
         T_new_old = poses @ inverse(np.array(self.poses))
-        kept, doubted = self.activity.inactive(), set(self.activity.active)
+        kept, doubted = self.activity.inactive(), self.activity.active | self.activity.spare
         moved = float(np.linalg.norm(poses[-1][:3, 3] - self.poses[-1][:3, 3]))
         reason = f"{len(result.accepted)} of {len(self.graph.loops)} closures believed, {result.seconds:.2f} s"
         self.events.append(LoopEvent("closed", frame.index, number, old, reason, moved))

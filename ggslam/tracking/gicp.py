@@ -106,6 +106,7 @@ class GicpTarget:
         voxel: float | None = None,
         base: GicpTarget | None = None,
         finish: bool = True,
+        like: GicpTarget | None = None,
     ) -> GicpTarget:
         """As `from_gaussians`, from contiguous float32 arrays [n, 3], [n, 4] wxyz, [n, 3], [n]; `birth` int32 [n].
 
@@ -114,6 +115,8 @@ class GicpTarget:
 
         With `finish` false the voxels' shapes, most of the work, are left to who needs them: a GPU makes its own, and
         the core makes them in the thread that first aligns to the target, on the threads of `context`.
+
+        `like` is a target that holds much the same: shapes of voxels where it does are copied. Without `base`.
         """
         target = cls()
         cameras = 0 if camera_positions is None else len(camera_positions)
@@ -129,6 +132,8 @@ class GicpTarget:
         arguments = native_target_settings(settings, target.voxel)
         earlier = None if base is None else base.gathered_handle
         build = target._library.ggslam_gicp_target_build if finish else target._library.ggslam_gicp_target_gather
+        if like is not None and base is None and finish:
+            build, earlier = target._library.ggslam_gicp_target_build_like, like.handle
         build(context.handle, target.gathered_handle, earlier, given, arguments)
         target._unfinished = None if finish else (context, arguments)
         return target

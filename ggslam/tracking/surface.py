@@ -117,9 +117,10 @@ class MeasuredSurface:
             for part, T in zip(self._parts, T_world_camera, strict=True):
                 part.T_world_camera = np.array(T, float)
         self.active = set(active)
-        self.target = None  # frees it before the next one is made
+        before = self.target if self._archive is None else None  # where memory is short it goes before the next is made
+        self.target = None
         self._arranged, self._arranged_of = sorted(self.active), len(self._parts)
-        self.target = self.of(self._arranged)
+        self.target = self._gather([self._parts[number] for number in self._arranged], None, before)
         return self.target
 
     def gather_again(self) -> None:
@@ -163,7 +164,7 @@ class MeasuredSurface:
             self._append(q.astype(np.float32) * (r / np.float32(32767)), normals, T.astype(float))
         self.arrange(set(range(len(self._parts))))
 
-    def _gather(self, parts: list[_Part], base: GicpTarget | None) -> GicpTarget:
+    def _gather(self, parts: list[_Part], base: GicpTarget | None, like: GicpTarget | None = None) -> GicpTarget:
         count = sum(part.count for part in parts)
         points, quaternions, log_scales = (np.empty((count, width), np.float32) for width in (3, 4, 3))
         begin = 0
@@ -175,7 +176,7 @@ class MeasuredSurface:
             begin += part.count
         return GicpTarget.from_arrays(
             points, quaternions, log_scales, np.full(count, _OPACITY_LOGIT, np.float32), self.settings, self._context,
-            base=base, finish=self.finish,
+            base=base, finish=self.finish, like=like,
         )  # fmt: skip
 
 

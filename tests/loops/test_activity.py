@@ -79,3 +79,24 @@ def test_correction_moves_them() -> None:
     keyframes.add(shifted[0], DEPTH)
     keyframes.activate_around(0)
     assert 0 in keyframes.active
+
+
+def test_rounds_without_end_keep_no_more_than_enough() -> None:
+    keyframes = ActiveKeyframes(ActivitySettings(most=40, forget_after=1000))
+    sizes, near, changes = [], [], 0
+    for k in range(1200):
+        keyframes.add(looking_out(2 * np.pi * k / 120), DEPTH)
+        changes += keyframes.update()
+        sizes.append(len(keyframes.active))
+        here = [abs((other - k + 60) % 120 - 60) < 8 for other in keyframes.active]
+        near.append(sum(here))
+    assert max(sizes) <= 60 and changes < 1200 / 2
+    assert min(near[120:]) >= 8  # what the camera sees is there, mapped now or in the rounds before
+    assert not keyframes.inactive()  # all lie right: no loop is looked for among them
+    keyframes.restart(600)
+    assert not keyframes.spare and 0 in keyframes.inactive()
+
+
+def test_spare_keyframes_are_forgotten_like_others() -> None:
+    keyframes = walked(3.0, settings=ActivitySettings(most=16))
+    assert len(keyframes.active) <= 18 and 40 in keyframes.inactive() and 120 in keyframes.inactive()

@@ -16,7 +16,9 @@ import pytest
 
 from ggslam.errors import CoreInputError, CoreMemoryError, GgslamError, NativeCoreError
 from ggslam.interface.binding import CORE
+from ggslam.interface.core.codec import OctreeSettings, RahtSettings
 from ggslam.interface.core.common import CoreFault
+from ggslam.interface.core.tracking import AlignPoints, AlignResult, AlignSettings
 from ggslam.interface.core.volumes import FusionInput, FusionSettings, FusionStats, InsertResult
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
@@ -89,6 +91,36 @@ def test_null_pointers_are_refused() -> None:
     ]:
         with pytest.raises(CoreInputError, match="null pointer"):
             function(*arguments)
+
+
+def test_objects_that_are_not_ready_are_refused() -> None:
+    library, context = load_library(), NativeContext(1)
+    numbers = np.zeros(64)
+    place = numbers.ctypes.data
+    slice_, target = library.ggslam_gpcc_slice_create(), library.ggslam_gicp_target_create()
+    raht, octree = RahtSettings(components=3, bit_depth=8, index=-1), OctreeSettings(depth=4)
+    points = AlignPoints(place, place, place, place, 3)
+    pose = np.eye(4)
+    align = (context.handle, target, ctypes.byref(points), ctypes.byref(AlignSettings()))
+    try:
+        with pytest.raises(CoreInputError, match="depth: expected that of the octree, 0, found 4"):
+            library.ggslam_gpcc_encode_geometry(context.handle, slice_, ctypes.byref(octree))
+        with pytest.raises(CoreInputError, match="slice: it has no octree yet"):
+            library.ggslam_gpcc_encode_attribute(context.handle, slice_, ctypes.byref(raht), place)
+        with pytest.raises(CoreInputError, match="slice: it has no octree yet"):
+            library.ggslam_gpcc_decode_attribute(context.handle, slice_, ctypes.byref(raht), place, 9, place)
+        with pytest.raises(CoreInputError, match="points: expected coordinates of 0 to below 2\\^4"):
+            library.ggslam_gpcc_build(context.handle, slice_, np.full(3, 16, np.int32).ctypes.data, 1, 4, place)
+        with pytest.raises(CoreInputError, match="level: expected"):
+            library.ggslam_gpcc_nodes(slice_, 0)
+        with pytest.raises(CoreInputError, match="target: it is not finished"):
+            library.ggslam_gicp_align(*align, None, None, pose.ctypes.data, place, place, ctypes.byref(AlignResult()))
+        with pytest.raises(CoreInputError, match="pose: expected numbers"):
+            bad = np.full(16, np.nan)
+            library.ggslam_gicp_align(*align, None, None, bad.ctypes.data, place, place, ctypes.byref(AlignResult()))
+    finally:
+        library.ggslam_gpcc_slice_destroy(slice_)
+        library.ggslam_gicp_target_destroy(target)
 
 
 def test_arrays_that_are_nowhere_and_negative_sizes_are_refused() -> None:

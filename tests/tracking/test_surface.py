@@ -50,6 +50,25 @@ def test_gathering_in_steps_is_gathering_at_once() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 3])
+def test_shapes_taken_over_are_those_computed(threads: int) -> None:
+    rng = np.random.default_rng(2)
+    settings, context = TrackerSettings().target, NativeContext(threads)
+    means = np.float32(rng.uniform(-1, 1, (9000, 3)) * [1, 1, 0.05])
+    quaternions = np.tile(np.float32([1, 0, 0, 0]), (9000, 1))
+    scales = np.tile(np.log(np.float32([0.01, 0.01, 0.001])), (9000, 1))
+    arrays = (means, quaternions, scales, np.full(9000, 3, np.float32))
+    chosen = means[:, 0] < rng.choice([0.5, 0.6], 9000)
+    for rows, others in ((slice(None), chosen), (chosen, slice(None)), (chosen, means[:, 1] > 0)):
+        alone, like = (GicpTarget.from_arrays(*(np.ascontiguousarray(a[part]) for a in arrays), settings, context)
+                       for part in (rows, others))  # fmt: skip
+        given = [np.ascontiguousarray(a[rows]) for a in arrays]
+        found = GicpTarget.from_arrays(*given, settings, context, like=like)
+        for level in (0, 1):
+            for name, values in alone.voxels(level).items():
+                assert np.array_equal(found.voxels(level)[name], values), name
+
+
+@pytest.mark.parametrize("threads", [1, 3])
 def test_a_new_view_of_a_measured_corner_is_located(threads: int) -> None:
     settings, context = TrackerSettings(), NativeContext(threads)
     surface = MeasuredSurface(settings.target, context)

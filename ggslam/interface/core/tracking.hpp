@@ -131,6 +131,12 @@ GGSLAM_EXPORT int ggslam_gicp_target_destroy(void* target);
 GGSLAM_EXPORT int ggslam_gicp_target_build(void* context, void* target, const void* base,
                                            const ggslam::TargetInput* input, const ggslam::TargetSettings* settings);
 
+// As ggslam_gicp_target_build without a base. The shapes of voxels that lie in `like`, a target made by one of the two,
+// with the same surroundings are copied from there; the result is the same.
+GGSLAM_EXPORT int ggslam_gicp_target_build_like(void* context, void* target, const void* like,
+                                                const ggslam::TargetInput* input,
+                                                const ggslam::TargetSettings* settings);
+
 // As ggslam_gicp_target_build, but leaves the voxels without shapes. Until ggslam_gicp_target_finish has been called, the
 // target may be a base, and be asked for its size, its moments and its blocks.
 GGSLAM_EXPORT int ggslam_gicp_target_gather(void* context, void* target, const void* base,

@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/tracking.hpp"
-HEADER_SHA256 = "0811102702916581ef06f94c1c74c56cc964e13f419c37c433954454cbb90a07"
+HEADER_SHA256 = "5808877624845db446b625e6e46bda69f88857bb1ab4827dd4007d25b40bc32e"
 
 
 class DepthPointsSettings(Structure):
@@ -124,6 +124,9 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_gicp_target_create": (c_void_p, []),
     "ggslam_gicp_target_destroy": (c_int, [c_void_p]),
     "ggslam_gicp_target_build": (c_int, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
+    "ggslam_gicp_target_build_like": (c_int, [
+        c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings),
+    ]),
     "ggslam_gicp_target_gather": (c_int, [c_void_p, c_void_p, c_void_p, POINTER(TargetInput), POINTER(TargetSettings)]),
     "ggslam_gicp_target_finish": (c_int, [c_void_p, c_void_p, POINTER(TargetSettings)]),
     "ggslam_gicp_target_size": (c_int, [c_void_p, c_int]),

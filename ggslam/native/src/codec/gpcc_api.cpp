@@ -107,6 +107,7 @@ template <class Settings>
 const Settings& check_attribute(const Slice& slice, const Settings* pointer, const std::int32_t* values) {
   const Settings& settings = object_of<Settings>(pointer);
   check_range("components", settings.components, 1, 3);
+  if (slice.tree.levels.empty() && slice.tree.leaves == 0) refuse("slice: it has no octree yet");
   check_array("attributes", values, static_cast<std::int64_t>(slice.tree.points));
   return settings;
 }
@@ -167,6 +168,8 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_merge(void* slice) try {
 
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slice, const gpcc::OctreeSettings* settings) try {
   Slice& s = object_of<Slice>(slice);
+  const int depth = object_of<gpcc::OctreeSettings>(settings).depth;
+  if (depth != s.tree.depth()) refuse("depth: expected that of the octree, %d, found %d", s.tree.depth(), depth);
   s.bytes.clear();
   GGSLAM_DISPATCH(gpcc::isa_of(context), octree_encode)(
       object_of<gpcc::OctreeSettings>(settings), s.tree, s.bytes);
@@ -176,6 +179,7 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_geometry(void* context, void* slic
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_encode_attribute(void* context, void* slice, const gpcc::RahtSettings* settings,
                                                         std::int32_t* attributes) try {
   Slice& s = object_of<Slice>(slice);
+  if (s.tree.levels.empty()) refuse("slice: it has no octree yet");
   s.bytes.clear();
   const gpcc::Status status =
       GGSLAM_DISPATCH(gpcc::isa_of(context), raht_encode)(

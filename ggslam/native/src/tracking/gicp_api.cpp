@@ -299,6 +299,13 @@ void check_points(const ggslam::AlignPoints* pointer, const ggslam::AlignSetting
   object_of<AlignSettings>(settings);
 }
 
+const ggslam::GicpTarget& check_target(const void* pointer) {
+  const auto& target = ggslam::object_of<ggslam::GicpTarget>(pointer);
+  for (const ggslam::VoxelLevel* level : {&target.fine, &target.coarse})
+    if (level->slot_key.empty() || level->voxels.size() < level->moments.size()) ggslam::refuse("target: it is not finished");
+  return target;
+}
+
 void check_reference(const ggslam::PhotometricPoints* points, const ggslam::PhotometricReferenceView* reference) {
   using namespace ggslam;
   if (points == nullptr || reference == nullptr) return;
@@ -322,7 +329,7 @@ GGSLAM_EXPORT int ggslam_gicp_align(void* context, const void* target, const ggs
   check_within("pose", pose_guess, 12, 1e9);
   RigidPose pose = pose_of(pose_guess);
   object_of<AlignResult>(result) = AlignResult{};
-  Aligner(object_of<Context>(context), *points, object_of<GicpTarget>(target), *settings,
+  Aligner(object_of<Context>(context), *points, check_target(target), *settings,
           photometric_points, reference, match, squared_distance)
       .run(pose, *result);
   for (int i = 0; i < 3; ++i) {
@@ -338,7 +345,7 @@ GGSLAM_EXPORT double ggslam_gicp_linearize(void* context_, const void* target_, 
                                            int32_t* match, float* squared_distance, double* h, double* b) try {
   using namespace ggslam;
   const auto& context = object_of<Context>(context_);
-  const auto& target = object_of<GicpTarget>(target_);
+  const auto& target = check_target(target_);
   check_points(points, settings, match, squared_distance);
   check_within("pose", pose, 12, 1e9);
   check_array("h", h, 36), check_array("b", b, 6);

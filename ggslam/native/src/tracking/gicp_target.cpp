@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstring>
 #include <memory>
 #include <numeric>
 
@@ -145,6 +146,36 @@ void concatenate(std::vector<Partition>& partitions, VoxelLevel& level) {
   }
 }
 
+// For each block of a level the one of another level that holds the same voxels with the same moments, or -1.
+std::vector<int32_t> equal_blocks(Context& context, const VoxelLevel& level, const VoxelLevel& before) {
+  std::vector<int32_t> equal(level.blocks.size(), -1);
+  context.pool.parallel_for(equal.size(), 256, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t b = begin; b < end; ++b) {
+      const int other = before.block_of(level.block_keys[b]);
+      if (other < 0 || before.blocks[other].occupied != level.blocks[b].occupied) continue;
+      const std::size_t bytes = sizeof(VoxelMoments) * __builtin_popcountll(level.blocks[b].occupied);
+      if (!std::memcmp(level.moments.data() + level.blocks[b].first, before.moments.data() + before.blocks[other].first,
+                       bytes))
+        equal[b] = other;
+    }
+  });
+  return equal;
+}
+
+// Whether the blocks around one are as before, too: then its voxels have the shapes that they had.
+bool has_equal_neighbours(const VoxelLevel& level, const VoxelLevel& before, const std::vector<int32_t>& equal,
+                          std::size_t block) {
+  const Vec3i c = block_coordinates(level.block_keys[block]);
+  for (int z = -1; z <= 1; ++z)
+    for (int y = -1; y <= 1; ++y)
+      for (int x = -1; x <= 1; ++x) {
+        const uint64_t key = block_key(c[0] + x, c[1] + y, c[2] + z);
+        const int near = level.block_of(key);
+        if (near >= 0 ? equal[near] < 0 : before.block_of(key) >= 0) return false;
+      }
+  return true;
+}
+
 // A coarse voxel is a block of the fine level.
 template <typename Merge>
 void coarsen(const VoxelLevel& fine, Merge merge, VoxelLevel& coarse) {
@@ -201,9 +232,9 @@ VoxelLevelView VoxelLevel::view() const {
 }
 
 void GicpTarget::build(Context& context, const GicpTarget* base, const TargetInput& input,
-                       const TargetSettings& settings) {
+                       const TargetSettings& settings, const GicpTarget* like) {
   gather(context, base, input, settings);
-  finish(context, settings);
+  finish(context, settings, like ? like : base);
 }
 
 void GicpTarget::gather(Context& context, const GicpTarget* base, const TargetInput& input,
@@ -226,16 +257,27 @@ void GicpTarget::gather(Context& context, const GicpTarget* base, const TargetIn
   coarsen(fine, GGSLAM_DISPATCH(context.isa, merge_moments), coarse);
 }
 
-void GicpTarget::finish(Context& context, const TargetSettings& settings) {
+void GicpTarget::finish(Context& context, const TargetSettings& settings, const GicpTarget* like) {
   const auto shape = GGSLAM_DISPATCH(context.isa, finish_voxels);
-  for (VoxelLevel* level : {&fine, &coarse}) {
-    level->index_blocks();
-    level->voxels.resize(level->moments.size());
-    const VoxelLevelView view = level->view();
-    context.pool.parallel_for(level->voxels.size(), 512, [&](std::size_t begin, std::size_t end, int) {
-      shape(settings, view, level->moments.data(), begin, end, level->voxels.data());
+  const bool usable = like && like->shaped && !std::memcmp(&like->shaped_with, &settings, sizeof settings);
+  for (VoxelLevel GicpTarget::*which : {&GicpTarget::fine, &GicpTarget::coarse}) {
+    VoxelLevel& level = this->*which;
+    level.index_blocks();
+    level.voxels.resize(level.moments.size());
+    const VoxelLevelView view = level.view();
+    const VoxelLevel* before = usable ? &(like->*which) : nullptr;
+    const std::vector<int32_t> equal = before ? equal_blocks(context, level, *before) : std::vector<int32_t>();
+    context.pool.parallel_for(level.blocks.size(), 16, [&](std::size_t begin, std::size_t end, int) {
+      for (std::size_t b = begin; b < end; ++b) {
+        const std::size_t first = level.blocks[b].first, count = __builtin_popcountll(level.blocks[b].occupied);
+        if (before && equal[b] >= 0 && has_equal_neighbours(level, *before, equal, b))
+          std::copy_n(before->voxels.data() + before->blocks[equal[b]].first, count, level.voxels.data() + first);
+        else
+          shape(settings, view, level.moments.data(), first, first + count, level.voxels.data());
+      }
     });
   }
+  shaped_with = settings, shaped = true;
 }
 
 }  // namespace ggslam
@@ -278,6 +320,15 @@ GGSLAM_EXPORT int ggslam_gicp_target_gather(void* context, void* target, const v
   ggslam::check_target(input, settings);
   ggslam::object_of<ggslam::GicpTarget>(target).gather(ggslam::object_of<ggslam::Context>(context),
       static_cast<const ggslam::GicpTarget*>(base), *input, *settings);
+  return 0;
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_gicp_target_build_like(void* context, void* target, const void* like,
+                                                const ggslam::TargetInput* input,
+                                                const ggslam::TargetSettings* settings) try {
+  ggslam::check_target(input, settings);
+  ggslam::object_of<ggslam::GicpTarget>(target).build(ggslam::object_of<ggslam::Context>(context), nullptr, *input,
+                                                      *settings, static_cast<const ggslam::GicpTarget*>(like));
   return 0;
 } GGSLAM_CATCH_ALL
 

