@@ -21,7 +21,10 @@ if [ "$("$venv/bin/python" -c 'import platform, sys; print(platform.python_imple
   install --no-deps --no-build-isolation --require-hashes -r "requirements/$what.lock"
   # shellcheck disable=SC2086
   install ${TORCH:-torch==2.13.0}
-  install --no-deps --no-build-isolation .
+  install --no-deps --no-build-isolation . || {
+    echo "the locked build tools failed; building with those that pip chooses"
+    install --no-deps .
+  }
 else
   install --upgrade pip
   # The pinned torch comes first, so that nothing else chooses another build of it.
