@@ -32,7 +32,7 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
 
 pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="mounting a small disk needs root"),
-    pytest.mark.long("ten runs and exports in processes of their own"),
+    pytest.mark.slow,  # ten runs and exports in processes of their own
 ]
 
 
