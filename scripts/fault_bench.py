@@ -22,7 +22,7 @@ MEMORY_BYTES = 4 << 30
 SECONDS = 120
 FEW = ("--set", "mapping.iterations_per_frame=1", "--set", "mapping.first_frame_iterations=4", "--no-eval")
 
-Hook = Callable[[int], None]
+Hook = Callable[[int], object]
 
 
 @dataclass
@@ -39,10 +39,13 @@ class Ended:
 
     @property
     def said(self) -> str:
-        """The last thing that a person reads: a message of one paragraph, without colours."""
+        """The line that matters to a person: the error, else what a command doubts, else the last one."""
         lines = [line.strip() for line in self.text.replace("\r", "\n").splitlines() if line.strip()]
-        starts = [i for i, line in enumerate(lines) if line.startswith(("error:", "Error", "warning", "interrupted"))]
-        return " ".join(lines[starts[-1] :] if starts else lines[-1:])
+        for words in (("error:", "Error"), ("interrupted", "stopped"), ("warning", "doubt", "health", "note")):
+            found = [line for line in lines if line.lower().startswith(tuple(word.lower() for word in words))]
+            if found:
+                return found[-1]
+        return lines[-1] if lines else ""
 
 
 @dataclass
@@ -114,9 +117,12 @@ class Place:
 
 
 def sums(folder: Path) -> dict[str, str]:
-    """SHA-256 of all regular files below a folder, by name; records of commands aside."""
+    """SHA-256 of all regular files below a folder, by name; records of commands and what is on a small disk, which is
+    gone afterwards, aside."""
     found = {}
     for path in sorted(folder.rglob("*")):
+        if "disk" in path.relative_to(folder).parts:
+            continue
         if path.is_file() and not path.is_symlink() and not path.name.endswith((".said", ".lock")):
             found[str(path.relative_to(folder))] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found

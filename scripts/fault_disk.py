@@ -37,9 +37,12 @@ def small_disk(folder: Path, size: str = "1m") -> Iterator[Path]:
         subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def make_read_only(folder: Path) -> None:
-    """Nothing can be written to a mounted disk from now on."""
-    subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+def set_immutable(folder: Path, immutable: bool) -> bool:
+    """Lets nobody, root included, write in a folder (or lets them again); whether that worked."""
+    if shutil.which("chattr") is None:
+        return False
+    folders = [str(folder), *(str(path) for path in folder.rglob("*") if path.is_dir())]
+    return subprocess.run(["chattr", "+i" if immutable else "-i", *folders], capture_output=True).returncode == 0
 
 
 def emptied(folder: Path) -> None:
@@ -94,9 +97,16 @@ def full_run(size: str) -> Callable[[Place], None]:
 
 
 def read_only_run(place: Place) -> None:
-    with small_disk(place.folder / "disk", "100m") as disk, fallback(place.folder / "fallback"):
-        place.out = disk / "out"
-        place.map_recording(place.recording(), after=lambda k: make_read_only(disk) if k == 6 else None)
+    (place.folder / "try").mkdir()
+    if not set_immutable(place.folder / "try", True):
+        raise NotHere("folders cannot be made immutable (chattr)")
+    set_immutable(place.folder / "try", False)
+    recording = place.recording()
+    with fallback(place.folder / "fallback"):
+        try:
+            place.map_recording(recording, after=lambda k: k == 6 and set_immutable(place.out, True))
+        finally:
+            set_immutable(place.out, False)
 
 
 def deleted_out(place: Place) -> None:
@@ -116,7 +126,7 @@ FAULTS: dict[str, Callable[[Place], None]] = {
     "the disk is full: export": full("export", "--out", "map.ply"),
     "the disk is full: export of a mesh": full("export", "--format", "mesh", "--voxel", "0.02", "--out", "mesh.ply"),
     "the disk is full: encode": full("encode", "points.bin", size="8k"),
-    "the disk is full: edit": full("edit", "--rename", "1", "mug", "--out", "edited"),
+    "the disk is full: edit": full("edit", "--rename", "1", "thing of mine", "--out", "edited"),
     "the disk is full: a page for the browser": full("view", "--html", "room.html"),
     "the output folder becomes read-only in mid-run": read_only_run,
     "the output folder is deleted in mid-run": deleted_out,

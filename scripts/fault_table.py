@@ -87,6 +87,14 @@ def page(rows: list[Row]) -> str:
     )
 
 
+def write(rows: list[Row], markdown: Path | None, records: Path | None) -> None:
+    """What is known so far."""
+    if markdown is not None:
+        markdown.write_text(page(rows))
+    if records is not None:
+        records.write_text(json.dumps([asdict(row) for row in rows], indent=1))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="words, by commas")
@@ -104,10 +112,8 @@ def main() -> None:
             if row is not None:
                 rows.append(row)
                 print(table([row]).splitlines()[-1], flush=True)
+                write(rows, given.markdown, given.json)
     bad = [row for row in rows if row.problems]
-    for path, text in ((given.markdown, page(rows)), (given.json, json.dumps([asdict(row) for row in rows], indent=1))):
-        if path is not None:
-            path.write_text(text)
     print(f"{len(rows)} faults in {time.perf_counter() - start:.0f} s, {len(bad)} bad")
     for row in bad:
         print(f"bad: {row.fault}: {', '.join(row.problems)}")

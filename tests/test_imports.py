@@ -101,6 +101,19 @@ def test_imports_run_downwards(name: str) -> None:
             refuse_upward(JOBS, 2, name)
 
 
+@pytest.mark.parametrize("name", [n for n in modules() if n.count(".") > 0])
+def test_the_public_face_is_for_others(name: str) -> None:
+    """It leads to every floor, so within the package only the version is taken from it; nor is a room imported by a
+    text, which no check of directions sees."""
+    for node in ast.walk(ast.parse(modules()[name].read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module == "ggslam":
+            taken = {alias.name for alias in node.names} - {"__version__", "errors"}
+            assert not taken or all(f"ggslam.{n}" in modules() for n in taken), f"{name}:{node.lineno}: {taken}"
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
+            texts = [a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+            assert not [t for t in texts if t.startswith("ggslam")], f"{name}:{node.lineno}: {texts}"
+
+
 def test_no_circles() -> None:
     """Not between modules of one room either, and not by imports inside functions."""
     state: dict[str, int] = {}

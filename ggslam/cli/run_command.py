@@ -168,16 +168,14 @@ def run(
     watched = _Watched(log, (host, port) if view else None, strict)
     if resume is not None:
         return _go_on(context, resume, sequence, checkpoint_every, evaluate, watched)
-    if sequence is None:
-        raise ConfigError("expected a recording (SEQUENCE), or --resume with a run")
+    sequence = _recording(sequence)
     reading = SequenceRequest(
         sequence, format_name, start, stop, stride, scale, masks, depth_scale, "skip" if skip_bad_frames else "error",
         depth_camera, min_confidence, tuple(topics or ()), pose_convention,
     )  # fmt: skip
     given = _overrides(settings, {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
-        "threads": threads, "seed": seed, "loops.enabled": loops,
-        "tracker": None if tracker is None else tracker.value, "device": None if device is None else device.value,
+        "threads": threads, "seed": seed, "loops.enabled": loops, "tracker": tracker, "device": device,
     })  # fmt: skip
     request = replace(
         _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
@@ -186,9 +184,16 @@ def run(
     _run_and_show(partial(execute, request), sequence.resolve().name, watched)
 
 
+def _recording(sequence: Path | None) -> Path:
+    if sequence is None:
+        raise ConfigError("expected a recording (SEQUENCE), or --resume with a run")
+    return sequence
+
+
 def _overrides(settings: list[str] | None, shortcuts: dict[str, Any]) -> list[str]:
     """What `--set` says, and the options that stand for a setting."""
-    return [*(settings or []), *(f"{name}={value}" for name, value in shortcuts.items() if value is not None)]
+    values = {name: value.value if isinstance(value, Enum) else value for name, value in shortcuts.items()}
+    return [*(settings or []), *(f"{name}={value}" for name, value in values.items() if value is not None)]
 
 
 def _go_on(

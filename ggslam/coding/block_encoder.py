@@ -209,7 +209,7 @@ def _encode_cut(cloud: _Spool, cut: _Cut, coded: IO[bytes], out: Path) -> Coding
         coded.write(done.data)
         slices.append(replace(done, data=b""))
     with atomic_write(out) as temporary, temporary.open("wb") as file:
-        file.write(parameter_units(shared))
+        file.write(parameter_units(shared, len(slices)))
         coded.seek(0)
         shutil.copyfileobj(coded, file, 1 << 20)
         size = file.tell()

@@ -35,8 +35,20 @@ def decode_cloud(data: bytes | memoryview, threads: int | None = None) -> PointC
     Raises:
         FormatError: the stream is damaged, or uses a tool that this decoder lacks (the message names it).
     """
-    stream = read_stream(data)
+    stream = _whole(data)
     return _decode(stream, range(len(stream.slices)), threads)
+
+
+def _whole(data: bytes | memoryview) -> CodedStream:
+    """The stream; FormatError, if slices are missing."""
+    stream = read_stream(data)
+    written = stream.side.get("slices", len(stream.slices))
+    if written != len(stream.slices):
+        raise FormatError(
+            f"the stream has {len(stream.slices)} of its {written} slices: was it cut off? "
+            "(`decode_slice` decodes those that are there)"
+        )
+    return stream
 
 
 @dataclass(frozen=True)
@@ -56,7 +68,7 @@ class CloudInParts:
 
 def decode_in_parts(data: bytes | memoryview, threads: int | None = None) -> CloudInParts:
     """`decode_cloud` slice by slice: no more slices are decoded in memory than two for each thread."""
-    stream = read_stream(data)
+    stream = _whole(data)
 
     chains = _chains(stream, range(len(stream.slices)))
 

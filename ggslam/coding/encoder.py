@@ -34,7 +34,8 @@ def encode_cloud(
 
     Args:
         points: [N, 3], float (metres) or integer (voxels).
-        attributes: by name, whole numbers [N, 3] or [N].
+        attributes: by name, whole numbers [N, 3] or [N]. "object_id" comes back exactly; others are coded with the
+            quantiser parameter of the settings, unless `AttributeSettings(lossless=True)` says that they are ids.
         settings: every choice; None: the defaults.
         reconstruct: also return what a decoder makes of the stream.
 
@@ -60,7 +61,7 @@ def encode_cloud(
     cloud = CloudToCode(points, arrays, numbers, plans, sequence, geometry, quantization, settings, reconstruct)
     count = 1 if numbers is None else int(numbers.max()) + 1
     slices = list(in_order(lambda number: encode_slice(cloud, number), count, settings.threads))
-    data = parameter_units(cloud) + b"".join(coded.data for coded in slices)
+    data = parameter_units(cloud, count) + b"".join(coded.data for coded in slices)
     report = CodingReport(
         len(points), sum(coded.report.points for coded in slices), len(data),
         tuple(coded.report for coded in slices), time.perf_counter() - start,
@@ -89,13 +90,15 @@ def sequence_parameters(quantization: Quantization, plans: list[CodedAttribute])
     )  # fmt: skip
 
 
-def parameter_units(cloud: CloudToCode) -> bytes:
+def parameter_units(cloud: CloudToCode, slices: int) -> bytes:
     """Parameter sets, once for all slices, and the unit of what they cannot hold."""
     attribute = {parameters.attribute_id: parameters for _, parameters in cloud.plans}
     units = [unit_bytes(UnitType.SEQUENCE_PARAMETERS, cloud.sequence.write())]
     units.append(unit_bytes(UnitType.GEOMETRY_PARAMETERS, cloud.geometry.write()))
     units += [unit_bytes(UnitType.ATTRIBUTE_PARAMETERS, attribute[identity].write()) for identity in sorted(attribute)]
     content = _side_information(cloud)
+    if slices > 1:
+        content["slices"] = slices  # the standard does not tell where a stream of several slices was cut off
     if content:
         units.append(unit_bytes(UnitType.USER_DATA, write_user_data(content)))
     return b"".join(units)

@@ -145,8 +145,8 @@ def choose_quantization(
             f"the grid is {extent.max()} voxels long, more than 2^{GRID_BITS}: choose larger voxels "
             f"(now {1 / scale:g}) or a smaller geometry scale"
         )
-    # A point of an integer grid stands for itself, a voxel of another grid for the integers in it: where scale is a / b,
-    # they lie 0, 1 / b, ... (b - 1) / b of a voxel from its lower face, one as often as the other.
+    # A point of an integer grid stands for itself, a voxel of another grid for the integers in it: where the scale is
+    # a / b, they lie 0, 1 / b, ... (b - 1) / b of a voxel from its lower face, one as often as the other.
     centre = 0.5 * (1 - 1 / Fraction(scale).limit_denominator(1 << 16).denominator) if integers else 0.5
     x, y, z = (int(v) for v in first)
     return Quantization(scale, (x, y, z), (int(extent[0]), int(extent[1]), int(extent[2])), centre,

@@ -106,5 +106,5 @@ class CodecSettings:
             raise Conflict("shift", f"expected finite numbers, found {self.shift!r}")
 
     def attribute(self, name: str) -> AttributeSettings:
-        """Settings of one attribute."""
-        return self.attributes.get(name, AttributeSettings())
+        """Settings of one attribute. Object ids are lossless if nothing else is said."""
+        return self.attributes.get(name, AttributeSettings(lossless=name == "object_id"))

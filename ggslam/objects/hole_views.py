@@ -87,7 +87,7 @@ def look(kept: Gaussians, removed: Gaussians, views: Sequence[CameraView], count
     return [seen[i] for i in order if areas[i] > max(8, 0.05 * areas[order[0]])]
 
 
-def looked_again(kept: Gaussians, views: Sequence[HoleView]) -> list[HoleView]:
+def look_again(kept: Gaussians, views: Sequence[HoleView]) -> list[HoleView]:
     """The same views with what they show of `kept` now."""
     rasterizer, out = CpuRasterizer(), []
     for v in views:

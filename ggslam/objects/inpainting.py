@@ -19,7 +19,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from ggslam.objects.hole_refinement import Recorded, refine
-from ggslam.objects.hole_views import CameraView, HoleView, look, looked_again
+from ggslam.objects.hole_views import CameraView, HoleView, look, look_again
 from ggslam.objects.plane_filling import as_seen, cover, find_hole, make_chart, paint, widen_hole
 from ggslam.objects.rim_planes import RimPlane, find_rim_planes, rim_points
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
@@ -114,7 +114,7 @@ class _Hole:
             return Filling()
         dropped = drop_traces(self.scene, self.removed, self.views, self.ignored)
         self.old -= dropped
-        views = looked_again(copies_of(self.scene.gaussians, self.surroundings()), views)
+        views = look_again(copies_of(self.scene.gaussians, self.surroundings()), views)
         planes = self._continue_planes(views)
         self._close_views(views)
         if recorded is not None and self.added_count:

@@ -43,7 +43,7 @@ def measure_exposure(
     some = (slice(None, None, STEP), slice(None, None, STEP))
     depth, rendered_depth = depth[some], rendered_depth[some]
     seen = color[some].astype(np.float32) / 255
-    shown = np.moveaxis(image[(slice(None), *some)], 0, 2)
+    shown = np.moveaxis(image[:, ::STEP, ::STEP], 0, 2)
     near = np.abs(rendered_depth - depth) < SAME_DEPTH * depth
     known = (depth > 0) & (alpha[some] > OPAQUE) & near
     exposure = identity_exposure()

@@ -38,7 +38,7 @@ class FrameClock:
         """When the frame of index or timestamp 0 is due."""
         self._catching_up = False
 
-    def paced(self, frames: Iterable[Frame], drop: Callable[[Frame], None]) -> Iterator[Frame]:
+    def pace(self, frames: Iterable[Frame], drop: Callable[[Frame], None]) -> Iterator[Frame]:
         """The frames in time; `drop` gets each that is too late. The first one is always in time, and the clock starts
         when the caller is done with it."""
         iterator, asked, first = iter(frames), self._now(), True

@@ -59,7 +59,7 @@ class RealtimeSlam:
 
     def _track(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
         slam, clock = self.slam, FrameClock(self.period, self.live)
-        for frame in clock.paced(frames, lambda late: slam.dropped_frames.append(late.index)):
+        for frame in clock.pace(frames, lambda late: slam.dropped_frames.append(late.index)):
             if not slam.frames:
                 self._first(frame, report)
             else:

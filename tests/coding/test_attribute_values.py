@@ -138,3 +138,11 @@ def test_arrays_that_do_not_fit_are_refused(values: np.ndarray, own: dict, messa
 def test_settings_of_an_absent_attribute_are_refused() -> None:
     with pytest.raises(ConfigError, match="no attribute 'id'"):
         encode_cloud(np.zeros((1, 3)), {}, CodecSettings(attributes=IDS))
+
+
+def test_object_ids_come_back_exactly_without_being_asked() -> None:
+    """An id beside the right one is another object."""
+    grid = np.random.default_rng(0).integers(0, 30, (3000, 3))
+    ids = np.where(grid[:, 0] < 15, 3, 900).astype(np.uint16)
+    decoded = decode_cloud(encode_cloud(grid, {"object_id": ids}, CodecSettings(qp=40)).data)
+    assert (decoded.attributes["object_id"] == np.where(decoded.points[:, 0] < 15, 3, 900)).all()

@@ -19,6 +19,7 @@ from ggslam.coding.attribute_syntax import (
     DetailSettings,
 )
 from ggslam.coding.container import HEADER, UnitType, read_units, unit_bytes
+from ggslam.coding.decoder import decode_in_parts, decode_slice, list_slices
 from ggslam.coding.geometry_syntax import ALL_AXES, GeometryHeader, GeometryParameters
 from ggslam.coding.native_settings import AttributePayload, CodingContext, RahtSettings
 from ggslam.coding.sequence_parameters import AttributeDescription
@@ -97,6 +98,20 @@ def test_every_truncation_is_noticed(streams: list[bytes]) -> None:
         if length not in ends:
             with pytest.raises(FormatError):
                 decode_cloud(data[:length], threads=1)
+
+
+def test_a_stream_that_ends_between_two_slices_is_noticed() -> None:
+    grid = np.random.default_rng(0).integers(0, 64, (2000, 3))
+    data = encode_cloud(grid, {}, CodecSettings(slices=4)).data
+    sizes = np.cumsum([units.size_bytes for units in list_slices(data)])
+    assert len(sizes) == 4
+    for there in (1, 2, 3):
+        cut = data[: len(data) - int(sizes[-1] - sizes[there - 1])]
+        with pytest.raises(FormatError, match=f"{there} of its 4 slices"):
+            decode_cloud(cut)
+        with pytest.raises(FormatError, match=f"{there} of its 4 slices"):
+            decode_in_parts(cut)
+        assert len(decode_slice(cut, 0)) == len(decode_slice(data, 0))
 
 
 def test_a_truncated_payload_is_noticed() -> None:

@@ -119,3 +119,12 @@ def test_settings_are_whole_numbers_and_boxes_have_insides() -> None:
     for wrong in ({"qp": 22.5}, {"slices": 1.5}, {"box": ((0, 0, 0), (1, -1, 1))}, {"box": 1}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             CodecSettings(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("scale", [1 / 2, 3 / 4, 15 / 16, 1 / 3, 0.3, 2.0])
+def test_voxels_of_an_integer_grid_stand_for_the_integers_in_them(scale: float) -> None:
+    """Neither shifted up nor down, whatever the quotient."""
+    integers = np.arange(480).reshape(-1, 1).repeat(3, 1)
+    grid = choose_quantization(integers, None, 10, scale, None)
+    error = grid.restore(grid.apply(integers)) - integers
+    assert abs(error.mean()) < 0.01 and np.abs(error).max() <= 0.5 / scale + 1e-9

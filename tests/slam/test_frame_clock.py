@@ -54,7 +54,7 @@ def taken(
 ) -> tuple[list[int], list[int]]:
     """Indices of frames that were taken and that were dropped, where a frame takes `work(index)` seconds."""
     kept, dropped = [], []
-    for frame in clock.paced(frames, lambda late: dropped.append(late.index)):
+    for frame in clock.pace(frames, lambda late: dropped.append(late.index)):
         kept.append(frame.index)
         time.sleep(work(frame.index))
     return kept, dropped

@@ -28,9 +28,10 @@ from ggslam.jobs.volumes.pictures import mesh_picture, occupancy_picture
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import change_in_run
+from ggslam.runs.records.volumes import VolumesRecord
 from ggslam.system.atomic import make_folder
 from ggslam.system.foreign import is_plain_name
-from ggslam.system.json_files import read_json, write_json
+from ggslam.system.json_files import write_json
 from ggslam.system.staging import finish_saving, new_staging, publish
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.maps import VolumeMaps
@@ -42,7 +43,7 @@ from ggslam.volumes.tsdf import SIDE
 from ggslam.volumes.tsdf_file import save_tsdf
 from ggslam.volumes.upright import Upright, estimate_up
 
-RECORD = "volumes.json"
+RECORD = VolumesRecord.FILE
 """Is there if and only if a folder holds volumes."""
 _FILES = (
     "tsdf.npz", "mesh.ply", "mesh.png", "objects.png", "esdf.png", "map.pgm", "map.yaml", "occupancy.bt",
@@ -254,9 +255,9 @@ def prepare_folder(out: Path) -> None:
 def _earlier_files(out: Path) -> list[str]:
     """Names of the files that earlier volumes left in the folder, and that later ones replace."""
     try:
-        names = read_json(out / RECORD)["files"]
+        names = VolumesRecord.read(out).files
         return [name for name in names if is_plain_name(name) and name != RECORD and (out / name).is_file()]
-    except (RunFolderError, KeyError, TypeError):
+    except RunFolderError:
         return []
 
 

@@ -57,8 +57,9 @@ const Grid& check_grid(const Grid* pointer, int axis = 0) {
   check_range("axis", axis, 0, 2);
   check_within("scale", &grid.scale, 1, 1e300), check_within("rounding", &grid.rounding, 1, 1e300);
   for (int a = 0; a < 3; ++a) {
-    constexpr std::int64_t kMost = std::int64_t{1} << 52;  // doubles hold all whole numbers up to there
-    check_range("first", grid.first[a], -kMost, kMost);
+    // Doubles hold all whole numbers up to 2^52; where no doubles are in between, nothing may overflow.
+    const std::int64_t most = std::int64_t{1} << (grid.exact ? 62 : 52);
+    check_range("first", grid.first[a], -most, most);
     check_range("last", grid.last[a], grid.first[a], grid.first[a] + std::numeric_limits<std::int32_t>::max());
   }
   return grid;
