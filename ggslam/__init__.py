@@ -20,6 +20,7 @@ if _TYPE_CHECKING:
     from ggslam.errors import ConfigError as ConfigError
     from ggslam.errors import FormatError as FormatError
     from ggslam.errors import GgslamError as GgslamError
+    from ggslam.errors import InputError as InputError
     from ggslam.errors import MissingDependency as MissingDependency
     from ggslam.errors import RenderError as RenderError
     from ggslam.errors import RunFolderError as RunFolderError
@@ -86,6 +87,7 @@ _HOMES = {
         "ConfigError",
         "FormatError",
         "GgslamError",
+        "InputError",
         "MissingDependency",
         "RenderError",
         "RunFolderError",

@@ -19,6 +19,10 @@ class ConfigError(GgslamError):
     """A setting is unknown or has an impossible value."""
 
 
+class InputError(GgslamError, ValueError):
+    """An argument of a Python call has a type, a shape or a value that cannot be."""
+
+
 class FormatError(GgslamError):
     """A file (PLY, trajectory, run folder...) does not follow its format."""
 
@@ -51,5 +55,5 @@ class CoreMemoryError(NativeCoreError, MemoryError):
     """Memory ran out in the compiled core."""
 
 
-class CoreInputError(GgslamError, ValueError):
+class CoreInputError(InputError):
     """The compiled core was given a size, a number or an array that cannot be."""

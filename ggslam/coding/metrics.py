@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ggslam.errors import InputError
 from ggslam.geometry.normals import estimate_normals
 
 _CHUNK = 1 << 17
@@ -72,10 +73,10 @@ def color_quality(reference: np.ndarray, decoded: np.ndarray) -> ColorQuality:
     """PSNR of colours [N, 3] in [0, 255], row by row: for clouds whose points correspond (`matching_rows`).
 
     Raises:
-        ValueError: the shapes differ, or there are no rows.
+        InputError: the shapes differ, or there are no rows.
     """
     if reference.shape != decoded.shape or reference.ndim != 2 or not len(reference):
-        raise ValueError(f"expected two arrays [N, 3], found {reference.shape} and {decoded.shape}")
+        raise InputError(f"expected two arrays [N, 3], found {reference.shape} and {decoded.shape}")
     return _color_quality(_color_mse(reference, decoded))
 
 
@@ -104,7 +105,7 @@ class CloudPair:
         self._reference = np.asarray(reference, np.float64)
         self._decoded = np.asarray(decoded, np.float64)
         if not len(self._reference) or not len(self._decoded):
-            raise ValueError("a cloud without points cannot be compared")
+            raise InputError("a cloud without points cannot be compared")
 
     def geometry(self, peak: float, normals: np.ndarray | None = None) -> GeometryQuality:
         """D1 and D2.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.evaluation.segmentation import Matching
 from ggslam.scene.camera import Camera
 
@@ -63,11 +64,11 @@ class GaussianTruth:
             numbers: which Gaussians they are, int64 [M].
 
         Raises:
-            ValueError: images of another size than the camera's.
+            InputError: images of another size than the camera's.
         """
         size = (camera.height, camera.width)
         if depth.shape != size or truth.shape != size:
-            raise ValueError(f"expected images of {size}, found depth {depth.shape}, truth {truth.shape}")
+            raise InputError(f"expected images of {size}, found depth {depth.shape}, truth {truth.shape}")
         T = T_camera_world.astype(np.float32)
         x, y, z = T[:3, :3] @ np.ascontiguousarray(means.T) + T[:3, 3:]
         # Bounds without a division, so that only Gaussians in the image are divided and rounded.

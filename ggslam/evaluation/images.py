@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import torch
 
+from ggslam.errors import InputError
 from ggslam.evaluation.lpips import SMALLEST_SIDE, Lpips
 
 SSIM_WINDOW = 11
@@ -79,11 +80,16 @@ def score_image(
         lpips: the metric if it shall be scored.
 
     Raises:
-        ValueError: sizes that do not agree.
+        InputError: sizes that do not agree, or no numpy arrays.
     """
+    named = {"rendered_color": rendered_color, "rendered_depth": rendered_depth, "color": color, "depth": depth}
+    for name, given in named.items():
+        if not isinstance(given, np.ndarray) and (given is not None or name != "rendered_depth"):
+            hint = "; call .detach().cpu().numpy()" if isinstance(given, torch.Tensor) else ""
+            raise InputError(f"score_image: {name}: expected a numpy array, found {type(given).__name__}{hint}")
     image, reference = unit_range(rendered_color), unit_range(color)
-    if image.shape != reference.shape or image.shape[:2] != depth.shape:
-        raise ValueError(f"sizes differ: rendered {image.shape}, recorded {reference.shape}, depth {depth.shape}")
+    if image.shape != reference.shape or image.ndim != 3 or image.shape[:2] != depth.shape:
+        raise InputError(f"sizes differ: rendered {image.shape}, recorded {reference.shape}, depth {depth.shape}")
     valid = np.isfinite(depth) & (depth > 0)
     similarity = ssim_map(image, reference)
     scores: dict[str, float] = {

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from ggslam.errors import InputError
 from ggslam.evaluation.lpips_weights import find_weights, read_weights
 
 SMALLEST_SIDE = 31
@@ -58,12 +59,12 @@ class Lpips:
         """Distance of two RGB images [H, W, 3], each uint8 or floating point in [0, 1].
 
         Raises:
-            ValueError: shapes differ, or an image is smaller than 31 pixels.
+            InputError: shapes differ, or an image is smaller than 31 pixels.
         """
         if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3:
-            raise ValueError(f"LPIPS needs two images [H, W, 3] of one size, found {image.shape}, {reference.shape}")
+            raise InputError(f"LPIPS needs two images [H, W, 3] of one size, found {image.shape}, {reference.shape}")
         if min(image.shape[:2]) < SMALLEST_SIDE:
-            raise ValueError(f"LPIPS needs images of at least {SMALLEST_SIDE} pixels, found {image.shape[:2]}")
+            raise InputError(f"LPIPS needs images of at least {SMALLEST_SIDE} pixels, found {image.shape[:2]}")
         both = torch.stack([_to_signed(image), _to_signed(reference)]).permute(0, 3, 1, 2).to(self.device)
         x = (both - self._shift) / self._scale
         total = 0.0

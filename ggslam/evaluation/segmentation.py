@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from ggslam.errors import InputError
+
 FOUND_IOU = 0.5
 """An object is found if its mask has more than this IoU; no two masks can then claim the same object."""
 
@@ -98,13 +100,13 @@ class SegmentationCounts:
             truth: true ids uint16 [H, W]; pixels of 0 are ignored.
 
         Raises:
-            ValueError: other shapes or types.
+            InputError: other shapes or types.
         """
         for name, image in (("predicted", predicted), ("truth", truth)):
             if image.ndim != 2 or image.dtype != np.uint16:
-                raise ValueError(f"{name}: expected ids uint16 [H, W], found {image.dtype} {list(image.shape)}")
+                raise InputError(f"{name}: expected ids uint16 [H, W], found {image.dtype} {list(image.shape)}")
         if predicted.shape != truth.shape:
-            raise ValueError(f"sizes differ: predicted {list(predicted.shape)}, truth {list(truth.shape)}")
+            raise InputError(f"sizes differ: predicted {list(predicted.shape)}, truth {list(truth.shape)}")
         self.frames += 1
         labelled = truth > 0
         true_ids, t = _compact(truth[labelled])
@@ -145,10 +147,10 @@ class SegmentationCounts:
                 the true ids.
 
         Raises:
-            ValueError: none of these.
+            InputError: none of these.
         """
         if matching not in ("same", "assignment", "auto"):
-            raise ValueError(f"matching: expected same, assignment or auto, found {matching!r}")
+            raise InputError(f"matching: expected same, assignment or auto, found {matching!r}")
         table = self._table()
         same = Matching("same", {i: i for i in map(int, np.intersect1d(table.true_ids, table.predicted_ids))})
         if matching == "same":

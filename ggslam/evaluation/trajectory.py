@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import FormatError
+from ggslam.errors import FormatError, InputError
 from ggslam.formats.trajectory import read_trajectory
 from ggslam.scene.poses import fit_similarity, inverse
 
@@ -63,7 +63,7 @@ def align_points(source: np.ndarray, target: np.ndarray, with_scale: bool = Fals
         (T_target_source [4, 4] rigid, scale s): target ~ R (s source) + t.
     """
     if source.shape != target.shape or source.ndim != 2 or len(source) < FEWEST_POSES:
-        raise ValueError(f"expected two sets of at least {FEWEST_POSES} points, found {source.shape}, {target.shape}")
+        raise InputError(f"expected two sets of at least {FEWEST_POSES} points, found {source.shape}, {target.shape}")
     T, scale = fit_similarity(source, target, with_scale)
     return T, float(scale)
 
@@ -81,14 +81,14 @@ def score_trajectory(
         rpe_delta: distance of the frames between which motion is compared.
 
     Returns:
-        The scores; None if fewer than 3 frames are known in both.
+        The scores; None if fewer than 3 frames are known (given and finite) in both, also of empty trajectories.
 
     Raises:
-        ValueError: different lengths, or rpe_delta < 1.
+        InputError: different lengths, poses of another shape, or rpe_delta < 1.
     """
     P, Q = _stack(estimated), _stack(truth)
     if len(P) != len(Q) or rpe_delta < 1:
-        raise ValueError(f"{len(P)} estimated and {len(Q)} true poses, rpe_delta {rpe_delta}")
+        raise InputError(f"{len(P)} estimated and {len(Q)} true poses, rpe_delta {rpe_delta}")
     known = np.isfinite(P).all((1, 2)) & np.isfinite(Q).all((1, 2))
     if known.sum() < FEWEST_POSES:
         return None
@@ -166,8 +166,14 @@ def associate(times: np.ndarray, other_times: np.ndarray, max_difference_s: floa
 
 def _stack(poses: np.ndarray | Sequence[np.ndarray | None]) -> np.ndarray:
     """[N, 4, 4] float64 with NaN for None."""
-    unknown = np.full((4, 4), np.nan)
-    return np.array([unknown if T is None else T for T in poses], np.float64).reshape(-1, 4, 4)
+    stacked = np.full((len(poses), 4, 4), np.nan)
+    for i, T in enumerate(poses):
+        if T is None:
+            continue
+        if np.shape(T) != (4, 4):
+            raise InputError(f"pose {i}: expected a 4x4 matrix, found shape {list(np.shape(T))}")
+        stacked[i] = T
+    return stacked
 
 
 def _distances(T: np.ndarray, P: np.ndarray, Q: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ggslam.errors import FormatError
+from ggslam.errors import FormatError, InputError
 from ggslam.formats.ply import read_ply, write_ply_parts
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -41,7 +41,7 @@ def write_gaussian_ply(
         comments: single ASCII lines for the header.
 
     Raises:
-        ValueError: an unknown extra.
+        InputError: an unknown extra.
         FormatError: an object id above 2^24.
         RunFolderError: the file cannot be written.
     """
@@ -61,13 +61,13 @@ def write_gaussian_parts(
         like: a map with the channels of the parts, empty perhaps.
 
     Raises:
-        ValueError: an unknown extra, or another number of Gaussians than `count`.
+        InputError: an unknown extra, or another number of Gaussians than `count`.
         FormatError: an object id above 2^24.
         RunFolderError: the file cannot be written.
     """
     unknown = set(extra) - set(EXTRAS)
     if unknown:
-        raise ValueError(f"unknown extra properties {sorted(unknown)}, expected some of {EXTRAS}")
+        raise InputError(f"unknown extra properties {sorted(unknown)}, expected some of {EXTRAS}")
     empty = GaussianMap(like.sh_degree, like.features.shape[1], with_moments=False)
     rows = (_vertices(path, part, extra) for part in parts)
     write_ply_parts(path, "vertex", count, rows, _vertices(path, empty, extra).dtype, comments)

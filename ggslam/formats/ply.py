@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ggslam.errors import FormatError
+from ggslam.errors import FormatError, InputError
 from ggslam.formats.ply_header import FORMATS, PLY_NAMES, SIZED_NAMES, Element, Header, read_header
 from ggslam.formats.text_numbers import fit, parse_numbers
 from ggslam.system.atomic import atomic_write
@@ -103,13 +103,13 @@ def write_ply_parts(
             file.write(_pack(rows).tobytes())
             written += len(rows)
         if written != count:
-            raise ValueError(f"{path}: {written} rows were given, {count} were announced")
+            raise InputError(f"{path}: {written} rows were given, {count} were announced")
 
 
 def _header(elements: Mapping[str, tuple[int, np.dtype]], comments: Sequence[str], sized_names: bool) -> bytes:
     for text in comments:
         if not text.isascii() or not text.isprintable():
-            raise ValueError(f"a PLY comment must be one line of ASCII, found {text!r}")
+            raise InputError(f"a PLY comment must be one line of ASCII, found {text!r}")
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
     types = SIZED_NAMES if sized_names else PLY_NAMES
     for name, (count, dtype) in elements.items():
@@ -119,19 +119,19 @@ def _header(elements: Mapping[str, tuple[int, np.dtype]], comments: Sequence[str
 
 def _checked_name(name: str) -> str:
     if not name.isascii() or not name.isprintable() or len(name.split()) != 1:
-        raise ValueError(f"a PLY name must be one ASCII word, found {name!r}")
+        raise InputError(f"a PLY name must be one ASCII word, found {name!r}")
     return name
 
 
 def _declarations(dtype: np.dtype, names: Mapping[str, str]) -> Iterator[str]:
     """Property lines of a structured type, whose types have these names."""
     if not dtype.names:
-        raise ValueError(f"a PLY element needs a structured array, found {dtype}")
+        raise InputError(f"a PLY element needs a structured array, found {dtype}")
     for name in dtype.names:
         base, shape = dtype[name].base, dtype[name].shape
         code = base.str[1:]
         if code not in names or len(shape) > 1 or (shape and shape[0] > 255):
-            raise ValueError(f"PLY has no type for field '{name}' ({dtype[name]})")
+            raise InputError(f"PLY has no type for field '{name}' ({dtype[name]})")
         listed = "list uchar " if shape else ""
         yield f"property {listed}{names[code]} {_checked_name(name)}"
 

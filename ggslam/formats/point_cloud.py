@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import FormatError
+from ggslam.errors import FormatError, InputError
 from ggslam.formats.gaussian_ply import object_ids
 from ggslam.formats.pcd import read_pcd, write_pcd
 from ggslam.formats.ply import read_ply, write_ply
@@ -28,6 +28,7 @@ _GAUSSIAN_COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
 _PACKED_COLORS = ("rgb", "rgba")
 _REFLECTANCE = ("reflectance", "refc", "intensity", "scalar_intensity")
 _ALPHA = {"alpha", "a", "diffuse_alpha"}
+_WRITTEN_SUFFIXES = ("", ".ply", ".pcd")
 _WRITTEN_INTEGERS = ("u1", "i2", "u2", "i4", "u4")
 
 
@@ -102,9 +103,13 @@ def write_point_cloud(
         comments: single ASCII lines for the header (PLY only).
 
     Raises:
-        FormatError: an attribute holds integers of more than 32 bits.
+        FormatError: an attribute holds integers of more than 32 bits, or the name ends as that of another format.
+        InputError: points or an attribute of another shape or type.
         RunFolderError: the file cannot be written.
     """
+    if Path(path).suffix.lower() not in _WRITTEN_SUFFIXES:
+        raise FormatError(f"{path}: expected a name that ends in .ply or .pcd")
+    _check_shapes(path, points, attributes)
     columns = {name: _to_written_type(path, "position", points[:, axis]) for axis, name in enumerate("xyz")}
     pcd = Path(path).suffix.lower() == ".pcd"
     for name, values in attributes.items():
@@ -122,6 +127,20 @@ def write_point_cloud(
     for name, values in columns.items():
         rows[name] = values
     write_ply(path, {"vertex": rows}, comments, sized_names=True)
+
+
+def _check_shapes(path: str | Path, points: np.ndarray, attributes: Mapping[str, np.ndarray]) -> None:
+    for name, values in {"points": points, **attributes}.items():
+        found = f"{values.dtype} {list(values.shape)}" if isinstance(values, np.ndarray) else type(values).__name__
+        if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiub":
+            raise InputError(f"{path}: {name}: expected an array of numbers, found {found}")
+        if name == "points" or name == "color":
+            fits = values.ndim == 2 and values.shape[1] == 3 and len(values) == len(points)
+        else:
+            fits = values.ndim in (1, 2) and len(values) == len(points)
+        if not fits:
+            shape = {"points": "[N, 3]", "color": f"[{len(points)}, 3]"}.get(name, f"[{len(points)}] or [.., k]")
+            raise InputError(f"{path}: {name}: expected {shape}, found {found}")
 
 
 def _to_written_type(path: str | Path, name: str, values: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.formats.surface_discs import SurfaceDiscs, disc_samples
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -73,10 +74,10 @@ def sample_points(
         with_object_id: whether the points carry the object ids.
 
     Raises:
-        ValueError: impossible settings, or a map that spans more than 2^21 voxels.
+        InputError: impossible settings, or a map that spans more than 2^21 voxels.
     """
     if not voxel_size > 0 or not 0 < minimum_opacity < 1:
-        raise ValueError(f"impossible voxel size {voxel_size} or minimum opacity {minimum_opacity}")
+        raise InputError(f"impossible voxel size {voxel_size} or minimum opacity {minimum_opacity}")
     discs = SurfaceDiscs.of(gaussians, minimum_opacity)
     merged = _add_samples(_Sums.empty(), gaussians, discs, voxel_size, with_object_id)
     return _cloud(merged, voxel_size, with_object_id)
@@ -215,7 +216,7 @@ def _add_samples(
     for position, weight, color, object_id in disc_samples(gaussians, discs, voxel_size, chunk):
         lattice = np.rint(position / voxel_size)
         if np.abs(lattice).max(initial=0) >= 1 << (_BITS - 1):
-            raise ValueError(f"the map spans more than 2^{_BITS} voxels of {voxel_size} m")
+            raise InputError(f"the map spans more than 2^{_BITS} voxels of {voxel_size} m")
         labels = object_id if with_object_id else np.zeros_like(object_id)
         part = _Sums.of([_Sums(_pack(lattice.astype(np.int64)), labels, weight, weight[:, None] * color)])
         pending.append(part)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import FormatError
+from ggslam.errors import FormatError, InputError
 from ggslam.scene.poses import is_valid_pose, matrix_to_quaternion, orthonormalize, quaternion_to_matrix
 from ggslam.system.atomic import write_text
 from ggslam.system.foreign import read_foreign_text
@@ -48,10 +48,14 @@ def write_tum(path: str | Path, timestamps: Sequence[float] | np.ndarray, T_worl
         The number of poses written.
 
     Raises:
+        InputError: poses of another shape, or of another number than the times.
         RunFolderError: the file cannot be written.
     """
+    poses = np.asarray(T_world_camera, float)
+    if poses.shape != (len(timestamps), 4, 4):
+        raise InputError(f"{path}: {len(timestamps)} times need poses [N, 4, 4], found shape {list(poses.shape)}")
     lines = [TUM_HEADER]
-    for time, T in zip(timestamps, np.asarray(T_world_camera, float).reshape(-1, 4, 4), strict=True):
+    for time, T in zip(timestamps, poses, strict=True):
         if not np.isfinite(T).all():
             continue
         w, x, y, z = matrix_to_quaternion(T[:3, :3])

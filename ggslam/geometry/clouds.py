@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ggslam.errors import InputError
 from ggslam.scene.poses import transform_points
 
 MOST_QUERIES = 500_000
@@ -26,15 +27,15 @@ class Cloud:
         points: [N, 3] metres, N > 0.
 
     Raises:
-        ValueError: no points, or one that is not finite.
+        InputError: no points, or one that is not finite.
     """
 
     def __init__(self, points: np.ndarray) -> None:
         points = np.asarray(points, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-            raise ValueError(f"expected points [N, 3], found an array of shape {points.shape}")
+            raise InputError(f"expected points [N, 3], found an array of shape {points.shape}")
         if not np.isfinite(points).all():
-            raise ValueError(f"point {int(np.argmin(np.isfinite(points).all(1)))} is not finite")
+            raise InputError(f"point {int(np.argmin(np.isfinite(points).all(1)))} is not finite")
         self.points = points
 
     def __len__(self) -> int:
@@ -84,7 +85,7 @@ def overlap(
         seed: of the sample of a source of more than `MOST_QUERIES` points.
 
     Raises:
-        ValueError: a cloud is empty or not finite, or the distance is not positive.
+        InputError: a cloud is empty or not finite, or the distance is not positive.
     """
     distance = check_distance(max_distance)
     apart, _ = nearest_points(as_cloud(source), as_cloud(target), T_target_source, seed, distance)
@@ -110,7 +111,7 @@ def as_cloud(points: Points) -> Cloud:
 
 
 def check_distance(distance: float) -> float:
-    """The distance, metres; raises ValueError unless it is positive and finite."""
+    """The distance, metres; raises InputError unless it is positive and finite."""
     if not 0 < distance < np.inf:
-        raise ValueError(f"expected a positive distance in metres, found {distance}")
+        raise InputError(f"expected a positive distance in metres, found {distance}")
     return float(distance)

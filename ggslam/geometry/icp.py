@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.geometry.clouds import Cloud, Overlap, Points, as_cloud, check_distance, overlap
 from ggslam.geometry.normals import estimate_normals
 from ggslam.scene.poses import orthonormalize, se3_exp, transform_points, turning_angle
@@ -60,7 +61,7 @@ def register(
         seed: of the draw.
 
     Raises:
-        ValueError: a cloud is empty or not finite, a distance is not positive, or fewer than 10 points have a partner
+        InputError: a cloud is empty or not finite, a distance is not positive, or fewer than 10 points have a partner
             at some iteration.
     """
     source, target = as_cloud(source), as_cloud(target)
@@ -109,7 +110,7 @@ def _step(moved: np.ndarray, target: Cloud, normals: _LazyNormals, distance: flo
     apart, nearest = target.tree.query(moved, distance_upper_bound=distance, workers=-1)
     pairs = np.isfinite(apart)
     if pairs.sum() < FEWEST_MATCHES:
-        raise ValueError(f"expected at least {FEWEST_MATCHES} points within {distance} m of the target, found "
+        raise InputError(f"expected at least {FEWEST_MATCHES} points within {distance} m of the target, found "
                          f"{int(pairs.sum())} of {len(moved)}")  # fmt: skip
     p, q, n = moved[pairs], target.points[nearest[pairs]], normals.of(nearest[pairs])
     J = np.concatenate([n, np.cross(p, n)], 1)

@@ -107,8 +107,11 @@ class ExposureSettings:
     """Whether all keyframes get an exposure of their own."""
     compensate: bool = setting(True, basic=True)
     """Whether keyframes that the camera saw with another exposure than the map get one of their own; on the CPU."""
-    change: float = setting(0.12, 0.01, 10)
-    """Change of the gains, as a natural logarithm, from which the exposure counts as another."""
+    change: float = setting(0.45, 0.01, 10)
+    """Mean change of the gains, as a natural logarithm, from which exposures are compensated, earlier ones too; cameras
+    that regulate themselves a little stay below."""
+    least: float = setting(0.1, 0.001, 10)
+    """Change of a gain, as a natural logarithm, from which a keyframe is then given an exposure of its own."""
     rate: float = setting(2e-3, 0, 1)
     """Learning rate of gains and offsets."""
     regularization: float = setting(1e-2, 0, 1e6)

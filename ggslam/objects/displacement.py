@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.objects.editing import Change
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.rendering.types import GaussianTensors
@@ -62,14 +63,14 @@ class Displacement:
         """What `to_json` gave.
 
         Raises:
-            ValueError: it is something else.
+            InputError: it is something else.
         """
         if not isinstance(values, dict):
-            raise ValueError(f"displaced: expected motions by object id, found {values!r:.60}")
+            raise InputError(f"displaced: expected motions by object id, found {values!r:.60}")
         motions = {int(i): None if T is None else np.array(T, float) for i, T in values.items()}
         wrong = [i for i, T in motions.items() if T is not None and (T.shape != (4, 4) or not np.isfinite(T).all())]
         if wrong:
-            raise ValueError(f"displaced: expected a 4x4 matrix of object {wrong[0]}")
+            raise InputError(f"displaced: expected a 4x4 matrix of object {wrong[0]}")
         return Displacement(motions)
 
     def _move(self, object_id: int, motion: np.ndarray, scene: SegmentedMap) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ggslam.errors import InputError
 from ggslam.scene.gaussian_map import GaussianMap
 
 
@@ -24,11 +25,11 @@ def objects_at(
         uint16 [n] object ids, 0 = no object.
 
     Raises:
-        ValueError: points of another shape, or that are not finite.
+        InputError: points of another shape, or that are not finite.
     """
     places = np.atleast_2d(np.asarray(points, np.float64))
     if places.ndim != 2 or places.shape[1] != 3 or not np.isfinite(places).all():
-        raise ValueError(f"points: expected finite numbers [n, 3], found shape {list(np.shape(points))}")
+        raise InputError(f"points: expected finite numbers [n, 3], found shape {list(np.shape(points))}")
     rows = np.flatnonzero(gaussians.opacities.detach().cpu().numpy() >= min_opacity)
     found = np.zeros(len(places), np.uint16)
     if not len(rows) or not len(places):

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pydantic
 
-from ggslam.errors import ConfigError, FormatError
+from ggslam.errors import ConfigError, FormatError, InputError
 from ggslam.objects.boxes import OrientedBox, Vector, middle_of, oriented_box
 from ggslam.objects.colors import id_palette
 from ggslam.scene.gaussian_map import GaussianMap
@@ -107,7 +107,7 @@ class ObjectTable:
             observations: of ids, where known.
 
         Raises:
-            ValueError: an object id outside 0 to 65535.
+            InputError: an object id outside 0 to 65535.
         """
         return ObjectTable.of_parts([gaussians], classifier, supervision, names, observations)
 
@@ -178,8 +178,10 @@ class ObjectTable:
         """Ids that a list like "mug,7" or "all" stands for, each once, in the order given.
 
         Raises:
-            ConfigError: no object is called so, or the list is empty.
+            ConfigError: no object is called so, or the list is empty, or it is no text.
         """
+        if not isinstance(text, str):
+            raise ConfigError(f'objects: expected names or ids as text like "mug,7", found {text!r}')
         wanted = text.strip().casefold()
         if wanted == "all":
             return self.ids()
@@ -262,7 +264,7 @@ def _gather(part: GaussianMap, classifier: IdentityClassifier, gathered: dict[in
     """Adds the labelled Gaussians of a part of a map to their objects; returns how many are not labelled."""
     ids = part.object_id.numpy()
     if len(ids) and not 0 <= ids.min() <= ids.max() < 1 << 16:
-        raise ValueError(f"object ids must be 0 to 65535, found {ids.min()} to {ids.max()}")
+        raise InputError(f"object ids must be 0 to 65535, found {ids.min()} to {ids.max()}")
     order = np.argsort(ids, kind="stable")
     present, starts = np.unique(ids[order], return_index=True)
     rows = dict(zip(present.tolist(), np.split(order, starts[1:]), strict=True)) if len(ids) else {}

@@ -17,6 +17,7 @@ from ggslam.rendering.gsplat_backend import render_gsplat
 from ggslam.rendering.reference import render_reference
 from ggslam.rendering.types import LOW_PASS, Gaussians, RenderBuffers, check_pose
 from ggslam.scene.camera import Camera
+from ggslam.scene.poses import is_valid_pose
 
 Backend = Callable[..., RenderBuffers]
 
@@ -117,5 +118,7 @@ def _camera_to_world(
     name = "T_camera_world" if T_world_camera is None else "T_world_camera"
     given = T_camera_world if T_world_camera is None else T_world_camera
     pose = given if isinstance(given, torch.Tensor) else torch.as_tensor(np.asarray(given, np.float64))
-    check_pose(pose.detach().cpu().numpy(), name)
+    matrix = check_pose(pose.detach().cpu().numpy(), name)
+    if not is_valid_pose(matrix):
+        raise RenderError(f"{name}: expected a rotation in the upper left, found {matrix[:3, :3].tolist()}")
     return rigid_inverse(pose) if T_world_camera is None else pose

@@ -30,9 +30,9 @@ def color_loss(image: torch.Tensor, target: torch.Tensor, dssim_weight: float = 
         dssim_weight: w, in [0, 1]; 0 leaves out SSIM, which is most of the work.
 
     Raises:
-        RenderError: the shapes differ.
+        RenderError: the shapes differ, or an image has no floating-point numbers.
     """
-    _check_shapes("color_loss", image, target)
+    _check_images("color_loss", image, target)
     loss = (image - target).abs().mean()
     if dssim_weight:
         loss = (1 - dssim_weight) * loss + dssim_weight * (1 - ssim_map(image, target).mean())
@@ -67,9 +67,9 @@ def depth_loss(depth: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         target: measured depth [H, W], metres; 0, negative, infinite or NaN: none.
 
     Raises:
-        RenderError: the shapes differ.
+        RenderError: the shapes differ, or an image has no floating-point numbers.
     """
-    _check_shapes("depth_loss", depth, target)
+    _check_images("depth_loss", depth, target)
     valid = torch.isfinite(target) & (target > 0)
     error = (depth - torch.where(valid, target, torch.zeros_like(target))).abs()
     return torch.where(valid, error, torch.zeros_like(error)).sum() / valid.sum().clamp(min=1)
@@ -123,6 +123,11 @@ def _log_softmax(logits: torch.Tensor) -> torch.Tensor:
     return torch.log_softmax(torch.cat([logits, nothing], -1), -1)
 
 
-def _check_shapes(name: str, one: torch.Tensor, other: torch.Tensor) -> None:
+def _check_images(name: str, one: torch.Tensor, other: torch.Tensor) -> None:
+    for image in (one, other):
+        if not isinstance(image, torch.Tensor) or not image.is_floating_point():
+            found = str(image.dtype) if isinstance(image, torch.Tensor) else type(image).__name__
+            hint = "; divide it by 255" if name == "color_loss" and found == "torch.uint8" else ""
+            raise RenderError(f"{name}: expected tensors of floating-point numbers, found {found}{hint}")
     if one.shape != other.shape:
         raise RenderError(f"{name}: expected two images of one shape, found {list(one.shape)} and {list(other.shape)}")

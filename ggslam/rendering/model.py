@@ -15,6 +15,8 @@ from ggslam.rendering.types import PARAMETERS, Gaussians, GaussianTensors, check
 from ggslam.scene.gaussian_map import GaussianMap, rgb_to_sh
 
 _LABELS = ("birth_keyframe", "object_id")
+_COLOR_SLACK = 1e-3
+"""By which rounding may bring a colour out of 0 to 1."""
 _SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 DEFAULT_RATES: Mapping[str, float] = {
     "means": 6e-4, "quaternions": 4e-3, "log_scales": 1e-2, "opacity_logits": 5e-2, "sh": 1.8e-2, "features": 1e-2,
@@ -80,13 +82,13 @@ class GaussianModel(torch.nn.Module):
             points: [N, 3] metres.
             colors: [N, 3] RGB: uint8, or floats in [0, 1].
             scales: standard deviation in metres, one for all or [N]; None: half the mean distance of the three nearest
-                points.
+                points (of points that others lie on: of the nearest elsewhere).
             opacity: of every Gaussian, in (0, 1).
             sh_degree: of the colours, 0 to 3.
             feature_channels: F, all zero at first.
 
         Raises:
-            RenderError: shapes that do not fit, no points, or values out of range.
+            RenderError: shapes that do not fit, no points, or values that are not finite or out of range.
         """
         means = torch.as_tensor(np.asarray(points, np.float32)).clone()
         rgb = torch.as_tensor(np.asarray(colors))
@@ -94,6 +96,13 @@ class GaussianModel(torch.nn.Module):
         count = len(means)
         if means.ndim != 2 or means.shape[1] != 3 or rgb.shape != means.shape or not count:
             raise RenderError(f"from_points: expected points and colors [N, 3], found {means.shape} and {rgb.shape}")
+        if not np.isfinite(means.numpy()).all():
+            raise RenderError(f"from_points: point {int((~torch.isfinite(means)).any(1).int().argmax())} is not finite")
+        if not (rgb >= -_COLOR_SLACK).all() or not (rgb <= 1 + _COLOR_SLACK).all():
+            low, high = float(rgb.min()), float(rgb.max())
+            raise RenderError(
+                f"from_points: colors reach from {low:g} to {high:g}, expected uint8, or floating-point numbers 0 to 1"
+            )
         if not 0 < opacity < 1 or not 0 <= sh_degree <= 3 or feature_channels < 0:
             raise RenderError("from_points: expected opacity in (0, 1), sh_degree 0 to 3, feature_channels from 0")
         if scales is None:
@@ -101,7 +110,7 @@ class GaussianModel(torch.nn.Module):
         else:
             spread = np.broadcast_to(np.asarray(scales, np.float32), count)
         if not (spread > 0).all():
-            raise RenderError("from_points: expected scales above 0 (are there points twice?)")
+            raise RenderError("from_points: expected scales above 0")
         sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
         sh[:, 0] = rgb_to_sh(rgb)
         logit = float(np.log(opacity / (1 - opacity)))
@@ -173,9 +182,15 @@ class GaussianModel(torch.nn.Module):
 
 
 def _neighbour_distance(points: np.ndarray) -> np.ndarray:
-    """Half the mean distance of each point [N, 3] to the three nearest others, as in 3D Gaussian Splatting."""
+    """Half the mean distance of each point [N, 3] to the three nearest others, as in 3D Gaussian Splatting; where all
+    of these are at the same place, to the three nearest places elsewhere."""
     neighbours = min(3, len(points) - 1)
     if not neighbours:
         return np.full(len(points), 0.01, np.float32)
     distances, _ = cKDTree(points).query(points, neighbours + 1)
-    return (0.5 * distances[:, 1:].mean(1)).astype(np.float32)
+    spread = (0.5 * distances[:, 1:].mean(1)).astype(np.float32)
+    if (spread > 0).all():
+        return spread
+    places, place = np.unique(points, axis=0, return_inverse=True)
+    elsewhere = _neighbour_distance(places)[place.reshape(-1)]
+    return np.where(spread > 0, spread, elsewhere)

@@ -9,6 +9,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from ggslam.errors import InputError
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -32,9 +34,10 @@ class Camera:
     cy: float
 
     def __post_init__(self) -> None:
+        """Raises InputError for a size below 1, a focal length that is not positive, or numbers that are not finite."""
         numbers = (self.fx, self.fy, self.cx, self.cy)
         if self.width < 1 or self.height < 1 or not all(map(math.isfinite, numbers)) or self.fx <= 0 or self.fy <= 0:
-            raise ValueError(f"impossible camera: {self}")
+            raise InputError(f"impossible camera: {self}")
 
     def resize(self, width: int, height: int) -> Camera:
         """The camera of the same view with its image resampled to `width` x `height` pixels."""

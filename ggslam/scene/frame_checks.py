@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ggslam.errors import SequenceError
@@ -10,13 +12,25 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 
 FARTHEST_SCENE_M = 100.0
-"""No depth camera sees farther; a room in millimetres has numbers above it."""
+"""No depth camera sees farther; a room in millimetres or centimetres has numbers above it."""
 
 
-def in_millimetres(depth: np.ndarray) -> bool:
-    """Whether a depth image [H, W] that should be in metres can only be in millimetres; looks at every eighth pixel
-    and row."""
-    return _median(depth) > FARTHEST_SCENE_M
+_FARTHEST_SCENE_CM = 1000.0
+"""Larger numbers are hardly centimetres: no camera for rooms sees 10 m in half of its pixels."""
+
+
+def wrong_unit(depth: np.ndarray) -> str:
+    """What to say of a depth image [H, W] that cannot be in metres; empty if it can. Looks at every eighth pixel and
+    row."""
+    median = _median(depth)
+    if median <= FARTHEST_SCENE_M:
+        return ""
+    if median <= _FARTHEST_SCENE_CM:
+        return (
+            f"depth looks like millimetres or centimetres (median {median:.0f}), expected metres: divide millimetres "
+            "by 1000, centimetres by 100"
+        )
+    return f"depth looks like millimetres (median {median:.0f}), expected metres: divide it by 1000"
 
 
 def _median(depth: np.ndarray) -> float:
@@ -27,7 +41,11 @@ def _median(depth: np.ndarray) -> float:
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:
-    """Raises SequenceError unless the frame's images have the camera's size and the types that `Frame` promises."""
+    """Raises SequenceError unless the frame is of the camera and what `Frame` promises: images of its size, of the
+    right types and in metres; a finite time; and no pose or a finite one [4, 4]."""
+    if not isinstance(frame.color, np.ndarray) or not isinstance(frame.depth, np.ndarray):
+        name, image = ("depth", frame.depth) if isinstance(frame.color, np.ndarray) else ("colour", frame.color)
+        raise SequenceError(f"frame {frame.source_index}: {name} is {type(image).__name__}, expected a numpy array")
     size = (camera.height, camera.width)
     for name, image, shape, kind in (("colour", frame.color, (*size, 3), "u1"), ("depth", frame.depth, size, "f4")):
         if image.shape[:2] != size:
@@ -39,10 +57,17 @@ def check_frame(frame: Frame, camera: Camera) -> None:
             raise SequenceError(
                 f"frame {frame.source_index}: {name} is {found}, expected {np.dtype(kind)} {list(shape)}"
             )
-    if in_millimetres(frame.depth):
-        raise SequenceError(
-            f"frame {frame.source_index}: depth looks like millimetres (median {_median(frame.depth):.0f}), expected "
-            "metres: divide it by 1000"
-        )
+    if frame.camera is not camera and frame.camera != camera:
+        raise SequenceError(f"frame {frame.source_index}: it is of {frame.camera}, expected {camera}")
+    if unit := wrong_unit(frame.depth):
+        raise SequenceError(f"frame {frame.source_index}: {unit}")
     if not (frame.depth >= 0).all() or not np.isfinite(frame.depth).all():
         raise SequenceError(f"frame {frame.source_index}: depth has negative, infinite or NaN values; 0 means none")
+    if not math.isfinite(frame.timestamp):
+        raise SequenceError(f"frame {frame.source_index}: its time is {frame.timestamp}, expected seconds")
+    T = frame.T_world_camera
+    if T is not None and (np.shape(T) != (4, 4) or not np.isfinite(T).all()):
+        found = "numbers that are not finite" if np.shape(T) == (4, 4) else f"shape {list(np.shape(T))}"
+        raise SequenceError(
+            f"frame {frame.source_index}: T_world_camera has {found}, expected a finite 4x4 matrix or None"
+        )

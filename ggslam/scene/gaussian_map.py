@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 
 import torch
 
+from ggslam.errors import InputError
+
 SH_C0 = 0.28209479177387814
 """Zeroth spherical-harmonic constant: colour = 0.5 + SH_C0 * sh[0] for degree 0."""
 
@@ -68,7 +70,7 @@ class GaussianMap:
 
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
+            raise InputError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
         self._storage: dict[str, torch.Tensor] = {}
         self._views: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
         self._allocate(0)
@@ -187,14 +189,14 @@ class GaussianMap:
         """Adds rows that `take` of a map with the same channels gave, bit for bit; returns where they are now.
 
         Raises:
-            ValueError: an array is missing or has another shape or type.
+            InputError: an array is missing or has another shape or type.
         """
         added = len(rows["means"]) if "means" in rows else 0
         for name, array in self._arrays(0).items():
             found = rows.get(name)
             if found is None or found.dtype != array.dtype or found.shape != (added, *array.shape[1:]):
                 shape = "nothing" if found is None else f"{found.dtype} {list(found.shape)}"
-                raise ValueError(f"rows of Gaussians: {name}: expected {array.dtype} of {added} rows, found {shape}")
+                raise InputError(f"rows of Gaussians: {name}: expected {array.dtype} of {added} rows, found {shape}")
         self.reserve(self.count + added)
         place = slice(self.count, self.count + added)
         for name, array in self._arrays(place.stop).items():

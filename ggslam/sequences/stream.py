@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Generic, TypeVar
 
+from ggslam.errors import InputError
+
 Item = TypeVar("Item")
 
 
@@ -71,7 +73,7 @@ class ReadAhead(Iterator[Item]):
 
     def __init__(self, read: Callable[[int], Item], count: int, prefetch: int) -> None:
         if prefetch < 1:
-            raise ValueError(f"prefetch must be at least 1, found {prefetch}")
+            raise InputError(f"prefetch must be at least 1, found {prefetch}")
         self._buffer: _Buffer[Item] = _Buffer(prefetch)
         # The thread gets the buffer, not this object: only then can this object be collected while the thread waits.
         self._thread = threading.Thread(

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, InputError
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.camera import Camera
@@ -56,6 +56,7 @@ class Slam:
             `mapping.extra_loss.ExtraLoss`; on the CPU only.
 
     Raises:
+        InputError: a camera, settings or an extra loss that are none.
         ConfigError: a limit of memory that is less than the program itself takes; no such device; an extra loss on a
             GPU.
     """
@@ -64,6 +65,7 @@ class Slam:
         self, camera: Camera, config: Config | None = None, has_masks: bool | None = None, paging: Path | None = None,
         library: CudaLibrary | None = None, extra_loss: ExtraLoss | None = None,
     ) -> None:  # fmt: skip
+        _check_arguments(camera, config, extra_loss)
         self.camera = camera
         self.config = config or Config()
         parts = make_parts(camera, self.config, has_masks, paging, library)
@@ -116,7 +118,7 @@ class Slam:
         """Track, maybe insert a keyframe, train.
 
         Raises:
-            SequenceError: the frame's images do not fit the camera.
+            SequenceError: the frame is of another camera, or not what `Frame` says.
         """
         start = time.perf_counter()
         self.times.start()
@@ -215,7 +217,7 @@ class Slam:
         """Locates one frame against the current target; a lost one is looked up among all keyframes.
 
         Raises:
-            SequenceError: images of another size than the camera's, or of another type than `Frame` says.
+            SequenceError: the frame is of another camera, or not what `Frame` says.
         """
         check_frame(frame, self.camera)
         start = time.perf_counter()
@@ -293,3 +295,15 @@ class Slam:
                 self._corrections.apply(correction, self.loops)
         if self.pager is not None:
             self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
+
+
+def _check_arguments(camera: object, config: object, extra_loss: object) -> None:
+    """Raises InputError unless they are a camera, settings and a function."""
+    if not isinstance(camera, Camera):
+        hint = "; its `camera` is one" if isinstance(getattr(camera, "camera", None), Camera) else ""
+        raise InputError(f"Slam: camera: expected a Camera, found {type(camera).__name__}{hint}")
+    if config is not None and not isinstance(config, Config):
+        hint = "; Config(**values) makes one of a dict" if isinstance(config, dict) else ""
+        raise InputError(f"Slam: config: expected a Config, found {type(config).__name__}{hint}")
+    if extra_loss is not None and not callable(extra_loss):
+        raise InputError(f"Slam: extra_loss: expected a function, found {extra_loss!r}")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.native.loader import load_library
 from ggslam.volumes.occupancy import OccupancyMap
 
@@ -34,10 +35,10 @@ def agreement(reference: OccupancyMap, other: OccupancyMap) -> Agreement:
     """Compares two maps of one resolution, usually the unquantised update (`quantize=False`) with the quantised one.
 
     Raises:
-        ValueError: the maps have different resolutions.
+        InputError: the maps have different resolutions.
     """
     if reference.resolution != other.resolution:
-        raise ValueError(f"maps of one resolution expected, found {reference.resolution} and {other.resolution} m")
+        raise InputError(f"maps of one resolution expected, found {reference.resolution} and {other.resolution} m")
     counts = (ctypes.c_uint64 * 9)()
     load_library().ggslam_occupancy_compare(
         reference.handle, other.handle, reference.settings.threshold, other.settings.threshold, counts

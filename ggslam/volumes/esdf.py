@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, InputError
 from ggslam.interface.core.volumes import FieldStats
 from ggslam.native.loader import load_library
 from ggslam.system.settings import setting, settings_class
@@ -142,7 +142,7 @@ class DistanceField:
         """
         where = np.ascontiguousarray(points, np.float64)
         if where.ndim != 2 or where.shape[1] != 3:
-            raise ValueError(f"expected points [N, 3], found an array of shape {where.shape}")
+            raise InputError(f"expected points [N, 3], found an array of shape {where.shape}")
         n = len(where)
         distance, gradient, known = np.empty(n, np.float32), np.empty((n, 3), np.float32), np.empty(n, np.uint8)
         arrays = (a.ctypes.data for a in (where, distance, gradient, known))
@@ -154,10 +154,10 @@ class DistanceField:
         known and in front of surfaces: bool [N]. It may contain unknown voxels.
 
         Raises:
-            ValueError: a radius of `max_distance` or more, for which the field cannot tell.
+            InputError: a radius of `max_distance` or more, for which the field cannot tell.
         """
         if not 0 <= radius < self.settings.max_distance:
-            raise ValueError(f"radius: expected 0 to below {self.settings.max_distance:g}, found {radius:g}")
+            raise InputError(f"radius: expected 0 to below {self.settings.max_distance:g}, found {radius:g}")
         values = self.query(points)
         return values.known & (values.distance > radius)
 

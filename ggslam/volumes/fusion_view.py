@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.interface.core.volumes import FusionInput
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
@@ -36,7 +37,7 @@ class FusionView:
         """Checks them; positions must be within `limit` metres of the origin.
 
         Raises:
-            ValueError: naming what was expected and what was found.
+            InputError: naming what was expected and what was found.
         """
         size = (camera.height, camera.width)
         self.camera = camera
@@ -45,12 +46,12 @@ class FusionView:
         self.labels = None if labels is None else _image("labels", labels, np.uint16, size)
         T = np.asarray(T_world_camera, float)
         if T.shape != (4, 4) or not np.isfinite(T).all():
-            raise ValueError(f"T_world_camera: expected a finite matrix [4, 4], found {T_world_camera}")
+            raise InputError(f"T_world_camera: expected a finite matrix [4, 4], found {T_world_camera}")
         R = T[:3, :3]
         if np.abs(R.T @ R - np.eye(3)).max() > _RIGID or np.linalg.det(R) < 0:
-            raise ValueError(f"T_world_camera: expected a rotation in the upper left, found {R.tolist()}")
+            raise InputError(f"T_world_camera: expected a rotation in the upper left, found {R.tolist()}")
         if np.abs(T[:3, 3]).max() > limit:
-            raise ValueError(f"T_world_camera: expected a position within {limit:g} m, found {T[:3, 3].tolist()}")
+            raise InputError(f"T_world_camera: expected a position within {limit:g} m, found {T[:3, 3].tolist()}")
         self.T_camera_world = inverse(T)
 
     def structure(self) -> FusionInput:
@@ -66,7 +67,7 @@ def _image(name: str, values: np.ndarray, dtype: type, shape: tuple[int, ...]) -
     array = np.asarray(values)
     integers = np.issubdtype(dtype, np.integer)
     if array.shape != shape or (array.dtype != dtype if integers else array.dtype.kind != "f"):
-        raise ValueError(
+        raise InputError(
             f"{name}: expected {np.dtype(dtype).name} {list(shape)}, found {array.dtype} {list(array.shape)}"
         )
     return np.ascontiguousarray(array, dtype)

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, InputError
 from ggslam.interface.core import volumes
 from ggslam.interface.core.volumes import DepthImage, InsertResult, InsertSettings
 from ggslam.native.loader import NativeContext, load_library
@@ -123,7 +123,7 @@ class OccupancyMap:
             max_range: metres; rays to farther points end there, without a hit.
 
         Raises:
-            ValueError: points of another shape.
+            InputError: points of another shape.
             ConfigError: the origin lies outside the grid.
         """
         points = contiguous_points(points)
@@ -154,12 +154,12 @@ class OccupancyMap:
             min_depth, max_depth: pixels outside are left out, metres.
 
         Raises:
-            ValueError: the image is not of the camera's size.
+            InputError: the image is not of the camera's size.
             ConfigError: the camera stands outside the grid.
         """
         depth = np.ascontiguousarray(depth, np.float32)
         if depth.shape != (camera.height, camera.width):
-            raise ValueError(f"depth: expected shape {[camera.height, camera.width]}, found {list(depth.shape)}")
+            raise InputError(f"depth: expected shape {[camera.height, camera.width]}, found {list(depth.shape)}")
         T = np.asarray(T_world_camera, np.float64)
         image = DepthImage(
             depth.ctypes.data, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,

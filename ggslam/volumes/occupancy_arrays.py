@@ -7,6 +7,7 @@ import ctypes
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.native.loader import load_library
 
 LEAF = np.dtype([("centre", np.float32, 3), ("size", np.float32), ("log_odds", np.float32)])
@@ -21,9 +22,9 @@ def contiguous_points(points: np.ndarray) -> np.ndarray:
     """Points as float32 [N, 3], C order.
 
     Raises:
-        ValueError: another shape.
+        InputError: another shape.
     """
     points = np.ascontiguousarray(points, np.float32)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: expected shape [N, 3], found {list(points.shape)}")
+        raise InputError(f"points: expected shape [N, 3], found {list(points.shape)}")
     return points

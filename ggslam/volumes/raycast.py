@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.interface.core.volumes import RaycastView, SurfaceImages
 from ggslam.native.loader import load_library
 from ggslam.scene.camera import Camera
@@ -50,13 +51,13 @@ def render_depth(
         min_weight: voxels of less weight (in measurements from 1 m), or never seen, count as unknown.
 
     Raises:
-        ValueError: a range that is none, or a pose that is not finite.
+        InputError: a range that is none, or a pose that is not finite.
     """
     if not 0 < near < far:
-        raise ValueError(f"expected 0 < near < far, found near {near} and far {far}")
+        raise InputError(f"expected 0 < near < far, found near {near} and far {far}")
     pose = np.asarray(T_world_camera, np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise ValueError(f"expected a finite pose [4, 4], found {pose.tolist()}")
+        raise InputError(f"expected a finite pose [4, 4], found {pose.tolist()}")
     shape = (camera.height, camera.width)
     images = RenderedSurface(
         np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.uint8),

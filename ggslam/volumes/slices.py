@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.system.atomic import write_bytes, write_text
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.tsdf import SIDE
@@ -105,13 +106,13 @@ def slice_field(
         band: lowest and highest offset along the plane's normal, metres; None: the plane alone.
 
     Raises:
-        ValueError: a resolution or band that is not positive, or more than 50 million cells.
+        InputError: a resolution or band that is not positive, or more than 50 million cells.
     """
     if not resolution > 0 or (band is not None and not band[0] <= band[1]):
-        raise ValueError(f"expected a positive resolution and an ascending band, found {resolution} and {band}")
+        raise InputError(f"expected a positive resolution and an ascending band, found {resolution} and {band}")
     width, height = (max(1, int(np.ceil((plane.high[a] - plane.low[a]) / resolution - 1e-6))) for a in (0, 1))
     if width * height > _MOST_CELLS:
-        raise ValueError(f"resolution: {width} x {height} cells are more than {_MOST_CELLS}")
+        raise InputError(f"resolution: {width} x {height} cells are more than {_MOST_CELLS}")
     x = plane.low[0] + (np.arange(width) + 0.5) * resolution
     y = plane.low[1] + (np.arange(height) + 0.5) * resolution
     centres = (plane.origin + y[::-1, None, None] * plane.y_axis + x[None, :, None] * plane.x_axis).reshape(-1, 3)

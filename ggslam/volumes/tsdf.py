@@ -12,9 +12,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.interface.core.volumes import FusionSettings, FusionStats, VoxelArrays
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
+from ggslam.scene.frame_checks import wrong_unit
 from ggslam.volumes.fusion_view import FusionView
 from ggslam.volumes.settings import TsdfSettings
 
@@ -165,7 +167,8 @@ class TsdfMap:
             labels: uint16 [H, W], 0: none.
 
         Raises:
-            ValueError: an image of another size or kind than the camera's, or a pose that is not finite and rigid.
+            InputError: an image of another size or kind than the camera's, a pose that is not finite and rigid, or
+                depth that cannot be in metres.
         """
         view = FusionView(depth, camera, T_world_camera, color, labels, limit=MOST_VOXELS * self.settings.voxel)
         s, stats = self.settings, FusionStats()
@@ -175,6 +178,8 @@ class TsdfMap:
         self._library.ggslam_tsdf_integrate(
             self.handle, self.context.handle, ctypes.byref(view.structure()), ctypes.byref(numbers), ctypes.byref(stats)
         )
+        if not stats.blocks and (unit := wrong_unit(view.depth)):  # looked at only where nothing came of it
+            raise InputError(unit)
         return IntegrationStats(*(getattr(stats, field.name) for field in fields(IntegrationStats)))
 
     def decay(self, spare_in_view: bool = False) -> int:
@@ -224,17 +229,17 @@ class TsdfMap:
             voxels: `value`, `weight`, `color`, `label`, `votes` as in `BlockVoxels`; what is not given stays.
 
         Raises:
-            ValueError: an array of another name or shape.
+            InputError: an array of another name or shape.
         """
         at = _coordinates(coordinates)
         arrays = {}
         for name, array in voxels.items():
             if name not in _DTYPES:
-                raise ValueError(f"expected some of {', '.join(_DTYPES)}, found {name!r}")
+                raise InputError(f"expected some of {', '.join(_DTYPES)}, found {name!r}")
             arrays[name] = np.ascontiguousarray(array, _DTYPES[name])
             expected = (len(at), VOXELS) + ((3,) if name == "color" else ())
             if arrays[name].shape != expected:
-                raise ValueError(f"{name}: expected shape {expected}, found {arrays[name].shape}")
+                raise InputError(f"{name}: expected shape {expected}, found {arrays[name].shape}")
         pointers = VoxelArrays(**{name: array.ctypes.data for name, array in arrays.items()})
         self._library.ggslam_tsdf_write(self.handle, len(at), at.ctypes.data, ctypes.byref(pointers))
 
@@ -242,7 +247,7 @@ class TsdfMap:
         """Makes the blocks at coordinates [n, 3] free throughout, with weights uint16 [n] of 65535."""
         at, weights = _coordinates(coordinates), np.ascontiguousarray(weight, np.uint16)
         if weights.shape != (len(at),):
-            raise ValueError(f"weight: expected shape {(len(at),)}, found {weights.shape}")
+            raise InputError(f"weight: expected shape {(len(at),)}, found {weights.shape}")
         self._library.ggslam_tsdf_write_free(self.handle, len(at), at.ctypes.data, weights.ctypes.data)
 
     def erase(self, coordinates: np.ndarray) -> None:
@@ -262,5 +267,5 @@ class TsdfMap:
 def _coordinates(values: np.ndarray) -> np.ndarray:
     at = np.ascontiguousarray(values, np.int32)
     if at.ndim != 2 or at.shape[1] != 3:
-        raise ValueError(f"expected block coordinates [n, 3], found an array of shape {at.shape}")
+        raise InputError(f"expected block coordinates [n, 3], found an array of shape {at.shape}")
     return at

@@ -186,12 +186,17 @@ def scores_of_the_room(room: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.mark.long("runs a recording and scores it")
-@pytest.mark.parametrize("gain", [lambda k: 0.4 if k >= 12 else 1.0, lambda k: 1 - 0.6 * k / 23], ids=["jump", "drift"])
+@pytest.mark.parametrize(
+    ("gain", "more"),
+    [(lambda k: 0.4 if k >= 12 else 1.0, []), (lambda k: 1 - 0.6 * k / 23, ["mapping.exposure.change=0.12"])],
+    ids=["jump", "drift"],
+)
 def test_changes_of_exposure_are_compensated(
-    room: Path, scores_of_the_room: ImageScoresRecord, tmp_path: Path, gain: Callable[[int], float]
-) -> None:
+    room: Path, scores_of_the_room: ImageScoresRecord, tmp_path: Path, gain: Callable[[int], float],
+    more: list[str],
+) -> None:  # fmt: skip
     recording = dimmed(room, tmp_path / "recording", gain)
-    outcome = execute(RunRequest(SequenceRequest(recording), out=tmp_path / "run", overrides=STEPS))
+    outcome = execute(RunRequest(SequenceRequest(recording), out=tmp_path / "run", overrides=[*STEPS, *more]))
     assert [verdict.code for verdict in outcome.verdicts] == ["exposure"]
     assert outcome.metrics is not None and outcome.metrics.images.all is not None
     dim, well = outcome.metrics.images.all, scores_of_the_room

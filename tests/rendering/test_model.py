@@ -154,7 +154,7 @@ def test_from_points() -> None:
     with pytest.raises(RenderError, match="points and colors"):
         GaussianModel.from_points(points, colors[:5])
     with pytest.raises(RenderError, match="scales above 0"):
-        GaussianModel.from_points(np.zeros((9, 3)), colors[:9])
+        GaussianModel.from_points(points, colors, scales=0.0)
 
 
 def test_unknown_learning_rate() -> None:

@@ -85,20 +85,20 @@ class EditOutcome:
 
 
 def edit_run(
-    folder: RunFolder,
+    folder: str | Path | RunFolder,
     edits: Sequence[Edit],
-    out: Path | None = None,
+    out: str | Path | None = None,
     *,
     in_place: bool = False,
     overwrite: bool = False,
     inpainting: bool = False,
     settings: InpaintSettings | None = None,
-    sequence: Path | None = None,
+    sequence: str | Path | None = None,
 ) -> EditOutcome:
     """Edits a run's map, in the order given, and writes the result.
 
     Args:
-        folder: the run, with objects.
+        folder: the run, or its folder; with objects.
         edits: what to do.
         out: folder for the edited run; default: beside the run, with "-edited" added to its name.
         in_place: write into the run's own folder instead.
@@ -117,7 +117,9 @@ def edit_run(
         raise ConfigError("no edit was given; there are " + ", ".join(f"`{kind}`" for kind in KINDS))
     if sequence is not None and not inpainting:
         raise ConfigError("`sequence`: only `inpainting` looks at the recording")
-    target = _target(folder, out, in_place)
+    folder = folder if isinstance(folder, RunFolder) else RunFolder.open(Path(folder))
+    sequence = None if sequence is None else Path(sequence)
+    target = _target(folder, None if out is None else Path(out), in_place)
     source = _Source.of(folder)
     notes: list[str] = []
     recording = _open_recording(folder, sequence, notes) if inpainting else None

@@ -16,13 +16,19 @@ class ExposureAdam:
     It descends loss + regularization / 2 |exposure - anchor|^2: without the second term map and exposures could
     drift together, all keyframes darker and the map brighter, at no cost in the loss. The anchor is the identity, or
     what was measured when the keyframe was made, from where it starts: a step is at most 0.002 long and a keyframe is
-    trained on some ten times, so that a change by half would never be reached.
+    trained on some ten times, so that a change by half would never be reached. `measured` waits to become the anchor.
     """
 
     def __init__(self, settings: ExposureSettings, beta1: float = 0.9, beta2: float = 0.99) -> None:
         self.settings, self.beta1, self.beta2 = settings, beta1, beta2
         self.anchor = identity_exposure()
+        self.measured = identity_exposure()
         self.first, self.second, self.steps = np.zeros((3, 2)), np.zeros((3, 2)), 0
+
+    @property
+    def is_anchored(self) -> bool:
+        """Whether the anchor is another than the identity."""
+        return bool((self.anchor != identity_exposure()).any())
 
     def step(self, exposure: np.ndarray, gradient: np.ndarray, rate_factor: float = 1.0) -> np.ndarray:
         """The exposure after one step, float64 [3, 2].

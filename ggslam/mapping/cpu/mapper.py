@@ -20,7 +20,7 @@ from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.exposure import identity_exposure, measure_exposure, without_exposure
+from ggslam.rendering.exposure import change_of, measure_exposure, without_exposure
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
@@ -106,15 +106,28 @@ class CpuMapper(Mapper):
             return keyframe.color
         images = (view.image.numpy(), view.alpha.numpy(), view.expected_depth.numpy())
         found = measure_exposure(keyframe.color, depth, *images)
-        if found is None or np.abs(np.log(found[:, 0])).max() < self.settings.exposure.change:
+        if found is None:
             return keyframe.color
-        keyframe.exposure, self._exposure_optimizers[keyframe.index].anchor = found, found.copy()
-        return without_exposure(keyframe.color, found)
+        self._exposure_optimizers[keyframe.index].measured = found
+        changed = any(optimizer.is_anchored for optimizer in self._exposure_optimizers)
+        if not changed and abs(np.log(change_of(found))) > self.settings.exposure.change:
+            for earlier in self.keyframes:
+                self._anchor(earlier)
+            changed = True
+        return self._anchor(keyframe) if changed else keyframe.color
+
+    def _anchor(self, keyframe: Keyframe) -> np.ndarray:
+        """Gives a keyframe the exposure that was measured, if it differs from the map's; returns as `_compensate`."""
+        optimizer = self._exposure_optimizers[keyframe.index]
+        measured = optimizer.measured
+        if np.abs(np.log(measured[:, 0])).max() < self.settings.exposure.least:
+            return keyframe.color
+        keyframe.exposure, optimizer.anchor = measured.copy(), measured
+        return without_exposure(keyframe.color, measured)
 
     def _is_exposed(self, keyframe: Keyframe) -> bool:
         """Whether it has an exposure of its own."""
-        anchor = self._exposure_optimizers[keyframe.index].anchor
-        return self.settings.exposure.enabled or bool((anchor != identity_exposure()).any())
+        return self.settings.exposure.enabled or self._exposure_optimizers[keyframe.index].is_anchored
 
     def _show_labels(self, alpha: np.ndarray, depth: np.ndarray, stride: int = 2) -> MapLabels:
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""
