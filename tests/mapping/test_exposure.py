@@ -45,7 +45,7 @@ def test_finds_the_exposure_of_a_frame() -> None:
 
 
 def test_regularization_pulls_to_the_identity() -> None:
-    free, held = (fit(ExposureSettings(True, 5e-3, strength), 300) for strength in (0.0, 0.5))
+    free, held = (fit(ExposureSettings(enabled=True, rate=5e-3, regularization=strength), 300) for strength in (0.0, 0.5))
     assert (np.abs(held - identity_exposure()) < np.abs(free - identity_exposure())).all()
 
 
