@@ -95,6 +95,8 @@ def test_batches_of_frames_that_lack_something(room: Path) -> None:
     bare = dataclasses.replace(frame, mask=None, T_world_camera=None)
     batch = collate_frames([frame, bare])
     assert "mask" not in batch and torch.isnan(batch["T_world_camera"][1]).all()
+    last = open_sequence(room, start=2, stop=8, stride=2)[1:][-1]
+    assert [collate_frames([last])[name].tolist() for name in ("index", "source_index")] == [[1], [6]]
     small = open_sequence(room, stop=1, scale=0.5)[0]
     with pytest.raises(SequenceError, match="one size, found 80x60, 160x120"):
         collate_frames([frame, small])
