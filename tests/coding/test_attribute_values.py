@@ -157,5 +157,5 @@ def test_a_quantiser_beyond_the_bits_is_refused() -> None:
 
 
 def test_an_unknown_setting_is_named() -> None:
-    with pytest.raises(ConfigError, match="^CodecSettings: unknown setting voxl; did you mean voxel_size"):
-        CodecSettings(voxl=3)  # type: ignore[call-arg]
+    with pytest.raises(ConfigError, match="^CodecSettings: unknown setting voxel; did you mean voxel_size"):
+        CodecSettings(voxel=3)  # type: ignore[call-arg]

@@ -72,7 +72,7 @@ def test_data_loader(room: Path, workers: int) -> None:
     assert {name: (tuple(t.shape), t.dtype) for name, t in batch.items()} == {
         "color": ((3, 3, 120, 160), torch.float32), "depth": ((3, 120, 160), torch.float32),
         "T_world_camera": ((3, 4, 4), torch.float64), "timestamp": ((3,), torch.float64),
-        "index": ((3,), torch.int64), "mask": ((3, 120, 160), torch.int64),
+        "index": ((3,), torch.int64), "source_index": ((3,), torch.int64), "mask": ((3, 120, 160), torch.int64),
     }  # fmt: skip
     assert frame.mask is not None and frame.T_world_camera is not None
     assert torch.equal((batch["color"][1] * 255).round().byte().permute(1, 2, 0), torch.from_numpy(frame.color))
