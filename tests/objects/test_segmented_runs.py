@@ -197,14 +197,14 @@ def test_export_of_single_objects(run: RunFolder, tmp_path: Path) -> None:
 
 
 def test_export_of_one_object_to_a_file(run: RunFolder, tmp_path: Path) -> None:
-    first, second = run.object_table().objects[:2]
-    message = done("export", run.path, "--objects", first.id, "--out", tmp_path / "one.ply")
+    (first, second), out = run.object_table().objects[:2], tmp_path / "out"
+    message = done("export", run.path, "--objects", first.id, "--out", out / "one.ply")
     assert first.label() in message and f"{first.gaussians} Gaussians" in message
-    assert (read_gaussian_ply(tmp_path / "one.ply").object_id == first.id).all()
-    assert {p.name for p in tmp_path.iterdir()} == {"one.ply", "one_classifier.npz"}
+    assert (read_gaussian_ply(out / "one.ply").object_id == first.id).all()
+    assert {p.name for p in out.iterdir()} == {"one.ply", "one_classifier.npz"}
     several = f"{first.id},{second.id}"
-    assert "name a folder" in str(refused("export", run.path, "--objects", several, "--out", tmp_path / "two.ply"))
-    assert not (tmp_path / "two.ply").exists()
+    assert "name a folder" in str(refused("export", run.path, "--objects", several, "--out", out / "two.ply"))
+    assert not (out / "two.ply").exists()
 
 
 def test_export_of_all_objects_plain(run: RunFolder, tmp_path: Path) -> None:
