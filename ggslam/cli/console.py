@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Iterable
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleDimensions
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -26,10 +27,21 @@ from rich.text import Text
 from ggslam.cli.argument_names import with_options
 from ggslam.system.foreign import printable
 
+_NO_TERMINAL = 100_000
+"""Columns of what is no terminal: a log or a pipe has no width to wrap lines at."""
+
 
 class PlainConsole(Console):
     """A console that never hands on control characters of what it is given: names in a recording or a run could move
-    the cursor, recolour or rename the terminal, or hide what is printed."""
+    the cursor, recolour or rename the terminal, or hide what is printed. Where output is no terminal, lines are not
+    wrapped, unless COLUMNS says how wide it is."""
+
+    @property
+    def size(self) -> ConsoleDimensions:
+        """Columns and rows."""
+        found = super().size
+        asked = self._width is not None or self.is_terminal or "COLUMNS" in os.environ
+        return found if asked else ConsoleDimensions(_NO_TERMINAL, found.height)
 
     def _render_buffer(self, buffer: Iterable[Segment]) -> str:
         # The only place that all text passes, whatever it was part of; rich's own sequences are added in it.

@@ -42,7 +42,7 @@ OutPath = Annotated[
     typer.Option(
         help="File to write; its name says the format (.ply .glb .obj .spz .splat .sog .usda .usdc .usdz .pcd .txt, "
         ".compressed.ply; meta.json, lod-meta.json: SOG and streamed SOG in their folder). A folder for streamed-sog, "
-        "points, colmap, nerfstudio, and for --objects with ply; with mesh, --objects takes either."
+        "points, colmap, nerfstudio, and for several --objects with ply; with mesh, --objects takes either."
     ),
 ]
 FormatName = Annotated[
@@ -64,8 +64,8 @@ Voxel = Annotated[
 MinOpacity = Annotated[float, typer.Option(help="Leave out fainter Gaussians (not for trajectory, mesh).")]
 Objects = Annotated[
     str | None,
-    typer.Option(help="Objects by name or id (mug,7), or all. ply: a file for each; segmented, mesh, sog, "
-                 "streamed-sog, gltf, usd: only these."),
+    typer.Option(help="Objects by name or id (mug,7), or all. ply: a file for each (of one, --out may be the "
+                 "file); segmented, mesh, sog, streamed-sog, gltf, usd: only these."),
 ]  # fmt: skip
 Plain = Annotated[bool, typer.Option("--plain", help="Write only the fields of 3DGS: no object ids, no identities.")]
 Keyframes = Annotated[

@@ -107,9 +107,14 @@ class AttributeParameters:
 
     def qps(self, bit_depth: int, deltas: tuple[int, int] = (0, 0)) -> tuple[int, int]:
         """Quantiser parameters of component 0 and of the others, after a slice's deltas."""
-        highest = 51 + 6 * max(0, bit_depth - 8)
+        highest = highest_qp(bit_depth)
         first = min(max(self.qp + deltas[0], 4), highest)
         return first, min(max(first + self.chroma_offset + deltas[1], 4), highest)
+
+
+def highest_qp(bit_depth: int) -> int:
+    """The largest quantiser parameter of values of so many bits."""
+    return 51 + 6 * max(0, bit_depth - 8)
 
 
 def _read_details(r: BitReader, encoding: int) -> DetailSettings:

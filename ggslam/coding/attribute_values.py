@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.coding.attribute_syntax import MAX_PARAMETER_SETS, AttributeParameters
+from ggslam.coding.attribute_syntax import MAX_PARAMETER_SETS, AttributeParameters, highest_qp
 from ggslam.coding.sequence_parameters import (
     KNOWN_LABELS,
     MATRIX_BT709,
@@ -216,7 +216,7 @@ def plan_summaries(
         instance = sum(plan.description.label == description.label for plan, _ in plans)
         table = IdTable.of(summary.ids) if own.lossless else None
         plan = CodedAttribute(name, index, replace(description, instance=instance), table)
-        parameters = _parameters(own, settings, table)
+        parameters = _parameters(name, description.bit_depth, own, settings, table)
         # Attributes that are coded alike share a set: its id has 4 bits, and whole Gaussians have up to 21 attributes.
         plans.append((plan, replace(parameters, attribute_id=sets.setdefault(parameters, len(sets)))))
     if len(sets) > MAX_PARAMETER_SETS:
@@ -259,9 +259,13 @@ def _describe(name: str, values: AttributeSummary, own: AttributeSettings) -> At
     return AttributeDescription(label, components, depth, 0, matrix, True, own.offset, own.scale)
 
 
-def _parameters(own: AttributeSettings, settings: CodecSettings, table: IdTable | None) -> AttributeParameters:
+def _parameters(
+    name: str, depth: int, own: AttributeSettings, settings: CodecSettings, table: IdTable | None
+) -> AttributeParameters:
     qp = settings.qp if own.qp is None else own.qp
     offset = settings.chroma_offset if own.chroma_offset is None else own.chroma_offset
     if table is not None:
         qp, offset = table.qp(), 0
+    elif qp > highest_qp(depth):
+        raise ConfigError(f"attribute {name!r}: qp: expected 4 to {highest_qp(depth)} for {depth} bits, found {qp}")
     return AttributeParameters(qp, offset, settings.raht_prediction)

@@ -36,10 +36,10 @@ class RegistrationSettings:
     reprojection: float = setting(2.5, 0.01, 1e3, "px")
     """Inlier distance in pixels of a 320-pixel-wide image."""
     depth_constant: float = setting(0.025, 1e-4, 10, "m")
-    """Inlier distance in depth is constant + square z^2 (three standard deviations of two structured-light
-    measurements, and a feature's reach): the constant..."""
+    """Constant part of the inlier distance in depth, constant + square z^2: three standard deviations of two
+    structured-light measurements, and a feature's reach."""
     depth_square: float = setting(0.008, 0, 10, "1/m")
-    """...and the square."""
+    """Square part of the inlier distance in depth, see `depth_constant`."""
 
 
 @dataclass(frozen=True)

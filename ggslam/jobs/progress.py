@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long work tells how it goes on."""
+"""How long work reports its progress."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ggslam.slam.result import StepReport
 
 
 class Observer(Protocol):
-    """Is told how a run goes on."""
+    """Receives progress updates of a run."""
 
     def begin(self, stage: str, total: int) -> None:
         """A stage of `total` steps begins."""

@@ -26,9 +26,9 @@ class GraphSettings:
     turn_length: float = setting(1.0, 0, 1e3, "m")
     """A turn by one radian counts as a path of this length."""
     loop_translation: float = setting(0.01, 1e-5, 10, "m")
-    """Standard deviation per axis that is added to a closure's own, of the translation..."""
+    """Standard deviation of the translation per axis that is added to a closure's own."""
     loop_rotation_deg: float = setting(0.3, 1e-4, 90, "deg")
-    """...and of the rotation."""
+    """Standard deviation of the rotation per axis that is added to a closure's own."""
     drift_probability: float = setting(0.999, 0.5, 1 - 1e-12)
     """A closure is dismissed when drift stays below its correction with this probability."""
     inlier_probability: float = setting(0.99, 0.5, 1 - 1e-12)
@@ -50,9 +50,9 @@ class PlaceSettings:
     ferns: int = setting(500, 1, 10**5)
     """Pixels of the thumbnail that are compared."""
     near: float = setting(0.8, 0, 1e3, "m")
-    """Ferns tell near from far by a depth drawn between this..."""
+    """Ferns tell near from far by a depth drawn between this and `far`."""
     far: float = setting(3.5, 0, 1e3, "m")
-    """...and this."""
+    """Ferns tell near from far by a depth drawn between `near` and this."""
     shortlist: int = setting(50, 1, 10**6)
     """So many keyframes with the most common words have their thumbnails compared."""
     support: float = setting(0.25, 0, 1)
@@ -79,12 +79,12 @@ class VerificationSettings:
     min_alignment_overlap: float = setting(0.5, 0, 1)
     """Share of the points that G-ICP matches to the old surface."""
     max_rmse_constant: float = setting(0.01, 0, 10, "m")
-    """G-ICP's RMSE stays below this..."""
+    """G-ICP's RMSE stays below this; `max_rmse_sigmas` adds to it."""
     max_rmse_sigmas: float = setting(2.0, 0, 100)
-    """...plus this many standard deviations sigma(z) at the points' median depth z."""
+    """Standard deviations sigma(z) at the points' median depth z added to `max_rmse_constant`."""
     min_overlap: float = setting(0.4, 0, 1)
     """Share of the new points' voxels that the old points also fill."""
     voxel_constant: float = setting(0.03, 1e-3, 10, "m")
-    """Edge of those voxels is this..."""
+    """Edge of the voxels of `min_overlap`; `voxel_sigmas` adds to it."""
     voxel_sigmas: float = setting(4.0, 0, 100)
-    """...plus this many standard deviations sigma(z)."""
+    """Standard deviations sigma(z) added to `voxel_constant`."""

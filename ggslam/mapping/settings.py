@@ -16,9 +16,9 @@ class InsertionSettings:
     alpha_threshold: float = setting(0.6, 0, 1)
     """A pixel whose rendered alpha is below this is not yet explained by the map."""
     depth_tolerance_m: float = setting(0.05, 0, 1e3, "m")
-    """A pixel whose measured depth lies this much in front of the rendered depth is not explained either..."""
+    """A pixel whose measured depth lies this much in front of the rendered depth is not explained, either."""
     depth_tolerance_relative: float = setting(0.03, 0, 1)
-    """...or this share of the depth, whichever is larger."""
+    """As `depth_tolerance_m`, a share of the depth; the larger of the two counts."""
     opacity: float = setting(0.4, 1e-3, 0.999)
     """Opacity at birth."""
     scale_pixels: float = setting(0.7, 1e-2, 100, "px")
@@ -64,9 +64,9 @@ class LearningRates:
     epsilon: float = setting(1e-15, 1e-30, 1)
     """Added to the root of the second moment."""
     young_factor: float = setting(3.0, 1, 100)
-    """A Gaussian's first step is this much longer..."""
+    """A Gaussian's first step is this much longer; see `young_updates`."""
     young_updates: int = setting(8, 1, 10**4)
-    """...and the rates fall to their values over this many of its steps."""
+    """Over this many steps of a Gaussian `young_factor` falls to 1."""
 
 
 @settings_class(frozen=True)

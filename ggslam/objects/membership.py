@@ -48,13 +48,13 @@ class MembershipSettings:
     lonely: float = setting(0.1, 0, 1)
     """With no more than this share of its labelled neighbours on its side a label is taken for wrong (rule 2)."""
     agreement: float = setting(0.75, 0, 1)
-    """Share of members that takes a Gaussian along (rule 4); neighbours that are unlabelled like it do not count..."""
+    """Share of members that takes a Gaussian along (rule 4); neighbours that are unlabelled like it do not count."""
     few: float = setting(0.3, 0, 1)
-    """...but this share must be members."""
+    """Share of all neighbours that must be members to take a Gaussian along (rule 4)."""
     link_spacings: float = setting(4.0, 0, 1e6)
     """Members this many spacings of the object's Gaussians apart are still joined (rule 3)."""
     floater_share: float = setting(0.05, 0, 1)
-    """Components with less than this share of the members are floaters..."""
+    """Components with less than this share of the members are floaters."""
     confident: float = setting(0.6, 0, 1)
     """Probability of another object from which a Gaussian inside the hull is that object's."""
     crowding: float = setting(0.25, 0, 1)

@@ -19,9 +19,9 @@ class CleaningSettings:
     band_pixels: int = setting(2, 0, 20, "px")
     """How far from a segment's boundary its label is checked against depth."""
     jump_m: float = setting(0.02, 0, 10, "m")
-    """Neighbouring pixels whose depths differ by more than this are on different surfaces..."""
+    """Neighbouring pixels whose depths differ by more than this are on different surfaces; see `jump_relative`."""
     jump_relative: float = setting(0.02, 0, 1)
-    """...or by more than this share of their depth, whichever is larger."""
+    """As `jump_m`, a share of the depth; the larger of the two counts."""
 
 
 @settings_class(frozen=True)
@@ -31,27 +31,28 @@ class AssociationSettings:
     mode: Mode = "auto"
     """auto: use the masks' own ids when they prove consistent over time; always: associate; never: trust the ids."""
     depth_tolerance_m: float = setting(0.03, 0, 100, "m")
-    """Map and measurement show the same surface if their depths differ by less than this..."""
+    """Map and measurement show the same surface if their depths differ by less than this; see
+    `depth_tolerance_relative`."""
     depth_tolerance_relative: float = setting(0.03, 0, 1)
-    """...or by less than this share of the depth, whichever is larger."""
+    """As `depth_tolerance_m`, a share of the depth; the larger of the two counts."""
     min_confidence: float = setting(0.5, 0, 1)
     """Pixels whose label has a smaller share of the rendering weight say nothing."""
     min_overlap: float = setting(0.25, 0, 1)
-    """A segment goes to an object that already shows on this share of it..."""
+    """A segment goes to an object that already shows on this share of it; see `min_continuation`."""
     min_continuation: float = setting(0.08, 0, 1)
-    """...or on this share, if it has most of what is seen of the object (a floor that continues)."""
+    """As `min_overlap`, of a segment that has most of what is seen of the object (a floor that continues)."""
     whole: float = setting(0.6, 0.5, 1)
     """An object is found in one segment if the segment has this share of its visible part."""
     min_visible: float = setting(2e-4, 0, 1)
     """Objects visible on a smaller share of the image are no evidence for or against a merge."""
     merge_observations: int = setting(3, 1, 10**6)
-    """Two objects become one after lying together in one segment this often..."""
+    """Two objects become one after lying together in one segment this often; see `merge_ratio`."""
     merge_ratio: float = setting(1.0, 0, 1e6)
-    """...if together outweighs apart by this factor."""
+    """Two objects become one if they lay together this many times as often as apart."""
     split_observations: int = setting(3, 1, 10**6)
-    """A part of an object becomes an object after being a segment of its own this often..."""
+    """A part of an object becomes an object after being a segment of its own this often; see `split_ratio`."""
     split_ratio: float = setting(2.0, 0, 1e6)
-    """...if that is this many times as often as being in the segment of the rest."""
+    """A part becomes an object if it was a segment of its own this many times as often as in that of the rest."""
 
 
 @settings_class(frozen=True)
@@ -60,13 +61,13 @@ class GeometricSettings:
     is measured in every image."""
 
     tolerance_m: float = setting(0.006, 1e-5, 10, "m")
-    """Distance from a plane within which a pixel lies on it, without noise..."""
+    """Distance from a plane within which a pixel lies on it; `tolerance_sigmas` adds to it."""
     tolerance_sigmas: float = setting(3.0, 0, 100)
-    """...plus this many standard deviations of the depth noise."""
+    """Standard deviations sigma(z) of the depth noise added to `tolerance_m`."""
     jump_m: float = setting(0.012, 1e-5, 10, "m")
-    """Gap between two surfaces that separates them, without noise..."""
+    """Gap between two surfaces that separates them; `jump_sigmas` adds to it."""
     jump_sigmas: float = setting(4.0, 0, 100)
-    """...plus this many standard deviations of the depth noise."""
+    """Standard deviations sigma(z) of the depth noise added to `jump_m`."""
     concave_degrees: float = setting(25.0, 1, 180, "deg")
     """Surfaces that meet in a concave edge sharper than this are different objects."""
     block_pixels: int = setting(8, 4, 100, "px")

@@ -16,8 +16,8 @@ class Frame:
     """One RGB-D image pair with what is known about it.
 
     Attributes:
-        index: position in the selected part of the recording (0, 1, 2, ...).
-        source_index: position in the whole recording, before start/stop/stride.
+        index: position in the sequence that it was read from (0, 1, 2, ...); of a slice it counts from 0 again.
+        source_index: position in the whole recording, before start/stop/stride and slices.
         timestamp: seconds.
         color: uint8 [H, W, 3], RGB.
         depth: float32 [H, W], metres along the optical axis, 0 where unknown; registered to `color`.

@@ -26,7 +26,9 @@ def collate_frames(frames: ListOf[Frame]) -> dict[str, torch.Tensor]:
         depth: float32 [B, H, W] metres, 0 = unknown.
         T_world_camera: float64 [B, 4, 4], the recording's pose; NaN where it tells none.
         timestamp: float64 [B], seconds.
-        index: int64 [B], `Frame.index`.
+        index: int64 [B], `Frame.index`: the position in the sequence that the frame was read from, which in a slice
+            counts from 0 again.
+        source_index: int64 [B], `Frame.source_index`: the position in the whole recording.
         mask: int64 [B, H, W] instance ids, 0 = unlabelled; only there if every frame has one.
 
     Raises:
@@ -47,6 +49,7 @@ def collate_frames(frames: ListOf[Frame]) -> dict[str, torch.Tensor]:
         "T_world_camera": torch.from_numpy(np.stack(poses)),
         "timestamp": torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64),
         "index": torch.tensor([frame.index for frame in frames]),
+        "source_index": torch.tensor([frame.source_index for frame in frames]),
     }
     masks = [mask for frame in frames if (mask := frame.load_mask()) is not None]
     if len(masks) == len(frames):

@@ -88,9 +88,9 @@ class Sequence:
                 `scale` is not in (0, 1] or leaves hardly an image.
         """
         if on_bad_frame not in ("error", "skip"):
-            raise SequenceError(f"on_bad_frame: expected 'error' or 'skip', found '{on_bad_frame}'")
+            raise SequenceError(f"`on_bad_frame`: expected 'error' or 'skip', found '{on_bad_frame}'")
         if not (math.isfinite(scale) and 0 < scale <= 1):
-            raise SequenceError(f"scale: expected a number above 0 and at most 1, found {scale}")
+            raise SequenceError(f"`scale`: expected a number above 0 and at most 1, found {scale}")
         self.min_confidence: int | None = None
         if any(entry.confidence is not None for entry in recording.files):
             self.min_confidence = recording.min_confidence
@@ -121,7 +121,7 @@ class Sequence:
         self.camera: Camera = self._geometry.camera
         if scale < 1 and min(self.camera.width, self.camera.height) < SMALLEST_SIDE:
             size = f"{self.camera.width}x{self.camera.height}"
-            raise SequenceError(f"scale: {scale:g} leaves images of {size}, needed are {SMALLEST_SIDE} pixels a side")
+            raise SequenceError(f"`scale`: {scale:g} leaves images of {size}, needed are {SMALLEST_SIDE} pixels a side")
         self.native_camera: Camera = self._geometry.native_camera
 
     def _select(self, selection: range) -> int:

@@ -8,6 +8,7 @@ The settings of a part are declared beside the part (`ggslam/tracking`, `ggslam/
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import field
 from importlib import resources
 from pathlib import Path
@@ -117,12 +118,14 @@ def presets() -> dict[str, Path]:
     return {path.stem: path for folder in folders if folder.is_dir() for path in sorted(folder.glob("*.yaml"))}
 
 
-def load_config(preset_or_file: str | Path | None = None, overrides: list[str] | None = None) -> Config:
+def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[str] | None = None) -> Config:
     """Settings from a preset's name or a YAML file, then `name.of.setting=value` overrides, in order.
 
     Raises:
         ConfigError: naming the file and the setting.
     """
+    if overrides is not None and (isinstance(overrides, (str, bytes)) or not isinstance(overrides, Sequence)):
+        raise ConfigError(f'`overrides`: expected a list like ["mapping.iterations_per_frame=1"], found {overrides!r}')
     values: dict[str, Any] = {}
     origin = "settings"
     if preset_or_file is not None:

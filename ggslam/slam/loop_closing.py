@@ -46,9 +46,9 @@ class LoopSettings:
     confirmation_gap: int = setting(5, 1, 10**6, "keyframes")
     """In a row: no more than so many keyframes apart."""
     agreement_m: float = setting(0.05, 0, 1e3, "m")
-    """Two corrections are the same if they move the camera to places nearer than this..."""
+    """Two corrections are the same if they move the camera to places nearer than this and within `agreement_deg`."""
     agreement_deg: float = setting(2.0, 0, 180, "deg")
-    """...and turn it to directions nearer than this."""
+    """Two corrections are the same if they turn the camera to directions nearer than this and within `agreement_m`."""
     neighbourhood: int = setting(3, 0, 1000, "keyframes")
     """Keyframes before and after an old one whose points make its local map."""
     repair_iterations: int = setting(40, 0, 10**6)

@@ -39,7 +39,7 @@ class MaskSettings:
     """Objects that a segmenter or association found on fewer keyframes are noise. Runs of less than ten keyframes for
     each of these views ask for less."""
     min_gaussians: int = setting(20, 0, 10**9)
-    """...and so are those with fewer Gaussians."""
+    """Objects with fewer Gaussians that a segmenter or association found are noise, too."""
     cleaning: CleaningSettings = field(default_factory=CleaningSettings)
     association: AssociationSettings = field(default_factory=AssociationSettings)
     geometry: GeometricSettings = field(default_factory=GeometricSettings)

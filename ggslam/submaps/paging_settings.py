@@ -15,12 +15,13 @@ class PagingSettings:
     keep_radius: float = setting(3.0, 0, 1e6, "m")
     """Cells whose centres are nearer to the camera than this stay in memory, seen or not."""
     view_range: float = setting(12.0, 0.1, 1e6, "m")
-    """Farther than this from the camera the map is not needed to render a view..."""
+    """Farther than this from the camera the map is not needed to render a view."""
     view_margin: float = setting(1.1, 1, 100)
-    """...nor farther than the deepest that was measured in a part of the view (a tile of the image), times this..."""
+    """A part of the view (a tile of the image) needs the map up to the deepest that was measured in it times this, and
+    `view_spare`."""
     view_spare: float = setting(0.3, 0, 1e6, "m")
-    """...and this much more. Gaussians behind what is measured are hidden by what lies before them; where nothing was
-    measured, nothing is trained but colour."""
+    """Added to what `view_margin` allows. Gaussians behind what is measured are hidden by what lies before them; where
+    nothing was measured, nothing is trained but colour."""
     budget_mb: float = setting(0.0, 0, 1e9, "MB")
     """What map and keyframe images may take; 0: the memory limit less what the program itself was measured to need.
     With a number of one's own, a run repeats bit for bit; measured ones differ a little between runs."""

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+_UNKNOWN = "unknown setting"
 _DECLARATION = "ggslam"
 """Key of the declaration in a field's metadata."""
 
@@ -101,8 +102,10 @@ else:
                 try:
                     validator.validate_python(pydantic_core.ArgsKwargs(arguments, values), self_instance=self)
                 except pydantic_core.ValidationError as error:
-                    place = "" if getattr(checked, "is_root", False) else f"{checked.__name__}."
-                    raise ConfigError(place + explain(error, checked)) from None
+                    said = explain(error, checked)
+                    if not getattr(checked, "is_root", False):
+                        said = checked.__name__ + (": " if said.startswith(_UNKNOWN) else ".") + said
+                    raise ConfigError(said) from None
 
             checked.__init__ = initialise
             return checked
@@ -144,9 +147,10 @@ def _unknown(path: list[Any], kind: type) -> str:
         kind = group_of(typing.get_type_hints(kind)[name]) or kind
     prefix, name = "".join(f"{part}." for part in path[:-1]), str(path[-1])
     known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
-    near = difflib.get_close_matches(name, known, 1)
+    longer = sorted((k for k in known if len(name) > 3 and k.startswith(name)), key=len)
+    near = longer or difflib.get_close_matches(name, known, 1)
     hint = f"did you mean {prefix}{near[0]}?" if near else f"known: {', '.join(prefix + k for k in known)}"
-    return f"unknown setting {prefix}{name}; {hint}"
+    return f"{_UNKNOWN} {prefix}{name}; {hint}"
 
 
 def _values_at(path: list[Any], kind: type) -> str:

@@ -93,19 +93,19 @@ class AlignSettings:
     fine_iterations: int = setting(12, 1, 1000)
     """Iterations at the fine level."""
     translation_tolerance: float = setting(1e-4, 0, 1, "m")
-    """The iteration stops at a step below this..."""
+    """The iteration stops at a step below this and `rotation_tolerance`."""
     rotation_tolerance: float = setting(5e-5, 0, 1, "rad")
-    """...and below this."""
+    """The iteration stops at a step below this and `translation_tolerance`."""
     kernel_constant: float = setting(0.01, 1e-4, 10, "m")
-    """Width of the Geman-McClure kernel: this..."""
+    """Width of the Geman-McClure kernel; `kernel_sigmas` adds to it."""
     kernel_sigmas: float = setting(2.0, 0, 100)
-    """...plus this many standard deviations sigma(z) of the depth noise."""
+    """Standard deviations sigma(z) of the depth noise added to `kernel_constant`."""
     coarse_kernel_factor: float = setting(2.0, 0.1, 100)
     """The coarse level's kernel is this much wider."""
     overlap_constant: float = setting(0.01, 1e-4, 10, "m")
-    """A match is an inlier if its point-to-plane distance is below this..."""
+    """A match is an inlier if its point-to-plane distance is below this; `overlap_sigmas` adds to it."""
     overlap_sigmas: float = setting(2.0, 0, 100)
-    """...plus this many standard deviations sigma(z) of the depth noise."""
+    """Standard deviations sigma(z) of the depth noise added to `overlap_constant`."""
     min_normal_dot: float = setting(0.5, -2, 1)
     """Normals of a match agree to this cosine; -2: whatever their directions."""
     min_matches: int = setting(100, 6, 10**6)

@@ -105,5 +105,19 @@ def test_a_terminal_keeps_its_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(printing.progress_bar(), ProgressLines)
 
 
+def test_lines_of_a_log_are_not_wrapped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    words, names = " ".join(["word"] * 100), [f"precision {n}" for n in range(20)]
+    output = io.StringIO()
+    console = printing.PlainConsole(file=output)
+    console.print(words)
+    console.print(printing.table("scores", names, [["0.123"] * 20]))
+    lines = output.getvalue().splitlines()
+    assert lines[0] == words and "precision 19" in output.getvalue() and max(map(len, lines)) < 1000
+    assert printing.PlainConsole(file=output, width=60).width == 60, "a width that was asked for counts"
+    monkeypatch.setenv("COLUMNS", "70")
+    assert printing.PlainConsole(file=io.StringIO()).width == 70
+
+
 def test_durations() -> None:
     assert [duration(s) for s in (8.6, 125, 4800)] == ["9 s", "2 min 5 s", "1 h 20 min"]

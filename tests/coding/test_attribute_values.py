@@ -146,3 +146,16 @@ def test_object_ids_come_back_exactly_without_being_asked() -> None:
     ids = np.where(grid[:, 0] < 15, 3, 900).astype(np.uint16)
     decoded = decode_cloud(encode_cloud(grid, {"object_id": ids}, CodecSettings(qp=40)).data)
     assert (decoded.attributes["object_id"] == np.where(decoded.points[:, 0] < 15, 3, 900)).all()
+
+
+def test_a_quantiser_beyond_the_bits_is_refused() -> None:
+    grid = np.arange(30).reshape(10, 3)
+    colors, values = np.zeros((10, 3), np.uint8), np.arange(10, dtype=np.uint16)
+    with pytest.raises(ConfigError, match="attribute 'color': qp: expected 4 to 51 for 8 bits, found 99"):
+        encode_cloud(grid, {"color": colors}, CodecSettings(qp=99))
+    assert encode_cloud(grid, {"reflectance": values}, CodecSettings(qp=99)).data
+
+
+def test_an_unknown_setting_is_named() -> None:
+    with pytest.raises(ConfigError, match="^CodecSettings: unknown setting voxel; did you mean voxel_size"):
+        CodecSettings(voxel=3)  # type: ignore[call-arg]

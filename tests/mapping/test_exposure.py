@@ -45,7 +45,8 @@ def test_finds_the_exposure_of_a_frame() -> None:
 
 
 def test_regularization_pulls_to_the_identity() -> None:
-    free, held = (fit(ExposureSettings(enabled=True, rate=5e-3, regularization=strength), 300) for strength in (0.0, 0.5))
+    settings = [ExposureSettings(enabled=True, rate=5e-3, regularization=strength) for strength in (0.0, 0.5)]
+    free, held = (fit(one, 300) for one in settings)
     assert (np.abs(held - identity_exposure()) < np.abs(free - identity_exposure())).all()
 
 

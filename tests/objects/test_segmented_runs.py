@@ -196,6 +196,17 @@ def test_export_of_single_objects(run: RunFolder, tmp_path: Path) -> None:
     assert len(IdentityClassifier.from_file(out / "map_classifier.npz")) == len(table)
 
 
+def test_export_of_one_object_to_a_file(run: RunFolder, tmp_path: Path) -> None:
+    (first, second), out = run.object_table().objects[:2], tmp_path / "out"
+    message = done("export", run.path, "--objects", first.id, "--out", out / "one.ply")
+    assert first.label() in message and f"{first.gaussians} Gaussians" in message
+    assert (read_gaussian_ply(out / "one.ply").object_id == first.id).all()
+    assert {p.name for p in out.iterdir()} == {"one.ply", "one_classifier.npz"}
+    several = f"{first.id},{second.id}"
+    assert "name a folder" in str(refused("export", run.path, "--objects", several, "--out", out / "two.ply"))
+    assert not (out / "two.ply").exists()
+
+
 def test_export_of_all_objects_plain(run: RunFolder, tmp_path: Path) -> None:
     done("export", run.path, "--objects", "all", "--plain", "--min-opacity", 0.5, "--out", tmp_path / "parts")
     plys = list((tmp_path / "parts").glob("*.ply"))
@@ -213,7 +224,8 @@ def test_export_in_the_colours_of_the_objects(run: RunFolder, tmp_path: Path) ->
     assert np.abs(255 * colored.rgb.numpy() - palette[whole.object_id.numpy()]).max() < 0.01
     chosen = run.object_table().objects[2]
     one = tmp_path / "one.ply"
-    done("export", run.path, "--format", "segmented", "--objects", chosen.id, "--plain", "--out", one)
+    said = done("export", run.path, "--format", "segmented", "--objects", chosen.id, "--plain", "--out", one)
+    assert said.strip().endswith("in the colours of 1 object")
     assert len(read_gaussian_ply(one)) == chosen.gaussians and not (tmp_path / "one_classifier.npz").exists()
 
 

@@ -72,7 +72,7 @@ def test_data_loader(room: Path, workers: int) -> None:
     assert {name: (tuple(t.shape), t.dtype) for name, t in batch.items()} == {
         "color": ((3, 3, 120, 160), torch.float32), "depth": ((3, 120, 160), torch.float32),
         "T_world_camera": ((3, 4, 4), torch.float64), "timestamp": ((3,), torch.float64),
-        "index": ((3,), torch.int64), "mask": ((3, 120, 160), torch.int64),
+        "index": ((3,), torch.int64), "source_index": ((3,), torch.int64), "mask": ((3, 120, 160), torch.int64),
     }  # fmt: skip
     assert frame.mask is not None and frame.T_world_camera is not None
     assert torch.equal((batch["color"][1] * 255).round().byte().permute(1, 2, 0), torch.from_numpy(frame.color))
@@ -95,6 +95,8 @@ def test_batches_of_frames_that_lack_something(room: Path) -> None:
     bare = dataclasses.replace(frame, mask=None, T_world_camera=None)
     batch = collate_frames([frame, bare])
     assert "mask" not in batch and torch.isnan(batch["T_world_camera"][1]).all()
+    last = open_sequence(room, start=2, stop=8, stride=2)[1:][-1]
+    assert [collate_frames([last])[name].tolist() for name in ("index", "source_index")] == [[1], [6]]
     small = open_sequence(room, stop=1, scale=0.5)[0]
     with pytest.raises(SequenceError, match="one size, found 80x60, 160x120"):
         collate_frames([frame, small])

@@ -86,3 +86,9 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
     path.write_text("- 1\n- 2\n")
     with pytest.raises(ConfigError, match="broken.yaml"):
         load_config(path)
+
+
+@pytest.mark.parametrize("overrides", ["seed=3", {"seed": 3}])
+def test_overrides_that_are_no_list(overrides: Any) -> None:
+    with pytest.raises(ConfigError, match="`overrides`: expected a list like"):
+        load_config(None, overrides)

@@ -70,7 +70,8 @@ def test_how_many_there_are() -> None:
 @pytest.mark.parametrize("pair", ALL, ids=name)
 def test_each_says_what_it_does(pair: tuple[type, Known]) -> None:
     _, one = pair
-    assert len(one.text) > 10 and one.text.rstrip().endswith((".", "...")), one.text
+    assert len(one.text) > 10 and one.text.endswith("."), one.text
+    assert not one.text.startswith("...") and not one.text.endswith("..."), f"{one.path} is half a sentence"
     assert not one.is_number or not MEASURES.search(one.text.split(";")[0]), f"the unit of {one.path} is in its text"
     measured = one.kind is float and MEASURED.search(one.path) and "scatter" not in one.path
     if measured and not re.search(r"(relative|share|times|_voxels|_sigmas|factor|0 to 1)", one.path + one.text):
@@ -128,6 +129,7 @@ def test_groups_are_made_from_dictionaries() -> None:
     ("values", "message"),
     [
         ({"sed": 3}, "unknown setting sed; did you mean seed?"),
+        ({"mapping": {"iterations": 3}}, "mapping.iterations; did you mean mapping.iterations_per_frame?"),
         ({"loops": {"places": {"fern": 3}}}, "unknown setting loops.places.fern; did you mean loops.places.ferns?"),
         ({"loops": 3}, "loops: expected names with values, found 3"),
         ({"seed": 2.5}, "seed: expected a whole number, 0 to 9223372036854775807, found 2.5"),

@@ -47,7 +47,7 @@ def export_run(
 
     Args:
         run: the run, or its folder; for streamed-sog also the folder of a grid store.
-        out: file or, for points, colmap, nerfstudio and for objects one by one, folder to write.
+        out: file or, for points, colmap, nerfstudio and for several objects with ply, folder to write.
         format: ply: 3DGS Gaussians; segmented: the same in the colours of their objects; compressed-ply, spz, spz4,
             splat, sog: the same in fewer bytes; streamed-sog: in pieces and levels of detail; gltf: .glb (a .glb
             without `format` is a mesh); usd: .usda, .usdc, .usdz; points, pcd: coloured clouds; mesh: .glb, .obj or

@@ -47,24 +47,33 @@ def export_objects(
     folder: RunFolder, path: Path, objects: str, min_opacity: float = 0.0, plain: bool = False
 ) -> str:  # fmt: skip
     """Writes each of some objects as a 3DGS PLY of its own (`ID_NAME.ply`), their lines of the table as objects.json
-    and, unless `plain`, the classifier of the identities into the folder `path`; returns a line that says so.
+    and, unless `plain`, the classifier of the identities into the folder `path`; or a single object into the file
+    `path`, with the classifier beside it. Returns a line that says so.
 
     Args:
         folder: of a run with objects.
-        path: folder to write.
+        path: folder to write; or, if the name ends in .ply and is not that of a folder, the file of a single object.
         objects: names or ids, "mug,7", or "all".
         min_opacity: leave out fainter Gaussians.
         plain: leave out object ids and identities.
 
     Raises:
-        ConfigError: an object is not there.
+        ConfigError: an object is not there, or several are for one file.
         RunFolderError: the run has no objects, or the folder cannot be written.
     """
     scene = ObjectsInParts.of(folder)
     chosen = [scene.table.record(i) for i in scene.table.select(objects)]
     if not chosen:
         raise RunFolderError(f"{folder.path}: the run found no object; nothing to export")
+    to_file = path.suffix.lower() == ".ply" and not path.is_dir()
+    if to_file and len(chosen) > 1:
+        raise ConfigError(
+            f"`out` {path}: is the name of one file, but `objects` {objects} are {len(chosen)}, each with a file of "
+            "its own: name a folder"
+        )
     opaque, total = ChosenGaussians.of(folder, scene.map.rows, min_opacity), 0
+    if to_file:
+        return _export_object(opaque, path, chosen[0], None if plain else scene.classifier)
     make_folder(path)
     for record in chosen:
         total += opaque.objects([record.id]).write(path / object_file_name(record), () if plain else OBJECT_EXTRAS)
@@ -72,6 +81,16 @@ def export_objects(
     if not plain:
         _write_classifier(path / "map.ply", scene.classifier)
     return f"wrote {len(chosen)} object{'s' * (len(chosen) != 1)} to {path}: {total} Gaussians"
+
+
+def _export_object(
+    opaque: ChosenGaussians, path: Path, record: ObjectRecord, classifier: IdentityClassifier | None
+) -> str:
+    make_folder(path.parent)
+    count = opaque.objects([record.id]).write(path, () if classifier is None else OBJECT_EXTRAS)
+    if classifier is not None:
+        _write_classifier(path, classifier)
+    return f"wrote {record.label()} to {path}: {count} Gaussians"
 
 
 def export_segmented(
@@ -96,7 +115,8 @@ def export_segmented(
     count = chosen.write(path, () if plain else OBJECT_EXTRAS, lambda part: _color_by_object(part, palette))
     if not plain:
         _write_classifier(path, scene.classifier)
-    return f"wrote {path}: {count} Gaussians in the colours of {len(scene.table)} objects"
+    objects_written = len(scene.table) if ids is None else len(ids)
+    return f"wrote {path}: {count} Gaussians in the colours of {objects_written} object{'s' * (objects_written != 1)}"
 
 
 def _color_by_object(gaussians: GaussianMap, palette: torch.Tensor) -> None:

@@ -71,7 +71,7 @@ def export_mesh(
         folder: of the run.
         out: file; or, with `request.objects`, a folder, for a PLY of each object.
         request: see `MeshRequest`.
-        observer: is told how far it is.
+        observer: receives progress updates.
 
     Raises:
         ConfigError: impossible voxel, unknown object, or an object without any surface.

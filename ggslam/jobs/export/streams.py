@@ -85,4 +85,5 @@ def _write(
     told.begin("levels of detail", len(parts))
     size: StreamedSize = write_streamed_sog(folder, parts, count, names, lambda done: told.advance(done, len(parts)))
     levels = " + ".join(map(str, size.counts))
-    return f"wrote {folder / INDEX}: {levels} Gaussians in {size.chunks} SOGs, {size.bytes / 1e6:.1f} MB"
+    files = f"{size.chunks} SOG{'s' * (size.chunks != 1)}"
+    return f"wrote {folder / INDEX}: {levels} Gaussians in {files}, {size.bytes / 1e6:.1f} MB"

@@ -38,7 +38,7 @@ class Checkpointing:
         every: frames from one to the next; None: as often as takes no more than `SHARE` of the time; 0: only when the
             run ends early.
         sequence: the recording.
-        observer: is told what goes wrong; the run goes on.
+        observer: receives a note if a checkpoint cannot be saved; the run continues.
     """
 
     def __init__(self, checkpoints: Checkpoints, every: int | None, sequence: Sequence, observer: Observer) -> None:

@@ -83,7 +83,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
 
     Args:
         request: what to do.
-        observer: is told how it goes on.
+        observer: receives progress updates.
         follower: does more with each frame.
 
     Raises:
@@ -115,7 +115,7 @@ def resume(
 
     Args:
         run: its folder.
-        observer: is told how it goes on.
+        observer: receives progress updates.
         follower: does more with each frame.
         recording: where the recording is now, if it was moved.
         evaluate: score the run; None: as it was asked to.

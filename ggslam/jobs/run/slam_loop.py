@@ -36,7 +36,7 @@ class SlamLoop:
     Attributes:
         sequence: the recording.
         config: all settings.
-        observer: is told how it goes on.
+        observer: receives progress updates.
         folder: of the run.
         earlier: run whose map this one begins with.
         growing: whether that map grows.

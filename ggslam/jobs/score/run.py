@@ -47,7 +47,7 @@ def score_run(
     Args:
         folder: of the run.
         sequence: the recording, opened as the run opened it.
-        observer: is told of the progress.
+        observer: receives progress updates.
         lpips: score LPIPS too, if its weights are there.
         every: score the images of every n-th frame only.
         masks: where the masks of `sequence` come from, if they are not those that the run had; for the notes.

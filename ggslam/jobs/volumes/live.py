@@ -21,7 +21,7 @@ class LiveVolumes:
 
     Args:
         maps: to fuse into.
-        saw: is told of every frame that was fused, and its T_world_camera.
+        saw: receives every frame that was fused, and its T_world_camera.
         objects: whether object ids are voted for.
     """
 

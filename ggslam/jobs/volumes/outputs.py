@@ -224,7 +224,7 @@ def write_outputs(
         request: what is wanted.
         poses: T_world_camera of the frames that were fused.
         record: for volumes.json, where the volumes are from.
-        observer: is told how it goes on.
+        observer: receives progress updates.
     """
     earlier = _earlier_files(out)
     writer = _Writer(out, request, np.array(poses))

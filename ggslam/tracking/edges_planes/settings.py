@@ -44,9 +44,9 @@ class ExtractionSettings:
     min_cosine: float = setting(0.15, 0, 1)
     """Planes seen at a flatter angle (cosine between normal and ray) are left out."""
     min_depth: float = setting(0.1, 0, 1e4, "m")
-    """Of depth images nearer depth is not used..."""
+    """Nearer depth of depth images is not used."""
     max_depth: float = setting(8.0, 0.01, 1e4, "m")
-    """...nor is farther depth."""
+    """Farther depth of depth images is not used."""
 
     def __post_init__(self) -> None:
         if self.min_depth >= self.max_depth:
@@ -102,21 +102,21 @@ class FeatureAlignSettings:
     one that usually takes longer than what is left is not begun (the first matching always is). A frame that would
     be lost may take longer."""
     translation_tolerance: float = setting(1e-4, 0, 1, "m")
-    """The iteration stops at a step below this..."""
+    """The iteration stops at a step below this and `rotation_tolerance`."""
     rotation_tolerance: float = setting(5e-5, 0, 1, "rad")
-    """...and below this."""
+    """The iteration stops at a step below this and `translation_tolerance`."""
     huber_sigmas: float = setting(1.5, 0.01, 1e3)
     """From this many standard deviations on a residual counts linearly."""
     gate_constant: float = setting(0.02, 0, 1e3, "m")
-    """In the last matching, residuals above this..."""
+    """Residuals above this are outliers in the last matching; `gate_sigmas` adds to it."""
     gate_sigmas: float = setting(4.0, 0, 1e3)
-    """...plus this many standard deviations sigma(z) are outliers."""
+    """Standard deviations sigma(z) added to `gate_constant`."""
     edge_weight: float = setting(1.0, 0, 1e3)
     """Of an edge's residual against a plane's, when both are weighed by their noise."""
     overlap_constant: float = setting(0.01, 0, 1e3, "m")
-    """A match is an inlier if its point-to-plane distance is below this..."""
+    """A match is an inlier if its point-to-plane distance is below this; `overlap_sigmas` adds to it."""
     overlap_sigmas: float = setting(2.0, 0, 1e3)
-    """...plus this many standard deviations sigma(z)."""
+    """Standard deviations sigma(z) added to `overlap_constant`."""
     min_matches: int = setting(60, 6, 10**6)
     """Features that need a match."""
     convincing_overlap: float = setting(0.6, 0, 1)
