@@ -36,7 +36,7 @@ class PlainConsole(Console):
     the cursor, recolour or rename the terminal, or hide what is printed. Where output is no terminal, lines are not
     wrapped, unless COLUMNS says how wide it is."""
 
-    @property
+    @property  # type: ignore[misc]  # it is set nowhere
     def size(self) -> ConsoleDimensions:
         """Columns and rows."""
         found = super().size
