@@ -46,7 +46,7 @@ def _whole(data: bytes | memoryview) -> CodedStream:
     if written != len(stream.slices):
         raise FormatError(
             f"the stream has {len(stream.slices)} of its {written} slices: was it cut off? "
-            "(`decode_slice` decodes those that are there)"
+            "(ggslam.coding.decode_slice reads those that are there)"
         )
     return stream
 

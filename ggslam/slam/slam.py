@@ -300,7 +300,7 @@ class Slam:
 def _check_arguments(camera: object, config: object, extra_loss: object) -> None:
     """Raises InputError unless they are a camera, settings and a function."""
     if not isinstance(camera, Camera):
-        hint = "; its `camera` is one" if isinstance(getattr(camera, "camera", None), Camera) else ""
+        hint = "; its attribute camera is one" if isinstance(getattr(camera, "camera", None), Camera) else ""
         raise InputError(f"Slam: camera: expected a Camera, found {type(camera).__name__}{hint}")
     if config is not None and not isinstance(config, Config):
         hint = "; Config(**values) makes one of a dict" if isinstance(config, dict) else ""
