@@ -49,7 +49,7 @@ def test_redkitchen_begins_well(shared_data: Path, tmp_path: Path) -> None:
     assert m.images.held_out.psnr > 21 and m.images.all.psnr_unmasked > 20
 
 
-@pytest.mark.long("a true recording shows what a generated one does not")
+@pytest.mark.slow
 def test_shelf_is_tracked_to_the_end(shared_data: Path, tmp_path: Path) -> None:
     m, status = run(shared_data / "shelf", tmp_path / "run", ["mapping.iterations_per_frame=8"])
     assert len(status) == 15 and "lost" not in status

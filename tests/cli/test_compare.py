@@ -75,6 +75,7 @@ def test_a_run_against_itself(run: Path, tmp_path: Path) -> None:
         assert words in text
 
 
+@pytest.mark.long("ICP on the clouds of two runs, twice")
 @pytest.mark.parametrize("align", ["icp", "trajectory"])
 def test_a_moved_run_is_brought_back(run: Path, shifted: Path, tmp_path: Path, align: str) -> None:
     loose, text = compared(shifted, run, "--thresholds", "0.005 0.02", out=tmp_path)
@@ -137,6 +138,7 @@ def test_faults_are_named(run: Path, tmp_path: Path) -> None:
         assert (run / name).is_file()  # nothing was changed
 
 
+@pytest.mark.long("a cloud in voxels of 1 cm")
 def test_a_run_without_points_is_sampled_again(run: Path, tmp_path: Path) -> None:
     other = Path(shutil.copytree(run, tmp_path / "other"))
     (other / "points.ply").unlink()

@@ -140,11 +140,11 @@ def test_no_recording(tmp_path: Path) -> None:
         ({"stop": 0}, "stop must be above start 0, found 0"),
         ({"start": 3, "stop": 3}, "stop must be above start 3, found 3"),
         ({"stride": 0}, "stride must be at least 1, found 0"),
-        ({"scale": 0.0}, "scale: expected"),
-        ({"scale": 2.0}, "scale: expected"),
+        ({"scale": 0.0}, "`scale`: expected"),
+        ({"scale": 2.0}, "`scale`: expected"),
         ({"depth_scale": 0.0}, "depth scale must be a positive number"),
         ({"masks": "/nowhere/at/all"}, "masks folder /nowhere/at/all does not exist"),
-        ({"on_bad_frame": "ignore"}, "on_bad_frame: expected 'error' or 'skip'"),
+        ({"on_bad_frame": "ignore"}, "`on_bad_frame`: expected 'error' or 'skip'"),
     ],
 )
 def test_impossible_options(make: Make, options: dict[str, object], message: str) -> None:

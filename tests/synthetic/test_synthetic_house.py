@@ -139,6 +139,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.long("two recordings are drawn")
 def test_a_written_loop_repeats(quick_light: None, caster: RayCaster, house: Scene, tmp_path: Path) -> None:
     options = ["--frames", "3", "--width", "80", "--height", "60"]
     result = CliRunner().invoke(app, ["synth", str(tmp_path / "a"), "--scene", "loop", *options])
