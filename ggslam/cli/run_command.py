@@ -168,10 +168,9 @@ def run(
     watched = _Watched(log, (host, port) if view else None, strict)
     if resume is not None:
         return _go_on(context, resume, sequence, checkpoint_every, evaluate, watched)
-    sequence = _recording(sequence)
     reading = SequenceRequest(
-        sequence, format_name, start, stop, stride, scale, masks, depth_scale, "skip" if skip_bad_frames else "error",
-        depth_camera, min_confidence, tuple(topics or ()), pose_convention,
+        _recording(sequence), format_name, start, stop, stride, scale, masks, depth_scale,
+        "skip" if skip_bad_frames else "error", depth_camera, min_confidence, tuple(topics or ()), pose_convention,
     )  # fmt: skip
     given = _overrides(settings, {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
@@ -181,7 +180,7 @@ def run(
         _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
         map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every,
     )  # fmt: skip
-    _run_and_show(partial(execute, request), sequence.resolve().name, watched)
+    _run_and_show(partial(execute, request), _recording(sequence).resolve().name, watched)
 
 
 def _recording(sequence: Path | None) -> Path:
