@@ -129,7 +129,10 @@ def test_groups_are_made_from_dictionaries() -> None:
     ("values", "message"),
     [
         ({"sed": 3}, "unknown setting sed; did you mean seed?"),
-        ({"mapping": {"iterations": 3}}, "unknown setting mapping.iterations; did you mean mapping.iterations_per_frame?"),
+        (
+            {"mapping": {"iterations": 3}},
+            "unknown setting mapping.iterations; did you mean mapping.iterations_per_frame?",
+        ),
         ({"loops": {"places": {"fern": 3}}}, "unknown setting loops.places.fern; did you mean loops.places.ferns?"),
         ({"loops": 3}, "loops: expected names with values, found 3"),
         ({"seed": 2.5}, "seed: expected a whole number, 0 to 9223372036854775807, found 2.5"),
