@@ -180,7 +180,7 @@ def run(
         _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
         map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every,
     )  # fmt: skip
-    _run_and_show(partial(execute, request), _recording(sequence).resolve().name, watched)
+    _run_and_show(partial(execute, request), reading.path.resolve().name, watched)
 
 
 def _recording(sequence: Path | None) -> Path:

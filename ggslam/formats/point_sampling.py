@@ -108,10 +108,10 @@ def sample_parts(
     """Like `sample_points` of all parts together, in clouds one after the other, each with an origin of its own.
     Without a voxel size it goes with the map, see `voxel_size_for`.
 
-    Parts are read twice: at first to see which cubes of space each has samples in. Then they are swept along the
-    longest side of the map, each cut in sections; voxels in cubes that no later section reaches are handed out. So no
-    more is in memory than one part, the samples of a section, and voxels at the borders of what was done to what was
-    not.
+    Parts are read twice, and before that once more if a voxel size has to be found: at first to see which cubes of
+    space each has samples in. Then they are swept along the longest side of the map, each cut in sections; voxels in
+    cubes that no later section reaches are handed out. So no more is in memory than one part, the samples of a section,
+    and voxels at the borders of what was done to what was not.
     """
     if not parts:
         return

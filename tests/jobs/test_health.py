@@ -204,3 +204,15 @@ def test_changes_of_exposure_are_compensated(
     assert dim.psnr is not None and dim.psnr_exposed is not None
     assert dim.psnr_exposed > well.psnr - 1
     assert dim.psnr < well.psnr - 5  # as recorded
+
+
+def test_a_run_that_cannot_be_judged_is_saved(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Verdicts come before the map is saved, and must not cost it."""
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("no idea")
+
+    monkeypatch.setattr("ggslam.jobs.run.pipeline.judge", fail)
+    outcome = execute(RunRequest(SequenceRequest(room, stop=2), tmp_path / "run", overrides=FAST, evaluate=False))
+    assert outcome.error is None and outcome.failure is None and outcome.verdicts == []
+    assert len(RunFolder.open(tmp_path / "run").gaussians()) > 1000

@@ -212,7 +212,7 @@ class _Run:
         scored = self.request.evaluate and error is None and self._frames_stay()
         wanted = (*((MetricsRecord.FILE, "frames.csv") if scored else ()), REPORT_FILE)
         told = None if error is None else repr(error)
-        verdicts = judge(self.sequence, result)
+        verdicts = self._judge(result)
         try:
             folder, failure = save_somewhere(
                 self.folder, RunToWrite(self.config, described, result, told, names, wanted, verdicts)
@@ -220,6 +220,14 @@ class _Run:
         finally:
             result.close()
         return RunOutcome(folder, result, error=error or failure, failure=failure, verdicts=verdicts)
+
+    def _judge(self, result: SlamResult) -> list[Verdict]:
+        """What seems wrong. The map is not saved yet: whatever a look at it and the recording ends in, it will be."""
+        try:
+            return judge(self.sequence, result)
+        except Exception as error:
+            self.observer.note(f"the run could not be judged: {error!r}")
+            return []
 
     def _frames_stay(self) -> bool:
         """Whether the frames of the run can be read again."""
