@@ -165,6 +165,7 @@ def test_every_extra_is_in_the_list() -> None:
     assert listed == extras - for_us
 
 
+@pytest.mark.long("all pages are built")
 def test_pages_build_and_fetch_nothing(tmp_path: Path) -> None:
     pytest.importorskip("material", reason="mkdocs-material is not installed (extra [docs])")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path / "site")]

@@ -198,6 +198,7 @@ def test_edges_and_planes_start_in_a_saved_map_too(room: Path, first_half: Path,
     assert len(times) == 1 and times[0] > 0
 
 
+@pytest.mark.long("a second whole run")
 def test_a_saved_map_grows(room: Path, first_half: Path, tmp_path: Path) -> None:
     old = RunFolder.open(first_half)
     outcome = played(room, tmp_path / "grown", start=10, map=first_half)

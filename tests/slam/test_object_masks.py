@@ -73,6 +73,7 @@ def test_objects_cost_no_quality(room: Path, tmp_path: Path, own_scores: Metrics
     assert not (tmp_path / "plain" / "objects.json").exists() and plain.segmentation is None
 
 
+@pytest.mark.long("two whole runs")
 def test_shuffled_ids_become_objects(room: Path, tmp_path: Path) -> None:
     scramble_recording(room, tmp_path / "masks", 0, 0.2, 0.05, 0.01)
     outcome = run(room, tmp_path / "run", masks=tmp_path / "masks")

@@ -120,6 +120,7 @@ def test_an_object_is_edited_with_the_mouse(browser: Any, page: tuple[Any, Viewe
     assert RunFolder.open(model.save_folder() / "saved-by-mouse").object_table().record(record.id).name == "thing"
 
 
+@pytest.mark.long("a browser plays a whole recording")
 def test_the_recording_is_gone_through(browser: Any, page: tuple[Any, ViewedRun], tmp_path: Path) -> None:
     from selenium.webdriver.common.keys import Keys
 

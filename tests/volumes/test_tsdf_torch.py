@@ -27,6 +27,7 @@ def views(n: int) -> list[tuple]:
     return found
 
 
+@pytest.mark.long("the reference in plain torch")
 @pytest.mark.parametrize("voxel", [0.03, 0.08])
 def test_torch_and_native_fusion_agree(voxel: float) -> None:
     settings = TsdfSettings(voxel=voxel)
