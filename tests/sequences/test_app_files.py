@@ -154,7 +154,7 @@ def test_scanner_app_that_lacks_something(tmp_path: Path, frames: list[PhoneFram
 
 def test_record3d_of_2022(tmp_path: Path) -> None:
     """Portrait, and neither `dh` nor `dw`."""
-    frames = phone_frames(4, (360, 480), (192, 256), frames=120, focal=1.3)
+    frames = phone_frames(4, (240, 320), (192, 256), frames=120, focal=1.3)
     sequence = open_sequence(write_record3d_2022(tmp_path / "walk.r3d", frames))
     assert sequence.depth_size == (192, 256)
     assert_true(sequence, frames)
@@ -162,7 +162,7 @@ def test_record3d_of_2022(tmp_path: Path) -> None:
 
 
 def test_record3d_of_2022_with_depth_of_no_shape(tmp_path: Path) -> None:
-    frames = phone_frames(1, (360, 480), (191, 256), frames=120)
+    frames = phone_frames(1, (240, 320), (191, 256), frames=120)
     path = write_record3d_2022(tmp_path / "walk.r3d", frames)
     with pytest.raises(
         SequenceError, match=r"'dh' and 'dw' are missing .* the 48896 numbers of rgbd/0\.depth are no image"

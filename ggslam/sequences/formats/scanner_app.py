@@ -60,7 +60,8 @@ class ScannerAppFormat:
         times = [number_of(path, values, "time") for path, values in zip(paths, described, strict=True) if timed]
         recording = Recording(
             self.name, folder, frames, np.array(times) if timed else nominal_timestamps(len(frames)), 1000.0,
-            cameras[0], pose_source="frame_*.json, cameraPoseARFrame (ARKit axes)", warnings=_warnings(files, len(whole)),
+            cameras[0], pose_source="frame_*.json, cameraPoseARFrame (ARKit axes)",
+            warnings=_warnings(files, len(whole)),
         )  # fmt: skip
         if timed:
             recording.time_source = "frame_*.json, time"
