@@ -20,6 +20,7 @@ from ggslam.sequences.formats.record3d import Record3DFormat
 from ggslam.sequences.formats.replica import ReplicaFormat
 from ggslam.sequences.formats.ros_bag import Ros1Format, Ros2Format
 from ggslam.sequences.formats.ros_topics import ROLES
+from ggslam.sequences.formats.scanner_app import ScannerAppFormat
 from ggslam.sequences.formats.scannet import ScanNetFormat
 from ggslam.sequences.formats.scannetpp import ScanNetPlusFormat
 from ggslam.sequences.formats.seven_scenes import SevenScenesFormat
@@ -47,6 +48,7 @@ FORMATS: tuple[RecordingFormat, ...] = (
     Record3DFormat(),
     PolycamFormat(),
     StrayFormat(),
+    ScannerAppFormat(),
     RealSenseFormat(),
     Ros1Format(),
     Ros2Format(),
