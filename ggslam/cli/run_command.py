@@ -277,9 +277,15 @@ def _print(outcome: RunOutcome) -> None:
         print_scores(outcome.metrics)
     for verdict in outcome.verdicts:
         console.print(f"[yellow]{verdict.severity}:[/] {escape(verdict.text)}", highlight=False)
-    if outcome.error is None:
-        for hint in next_commands(outcome.folder.path):
-            console.print(hint, highlight=False, markup=False, soft_wrap=True)  # commands are copied: no line breaks
+    for hint in next_commands(outcome.folder.path) if outcome.error is None else go_on_command(outcome.folder.path):
+        console.print(hint, highlight=False, markup=False, soft_wrap=True)  # commands are copied: no line breaks
+
+
+def go_on_command(run: Path) -> list[str]:
+    """How a run that was cut off goes on, if it can."""
+    from ggslam.runs.checkpoints import has_checkpoints
+
+    return [f"next: ggslam run --resume {shlex.quote(str(run))}"] if has_checkpoints(run) else []
 
 
 def next_commands(run: Path) -> list[str]:

@@ -199,7 +199,8 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None) -> None:
         how = f"with another one neighbouring depth images agree with the poses to {doubt.best:.2%}, with this one "
         report.judge(judge_scale_by(report.depth_scale, 1 / doubt.ratio, f"{how}only to {doubt.error:.2%}"))
     elif doubt.error > 0.05:
-        text = f"true poses and depth disagree by {doubt.error:.0%}: wrong depth scale or poses, or little seen twice"
+        causes = "wrong intrinsics, depth scale or poses, or little seen twice"
+        text = f"true poses and depth disagree by {doubt.error:.0%}: {causes}"
         report.judge([Verdict("poses", "doubtful", text)])
 
 

@@ -179,6 +179,8 @@ def _add_poses(recording: Recording, path: Path) -> None:
             poses = poses_at(recording.timestamps, times, poses)
         elif recording.time_source.startswith("nominal"):
             recording.timestamps, recording.time_source = times, path.name
+        elif (np.diff(times) < 0).any():
+            recording.warnings.append(f"{path}: times do not increase; the poses are taken in the order of the lines")
     else:
         poses, problems = read_matrix_rows(path)
         if len(poses) != count:
