@@ -80,8 +80,7 @@ def describe(
     with, if any."""
     values = asdict(request)
     values.pop("record", None)
-    if isinstance(sequence, Sequence):
-        values["scale"] = sequence.scale
+    values["scale"] = sequence.scale if isinstance(sequence, Sequence) else values["scale"] or 1.0
     if isinstance(sequence, LiveSequence):  # what was recorded is a plain folder, scaled already
         values |= {"path": sequence.path if sequence.record else request.path, "scale": 1.0, "stop": None}
     for name in ("path", "masks", "depth_camera", "camera"):
