@@ -144,7 +144,7 @@ def test_merged_objects_are_one_everywhere() -> None:
     mapper = trained(pictures())
     identity = mapper.identity
     assert identity is not None
-    identity.merge(mapper.map, 2, 300)
+    identity.merge(mapper.map, [(2, 300)])
     assert sorted(identity.classifier.class_ids.tolist()) == [1, 2]
     mapper.run(10)
     mapper.finish_identity()
