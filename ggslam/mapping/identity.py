@@ -36,6 +36,8 @@ POOL_STEPS = 8
 """Steps' worth of pixels that are drawn from a keyframe at once."""
 TERMS, MIN_WEIGHT = 32, 5e-3
 """Contributions to a pixel that training looks at: at most so many, none lighter."""
+SPLIT_STRIDE = 2
+"""A split looks at every so manyth pixel and row."""
 BIRTH_VOTE = 0.1
 """Weight of the vote that a Gaussian gets for the pixel it is born from."""
 IDS = 65536

@@ -208,6 +208,8 @@ class Mapper(ABC):
         if labels.mask is None or self.identity is None:
             return
         self.identity.merge(self.map, labels.merges)
+        if labels.forgotten:
+            self.identity.forget(self.map, labels.forgotten)
         self.identity.observe(labels.mask)
         self.identity.split(self.map, self._rasterizer, labels.mask, labels.splits)
 

@@ -12,7 +12,7 @@ import torch
 from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
 from ggslam.mapping.cpu.pixel_pool import draw_pool
-from ggslam.mapping.identity import BIRTH_VOTE, MIN_WEIGHT, TERMS, IdentityLearner, MaskedKeyframe
+from ggslam.mapping.identity import BIRTH_VOTE, MIN_WEIGHT, SPLIT_STRIDE, TERMS, IdentityLearner, MaskedKeyframe
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.votes import merge_votes, vote_labels
 from ggslam.rendering.cpu import CpuRasterizer
@@ -60,10 +60,11 @@ class CpuIdentityLearner(IdentityLearner):
         splits = self._split_off(splits)
         if not splits:
             return
-        terms = rasterizer.pixel_terms(np.arange(mask.size))
+        seen = np.arange(mask.size).reshape(mask.shape)[::SPLIT_STRIDE, ::SPLIT_STRIDE].reshape(-1)
+        terms = rasterizer.pixel_terms(seen)
         used = np.arange(terms.weights.shape[1]) < terms.counts[:, None]
         gaussian, weight, size = terms.gaussians[used], terms.weights[used], len(gaussians)
-        seen_as = np.repeat(self.current(mask.reshape(-1)), used.sum(1))
+        seen_as = np.repeat(self.current(mask.reshape(-1)[seen]), terms.counts)
         everywhere = np.maximum(np.bincount(gaussian, weight, size), 1e-9)
         ids, changed = gaussians.vote_ids.numpy(), []
         for whole, part in splits:

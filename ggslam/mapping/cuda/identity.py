@@ -24,6 +24,7 @@ from ggslam.mapping.identity import (
     BIRTH_VOTE,
     IDS,
     MIN_WEIGHT,
+    SPLIT_STRIDE,
     TERMS,
     IdentityLearner,
     MaskedKeyframe,
@@ -125,10 +126,12 @@ class CudaIdentityLearner(IdentityLearner):
         splits = self._split_off(splits)
         if not splits:
             return
-        seen_as = torch.from_numpy(self.current(mask.reshape(-1)).astype(np.int32)).to(self.device)
+        grid = np.arange(mask.size, dtype=np.int32).reshape(mask.shape)[::SPLIT_STRIDE, ::SPLIT_STRIDE].reshape(-1)
+        seen = torch.from_numpy(grid).to(self.device)
+        seen_as = torch.from_numpy(self.current(mask.reshape(-1)[grid]).astype(np.int32)).to(self.device)
         everywhere, *here = (torch.zeros(len(gaussians), device=self.device) for _ in range(1 + len(splits)))
-        for begin in range(0, mask.size, SPLIT_PIXELS):
-            pixels = torch.arange(begin, min(begin + SPLIT_PIXELS, mask.size), dtype=torch.int32, device=self.device)
+        for begin in range(0, len(seen), SPLIT_PIXELS):
+            pixels = seen[begin : begin + SPLIT_PIXELS].contiguous()
             terms = rasterizer.pixel_terms(pixels, SPLIT_TERMS, SPLIT_MIN_WEIGHT)
             everywhere += terms.weight_sums(len(gaussians))
             for k, (_, part) in enumerate(splits):
