@@ -35,7 +35,7 @@ class MaskSettings:
     """auto: `model` if one is named, else the recording's masks if it has any, else geometry; none: no objects."""
     model: str = setting("", basic=True)
     """ONNX file of a segmentation model (YOLO-seg or SAM family); needs the extra [masks]."""
-    every: int = setting(4, 1, 10**6)
+    every: int = setting(6, 1, 10**6)
     """Frames that a segmenter lets pass at least: a fast camera's keyframes come sooner, and all the map gets labels
     from those that are segmented."""
     min_views: int = setting(3, 1, 10**6)

@@ -73,7 +73,9 @@ class CpuClassTable:
         codes = CODE_LENGTH * weights / np.maximum(np.linalg.norm(weights, axis=1, keepdims=True), 1e-12)
         return np.concatenate([codes, np.zeros((1, self._channels), np.float32)])[number]
 
-    def members(self, features: np.ndarray, object_ids: np.ndarray, rivals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def members(
+        self, features: np.ndarray, object_ids: np.ndarray, rivals: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Vectors that are more probably one of some objects than nothing and than a rival of their own. Costs what
         these objects cost, however many classes there are.
 
