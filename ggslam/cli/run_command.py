@@ -134,6 +134,7 @@ def run(
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
     masks: options.Masks = None,
+    camera: options.OwnCamera = None, intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
     min_confidence: options.MinConfidence = None,
     topics: options.Topics = None,
@@ -151,16 +152,14 @@ def run(
     skip_bad_frames: options.SkipBadFrames = False,
     log: Log = None,
     view: ShowPage = False,
-    host: options.Host = "127.0.0.1",
-    port: options.Port = 8080,
+    host: options.Host = "127.0.0.1", port: options.Port = 8080,
     evaluate: Evaluate = True,
     overwrite: Overwrite = False,
     strict: Strict = False,
     resume: Resume = None,
     checkpoint_every: CheckpointEvery = None,
-    help_settings: settings_help.HelpSettings = False,
-    help_setting: settings_help.HelpSetting = None,
-) -> None:
+    help_settings: settings_help.HelpSettings = False, help_setting: settings_help.HelpSetting = None,
+) -> None:  # fmt: skip
     """Track the camera, build the map, write a run folder and score it."""
     from ggslam.jobs.run.pipeline import execute
     from ggslam.runs.recordings import SequenceRequest
@@ -171,6 +170,7 @@ def run(
     reading = SequenceRequest(
         _recording(sequence), format_name, start, stop, stride, scale, masks, depth_scale,
         "skip" if skip_bad_frames else "error", depth_camera, min_confidence, tuple(topics or ()), pose_convention,
+        camera, intrinsics,
     )  # fmt: skip
     given = _overrides(settings, {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
