@@ -75,6 +75,9 @@ def localize(
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
+    camera: options.OwnCamera = None,
+    intrinsics: options.Intrinsics = None,
+    depth_camera: options.DepthCamera = None,
     columns: options.Columns = 4,
     skip_bad_frames: options.SkipBadFrames = False,
     threads: options.Threads = None,
@@ -89,6 +92,7 @@ def localize(
         sequence=SequenceRequest(
             sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
             on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
+            camera=camera, intrinsics=intrinsics, depth_camera=depth_camera,
         ),
         start_pose=start_pose, no_start_pose=no_start_pose, full=full_map, out=out, radius=radius, voxel=voxel,
         columns=columns, threads=threads,

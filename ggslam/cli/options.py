@@ -45,6 +45,16 @@ DepthCamera = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="YAML file with the calibration of a separate depth camera."),
 ]
+OwnCamera = Annotated[
+    Path | None,
+    typer.Option("--camera", metavar="FILE", help="YAML file with the calibration of the colour camera, instead of the "
+                 "recording's own: width, height, fx, fy, cx, cy[, distortion, depth_scale]."),
+]  # fmt: skip
+Intrinsics = Annotated[
+    str | None,
+    typer.Option(metavar="'FX FY CX CY [K1 ...]'", help="The same as numbers, of colour images as stored: pixels, then "
+                 "up to 8 coefficients of distortion in OpenCV's order."),
+]  # fmt: skip
 MinConfidence = Annotated[
     int | None, typer.Option(help="Drop depth of lower confidence (0, 1, 2; default 1), where the recording stores it.")
 ]

@@ -109,6 +109,9 @@ def volumes(
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
+    camera: options.OwnCamera = None,
+    intrinsics: options.Intrinsics = None,
+    depth_camera: options.DepthCamera = None,
     sequence: options.MovedSequence = None,
     skip_bad_frames: options.SkipBadFrames = False,
     device: Device = None,
@@ -123,6 +126,7 @@ def volumes(
     reading = SequenceRequest(
         source, format=format_name, start=start, stop=stop, stride=stride, scale=1.0 if scale is None else scale,
         depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
+        camera=camera, intrinsics=intrinsics, depth_camera=depth_camera,
     )  # fmt: skip
     request = VolumesRequest(
         source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,

@@ -35,6 +35,8 @@ class SequenceRequest:
     min_confidence: int | None = None
     topics: tuple[str, ...] = ()
     pose_convention: str | None = None
+    camera: Path | None = None
+    intrinsics: str | None = None
 
     def open(self) -> Sequence:
         """Opens the recording.
@@ -47,7 +49,7 @@ class SequenceRequest:
             self.path, format=self.format, start=self.start, stop=self.stop, stride=self.stride, scale=self.scale,
             masks=self.masks, depth_scale=self.depth_scale, on_bad_frame=self.on_bad_frame,  # type: ignore[arg-type]
             depth_camera=self.depth_camera, min_confidence=self.min_confidence, topics=self.topics,
-            pose_convention=self.pose_convention,
+            pose_convention=self.pose_convention, camera=self.camera, intrinsics=self.intrinsics,
         )  # fmt: skip
 
 
@@ -80,7 +82,7 @@ def describe(
     values.pop("record", None)
     if isinstance(sequence, LiveSequence):  # what was recorded is a plain folder, scaled already
         values |= {"path": sequence.path if sequence.record else request.path, "scale": 1.0, "stop": None}
-    for name in ("path", "masks", "depth_camera"):
+    for name in ("path", "masks", "depth_camera", "camera"):
         if values[name] is not None and not is_live(values[name]):
             values[name] = Path(values[name]).absolute()
     return SequenceRecord.of({
@@ -116,6 +118,7 @@ def request_in(record: OpenRecord, path: Path | None = None, masks: Path | None 
         **record.model_dump(), "path": Path(path if path is not None else record.path),
         "masks": None if used is None else Path(used), "topics": tuple(record.topics),
         "depth_camera": None if record.depth_camera is None else Path(record.depth_camera),
+        "camera": None if record.camera is None else Path(record.camera),
     })  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from ggslam.sequences.formats.record3d import Record3DFormat
 from ggslam.sequences.formats.replica import ReplicaFormat
 from ggslam.sequences.formats.ros_bag import Ros1Format, Ros2Format
 from ggslam.sequences.formats.ros_topics import ROLES
+from ggslam.sequences.formats.scanner_app import ScannerAppFormat
 from ggslam.sequences.formats.scannet import ScanNetFormat
 from ggslam.sequences.formats.scannetpp import ScanNetPlusFormat
 from ggslam.sequences.formats.seven_scenes import SevenScenesFormat
@@ -28,6 +29,7 @@ from ggslam.sequences.formats.transforms_json import TransformsFormat
 from ggslam.sequences.formats.tum import TumFormat
 from ggslam.sequences.formats.vmap import VmapFormat
 from ggslam.sequences.masks import find_masks
+from ggslam.sequences.own_camera import read_own_camera, use_own_camera
 from ggslam.sequences.pose_conventions import convert_poses
 from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat
 from ggslam.sequences.sequence import OnBadFrame, Sequence
@@ -47,6 +49,7 @@ FORMATS: tuple[RecordingFormat, ...] = (
     Record3DFormat(),
     PolycamFormat(),
     StrayFormat(),
+    ScannerAppFormat(),
     RealSenseFormat(),
     Ros1Format(),
     Ros2Format(),
@@ -69,6 +72,8 @@ def open_sequence(
     min_confidence: int | None = None,
     topics: Iterable[str] = (),
     pose_convention: str | None = None,
+    camera: str | Path | None = None,
+    intrinsics: str | None = None,
 ) -> Sequence:
     """Opens an RGB-D recording.
 
@@ -88,6 +93,8 @@ def open_sequence(
             sure it is; None: `DEFAULT_CONFIDENCE`.
         topics: of a ROS bag, "role=topic" each, where they are not found by themselves; see `ros_topics`.
         pose_convention: what the recording's poses really are, if not what its format says; see `pose_conventions`.
+        camera: YAML file with the calibration of the colour camera, instead of the recording's own (see `calibration`).
+        intrinsics: the same as "fx fy cx cy", then up to 8 coefficients of distortion, of colour images as stored.
 
     Raises:
         MissingDependency: a package is needed to read the recording.
@@ -96,7 +103,7 @@ def open_sequence(
     topics = tuple(topics)
     read = partial(
         _read_recording, Path(path).expanduser(), format, None if masks is None else Path(masks).expanduser(),
-        depth_scale, _options(depth_camera, min_confidence, topics), pose_convention,
+        depth_scale, _options(depth_camera, min_confidence, topics, camera, intrinsics), pose_convention,
     )  # fmt: skip
     recording = read()
     selection = _selection(recording, start, stop, stride)
@@ -106,6 +113,7 @@ def open_sequence(
         "masks": None if masks is None else Path(masks).expanduser(), "depth_scale": depth_scale,
         "on_bad_frame": on_bad_frame, "depth_camera": None if depth_camera is None else Path(depth_camera).expanduser(),
         "min_confidence": min_confidence, "topics": topics, "pose_convention": pose_convention,
+        "camera": None if camera is None else Path(camera).expanduser(), "intrinsics": intrinsics,
     }  # fmt: skip
     return sequence
 
@@ -126,6 +134,8 @@ def _read_recording(
     _check_places(recording)
     if options.depth_camera is not None:
         use_depth_camera(recording, options.depth_camera)
+    if options.own_camera is not None:
+        use_own_camera(recording, options.own_camera)
     if options.min_confidence is not None:
         recording.min_confidence = options.min_confidence
     if masks is not None:
@@ -137,7 +147,8 @@ def _read_recording(
             raise SequenceError(f"{folder}: tells no poses, so there are none to convert from {pose_convention}")
         recording.poses = convert_poses(recording.poses, pose_convention)
     if not (math.isfinite(recording.depth_scale) and recording.depth_scale > 0):
-        raise SequenceError(f"{folder}: depth scale must be a positive number, found {recording.depth_scale}")
+        told = "none" if math.isnan(recording.depth_scale) and depth_scale is None else f"{recording.depth_scale}"
+        raise SequenceError(f"{folder}: depth scale must be a positive number, found {told}")
     return recording
 
 
@@ -167,7 +178,10 @@ def _use_masks(recording: Recording, folder: Path) -> None:
     recording.files = [dataclasses.replace(entry, mask=mask) for entry, mask in pairs]
 
 
-def _options(depth_camera: str | Path | None, min_confidence: int | None, topics: Iterable[str]) -> ReadOptions:
+def _options(
+    depth_camera: str | Path | None, min_confidence: int | None, topics: Iterable[str], camera: str | Path | None,
+    intrinsics: str | None,
+) -> ReadOptions:  # fmt: skip
     if min_confidence is not None and min_confidence not in (0, 1, 2):
         raise SequenceError(f"min_confidence: expected 0, 1 or 2, found {min_confidence}")
     by_role = {}
@@ -176,7 +190,8 @@ def _options(depth_camera: str | Path | None, min_confidence: int | None, topics
         if role not in ROLES or not topic:
             raise SequenceError(f"topic: expected ROLE=TOPIC with a role of {', '.join(ROLES)}, found '{text}'")
         by_role[role] = topic
-    return ReadOptions(None if depth_camera is None else Path(depth_camera).expanduser(), by_role, min_confidence)
+    own = read_own_camera(None if camera is None else Path(camera).expanduser(), intrinsics)
+    return ReadOptions(None if depth_camera is None else Path(depth_camera).expanduser(), by_role, min_confidence, own)
 
 
 def recognise_format(path: str | Path) -> str | None:

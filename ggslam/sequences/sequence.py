@@ -71,7 +71,7 @@ class Sequence:
         mask_problems: damaged masks met so far (only with on_bad_frame="skip": their frames are delivered without):
             index of the frame -> reason.
         instance_names: mask id -> name, as far as known.
-        pose_source, time_source: where poses and timestamps come from, for reports.
+        pose_source, time_source, camera_source: where poses, timestamps and intrinsics come from, for reports.
         options: arguments of `open_sequence` besides the selection; None if it was made otherwise.
         warnings: what a user should know about this recording.
         skipped_frames: damaged frames skipped so far (only with on_bad_frame="skip").
@@ -106,6 +106,7 @@ class Sequence:
         self.instance_names: dict[int, str] = dict(recording.instance_names)
         self.pose_source: str = recording.pose_source
         self.time_source: str = recording.time_source
+        self.camera_source: str = recording.camera_source
         self.warnings: list[str] = list(recording.warnings)
         self._masks = MaskReader(entry.mask for entry in recording.files)
         masked = self._select(selection)

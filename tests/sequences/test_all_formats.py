@@ -79,17 +79,17 @@ def test_table_of_loaders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     [
         ("icl-nuim", (24.06, 24.0)), ("nerfstudio", (30, 31)), ("nerfcapture", (30, 31)), ("scannet++", (30, 31)),
         ("scannet++ iphone", (30, 30)), ("record3d", (30, 31)), ("polycam", (30, 31)), ("strayscanner", (30, 31)),
-        ("ros1", (30, 31)), ("ros2", (30, 31)),
+        ("3dscannerapp", (30, 31)), ("ros1", (30, 31)), ("ros2", (30, 31)),
     ],
 )  # fmt: skip
 def test_intrinsics(make_more: Callable[[str], Path], name: str, expected: tuple[float, float]) -> None:
     camera = open_sequence(make_more(name)).camera
     assert (camera.fx, camera.fy) == pytest.approx(expected)
-    if name not in ("icl-nuim", "scannet++ iphone", "record3d", "polycam", "strayscanner"):
+    if name not in ("icl-nuim", "scannet++ iphone", "record3d", "polycam", "strayscanner", "3dscannerapp"):
         assert (camera.cx, camera.cy) == (15, 11)
 
 
-@pytest.mark.parametrize("name", ["record3d", "polycam", "strayscanner"])
+@pytest.mark.parametrize("name", ["record3d", "polycam", "strayscanner", "3dscannerapp"])
 def test_confidence(make_more: Callable[[str], Path], name: str) -> None:
     place = make_more(name)
     for least, first_seen in ((None, 1), (0, 0), (1, 1), (2, 2)):
