@@ -129,7 +129,7 @@ RECORDINGS: dict[str, Damage] = {
     "an image file is text": lambda r: color(r).write_text("not an image"),
     "a depth image has another size": lambda r: cv2.imwrite(str(depth(r)), np.ones((24, 32), np.uint16)),
     "a depth image has 8 bits": lambda r: cv2.imwrite(str(depth(r)), np.ones((72, 96), np.uint8)),
-    "a mask has another size": lambda r: cv2.imwrite(str(r / "masks" / f"{AT:06d}.png"), np.ones((24, 32), np.uint16)),
+    "a mask has another shape": lambda r: cv2.imwrite(str(r / "masks" / f"{AT:06d}.png"), np.ones((32, 24), np.uint16)),
     "a mask is truncated": lambda r: cut(r / "masks" / f"{AT:06d}.png"),
     "a mask is missing": lambda r: (r / "masks" / f"{AT:06d}.png").unlink(),
     "a PNG claims 60,000 x 60,000 pixels": lambda r: instead(depth(r), png_bomb),

@@ -246,7 +246,8 @@ def missing_depth_problems(files: Iterable[FrameFiles]) -> dict[int, str]:
     for i, entry in enumerate(files):
         for kind, path in (("colour", entry.color), ("depth", entry.depth)):
             if isinstance(path, Path) and not path.is_file():
-                problems[i] = f"frame {i}: {kind} file {path} is missing"
+                what = "is not a regular file" if path.exists() else "is missing"
+                problems[i] = f"frame {i}: {kind} file {path} {what}"
     return problems
 
 

@@ -34,7 +34,7 @@ def new_staging(target: Path) -> Path:
 def leftovers(target: Path) -> list[Path]:
     """Hidden folders in `target` whose writers do not run any more, less one that waits to be put into place."""
     found = [path for path in target.iterdir() if (match := _NAME.fullmatch(path.name)) and not _runs(int(match[1]))]
-    waiting = [_saving_in(marker) for marker in target.glob("*.json")] if found else []
+    waiting = [_trusted_saving(marker) for marker in target.glob("*.json")] if found else []
     return [path for path in found if all(record is None or record["from"] != path.name for record in waiting)]
 
 
@@ -121,7 +121,7 @@ def _read_saving(marker: Path) -> dict[str, Any] | None:
     return dict(record)
 
 
-def _saving_in(marker: Path) -> dict[str, Any] | None:
+def _trusted_saving(marker: Path) -> dict[str, Any] | None:
     """The same; None also if somebody else wrote it."""
     try:
         return _read_saving(marker)

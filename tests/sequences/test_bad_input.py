@@ -215,6 +215,7 @@ def test_seven_scenes_bad_pose(make: Make) -> None:
         ("", "expected entries width"),
         ("width: 32\nheight: 24\nfx: wide\nfy: 3\ncx: 1\ncy: 1\n", "expected a number for 'fx', found 'wide'"),
         ("width: 32\nheight: 24\nfx: -3\nfy: 3\ncx: 1\ncy: 1\n", "impossible camera"),
+        ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1e7\ncy: 1\n", "impossible principal point 1e.07, 1 of"),
         ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\n", "entry 'depth_scale' is missing"),
         ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\ndepth_scale: 1\ndistortion: [1]\n", "for 'distortion'"),
     ],

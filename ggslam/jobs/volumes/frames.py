@@ -93,7 +93,11 @@ def frames_of_run(
     lacking = len(sequence) - len(source.poses)
     if lacking:
         source.notes.append(f"{lacking} frames that the run did not locate are left out")
-    source.notes += far_away(source.poses)
+    far = far_away(source.poses)
+    if far:
+        which = f"{len(far)}, the first of frame {far[0]}"
+        source.notes.append(f"poses far from all others are left out as damaged: {which}")
+        source.poses = {frame: T for frame, T in source.poses.items() if frame not in far}
     if folder.mark().edits:
         source.notes.append("the run was edited; volumes show what was recorded")
     if objects and folder.has_objects():
@@ -107,15 +111,11 @@ def frames_of_run(
     return source
 
 
-def far_away(poses: Mapping[int, np.ndarray]) -> list[str]:
-    """A note if poses [4, 4] by frame index say that the camera was much farther from the rest than anybody walks."""
+def far_away(poses: Mapping[int, np.ndarray]) -> list[int]:
+    """Frames at which the camera was much farther from the rest than anybody walks, of poses [4, 4] by frame."""
     frames, places = list(poses), np.array([T[:3, 3] for T in poses.values()], np.float64)
     off = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-    far = np.flatnonzero(off > max(FAR_M, FAR_TIMES * float(np.median(off))))
-    if not len(far):
-        return []
-    lie = "1 frame lies" if len(far) == 1 else f"{len(far)} frames lie"
-    return [f"{lie} far from all others (frame {frames[far[0]]}: {off[far[0]]:,.0f} m): damaged poses?"]
+    return [frames[k] for k in np.flatnonzero(off > max(FAR_M, FAR_TIMES * float(np.median(off))))]
 
 
 def frames_of_recording(request: SequenceRequest, objects: bool = True) -> FrameSource:
