@@ -32,7 +32,11 @@ RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `ggsla
 Start = Annotated[int, typer.Option("--start", help="First frame to use.", min=0)]
 Stop = Annotated[int | None, typer.Option(help="Stop before this frame.", min=1)]
 Stride = Annotated[int, typer.Option(help="Use only every n-th frame.", min=1)]
-Scale = Annotated[float, typer.Option(help="Resize the images by this factor, e.g. 0.5.")]
+Scale = Annotated[
+    float | None,
+    typer.Option(help="Resize the images by this factor, e.g. 0.5; default: 1, or of colour much finer than depth "
+                 "(phones) what leaves 640x480 pixels."),
+]  # fmt: skip
 Threads = Annotated[int | None, typer.Option(help="Number of threads; default: one per processor.", min=1, max=1024)]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
 DepthScale = Annotated[

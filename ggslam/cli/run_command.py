@@ -129,7 +129,7 @@ def run(
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
-    scale: options.Scale = 1.0,
+    scale: options.Scale = None,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,

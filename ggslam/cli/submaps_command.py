@@ -65,7 +65,7 @@ def submaps(
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
-    scale: options.Scale = 1.0,
+    scale: options.Scale = None,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     camera: options.OwnCamera = None,

@@ -124,7 +124,7 @@ def volumes(
 
     braking = Braking(Latencies(sensor_ms / 1e3, 0.0, plan_ms / 1e3, network_ms / 1e3), friction)
     reading = SequenceRequest(
-        source, format=format_name, start=start, stop=stop, stride=stride, scale=1.0 if scale is None else scale,
+        source, format=format_name, start=start, stop=stop, stride=stride, scale=scale,
         depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
         camera=camera, intrinsics=intrinsics, depth_camera=depth_camera,
     )  # fmt: skip

@@ -66,7 +66,7 @@ def open_sequence(
     start: int = 0,
     stop: int | None = None,
     stride: int = 1,
-    scale: float = 1.0,
+    scale: float | None = None,
     masks: str | Path | None = None,
     depth_scale: float | None = None,
     on_bad_frame: OnBadFrame = "error",
@@ -84,7 +84,8 @@ def open_sequence(
         format: name of a format in `FORMATS`; None: recognised from the folder or file.
         start, stop, stride: frames start, start + stride, ... below stop (None: to the end). A stop past the end means
             the end.
-        scale: size of the delivered images, in (0, 1].
+        scale: size of the delivered images, in (0, 1]; None: 1, but of colour much finer than depth (phones) what
+            leaves 640x480 pixels.
         masks: folder of instance masks to use instead of the recording's own; see `masks.find_masks`.
         depth_scale: depth units per metre, instead of the recording's own.
         on_bad_frame: "error": a damaged frame or mask raises; "skip": `stream` skips the frame and lists it in
@@ -111,7 +112,7 @@ def open_sequence(
     selection = _selection(recording, start, stop, stride)
     sequence = Sequence(recording, selection, scale=scale, on_bad_frame=on_bad_frame, reopen=read)
     sequence.options = {
-        "path": Path(path).expanduser(), "format": format, "scale": scale,
+        "path": Path(path).expanduser(), "format": format, "scale": sequence.scale,
         "masks": None if masks is None else Path(masks).expanduser(), "depth_scale": depth_scale,
         "on_bad_frame": on_bad_frame, "depth_camera": None if depth_camera is None else Path(depth_camera).expanduser(),
         "min_confidence": min_confidence, "topics": topics, "pose_convention": pose_convention,
