@@ -9,7 +9,8 @@ state costs.
     resumed     a run of a generated room, killed (SIGKILL) at a moment drawn evenly over its length, resumed, compared
                 with the run that nothing cut off: map, trajectory, keyframes, clouds, objects, votes, places
     overwrite   a run with --overwrite, killed at a moment drawn evenly over the time from the first file that it saves
-                to the end; then what each command takes the folder for: the old run, the new one, or neither
+                to the end, every second time between two files that change places, drawn evenly over the files; then
+                what each command takes the folder for: the old run, the new one, or neither
     cost        time spent on checkpoints over the time of the same run, with the default --checkpoint-every
 
 Each run is a process of its own (a fork, so that nothing is loaded twice).
@@ -139,6 +140,8 @@ def kill_and_resume(place: Path, reading: SequenceRequest, kills: int, every: in
         if not same:
             differing = [name for name in SAME if sums(out).get(name) != expected.get(name)]
             print(f"kill {done}: exit code {code}; differing: {', '.join(differing)}")
+        if done % 10 == 0:
+            print(f"{done} kills, {identical} as if nothing had happened", flush=True)
     print(f"resumed: {identical} of {kills} end as if nothing had happened ({describe(found)})")
 
 
@@ -156,19 +159,24 @@ def kill_while_overwriting(place: Path, reading: SequenceRequest, kills: int, rn
     expected = {name: sums(folder) for name, folder in (("old", old), ("new", new))}
     begin = time.perf_counter()
     saving_s = overwrite(place, reading, old, None)
+    files = len(list(new.iterdir()))
     print(f"saving takes {saving_s:.2f} s of the {time.perf_counter() - begin:.1f} s of a run")
     found: Counter[str] = Counter()
-    for _ in range(kills):
-        overwrite(place, reading, old, rng.uniform(0, saving_s))
+    for number in range(kills):
+        between = number % 2 == 1
+        overwrite(place, reading, old, rng.uniform(0, saving_s), rng.randrange(files) if between else None)
         answer = place / "answer"
         wait(fork(partial(answer_for, place / "run", expected, answer)))
-        found[answer.read_text()] += 1
+        found[f"{answer.read_text()}{' (between two files)' if between else ''}"] += 1
     mixed = sum(count for name, count in found.items() if "mixed" in name)
     print(f"overwrite: {mixed} of {kills} folders are mixed and accepted by a command ({describe(found)})")
 
 
-def overwrite(place: Path, reading: SequenceRequest, old: Path, after_s: float | None) -> float:
-    """Writes a run over a copy of `old`, killed so long after the first file; returns how long saving took."""
+def overwrite(
+    place: Path, reading: SequenceRequest, old: Path, after_s: float | None, at_file: int | None = None
+) -> float:
+    """Writes a run over a copy of `old`, killed so long after the first file, or before the file of this number changes
+    places; returns how long saving took."""
     out = place / "run"
     shutil.rmtree(out, ignore_errors=True)
     shutil.copytree(old, out)
@@ -184,18 +192,35 @@ def overwrite(place: Path, reading: SequenceRequest, old: Path, after_s: float |
         import ggslam.runs.folder
 
         ggslam.runs.folder.publish_run = publish_run  # type: ignore[assignment]
+        if at_file is not None:
+            kill_before_file(at_file)
         execute(request(reading, out, 0, "seed=2", overwrite=True))
 
     process = fork(run)
     os.read(reads, 1)
     begin = time.perf_counter()
-    if after_s is not None:
+    if after_s is not None and at_file is None:
         time.sleep(after_s)
         os.kill(process, signal.SIGKILL)
     wait(process)
     for end in (reads, writes):
         os.close(end)
     return time.perf_counter() - begin
+
+
+def kill_before_file(number: int) -> None:
+    """Kills this process when so many files have left the folder that they were staged in."""
+    real, moved = Path.replace, 0
+
+    def replace(path: Path, target: Path) -> Path:
+        nonlocal moved
+        if path.parent.name.startswith(".staged-") and Path(target).parent != path.parent:
+            if moved == number:
+                os.kill(os.getpid(), signal.SIGKILL)
+            moved += 1
+        return real(path, target)
+
+    Path.replace = replace  # type: ignore[method-assign,assignment]
 
 
 def answer_for(run: Path, expected: dict[str, dict[str, str]], answer: Path) -> None:

@@ -39,13 +39,16 @@ class Ended:
 
     @property
     def said(self) -> str:
-        """The line that matters to a person: the error, else what a command doubts, else the last one."""
-        lines = [line.strip() for line in self.text.replace("\r", "\n").splitlines() if line.strip()]
-        for words in (("error:", "Error"), ("interrupted", "stopped"), ("warning", "doubt", "health", "note")):
+        """The line that matters to a person: the error, else what a command doubts, else the last one that is no
+        proposal of what to do next."""
+        lines = [line.strip("│╭╰─╮╯ \t") for line in self.text.replace("\r", "\n").splitlines()]
+        lines = [line for line in lines if line not in ("", "Error")]
+        for words in (("error",), ("interrupted", "stopped"), ("wrong:",), ("warning", "doubtful:", "note")):
             found = [line for line in lines if line.lower().startswith(tuple(word.lower() for word in words))]
             if found:
-                return found[-1]
-        return lines[-1] if lines else ""
+                return found[-1 if words[0] == "error" else 0]
+        told = lines[: next((k for k, line in enumerate(lines) if line.startswith("next:")), len(lines))]
+        return told[-1] if told else ""
 
 
 @dataclass
@@ -106,7 +109,8 @@ class Place:
         kept = [*self.kept, *self._found()]
         if not kept:
             problems.append("nothing kept")
-        return Row(fault, worst.said.replace(str(self.folder), "."), worst.code, "; ".join(kept), problems)
+        said = next((ended.said for ended in (worst, self.ended[-1]) if ended.said), "")  # who is killed says nothing
+        return Row(fault, said.replace(str(self.folder), "."), worst.code, "; ".join(kept), problems)
 
     def _found(self) -> list[str]:
         found = [what for what in (run_at(self.out), run_elsewhere(self.ended[-1].text, self.folder)) if what]
@@ -186,6 +190,8 @@ def _in_child(words: list[str], said: Path, after: Hook | None, memory: int) -> 
         os.dup2(out, number)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.setsid()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # which nohup or a shell's background ignore
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     signal.alarm(SECONDS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + memory, used + memory))

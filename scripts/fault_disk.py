@@ -127,6 +127,7 @@ FAULTS: dict[str, Callable[[Place], None]] = {
     "the disk is full: export of a mesh": full("export", "--format", "mesh", "--voxel", "0.02", "--out", "mesh.ply"),
     "the disk is full: encode": full("encode", "points.bin", size="8k"),
     "the disk is full: edit": full("edit", "--rename", "1", "thing of mine", "--out", "edited"),
+    "the disk is full: pictures": full("render", "--out", "pictures", size="64k"),
     "the disk is full: a page for the browser": full("view", "--html", "room.html"),
     "the output folder becomes read-only in mid-run": read_only_run,
     "the output folder is deleted in mid-run": deleted_out,

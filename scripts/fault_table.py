@@ -34,6 +34,13 @@ import ggslam.cli.main  # noqa: E402, F401  (what all processes share)
 import ggslam.jobs.run.pipeline  # noqa: E402, F401
 
 FRAMES = 14
+HEAD = """# Faults
+
+What goes wrong, what ggslam says (the line that matters), and what is kept of your work; written by
+`python scripts/fault_table.py --markdown docs/faults.md`, which lets each happen in a folder of its own, here `.`.
+Exit codes: 0 done (3 with `--strict` where something seems wrong), 2 the input's fault, 1 the machine's or ours,
+128 + n after signal n, -9 after a kill. After a kill the line is that of the command that goes on.
+"""
 
 
 def make_inputs(folder: Path) -> tuple[Path, Path]:
@@ -79,12 +86,7 @@ def table(rows: list[Row]) -> str:
 
 def page(rows: list[Row]) -> str:
     """The table as a page of docs."""
-    return (
-        "# Faults\n\nWhat goes wrong, what ggslam says, and what is kept of your work; printed by\n"
-        "`python scripts/fault_table.py`, which lets each happen in a folder of its own, here `.`.\n"
-        "Exit codes: 2 the input's fault, 1 the machine's or ours, 128 + n after signal n, -9 after a kill.\n\n"
-        f"{table(rows)}\n"
-    )
+    return f"{HEAD}\n{table(rows)}\n"
 
 
 def write(rows: list[Row], markdown: Path | None, records: Path | None) -> None:

@@ -21,7 +21,7 @@ EPILOG = """
 
   ggslam export runs/kitchen --format gltf --out kitchen_splats.glb
 
-  ggslam export runs/kitchen --out kitchen.sog
+  ggslam export runs/kitchen --zoom 4 --out kitchen.sog
 
   ggslam export runs/kitchen --out kitchen.usdz
 
@@ -77,6 +77,12 @@ Rendered = Annotated[
                  "default where the recording is gone or the run was edited."),
 ]  # fmt: skip
 
+Zoom = Annotated[
+    float,
+    typer.Option(help="Formats of Gaussians: how many times larger than the run's images they will be drawn (of a map "
+                 "trained at 320x240, 4 for a window of 1280x960): sharper there, softer in small."),
+]  # fmt: skip
+
 
 SourcePath = Annotated[
     Path,
@@ -96,6 +102,7 @@ def export(
     keyframes: Keyframes = False,
     sequence: options.MovedSequence = None,
     rendered: Rendered = False,
+    zoom: Zoom = 1.0,
 ) -> None:
     """Write a run's map, trajectory or images in a format that other programs read."""
     from ggslam.cli.observer import ProgressObserver
@@ -104,6 +111,6 @@ def export(
     with progress_bar() as bar:
         message = export_run(
             run, out, asked, voxel=voxel, objects=objects, min_opacity=min_opacity, plain=plain, keyframes=keyframes,
-            recording=sequence, rendered=rendered, observer=ProgressObserver(bar),
+            recording=sequence, rendered=rendered, zoom=zoom, observer=ProgressObserver(bar),
         )  # fmt: skip
     console.print(message, highlight=False, markup=False)

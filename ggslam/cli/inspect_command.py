@@ -39,11 +39,13 @@ def inspect(
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
-    scale: options.Scale = 1.0,
+    scale: options.Scale = None,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
     masks: options.Masks = None,
+    camera: options.OwnCamera = None,
+    intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
     min_confidence: options.MinConfidence = None,
     topics: options.Topics = None,
@@ -67,7 +69,7 @@ def inspect(
     recording = open_sequence(
         sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, masks=masks,
         depth_scale=depth_scale, depth_camera=depth_camera, min_confidence=min_confidence, topics=topics or (),
-        pose_convention=pose_convention,
+        pose_convention=pose_convention, camera=camera, intrinsics=intrinsics,
     )  # fmt: skip
     report = inspect_sequence(recording, samples=samples)
     for name, value in _lines(report):
@@ -121,7 +123,7 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
     lines = [
         ("recording", f"{r.name} ({r.format})"),
         ("frames", f"{r.frames}, {r.duration_s:.1f} s at {r.rate_hz:.1f} Hz ({r.time_source})"),
-        ("camera", _camera(r.camera)),
+        ("camera", _camera(r.camera) + (f" ({r.camera_source})" if r.camera_source else "")),
         ("depth", f"{r.depth_m[0]:.2f} to {r.depth_m[2]:.2f} m, median {r.depth_m[1]:.2f} m; {r.valid_share:.0%} of "
                   f"pixels; {r.depth_scale:g} units a metre"),
         ("images", _images(r)),

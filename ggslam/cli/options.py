@@ -32,7 +32,11 @@ RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `ggsla
 Start = Annotated[int, typer.Option("--start", help="First frame to use.", min=0)]
 Stop = Annotated[int | None, typer.Option(help="Stop before this frame.", min=1)]
 Stride = Annotated[int, typer.Option(help="Use only every n-th frame.", min=1)]
-Scale = Annotated[float, typer.Option(help="Resize the images by this factor, e.g. 0.5.")]
+Scale = Annotated[
+    float | None,
+    typer.Option(help="Resize the images by this factor, e.g. 0.5; default: 1, or of colour much finer than depth "
+                 "(phones) what leaves 640x480 pixels."),
+]  # fmt: skip
 Threads = Annotated[int | None, typer.Option(help="Number of threads; default: one per processor.", min=1, max=1024)]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
 DepthScale = Annotated[
@@ -45,6 +49,16 @@ DepthCamera = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="YAML file with the calibration of a separate depth camera."),
 ]
+OwnCamera = Annotated[
+    Path | None,
+    typer.Option("--camera", metavar="FILE", help="YAML file with the calibration of the colour camera, instead of the "
+                 "recording's own: width, height, fx, fy, cx, cy[, distortion, depth_scale]."),
+]  # fmt: skip
+Intrinsics = Annotated[
+    str | None,
+    typer.Option(metavar="'FX FY CX CY [K1 ...]'", help="The same as numbers, of colour images as stored: pixels, then "
+                 "up to 8 coefficients of distortion in OpenCV's order."),
+]  # fmt: skip
 MinConfidence = Annotated[
     int | None, typer.Option(help="Drop depth of lower confidence (0, 1, 2; default 1), where the recording stores it.")
 ]

@@ -129,11 +129,12 @@ def run(
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
-    scale: options.Scale = 1.0,
+    scale: options.Scale = None,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
     masks: options.Masks = None,
+    camera: options.OwnCamera = None, intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
     min_confidence: options.MinConfidence = None,
     topics: options.Topics = None,
@@ -151,16 +152,14 @@ def run(
     skip_bad_frames: options.SkipBadFrames = False,
     log: Log = None,
     view: ShowPage = False,
-    host: options.Host = "127.0.0.1",
-    port: options.Port = 8080,
+    host: options.Host = "127.0.0.1", port: options.Port = 8080,
     evaluate: Evaluate = True,
     overwrite: Overwrite = False,
     strict: Strict = False,
     resume: Resume = None,
     checkpoint_every: CheckpointEvery = None,
-    help_settings: settings_help.HelpSettings = False,
-    help_setting: settings_help.HelpSetting = None,
-) -> None:
+    help_settings: settings_help.HelpSettings = False, help_setting: settings_help.HelpSetting = None,
+) -> None:  # fmt: skip
     """Track the camera, build the map, write a run folder and score it."""
     from ggslam.jobs.run.pipeline import execute
     from ggslam.runs.recordings import SequenceRequest
@@ -171,6 +170,7 @@ def run(
     reading = SequenceRequest(
         _recording(sequence), format_name, start, stop, stride, scale, masks, depth_scale,
         "skip" if skip_bad_frames else "error", depth_camera, min_confidence, tuple(topics or ()), pose_convention,
+        camera, intrinsics,
     )  # fmt: skip
     given = _overrides(settings, {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
@@ -277,9 +277,15 @@ def _print(outcome: RunOutcome) -> None:
         print_scores(outcome.metrics)
     for verdict in outcome.verdicts:
         console.print(f"[yellow]{verdict.severity}:[/] {escape(verdict.text)}", highlight=False)
-    if outcome.error is None:
-        for hint in next_commands(outcome.folder.path):
-            console.print(hint, highlight=False, markup=False, soft_wrap=True)  # commands are copied: no line breaks
+    for hint in next_commands(outcome.folder.path) if outcome.error is None else go_on_command(outcome.folder.path):
+        console.print(hint, highlight=False, markup=False, soft_wrap=True)  # commands are copied: no line breaks
+
+
+def go_on_command(run: Path) -> list[str]:
+    """How a run that was cut off goes on, if it can."""
+    from ggslam.runs.checkpoints import has_checkpoints
+
+    return [f"next: ggslam run --resume {shlex.quote(str(run))}"] if has_checkpoints(run) else []
 
 
 def next_commands(run: Path) -> list[str]:

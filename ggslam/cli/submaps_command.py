@@ -65,7 +65,11 @@ def submaps(
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
-    scale: options.Scale = 1.0,
+    scale: options.Scale = None,
+    format_name: options.Format = None,
+    depth_scale: options.DepthScale = None,
+    camera: options.OwnCamera = None,
+    intrinsics: options.Intrinsics = None,
     columns: options.Columns = 4,
 ) -> None:  # fmt: skip
     """Make a grid store, add a visit to one, or list its cells, parts, visits and changes."""
@@ -77,7 +81,10 @@ def submaps(
                     "sensor_range": sensor_range}  # fmt: skip
         request = SubmapsRequest(
             source, out, visit, poses, at, {name: value for name, value in settings.items() if value is not None},
-            SequenceRequest(source, start=start, stop=stop, stride=stride, scale=scale), columns,
+            SequenceRequest(
+                source, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
+                camera=camera, intrinsics=intrinsics,
+            ), columns,
         )  # fmt: skip
         with progress_bar() as bar:
             make_store(request, ProgressObserver(bar))

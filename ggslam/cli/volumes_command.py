@@ -109,6 +109,9 @@ def volumes(
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
+    camera: options.OwnCamera = None,
+    intrinsics: options.Intrinsics = None,
+    depth_camera: options.DepthCamera = None,
     sequence: options.MovedSequence = None,
     skip_bad_frames: options.SkipBadFrames = False,
     device: Device = None,
@@ -121,8 +124,9 @@ def volumes(
 
     braking = Braking(Latencies(sensor_ms / 1e3, 0.0, plan_ms / 1e3, network_ms / 1e3), friction)
     reading = SequenceRequest(
-        source, format=format_name, start=start, stop=stop, stride=stride, scale=1.0 if scale is None else scale,
+        source, format=format_name, start=start, stop=stop, stride=stride, scale=scale,
         depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
+        camera=camera, intrinsics=intrinsics, depth_camera=depth_camera,
     )  # fmt: skip
     request = VolumesRequest(
         source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,

@@ -36,6 +36,8 @@ POOL_STEPS = 8
 """Steps' worth of pixels that are drawn from a keyframe at once."""
 TERMS, MIN_WEIGHT = 32, 5e-3
 """Contributions to a pixel that training looks at: at most so many, none lighter."""
+SPLIT_STRIDE = 2
+"""A split looks at every so manyth pixel and row."""
 BIRTH_VOTE = 0.1
 """Weight of the vote that a Gaussian gets for the pixel it is born from."""
 IDS = 65536
@@ -147,18 +149,25 @@ class IdentityLearner(ABC):
         self._forget_shown()
         self.table.add(np.flatnonzero(np.bincount(self.current(mask).reshape(-1), minlength=1)).astype(np.uint16))
 
-    def merge(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
-        """Two objects turned out to be one: masks, votes and classes of `dropped` become those of `kept`."""
-        kept = int(self._alias[kept])
-        if kept == dropped:
+    def merge(self, gaussians: GaussianMap, pairs: Sequence[tuple[int, int]]) -> None:
+        """Objects turned out to be one: masks, votes and classes of the second of each pair become those of the
+        first. However many pairs there are, the Gaussians are gone through once."""
+        kept, dropped = [], []
+        for first, second in pairs:
+            into = int(self._alias[first])
+            if into != second:
+                self._alias[self._alias == second] = into
+                self._whole_of[second] = 0
+                kept.append(into)
+                dropped.append(second)
+        if not dropped:
             return
-        self._alias[self._alias == dropped] = kept
-        self._whole_of[dropped] = 0
         self._ids_changed()
         self._merge_votes(gaussians)
-        self.table.add(np.array([kept], np.uint16))
-        if self.table.classes(np.array([dropped]))[0] >= 0:
-            self._dissolve(gaussians, kept, dropped)
+        self.table.add(np.unique(self._alias[kept]))
+        gone = [i for i in dropped if self.table.classes(np.array([i]))[0] >= 0]
+        if gone:
+            self._dissolve(gaussians, gone)
 
     def forget(self, gaussians: GaussianMap, object_ids: Sequence[int]) -> None:
         """Objects that were none: their class goes, their Gaussians become what else they look like."""
@@ -178,13 +187,15 @@ class IdentityLearner(ABC):
     def _forget_shown(self) -> None:
         self._shown = None
 
-    def _split_off(self, whole: int, part: int) -> bool:
-        """Remembers a part of an object; False if both were merged into one."""
-        if whole == part:
-            return False
-        self._whole_of[part] = whole
-        self._ids_changed()
-        return True
+    def _split_off(self, splits: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Remembers parts of objects; without those that were merged into one."""
+        current = [(int(self._alias[whole]), int(self._alias[part])) for whole, part in splits]
+        found = [(whole, part) for whole, part in current if whole != part]
+        for whole, part in found:
+            self._whole_of[part] = whole
+        if found:
+            self._ids_changed()
+        return found
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
@@ -271,10 +282,12 @@ class IdentityLearner(ABC):
         of the rendered features [F, H, W]."""
 
     @abstractmethod
-    def split(self, gaussians: GaussianMap, rasterizer: Any, mask: np.ndarray, whole: int, part: int) -> None:
-        """An object turned out to be two: what the last rendering shows where `mask` (uint16 [H, W]) has the part, and
-        more of it there than elsewhere, now votes for the part as it did for the whole. In older keyframes the map
-        decides from now on which pixels of the whole are the part's."""
+    def split(
+        self, gaussians: GaussianMap, rasterizer: Any, mask: np.ndarray, splits: Sequence[tuple[int, int]]
+    ) -> None:
+        """Objects turned out to be two, a whole and a part each: what the last rendering shows where `mask` (uint16
+        [H, W]) has the part, and more of it there than elsewhere, now votes for the part as it did for the whole. In
+        older keyframes the map decides from now on which pixels of the whole are the part's."""
 
     @abstractmethod
     def _learned_labels(self, gaussians: GaussianMap) -> torch.Tensor:
@@ -289,6 +302,6 @@ class IdentityLearner(ABC):
         """The votes follow `_alias`."""
 
     @abstractmethod
-    def _dissolve(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
-        """Removes the class of `dropped`; Gaussians that have it get the code of what they are by votes, else of
-        `kept`."""
+    def _dissolve(self, gaussians: GaussianMap, dropped: Sequence[int]) -> None:
+        """Removes the classes of merged objects; Gaussians that have them get the code of what they are by votes, else
+        of what they were merged into."""

@@ -44,11 +44,13 @@ class KeyframeLabels:
         mask: uint16 [H, W], 0 = unlabelled; None: nothing is known.
         merges: (kept, dropped) objects that turned out to be one.
         splits: (whole, part): where the mask has the part, the map still shows the whole.
+        forgotten: objects that were none.
     """
 
     mask: np.ndarray | None = None
     merges: list[tuple[int, int]] = field(default_factory=list)
     splits: list[tuple[int, int]] = field(default_factory=list)
+    forgotten: list[int] = field(default_factory=list)
 
 
 Labeller = Callable[[Keyframe, "Callable[[], MapLabels] | None"], KeyframeLabels]

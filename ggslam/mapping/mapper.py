@@ -207,16 +207,11 @@ class Mapper(ABC):
         keyframe.mask = labels.mask
         if labels.mask is None or self.identity is None:
             return
-        for kept, dropped in labels.merges:
-            self.identity.merge(self.map, kept, dropped)
+        self.identity.merge(self.map, labels.merges)
+        if labels.forgotten:
+            self.identity.forget(self.map, labels.forgotten)
         self.identity.observe(labels.mask)
-        for whole, part in labels.splits:
-            self._split(labels.mask, whole, part)
-
-    def _split(self, mask: np.ndarray, whole: int, part: int) -> None:
-        """What the last rendering shows of `whole` where `mask` [H, W] has `part` becomes the part."""
-        assert self.identity is not None
-        self.identity.split(self.map, self._rasterizer, mask, whole, part)
+        self.identity.split(self.map, self._rasterizer, labels.mask, labels.splits)
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 

@@ -28,7 +28,20 @@ def merge_votes(gaussians: GaussianMap, alias: torch.Tensor) -> None:
     """Replaces ids in the votes by `alias` (int32 [65536] on the map's device); slots that then name one object become
     one."""
     ids, weights = gaussians.vote_ids, gaussians.vote_weights
-    ids.copy_(alias[ids.long()])
+    merged = alias[ids.long()]
+    if ids.device.type != "cpu":  # to ask which rows change would wait for the device
+        _merge_rows(merged, weights)
+        ids.copy_(merged)
+        return
+    rows = (merged != ids).any(1).nonzero()[:, 0]
+    if len(rows):
+        ids_there, weights_there = merged[rows], weights[rows]
+        _merge_rows(ids_there, weights_there)
+        ids[rows], weights[rows] = ids_there, weights_there
+
+
+def _merge_rows(ids: torch.Tensor, weights: torch.Tensor) -> None:
+    """Slots of a row that name one object become one, and those that name none lose their weight."""
     weights.masked_fill_(ids == 0, 0)
     for a in range(ids.shape[1]):
         for b in range(a + 1, ids.shape[1]):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -40,12 +40,14 @@ class Association:
         created: ids that appear for the first time.
         splits: (whole, part) pairs: the map still shows the whole where `ids` has the part. Votes that the whole has
             on those pixels were wrong; without taking them back, the part prevails once it has more of its own.
+        forgotten: ids of objects that no later keyframe found again: they are none.
     """
 
     ids: np.ndarray
     merges: list[tuple[int, int]] = field(default_factory=list)
     created: list[int] = field(default_factory=list)
     splits: list[tuple[int, int]] = field(default_factory=list)
+    forgotten: list[int] = field(default_factory=list)
 
 
 class Associator:
@@ -72,6 +74,9 @@ class Associator:
         self._blocked[[0, *reserved]] = True
         self._highest = 0
         self._ran_out = False
+        self._keyframes = 0
+        self._doubted: list[tuple[int, list[int]]] = []
+        """Keyframes that created objects, and these, until it shows whether they are found again."""
         self.sightings: dict[int, int] = {}
 
     @property
@@ -115,7 +120,23 @@ class Associator:
             self.sightings[i] = self.sightings.get(i, 0) + 1
         for kept, dropped in result.merges:
             self.sightings[kept] = max(self.sightings.get(kept, 0), self.sightings.pop(dropped, 0))
-        return result
+        return result if self.uses_own_ids else replace(result, forgotten=self._forget(result.created))
+
+    def _forget(self, created: list[int]) -> list[int]:
+        """Objects created long ago that no keyframe has found again."""
+        self._keyframes += 1
+        if created:
+            self._doubted.append((self._keyframes, created))
+        gone: list[int] = []
+        while self._doubted and self._keyframes - self._doubted[0][0] > self._settings.patience:
+            gone += [i for i in self._doubted.pop(0)[1] if self.sightings.get(i) == 1]
+        if gone:
+            self._current[np.isin(self._current, gone)] = 0
+            self._evidence.forget(set(gone))
+            self._fragments.forget(set(gone))
+            for i in gone:
+                del self.sightings[i]
+        return gone
 
     def _choose(
         self, overlap: SegmentOverlap, depth: np.ndarray, camera: Camera | None, T_world_camera: np.ndarray | None
@@ -203,14 +224,18 @@ class Associator:
     def _new_id(self, wanted: int) -> int:
         """The mask's own id if no object ever had it, else the next one free; 0 when none is left."""
         if self._used[wanted]:
-            free = np.flatnonzero(~(self._used | self._blocked))
-            later = free[free > self._highest]
-            if not len(free):
+            wanted = self._next_free(self._highest + 1) or self._next_free(1)
+            if not wanted:
                 if not self._ran_out:
                     _log.warning("more than 65535 objects: further ones stay unlabelled")
                 self._ran_out = True
                 return 0
-            wanted = int(later[0] if len(later) else free[0])
         self._used[wanted] = True
         self._highest = max(self._highest, wanted)
         return wanted
+
+    def _next_free(self, begin: int) -> int:
+        """The first id from `begin` on that no object ever had and that is not reserved; 0: there is none."""
+        taken = self._used[begin:] | self._blocked[begin:]
+        first = int(taken.argmin()) if len(taken) else 0
+        return begin + first if len(taken) and not taken[first] else 0

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,6 +81,13 @@ class PairEvidence:
             kept, dropped = (a, b) if self._largest.get(a, 0) >= self._largest.get(b, 0) else (b, a)
             self._join(kept, dropped)
             done.append((kept, dropped))
+
+    def forget(self, object_ids: Collection[int]) -> None:
+        """These objects are no more."""
+        for i in object_ids:
+            self._largest.pop(i, None)
+        for key in [key for key in self._pairs if key[0] in object_ids or key[1] in object_ids]:
+            del self._pairs[key]
 
     def _is_one(self, pair: _Pair) -> bool:
         enough = pair.observations >= self._settings.merge_observations

@@ -9,6 +9,7 @@ comes back at its place.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,6 +106,13 @@ class FragmentMemory:
             for fragment in fragments:
                 fragment.object_id = kept if fragment.object_id == dropped else fragment.object_id
             self._of[parent] = [fragment for fragment in fragments if fragment.object_id != parent]
+
+    def forget(self, object_ids: Collection[int]) -> None:
+        """These objects are no more."""
+        for i in object_ids:
+            self._of.pop(i, None)
+        for parent, fragments in self._of.items():
+            self._of[parent] = [fragment for fragment in fragments if fragment.object_id not in object_ids]
 
     def _is_proven(self, fragment: Fragment) -> bool:
         enough = fragment.apart >= self._settings.split_observations

@@ -49,6 +49,8 @@ class AssociationSettings:
     """Two objects become one after lying together in one segment this often; see `merge_ratio`."""
     merge_ratio: float = setting(1.0, 0, 1e6)
     """Two objects become one if they lay together this many times as often as apart."""
+    patience: int = setting(12, 1, 10**6)
+    """An object that none of so many further keyframes found again is forgotten: noise of a segmenter."""
     split_observations: int = setting(3, 1, 10**6)
     """A part of an object becomes an object after being a segment of its own this often; see `split_ratio`."""
     split_ratio: float = setting(2.0, 0, 1e6)

@@ -44,6 +44,8 @@ def publish_run(target: Path, write: Callable[[Path], RunRecord], old: Sequence[
             shutil.rmtree(staged, ignore_errors=True)
             if isinstance(error, OSError):
                 raise _explain(failure, error) from None
+            if isinstance(error, GgslamError):
+                error.args = (_without_staging(str(error), staged, target),)
             raise
         meanwhile = {"complete": False, "stopped_by": "saving did not finish"}
         try:
@@ -86,6 +88,12 @@ def change_in_run(path: Path | None) -> Iterator[None]:
         return
     with change_files(path.parent, [path.name]):
         yield
+
+
+def _without_staging(text: str, staged: Path, target: Path) -> str:
+    """What went wrong with a file, by the name that it was to have."""
+    text = text.replace(f"{staged}: cannot be made", f"{target}: cannot be written to")
+    return text.replace(f"{staged}{os.sep}", f"{target}{os.sep}")
 
 
 def _files_that_stay(staged: Path, target: Path, old: Sequence[str]) -> dict[str, object]:

@@ -27,7 +27,7 @@ class SequenceRequest:
     start: int = 0
     stop: int | None = None
     stride: int = 1
-    scale: float = 1.0
+    scale: float | None = None
     masks: Path | None = None
     depth_scale: float | None = None
     on_bad_frame: str = "error"
@@ -35,6 +35,8 @@ class SequenceRequest:
     min_confidence: int | None = None
     topics: tuple[str, ...] = ()
     pose_convention: str | None = None
+    camera: Path | None = None
+    intrinsics: str | None = None
 
     def open(self) -> Sequence:
         """Opens the recording.
@@ -47,7 +49,7 @@ class SequenceRequest:
             self.path, format=self.format, start=self.start, stop=self.stop, stride=self.stride, scale=self.scale,
             masks=self.masks, depth_scale=self.depth_scale, on_bad_frame=self.on_bad_frame,  # type: ignore[arg-type]
             depth_camera=self.depth_camera, min_confidence=self.min_confidence, topics=self.topics,
-            pose_convention=self.pose_convention,
+            pose_convention=self.pose_convention, camera=self.camera, intrinsics=self.intrinsics,
         )  # fmt: skip
 
 
@@ -67,7 +69,7 @@ class LiveRequest(SequenceRequest):
         plain = SequenceRequest(self.path, stop=self.stop, scale=self.scale, on_bad_frame=self.on_bad_frame)
         if replace(self, record=None) != LiveRequest(**asdict(plain)):
             raise SequenceError(f"{self.path}: of a live camera only `stop` and `scale` can be chosen")
-        source = open_live(str(self.path), self.scale)
+        source = open_live(str(self.path), 1.0 if self.scale is None else self.scale)
         return LiveSequence(source, self.stop, self.record)
 
 
@@ -78,9 +80,10 @@ def describe(
     with, if any."""
     values = asdict(request)
     values.pop("record", None)
+    values["scale"] = sequence.scale if isinstance(sequence, Sequence) else values["scale"] or 1.0
     if isinstance(sequence, LiveSequence):  # what was recorded is a plain folder, scaled already
         values |= {"path": sequence.path if sequence.record else request.path, "scale": 1.0, "stop": None}
-    for name in ("path", "masks", "depth_camera"):
+    for name in ("path", "masks", "depth_camera", "camera"):
         if values[name] is not None and not is_live(values[name]):
             values[name] = Path(values[name]).absolute()
     return SequenceRecord.of({
@@ -116,6 +119,7 @@ def request_in(record: OpenRecord, path: Path | None = None, masks: Path | None 
         **record.model_dump(), "path": Path(path if path is not None else record.path),
         "masks": None if used is None else Path(used), "topics": tuple(record.topics),
         "depth_camera": None if record.depth_camera is None else Path(record.depth_camera),
+        "camera": None if record.camera is None else Path(record.camera),
     })  # fmt: skip
 
 
@@ -139,7 +143,7 @@ def open_recording_of(
     if is_live(request.path):
         raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (`record`)")
     sequence = replace(request, scale=request.scale if scale is None else scale).open()
-    found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scale(request.scale))}
+    found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scale(record.open.scale))}
     expected = {"frames": record.frames, "camera": asdict(record.camera)}
     if json_ready(found) != expected:
         raise RunFolderError(f"{sequence.path}: not the recording of {folder.path}: expected {expected}, found {found}")

@@ -54,7 +54,7 @@ def save_run(
     if not result.keyframes or result.config is None:
         raise RunFolderError(f"{folder}: the run has no keyframe, so there is no map to save")
     if sequence is None:
-        request = SequenceRequest(Path(NO_RECORDING))
+        request = SequenceRequest(Path(NO_RECORDING), scale=1.0)
         described = describe(request, cast(Sequence, _Frames(result.keyframes[0].camera, len(result.frames))))
     else:
         described = describe(request_of(sequence), sequence)

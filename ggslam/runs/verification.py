@@ -49,7 +49,16 @@ class Verification:
         lines += [f"  {name}: not in the manifest" for name in self.others]
         lines += [f"  incomplete: {note}" for note in mark.notes() if not mark.complete and "edited" not in note]
         lines += ["  it can be gone on with: ggslam run --resume"] if self.resumable else []
-        return [*lines, "all as it was written" if self.good else "not as it was written, or not complete"]
+        return [*lines, self.summary()]
+
+    def summary(self) -> str:
+        """In one line."""
+        if self.good:
+            return "all as it was written"
+        names = [problem.name for problem in self.problems]
+        more = f" and {len(names) - 3} more" if names[3:] else ""
+        changed = f"not as it was written: {', '.join(names[:3])}{more}"
+        return "; ".join([changed] * bool(names) + ["not complete"] * (not self.mark.complete))
 
 
 def verify_run(path: Path) -> Verification:

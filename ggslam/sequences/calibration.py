@@ -30,6 +30,8 @@ from ggslam.sequences.recording import DepthCamera, Recording, read_text
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 
 MODELS = ("opencv", "fisheye")
+FARTHEST_CENTRE = 100.0
+"""Image sizes; no principal point, not even that of a picture cut out of a larger one, lies farther off."""
 
 
 def read_calibration(path: Path) -> dict[str, Any]:
@@ -62,6 +64,8 @@ def camera_entry(path: Path, settings: dict[str, Any]) -> Camera:
     width, height, fx, fy, cx, cy = (
         number_entry(path, settings, key) for key in ("width", "height", "fx", "fy", "cx", "cy")
     )
+    if abs(cx) > FARTHEST_CENTRE * abs(width) or abs(cy) > FARTHEST_CENTRE * abs(height):
+        raise SequenceError(f"{path}: impossible principal point {cx:g}, {cy:g} of an image of {width:g}x{height:g}")
     try:
         return Camera(int(width), int(height), fx, fy, cx, cy)
     except ValueError as error:

@@ -20,6 +20,7 @@ from ggslam.sequences.formats.record3d import Record3DFormat
 from ggslam.sequences.formats.replica import ReplicaFormat
 from ggslam.sequences.formats.ros_bag import Ros1Format, Ros2Format
 from ggslam.sequences.formats.ros_topics import ROLES
+from ggslam.sequences.formats.scanner_app import ScannerAppFormat
 from ggslam.sequences.formats.scannet import ScanNetFormat
 from ggslam.sequences.formats.scannetpp import ScanNetPlusFormat
 from ggslam.sequences.formats.seven_scenes import SevenScenesFormat
@@ -28,6 +29,7 @@ from ggslam.sequences.formats.transforms_json import TransformsFormat
 from ggslam.sequences.formats.tum import TumFormat
 from ggslam.sequences.formats.vmap import VmapFormat
 from ggslam.sequences.masks import find_masks
+from ggslam.sequences.own_camera import read_own_camera, use_own_camera
 from ggslam.sequences.pose_conventions import convert_poses
 from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat
 from ggslam.sequences.sequence import OnBadFrame, Sequence
@@ -47,11 +49,14 @@ FORMATS: tuple[RecordingFormat, ...] = (
     Record3DFormat(),
     PolycamFormat(),
     StrayFormat(),
+    ScannerAppFormat(),
     RealSenseFormat(),
     Ros1Format(),
     Ros2Format(),
 )
 """Known formats in the order in which they are tried."""
+SMALLEST_SCALE = 1e-6
+"""Units of depth images a metre, and one over it the largest: nobody counts in others, and float32 bears them."""
 
 
 def open_sequence(
@@ -61,7 +66,7 @@ def open_sequence(
     start: int = 0,
     stop: int | None = None,
     stride: int = 1,
-    scale: float = 1.0,
+    scale: float | None = None,
     masks: str | Path | None = None,
     depth_scale: float | None = None,
     on_bad_frame: OnBadFrame = "error",
@@ -69,6 +74,8 @@ def open_sequence(
     min_confidence: int | None = None,
     topics: Iterable[str] = (),
     pose_convention: str | None = None,
+    camera: str | Path | None = None,
+    intrinsics: str | None = None,
 ) -> Sequence:
     """Opens an RGB-D recording.
 
@@ -77,7 +84,8 @@ def open_sequence(
         format: name of a format in `FORMATS`; None: recognised from the folder or file.
         start, stop, stride: frames start, start + stride, ... below stop (None: to the end). A stop past the end means
             the end.
-        scale: size of the delivered images, in (0, 1].
+        scale: size of the delivered images, in (0, 1]; None: 1, but of colour much finer than depth (phones) what
+            leaves 640x480 pixels.
         masks: folder of instance masks to use instead of the recording's own; see `masks.find_masks`.
         depth_scale: depth units per metre, instead of the recording's own.
         on_bad_frame: "error": a damaged frame or mask raises; "skip": `stream` skips the frame and lists it in
@@ -88,6 +96,8 @@ def open_sequence(
             sure it is; None: `DEFAULT_CONFIDENCE`.
         topics: of a ROS bag, "role=topic" each, where they are not found by themselves; see `ros_topics`.
         pose_convention: what the recording's poses really are, if not what its format says; see `pose_conventions`.
+        camera: YAML file with the calibration of the colour camera, instead of the recording's own (see `calibration`).
+        intrinsics: the same as "fx fy cx cy", then up to 8 coefficients of distortion, of colour images as stored.
 
     Raises:
         MissingDependency: a package is needed to read the recording.
@@ -96,16 +106,17 @@ def open_sequence(
     topics = tuple(topics)
     read = partial(
         _read_recording, Path(path).expanduser(), format, None if masks is None else Path(masks).expanduser(),
-        depth_scale, _options(depth_camera, min_confidence, topics), pose_convention,
+        depth_scale, _options(depth_camera, min_confidence, topics, camera, intrinsics), pose_convention,
     )  # fmt: skip
     recording = read()
     selection = _selection(recording, start, stop, stride)
     sequence = Sequence(recording, selection, scale=scale, on_bad_frame=on_bad_frame, reopen=read)
     sequence.options = {
-        "path": Path(path).expanduser(), "format": format, "scale": scale,
+        "path": Path(path).expanduser(), "format": format, "scale": sequence.scale,
         "masks": None if masks is None else Path(masks).expanduser(), "depth_scale": depth_scale,
         "on_bad_frame": on_bad_frame, "depth_camera": None if depth_camera is None else Path(depth_camera).expanduser(),
         "min_confidence": min_confidence, "topics": topics, "pose_convention": pose_convention,
+        "camera": None if camera is None else Path(camera).expanduser(), "intrinsics": intrinsics,
     }  # fmt: skip
     return sequence
 
@@ -126,6 +137,8 @@ def _read_recording(
     _check_places(recording)
     if options.depth_camera is not None:
         use_depth_camera(recording, options.depth_camera)
+    if options.own_camera is not None:
+        use_own_camera(recording, options.own_camera)
     if options.min_confidence is not None:
         recording.min_confidence = options.min_confidence
     if masks is not None:
@@ -136,8 +149,9 @@ def _read_recording(
         if recording.poses is None:
             raise SequenceError(f"{folder}: tells no poses, so there are none to convert from {pose_convention}")
         recording.poses = convert_poses(recording.poses, pose_convention)
-    if not (math.isfinite(recording.depth_scale) and recording.depth_scale > 0):
-        raise SequenceError(f"{folder}: depth scale must be a positive number, found {recording.depth_scale}")
+    if not SMALLEST_SCALE <= recording.depth_scale <= 1 / SMALLEST_SCALE:
+        told = "none" if math.isnan(recording.depth_scale) and depth_scale is None else f"{recording.depth_scale}"
+        raise SequenceError(f"{folder}: depth scale must be a positive number of usual size, found {told}")
     return recording
 
 
@@ -167,7 +181,10 @@ def _use_masks(recording: Recording, folder: Path) -> None:
     recording.files = [dataclasses.replace(entry, mask=mask) for entry, mask in pairs]
 
 
-def _options(depth_camera: str | Path | None, min_confidence: int | None, topics: Iterable[str]) -> ReadOptions:
+def _options(
+    depth_camera: str | Path | None, min_confidence: int | None, topics: Iterable[str], camera: str | Path | None,
+    intrinsics: str | None,
+) -> ReadOptions:  # fmt: skip
     if min_confidence is not None and min_confidence not in (0, 1, 2):
         raise SequenceError(f"min_confidence: expected 0, 1 or 2, found {min_confidence}")
     by_role = {}
@@ -176,7 +193,8 @@ def _options(depth_camera: str | Path | None, min_confidence: int | None, topics
         if role not in ROLES or not topic:
             raise SequenceError(f"topic: expected ROLE=TOPIC with a role of {', '.join(ROLES)}, found '{text}'")
         by_role[role] = topic
-    return ReadOptions(None if depth_camera is None else Path(depth_camera).expanduser(), by_role, min_confidence)
+    own = read_own_camera(None if camera is None else Path(camera).expanduser(), intrinsics)
+    return ReadOptions(None if depth_camera is None else Path(depth_camera).expanduser(), by_role, min_confidence, own)
 
 
 def recognise_format(path: str | Path) -> str | None:

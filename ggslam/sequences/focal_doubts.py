@@ -46,7 +46,7 @@ def doubt_focal_length(pairs: list[tuple[Frame, Frame]]) -> FocalDoubt | None:
     """
     generator, errors = np.random.default_rng(0), []
     for first, second in pairs:
-        matched = _matches(first, second)
+        matched = match_points(first, second)
         if matched is not None:
             errors.append(_errors(*matched, first.camera, generator))
     if not errors:
@@ -56,8 +56,8 @@ def doubt_focal_length(pairs: list[tuple[Frame, Frame]]) -> FocalDoubt | None:
     return FocalDoubt(float(medians[len(FACTORS) // 2]), float(FACTORS[best]), float(medians[best]))
 
 
-def _matches(first: Frame, second: Frame) -> tuple[np.ndarray, np.ndarray] | None:
-    """Columns, rows and depth of the same points in two frames, float64 [n, 3] each."""
+def match_points(first: Frame, second: Frame) -> tuple[np.ndarray, np.ndarray] | None:
+    """Columns, rows and depth of the same points in two frames, float64 [n, 3] each; None if they are few."""
     seen = []
     for frame in (first, second):
         grey = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)

@@ -88,7 +88,8 @@ def _read_array(path: Path) -> np.ndarray:
 def describe_channels(image: np.ndarray) -> str:
     """Channels and bits of an image, for messages."""
     channels = 1 if image.ndim == 2 else image.shape[2]
-    return f"{channels} channel{'s' if channels > 1 else ''} of {8 * image.dtype.itemsize}-bit {image.dtype.kind}"
+    kind = {"u": "integers", "i": "signed integers", "f": "floats"}.get(image.dtype.kind, str(image.dtype))
+    return f"{channels} channel{'s' if channels > 1 else ''} of {8 * image.dtype.itemsize}-bit {kind}"
 
 
 def read_content(path: Path) -> bytes:

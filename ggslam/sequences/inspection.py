@@ -15,10 +15,18 @@ from ggslam.sequences.alignment import Alignment, measure_alignment
 from ggslam.sequences.focal_doubts import doubt_focal_length
 from ggslam.sequences.pose_conventions import CONVENTIONS, OURS
 from ggslam.sequences.pose_doubts import PoseDoubt, doubt_poses, pairs_apart
+from ggslam.sequences.scale_doubts import measure_scale_signs
 from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.step_doubts import REACH as STEP_REACH
 from ggslam.sequences.step_doubts import doubt_steps
-from ggslam.sequences.verdicts import Verdict, judge_depth_scale, judge_intrinsics, judge_scale_by, judge_times
+from ggslam.sequences.verdicts import (
+    Verdict,
+    judge_depth_scale,
+    judge_intrinsics,
+    judge_scale_by,
+    judge_scale_signs,
+    judge_times,
+)
 
 APART = 12
 """Frames from one to the other of those that are compared where no true pose tells how far the camera moved."""
@@ -40,7 +48,7 @@ class SequenceReport:
     Attributes:
         name, format, frames: of the sequence.
         duration_s, rate_hz: by the timestamps; rate is the median one (NaN for a single frame).
-        time_source, pose_source: where they come from.
+        time_source, pose_source, camera_source: where they come from.
         camera, native_camera: delivered and stored intrinsics.
         color_size, depth_size: (width, height) of the stored images.
         lens: what is undone, for people; "" for a pinhole camera.
@@ -88,6 +96,7 @@ class SequenceReport:
     mask_ids: list[int] = field(default_factory=list)
     labelled_share: float = 0.0
     named_ids: int = 0
+    camera_source: str = ""
     damaged: list[str] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -106,7 +115,7 @@ def inspect_sequence(sequence: Sequence, samples: int = 8, masks: bool = True) -
         sequence.name, sequence.format, len(sequence), float(times[-1] - times[0]), _rate(intervals),
         sequence.time_source, sequence.pose_source, sequence.camera, sequence.native_camera, sequence.depth_scale,
         sequence.color_size, sequence.depth_size, sequence.lens, sequence.registered, sequence.min_confidence,
-        named_ids=len(sequence.instance_names), warnings=list(sequence.warnings),
+        named_ids=len(sequence.instance_names), camera_source=sequence.camera_source, warnings=list(sequence.warnings),
     )  # fmt: skip
     chosen = np.unique(np.linspace(0, len(sequence) - 1, max(1, min(samples, len(sequence)))).round().astype(int))
     frames = [frame for i in chosen if (frame := _try(sequence, int(i), report, masks)) is not None]
@@ -125,6 +134,9 @@ def inspect_sequence(sequence: Sequence, samples: int = 8, masks: bool = True) -
     _check_camera(report, pairs)
     _check_steps(report, sequence)
     _warn(report, times, frames)
+    if not report.posed_frames and not any(verdict.code == "depth_scale" for verdict in report.verdicts):
+        signs = measure_scale_signs(sequence, frames)
+        report.judge([] if signs is None else judge_scale_signs(report.depth_scale, signs))
     return report
 
 
@@ -187,7 +199,8 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None) -> None:
         how = f"with another one neighbouring depth images agree with the poses to {doubt.best:.2%}, with this one "
         report.judge(judge_scale_by(report.depth_scale, 1 / doubt.ratio, f"{how}only to {doubt.error:.2%}"))
     elif doubt.error > 0.05:
-        text = f"true poses and depth disagree by {doubt.error:.0%}: wrong depth scale or poses, or little seen twice"
+        causes = "wrong intrinsics, depth scale or poses, or little seen twice"
+        text = f"true poses and depth disagree by {doubt.error:.0%}: {causes}"
         report.judge([Verdict("poses", "doubtful", text)])
 
 

@@ -11,7 +11,12 @@ from ggslam.scene.camera import Camera
 from ggslam.sequences.recording import FrameFiles, ImageFile, Recording
 from ggslam.sequences.registration import DepthRegistration
 from ggslam.sequences.resampling import resize_color, resize_depth, resize_mask
+from ggslam.sequences.upsampling import upsample_depth
 
+FINER = 2.5
+"""Colour with so many times as many columns as depth is not cut to the size of depth: depth is brought to colour."""
+USUAL_PIXELS = 640 * 480
+"""Pixels of an image that two processors map as quickly as they usually do: the default scale of finer colour."""
 ASPECT_TOLERANCE = 0.01
 """Relative difference of width/height up to which two sizes count as the same view (1296x968 and 640x480: 0.4 %)."""
 
@@ -37,17 +42,20 @@ class ImageGeometry:
     """Turns the images of one recording, as stored, into images of `camera`.
 
     Colour and depth of different resolution are brought to the smaller one (to the depth image's when it has its own
-    intrinsics); depth of another camera is registered to the colour image, at about its own resolution; lens distortion
-    is undone, frames with intrinsics of their own are brought to those of the recording, and the result is scaled down.
+    intrinsics), unless colour is much finer: then depth is brought to colour, see `upsampling`. Depth of another camera
+    is registered to the colour image, at about its own resolution; lens distortion is undone, frames with intrinsics of
+    their own are brought to those of the recording, and the result is scaled down.
 
     Attributes:
         camera: intrinsics of the images that come out.
         native_camera: the same before scaling.
+        scale: of one to the other; None was given: 1, of much finer colour what leaves `USUAL_PIXELS`.
+        finer: whether depth is brought to finer colour.
         color_size, depth_size: sizes (width, height) that every stored image must have.
     """
 
     def __init__(
-        self, recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size, scale: float
+        self, recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size, scale: float | None
     ) -> None:
         if recording.depth_camera is None and not same_aspect(color_size, depth_size):
             raise SequenceError(
@@ -60,16 +68,24 @@ class ImageGeometry:
         self._warp: np.ndarray | None = None
         self._seen: np.ndarray | None = None
         self._registration: DepthRegistration | None = None
+        self.finer = False
         if recording.depth_camera is not None:
             self.native_camera = self._register(recording, depth_size, files)
         elif recording.depth_calibration is not None:
             self.native_camera = Camera(*depth_size, *recording.depth_calibration)
             self._align_color(color_camera.resize(*depth_size))
         else:
-            size = min(color_size, depth_size, key=lambda s: s[0] * s[1])
+            self.finer = color_size[0] >= FINER * depth_size[0]
+            size = color_size if self.finer else min(color_size, depth_size, key=lambda s: s[0] * s[1])
             self.native_camera = color_camera.resize(*size)
-        self._maps = _undistortion(self.native_camera, recording.distortion, recording.fisheye)
+        if scale is None:
+            most = USUAL_PIXELS / (self.native_camera.width * self.native_camera.height)
+            scale = min(1.0, most**0.5) if self.finer else 1.0
+        self.scale: float = scale
         self.camera = self.native_camera.scale(scale)
+        # Finer colour is brought to its last size first: it may have many times as many pixels.
+        self._work = self.camera if self.finer else self.native_camera
+        self._maps = _undistortion(self._work, recording.distortion, recording.fisheye)
 
     def _register(self, recording: Recording, depth_size: Size, files: FrameFiles) -> Camera:
         """Prepares registration of depth; returns the colour camera at about the depth image's resolution."""
@@ -129,7 +145,7 @@ class ImageGeometry:
 
     def color(self, color: np.ndarray) -> np.ndarray:
         """Colour uint8 [H, W, 3] as stored -> image of `camera`."""
-        native, size = (self.native_camera.width, self.native_camera.height), (self.camera.width, self.camera.height)
+        native, size = (self._work.width, self._work.height), (self.camera.width, self.camera.height)
         if self._warp is None and self._maps is None:
             return resize_color(color, *size)
         color = resize_color(color, *native)
@@ -139,8 +155,10 @@ class ImageGeometry:
             color = cv2.remap(color, *self._maps, interpolation=cv2.INTER_LINEAR)
         return resize_color(color, *size)
 
-    def depth(self, depth: np.ndarray) -> np.ndarray:
-        """Depth float32 [H, W] metres as stored -> image of `camera`."""
+    def depth(self, depth: np.ndarray, color: np.ndarray) -> np.ndarray:
+        """Depth float32 [H, W] metres as stored, with the colour image as stored -> image of `camera`."""
+        if self.finer:
+            return self._depth_on_color(depth, color)
         if self._registration is not None:
             return resize_depth(self._registration(depth), self.camera.width, self.camera.height)
         depth = resize_depth(depth, self.native_camera.width, self.native_camera.height)
@@ -150,9 +168,18 @@ class ImageGeometry:
             depth = cv2.remap(depth, *self._maps, interpolation=cv2.INTER_NEAREST)
         return resize_depth(depth, self.camera.width, self.camera.height)
 
+    def _depth_on_color(self, depth: np.ndarray, color: np.ndarray) -> np.ndarray:
+        """Depth on the pixels of finer colour."""
+        width, height = self.camera.width, self.camera.height
+        if width < depth.shape[1] or height < depth.shape[0]:
+            depth = resize_depth(depth, width, height)
+        else:
+            depth = upsample_depth(depth, resize_color(color, width, height))
+        return depth if self._maps is None else cv2.remap(depth, *self._maps, interpolation=cv2.INTER_NEAREST)
+
     def mask(self, mask: np.ndarray) -> np.ndarray:
         """Ids uint16 [H, W] as stored, on the colour image -> image of `camera`."""
-        native = (self.native_camera.width, self.native_camera.height)
+        native = (self._work.width, self._work.height)
         mask = resize_mask(mask, *native)
         if self._warp is not None:
             mask = cv2.warpAffine(mask, self._warp, native, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)

@@ -103,6 +103,24 @@ class DepthCamera:
 
 
 @dataclass(frozen=True)
+class OwnCamera:
+    """A colour camera that a user gives; see `own_camera`.
+
+    Attributes:
+        source: which argument tells it, for reports.
+        camera, calibration, distortion, fisheye: as in `Recording`.
+        depth_scale: units of the depth images per metre, or None.
+    """
+
+    source: str
+    camera: Camera | None
+    calibration: Calibration | None
+    distortion: np.ndarray | None
+    fisheye: bool
+    depth_scale: float | None
+
+
+@dataclass(frozen=True)
 class ReadOptions:
     """What a user says about a recording that it does not say itself.
 
@@ -110,11 +128,13 @@ class ReadOptions:
         depth_camera: YAML file with intrinsics of a depth camera that is not the colour camera, see `calibration`.
         topics: of a bag: role (color, depth, color_info, depth_info, pose) -> topic.
         min_confidence: depth less sure than this (0 to 2) is dropped; None: `DEFAULT_CONFIDENCE`.
+        own_camera: of colour, instead of what the recording tells.
     """
 
     depth_camera: Path | None = None
     topics: Mapping[str, str] = field(default_factory=dict)
     min_confidence: int | None = None
+    own_camera: OwnCamera | None = None
 
 
 NO_OPTIONS = ReadOptions()
@@ -144,6 +164,7 @@ class Recording:
         min_confidence: depth less sure than this is dropped in frames that have a confidence image.
         poses: float64 [n, 4, 4] T_world_camera with rows of NaN where unknown, or None.
         pose_source: file or folder that the poses come from, for reports.
+        camera_source: where the intrinsics come from, for reports; "" where only one place can tell them.
         time_source: where the timestamps come from, for reports.
         instance_names: names of mask ids.
         problems: frames known to be damaged without reading their images: frame number -> reason.
@@ -165,6 +186,7 @@ class Recording:
     min_confidence: int = DEFAULT_CONFIDENCE
     poses: np.ndarray | None = None
     pose_source: str = "none"
+    camera_source: str = ""
     time_source: str = f"nominal {NOMINAL_RATE:g} frames/s"
     instance_names: dict[int, str] = field(default_factory=dict)
     problems: dict[int, str] = field(default_factory=dict)
@@ -224,7 +246,8 @@ def missing_depth_problems(files: Iterable[FrameFiles]) -> dict[int, str]:
     for i, entry in enumerate(files):
         for kind, path in (("colour", entry.color), ("depth", entry.depth)):
             if isinstance(path, Path) and not path.is_file():
-                problems[i] = f"frame {i}: {kind} file {path} is missing"
+                what = "is not a regular file" if path.exists() else "is missing"
+                problems[i] = f"frame {i}: {kind} file {path} {what}"
     return problems
 
 

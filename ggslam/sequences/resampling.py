@@ -8,6 +8,8 @@ import math
 import cv2
 import numpy as np
 
+LEAST_WEIGHT = np.float32(0.1)
+"""Share of what samples cover on average that one has to cover to tell which surface a pixel shows."""
 DEPTH_TOLERANCE = np.float32(1.02)
 """Depths under a pixel that are within 2 % of the nearest one belong to the same surface."""
 
@@ -24,10 +26,14 @@ def resize_depth(depth: np.ndarray, width: int, height: int) -> np.ndarray:
     """Depth float32 [H, W] on `height` x `width` pixels, without inventing surfaces between foreground and background.
 
     Of the samples under a new pixel only those within 2 % of the nearest valid one are averaged; fewer than half of
-    them valid gives 0. Enlarging takes the nearest pixel.
+    them valid gives 0. Where sizes do not divide, samples count by how much of them lies under the new pixel, and
+    inverse depths are averaged, so that a plane keeps its depth at the centre of every pixel. Enlarging takes the
+    nearest pixel.
     """
     if depth.shape == (height, width):
         return depth
+    if width < depth.shape[1] and height < depth.shape[0] and (depth.shape[1] % width or depth.shape[0] % height):
+        return _resize_depth_by_area(depth, width, height)
     far = np.float32(1e9)
     known = np.where(depth > 0, depth, far)
     samples = _samples_of(known, width, height)
@@ -43,6 +49,50 @@ def resize_depth(depth: np.ndarray, width: int, height: int) -> np.ndarray:
         total += z * same
         count += same
     return np.where((2 * missing <= len(samples)) & (nearest < far), total / count, np.float32(0))
+
+
+def _resize_depth_by_area(depth: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Depth [H, W] on fewer pixels, whatever the factor; see `resize_depth`."""
+    inverse = np.zeros_like(depth)
+    np.divide(np.float32(1), depth, out=inverse, where=depth > 0)
+    rows, columns = _overlaps(depth.shape[0], height), _overlaps(depth.shape[1], width)
+    strips = [(np.take(inverse, index, axis=0), weight) for index, weight in rows]
+    samples = [
+        (np.take(strip, index, axis=1), row_weight[:, None] * weight[None, :])
+        for strip, row_weight in strips
+        for index, weight in columns
+    ]
+    nearest = np.zeros((height, width), np.float32)
+    for inverse_z, weight in samples:  # what no more than touches a pixel does not decide which surface it shows
+        np.maximum(nearest, inverse_z, out=nearest, where=weight * np.float32(len(samples)) > LEAST_WEIGHT)
+    limit, most = nearest / DEPTH_TOLERANCE, nearest * DEPTH_TOLERANCE
+    total, same, known = (np.zeros((height, width), np.float32) for _ in range(3))
+    for inverse_z, weight in samples:
+        near = weight * ((inverse_z > limit) & (inverse_z < most))
+        total += near * inverse_z
+        same += near
+        known += weight * (inverse_z > 0)
+    there = (known >= np.float32(0.5)) & (nearest > 0) & (total > 0)
+    result = np.zeros((height, width), np.float32)
+    np.divide(same, total, out=result, where=there)
+    return result
+
+
+def _overlaps(size: int, new_size: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """What lies under every new pixel along one axis, sample by sample: source index int64 [new_size] and weight
+    float32 [new_size]. Weights of a new pixel add up to 1, and their mean place is its centre."""
+    ratio = size / new_size
+    begin, end = np.arange(new_size) * ratio, np.arange(1, new_size + 1) * ratio
+    first = np.floor(begin + 1e-9).astype(np.int64)
+    count = int((np.ceil(end - 1e-9).astype(np.int64) - first).max())
+    at = first[:, None] + np.arange(count)
+    weights = np.clip(np.minimum(end[:, None], at + 1) - np.maximum(begin[:, None], at), 0, None) / ratio
+    offset = at + 0.5 - (begin + end)[:, None] / 2
+    spread = (weights * offset**2).sum(1) - (weights * offset).sum(1) ** 2
+    mean = (weights * offset).sum(1)
+    tilt = np.divide(mean, spread, out=np.zeros(new_size), where=spread > 1e-9)
+    weights = weights * (1 - tilt[:, None] * (offset - mean[:, None]))
+    return [(np.minimum(at[:, k], size - 1), weights[:, k].astype(np.float32)) for k in range(count)]
 
 
 def resize_mask(mask: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -59,6 +59,8 @@ class Sequence:
         path: folder or file of the recording.
         camera: intrinsics of the delivered images.
         native_camera: the same before `scale`.
+        scale: of the delivered images to the native ones.
+        finer: whether colour is much finer than depth, which is brought to colour.
         depth_scale: units per metre of the stored depth images.
         color_size, depth_size: (width, height) of the stored images.
         lens: distortion that is undone and intrinsics that change, in words; "" for a pinhole camera that stays one.
@@ -71,15 +73,15 @@ class Sequence:
         mask_problems: damaged masks met so far (only with on_bad_frame="skip": their frames are delivered without):
             index of the frame -> reason.
         instance_names: mask id -> name, as far as known.
-        pose_source, time_source: where poses and timestamps come from, for reports.
+        pose_source, time_source, camera_source: where poses, timestamps and intrinsics come from, for reports.
         options: arguments of `open_sequence` besides the selection; None if it was made otherwise.
         warnings: what a user should know about this recording.
         skipped_frames: damaged frames skipped so far (only with on_bad_frame="skip").
     """
 
     def __init__(
-        self, recording: Recording, selection: range, *, scale: float = 1.0, on_bad_frame: OnBadFrame = "error",
-        reopen: Callable[[], Recording] | None = None,
+        self, recording: Recording, selection: range, *, scale: float | None = None,
+        on_bad_frame: OnBadFrame = "error", reopen: Callable[[], Recording] | None = None,
     ) -> None:  # fmt: skip
         """Prepares the frames `selection` of a recording; `reopen` reads its description again, in another process.
 
@@ -89,7 +91,7 @@ class Sequence:
         """
         if on_bad_frame not in ("error", "skip"):
             raise SequenceError(f"`on_bad_frame`: expected 'error' or 'skip', found '{on_bad_frame}'")
-        if not (math.isfinite(scale) and 0 < scale <= 1):
+        if scale is not None and not (math.isfinite(scale) and 0 < scale <= 1):
             raise SequenceError(f"`scale`: expected a number above 0 and at most 1, found {scale}")
         self.min_confidence: int | None = None
         if any(entry.confidence is not None for entry in recording.files):
@@ -106,6 +108,7 @@ class Sequence:
         self.instance_names: dict[int, str] = dict(recording.instance_names)
         self.pose_source: str = recording.pose_source
         self.time_source: str = recording.time_source
+        self.camera_source: str = recording.camera_source
         self.warnings: list[str] = list(recording.warnings)
         self._masks = MaskReader(entry.mask for entry in recording.files)
         masked = self._select(selection)
@@ -119,10 +122,13 @@ class Sequence:
         self.color_size: tuple[int, int] = self._geometry.color_size
         self.depth_size: tuple[int, int] = self._geometry.depth_size
         self.camera: Camera = self._geometry.camera
-        if scale < 1 and min(self.camera.width, self.camera.height) < SMALLEST_SIDE:
+        self.scale: float = self._geometry.scale
+        if self.scale < 1 and min(self.camera.width, self.camera.height) < SMALLEST_SIDE:
             size = f"{self.camera.width}x{self.camera.height}"
-            raise SequenceError(f"`scale`: {scale:g} leaves images of {size}, needed are {SMALLEST_SIDE} pixels a side")
+            needed = f"needed are {SMALLEST_SIDE} pixels a side"
+            raise SequenceError(f"`scale`: {self.scale:g} leaves images of {size}, {needed}")
         self.native_camera: Camera = self._geometry.native_camera
+        self.finer: bool = self._geometry.finer
 
     def _select(self, selection: range) -> int:
         """Takes these frames of the recording; returns how many of them have masks."""
@@ -238,13 +244,14 @@ class Sequence:
             raise SequenceError(self._recording.problems[source])
         color, depth = self._read(source)
         self._geometry.check(color, depth, files)
+        color = self._geometry.steady(color, files, cv2.INTER_LINEAR)
         pose = None if self.ground_truth is None else self.ground_truth[index]
         return Frame(
             index=index,
             source_index=source,
             timestamp=float(self.timestamps[index]),
-            color=self._geometry.color(self._geometry.steady(color, files, cv2.INTER_LINEAR)),
-            depth=self._geometry.depth(self._geometry.steady(depth, files, cv2.INTER_NEAREST)),
+            color=self._geometry.color(color),
+            depth=self._geometry.depth(self._geometry.steady(depth, files, cv2.INTER_NEAREST), color),
             camera=self.camera,
             mask=self._mask(index) if masks is True else None,
             T_world_camera=pose.copy() if pose is not None and np.isfinite(pose).all() else None,
@@ -312,7 +319,7 @@ class Sequence:
             depth[confidence < self._recording.min_confidence] = 0
         return read_color(files.color), depth
 
-    def _measure(self, scale: float) -> ImageGeometry:
+    def _measure(self, scale: float | None) -> ImageGeometry:
         """Sizes and cameras from the first readable frame."""
         first_error: SequenceError | None = None
         for source in self._selection:

@@ -19,6 +19,15 @@ SMALLEST_MEDIAN_DEPTH, LARGEST_MEDIAN_DEPTH = 0.1, 6.0
 """Metres; a median depth outside suggests a wrong depth scale: RGB-D cameras see rooms."""
 USUAL_MEDIAN_DEPTH = 1.8
 """Metres; of rooms."""
+MILLIMETRES = 1000.0
+SMALL_NEAR, SMALL_MEDIAN, SMALL_FAR = 0.25, 0.65, 1.4
+"""Metres: depth of a room that is read too small lies nearer than cameras measure, and ends where a room begins."""
+LARGEST_FAR = 12.0
+"""Metres, beyond what depth cameras measure."""
+LOWEST_CARRIED, HIGHEST_CARRIED = 0.5, 2.5
+"""Metres above the floor, between which cameras are carried."""
+SLOW, FAST = 0.35, 1.5
+"""Metres a second, between which cameras usually move."""
 USUAL_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10000.0, 512.0, 256.0, 1.0)
 """Depth units per metre that cameras and data sets use."""
 LEAST_ANGLE, LARGEST_ANGLE = 20.0, 120.0
@@ -60,6 +69,47 @@ def judge_depth_scale(scale: float, median_m: float) -> list[Verdict]:
     text = f"depth scale {scale:g} is suspicious: the median depth is {median_m:.3g} m"
     found = median_m * scale / likely
     return [Verdict("depth_scale", "wrong", f"{text}; try `depth_scale` {likely:g}, with which it is {found:.2g} m")]
+
+
+@dataclass(frozen=True)
+class ScaleSigns:
+    """What tells how large the world of a recording is, in metres of its depth scale.
+
+    Attributes:
+        near, median, far: 1st, 50th and 99th percentile of depth.
+        floor: height of the camera above the floor, or a table; None if none is seen.
+        speed: of the camera, metres a second; None if it cannot be told.
+    """
+
+    near: float
+    median: float
+    far: float
+    floor: float | None
+    speed: float | None
+
+
+def judge_scale_signs(scale: float, signs: ScaleSigns) -> list[Verdict]:
+    """What the size of the world says of depth with `scale` units per metre, where no pose tells more: nothing unless
+    all that was measured points the same way. Millimetres are never called too small: cameras write them of near things
+    too."""
+    carried = signs.floor is None or signs.floor < LOWEST_CARRIED
+    slow = signs.speed is None or signs.speed < SLOW
+    low = signs.near < SMALL_NEAR or (signs.floor is not None and signs.floor < LOWEST_CARRIED)
+    small = signs.median < SMALL_MEDIAN and signs.far < SMALL_FAR and low and carried and slow
+    high = signs.floor is None or signs.floor > HIGHEST_CARRIED
+    large = signs.far > LARGEST_FAR and high and (signs.speed is None or signs.speed > FAST)
+    if not (small or large):
+        return []
+    others = [known for known in USUAL_SCALES if (MILLIMETRES <= known < scale if small else known > scale)]
+    if not others:
+        return []
+    likely = min(others, key=lambda known: abs(np.log(signs.median * scale / known / USUAL_MEDIAN_DEPTH)))
+    words = [f"depth from {signs.near:.2g} to {signs.far:.2g} m, median {signs.median:.2g} m"]
+    words += [f"the camera {signs.floor:.2g} m above the floor"] if signs.floor is not None else []
+    words += [f"moving {signs.speed:.2g} m a second"] if signs.speed is not None else []
+    text = f"depth scale {scale:g} is doubtful if this is a room: {', '.join(words)}"
+    text += f"; try `depth_scale` {likely:g}, with which the median depth is {signs.median * scale / likely:.2g} m"
+    return [Verdict("depth_scale", "doubtful", text)]
 
 
 def judge_scale_by(scale: float, ratio: float, how: str) -> list[Verdict]:

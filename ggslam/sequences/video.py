@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.sequences.edit_list import count_hidden_frames
 from ggslam.sequences.recording import NumberedImage
 
 FORWARD = 90
@@ -22,7 +23,8 @@ class Video:
 
     Attributes:
         path: the file.
-        count: frames, as the container tells.
+        count: frames that can be played, as the container tells.
+        hidden: further frames at the start of the file that nobody can play, see `edit_list`.
         rate: frames per second.
     """
 
@@ -32,7 +34,8 @@ class Video:
         self._lock = threading.Lock()
         self._capture = self._open()
         self._next = 0
-        self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.hidden = count_hidden_frames(path)
+        self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) - self.hidden
         self.rate = float(self._capture.get(cv2.CAP_PROP_FPS)) or 30.0
 
     def _open(self) -> cv2.VideoCapture:

@@ -35,6 +35,9 @@ class MaskSettings:
     """auto: `model` if one is named, else the recording's masks if it has any, else geometry; none: no objects."""
     model: str = setting("", basic=True)
     """ONNX file of a segmentation model (YOLO-seg or SAM family); needs the extra [masks]."""
+    every: int = setting(6, 1, 10**6)
+    """Frames that a segmenter lets pass at least: a fast camera's keyframes come sooner, and all the map gets labels
+    from those that are segmented."""
     min_views: int = setting(3, 1, 10**6)
     """Objects that a segmenter or association found on fewer keyframes are noise. Runs of less than ten keyframes for
     each of these views ask for less."""
@@ -70,6 +73,7 @@ class ObjectMasks:
             model = OnnxSegmenter(settings.model, settings.onnx)
             self._segment = lambda frame: model.segment(frame.color)
         self._associator = self._make_associator()
+        self._segmented: int | None = None  # number of the last frame that was
 
     def _make_associator(self) -> Associator:
         """A segmenter's ids mean nothing from one frame to the next; a recording's may."""
@@ -105,6 +109,8 @@ class ObjectMasks:
         Raises:
             SequenceError: the frame's mask is damaged or of another size than its images.
         """
+        if self._rests(frame):
+            return KeyframeLabels()
         segments = self._segments(frame)
         if segments is None or not segments.any():
             return KeyframeLabels(segments)
@@ -120,7 +126,17 @@ class ObjectMasks:
         if self._source == "recording" and self._associator.uses_own_ids is not False:
             return KeyframeLabels(segments, found.merges)
         trusted = boundary_trust(found.ids, depth, self.settings.cleaning)
-        return KeyframeLabels(np.where(trusted, found.ids, 0).astype(np.uint16), found.merges, found.splits)
+        mask = np.where(trusted, found.ids, 0).astype(np.uint16)
+        return KeyframeLabels(mask, found.merges, found.splits, found.forgotten)
+
+    def _rests(self, frame: Frame) -> bool:
+        """Whether too few frames have passed since the last one that was segmented."""
+        if self._source not in ("geometry", "model"):
+            return False
+        rests = self._segmented is not None and 0 <= frame.index - self._segmented < self.settings.every
+        if not rests:
+            self._segmented = frame.index
+        return rests
 
     def _segments(self, frame: Frame) -> np.ndarray | None:
         if self._source in (None, "recording"):

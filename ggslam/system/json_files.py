@@ -45,5 +45,7 @@ def read_json(path: Path) -> Any:
     """
     try:
         return json.loads(read_foreign_text(path, RunFolderError))
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise RunFolderError(f"{path}: cannot be read: {error}") from None
+    except RecursionError:
+        raise RunFolderError(f"{path}: cannot be read: nested too deeply") from None

@@ -34,7 +34,7 @@ def new_staging(target: Path) -> Path:
 def leftovers(target: Path) -> list[Path]:
     """Hidden folders in `target` whose writers do not run any more, less one that waits to be put into place."""
     found = [path for path in target.iterdir() if (match := _NAME.fullmatch(path.name)) and not _runs(int(match[1]))]
-    waiting = [_read_saving(marker) for marker in target.glob("*.json")] if found else []
+    waiting = [_trusted_saving(marker) for marker in target.glob("*.json")] if found else []
     return [path for path in found if all(record is None or record["from"] != path.name for record in waiting)]
 
 
@@ -59,7 +59,11 @@ def publish(staged: Path, target: Path, marker: str, old: Sequence[str], before:
 
 
 def is_being_saved(target: Path, marker: str) -> bool:
-    """Whether files of a folder are changing places, or were when the program that did it was killed."""
+    """Whether files of a folder are changing places, or were when the program that did it was killed.
+
+    Raises:
+        RunFolderError: the marker says so, but not as `publish` does.
+    """
     return _read_saving(target / marker) is not None
 
 
@@ -67,7 +71,7 @@ def finish_saving(target: Path, marker: str) -> None:
     """Finishes a `publish` that was interrupted; does nothing if there was none.
 
     Raises:
-        RunFolderError: the folder cannot be written to, or the files are gone.
+        RunFolderError: the folder cannot be written to, the files are gone, or the marker was not written by `publish`.
     """
     record = _read_saving(target / marker)
     if record is None:
@@ -97,14 +101,32 @@ def _exchange(staged: Path, target: Path, marker: str, stale: Sequence[str]) -> 
 
 
 def _read_saving(marker: Path) -> dict[str, Any] | None:
-    """What a marker says of a saving under way; None if nothing, or if it was not written by `publish`."""
+    """What a marker says of a saving under way; None if nothing, or if it cannot be read at all.
+
+    Raises:
+        RunFolderError: names that `publish` does not write: somebody else wrote them.
+    """
     try:
-        values = json.loads(read_foreign_text(marker))
-        record = values[_SAVING]
-        good = _NAME.fullmatch(record["from"]) and all(map(is_plain_name, record["stale"]))
+        record = json.loads(read_foreign_text(marker))[_SAVING]
     except (GgslamError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    return dict(record) if good else None
+    try:
+        names = [record["from"], *record["stale"]]
+        good = _NAME.fullmatch(record["from"]) and all(map(is_plain_name, record["stale"]))
+    except (KeyError, TypeError):
+        names, good = [record], None
+    if not good:
+        shown = repr(names)[:100]
+        raise RunFolderError(f"{marker}: 'saving' names what no run would ({shown}); nothing was moved or deleted")
+    return dict(record)
+
+
+def _trusted_saving(marker: Path) -> dict[str, Any] | None:
+    """The same; None also if somebody else wrote it."""
+    try:
+        return _read_saving(marker)
+    except RunFolderError:
+        return None
 
 
 def _runs(process: int) -> bool:

@@ -16,6 +16,7 @@ from typer.testing import CliRunner, Result
 from ggslam.cli.main import app
 from ggslam.errors import GgslamError
 from ggslam.formats.triangle_mesh import read_mesh
+from ggslam.jobs.volumes.frames import far_away
 from ggslam.runs.folder import RunFolder
 from ggslam.volumes.octomap_files import read_octomap
 from ggslam.volumes.tsdf_file import load_tsdf
@@ -151,6 +152,15 @@ def test_what_was_fused_before_a_damaged_frame_is_written(room: Path, tmp_path: 
     assert found["frames"] == 5 and victim.name in found["stopped_by"]
     made(damaged, "--out", tmp_path / "out", *QUICK, "--skip-bad-frames")
     assert record(tmp_path / "out")["frames"] == 23
+
+
+def test_a_frame_far_from_the_others_is_found() -> None:
+    poses = {k: np.eye(4) for k in range(9)}
+    for k, T in poses.items():
+        T[0, 3] = 0.1 * k
+    assert far_away(poses) == []
+    poses[6][1, 3] = 1e5
+    assert far_away(poses) == [6]
 
 
 def test_mistakes_are_named(room: Path, tmp_path: Path) -> None:

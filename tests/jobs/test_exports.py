@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from ggslam.cli.main import app
 from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
+from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.jobs.export.export_run import export_run
 from ggslam.jobs.export.formats import ExportFormat, choose_format
 from ggslam.jobs.export.splats import ENDINGS, export_packed
@@ -55,6 +57,27 @@ def test_a_folder_with_something_in_it_is_left_alone(run: RunFolder, tmp_path: P
         with pytest.raises(RunFolderError, match="not an empty folder"):
             export(run, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("name", ["map.ply", "map.compressed.ply", "map.splat", "map.sog", "map.glb"])
+def test_gaussians_for_a_larger_window_are_wider(run: RunFolder, tmp_path: Path, name: str) -> None:
+    asked = "gltf" if name == "map.glb" else None
+    for zoom, folder in ((1.0, "small"), (4.0, "large")):
+        export_run(run, tmp_path / folder / name, asked, zoom=zoom)
+    assert (tmp_path / "small" / name).read_bytes() != (tmp_path / "large" / name).read_bytes()
+    if name == "map.ply":
+        small, large = (read_gaussian_ply(tmp_path / folder / name) for folder in ("small", "large"))
+        torch.testing.assert_close(small.means, large.means)
+        assert (large.log_scales > small.log_scales).all()
+
+
+def test_a_zoom_goes_with_gaussians_and_is_at_least_one(run: RunFolder, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="`zoom` goes with formats of Gaussians, not trajectory"):
+        export_run(run, tmp_path / "poses.txt", zoom=2.0)
+    with pytest.raises(ConfigError, match="`zoom`: expected 1 to 1000, found 0.5"):
+        export_run(run, tmp_path / "map.ply", zoom=0.5)
+    result = CliRunner().invoke(app, ["export", str(run.path), "--out", str(tmp_path / "map.ply"), "--zoom", "0"])
+    assert str(result.exception) == "--zoom: expected 1 to 1000, found 0" and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", ["compressed-ply", "spz", "spz4", "splat"])

@@ -109,6 +109,19 @@ def test_a_run_from_elsewhere_stays_in_its_folder(
     assert not (tmp_path / "out.ply").exists() or SECRET not in (tmp_path / "out.ply").read_text(errors="replace")
 
 
+@pytest.mark.parametrize("attack", [stale(".."), staged_elsewhere], ids=["parent", "elsewhere"])
+def test_a_saving_that_no_run_began_is_refused(
+    room_run: RunFolder, tmp_path: Path, home: Path, attack: Callable[[Path, Path], None]
+) -> None:
+    run = Path(shutil.copytree(room_run.path, tmp_path / "run"))
+    attack(run, home)
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    for command in (("report", run), ("verify", run), ("export", run, "--out", tmp_path / "out.ply")):
+        done = ggslam(*command)
+        assert done.returncode == 2 and "run.json: 'saving' names what no run would" in done.stderr
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
 def test_a_pipe_in_a_run_is_not_waited_for(room_run: RunFolder, tmp_path: Path) -> None:
     run = Path(shutil.copytree(room_run.path, tmp_path / "run"))
     (run / "map.ply").unlink()

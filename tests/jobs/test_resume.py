@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from command_line import ggslam, refuse, succeed
 
+from ggslam.cli.run_command import go_on_command
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run import rescue
@@ -234,7 +235,9 @@ def test_a_signal_saves_what_there_is(room: Path, whole: Path, tmp_path: Path, n
     mark = RunFolder.open(out).mark()
     assert not mark.complete and len(RunFolder.open(out).trajectory()) == 8
     assert signal.getsignal(number) is before
+    assert go_on_command(out) == [f"next: ggslam run --resume {out}"]
     outcome = resume(out, checkpoint_every=0)  # the state of the last frame was saved
+    assert go_on_command(out) == []
     assert outcome.error is None and outcome.result.times.saved == 1
     assert_same(out, whole)
 

@@ -240,7 +240,7 @@ def test_pixels_drawn_before_their_objects_were_forgotten_change_nothing(cuda_li
 
 def test_new_gaussians_have_the_objects_of_their_pixels(cuda_library: CudaLibrary) -> None:
     both = Both(cuda_library)
-    both.cuda.merge(both.device_map, 2, 300)
+    both.cuda.merge(both.device_map, [(2, 300)])
     pixels = torch.tensor([5 * WIDTH + 16, 5 * WIDTH + 3, 0, 23], device=both.device)
     assert both.cuda.labels_at(both.keyframe, pixels).tolist() == [2, 2, 1, 0]
     assert both.cuda.labels_at(MaskedKeyframe(1, None, both.device), pixels).tolist() == [0] * 4
@@ -264,8 +264,8 @@ def test_merges_removals_and_labels_are_those_of_the_cpu(cuda_library: CudaLibra
     for gaussians in (both.map, both.device_map):
         gaussians.features[:9] = torch.from_numpy(both.cpu.table.codes(np.full(9, 300))).to(gaussians.device)
         gaussians.vote_weights[:6] = 0  # learned, but never seen
-    both.cpu.merge(both.map, 2, 300)
-    both.cuda.merge(both.device_map, 2, 300)
+    both.cpu.merge(both.map, [(2, 300)])
+    both.cuda.merge(both.device_map, [(2, 300)])
     both.check()
     assert torch.allclose(both.map.features[:6], torch.from_numpy(both.cpu.table.codes(np.full(6, 2))))
     assert 300 not in both.cuda.classifier.class_ids and np.array_equal(both.cuda.current(np.array([300])), [2])
@@ -277,8 +277,8 @@ def test_merges_removals_and_labels_are_those_of_the_cpu(cuda_library: CudaLibra
         learner.label(gaussians)
     both.check()
     assert set(both.map.object_id.unique().tolist()) == {0, 1}
-    both.cpu.merge(both.map, 7, 7)
-    both.cuda.merge(both.device_map, 7, 7)
+    both.cpu.merge(both.map, [(7, 7)])
+    both.cuda.merge(both.device_map, [(7, 7)])
     both.check()
 
 
@@ -303,8 +303,8 @@ def test_a_split_is_that_of_the_cpu(cuda_library: CudaLibrary, monkeypatch: pyte
     both.begin()
     both.step(2)
     both.observe(picture())
-    both.cpu.split(both.map, both.view, picture(), 1, 300)  # type: ignore[arg-type]
-    both.cuda.split(both.device_map, both.view, picture(), 1, 300)  # type: ignore[arg-type]
+    both.cpu.split(both.map, both.view, picture(), [(1, 300)])  # type: ignore[arg-type]
+    both.cuda.split(both.device_map, both.view, picture(), [(1, 300)])  # type: ignore[arg-type]
     both.check()
     assert (both.map.vote_ids == 300).any()
     both.step(3, seed=2)  # on the old mask: the map tells which pixels are the part's

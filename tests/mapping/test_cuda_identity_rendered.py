@@ -82,7 +82,7 @@ def test_a_step_waits_for_nothing(schedule: str) -> None:
         learner.observe(picture())
         learner.begin(gaussians, slice(0, len(gaussians)), torch.ones(len(gaussians), dtype=torch.int32, device="cuda"))
         view = rasterizer.forward(gaussians, CAMERA, np.eye(4), features=schedule == "dense")
-        learner.split(gaussians, rasterizer, picture(), 1, 300)
+        learner.split(gaussians, rasterizer, picture(), [(1, 300)])
         watch.forget()
         for _ in range(4):
             assert learner.due(keyframe)
@@ -91,7 +91,7 @@ def test_a_step_waits_for_nothing(schedule: str) -> None:
         names = {call.operation for call in watch.calls}
         assert "draw_pixels" in names and ("cross_entropy" in names) == (schedule != "votes")
         assert np.isfinite(learner.last_loss) == (schedule != "votes") and bool(watch.waits) == (schedule != "votes")
-        learner.merge(gaussians, 1, 2)
+        learner.merge(gaussians, [(1, 2)])
         learner.forget(gaussians, [300])
         learner.label(gaussians)
         assert set(watch.read(gaussians.object_id).tolist()) == {1}

@@ -144,7 +144,7 @@ def test_merged_objects_are_one_everywhere() -> None:
     mapper = trained(pictures())
     identity = mapper.identity
     assert identity is not None
-    identity.merge(mapper.map, 2, 300)
+    identity.merge(mapper.map, [(2, 300)])
     assert sorted(identity.classifier.class_ids.tolist()) == [1, 2]
     mapper.run(10)
     mapper.finish_identity()
@@ -305,6 +305,39 @@ def test_the_sample_is_balanced_and_its_votes_are_not() -> None:
     assert at_boundary(ids).reshape(-1)[pool.pixels].mean() > 0.5
     votes = np.bincount(drawn, pool.vote_weights)
     assert votes[2] / votes.sum() == pytest.approx(100 / 9000, rel=0.1)
+
+
+def test_members_are_what_the_classifier_takes_for_an_object_rather_than_for_its_rival() -> None:
+    rng = np.random.default_rng(0)
+    table = CpuClassTable(rng)
+    table.add(np.arange(1, 40, dtype=np.uint16))
+    asked, features = np.array([7, 21]), rng.normal(0, 0.7, (5000, 16)).astype(np.float32)
+    labels = table.classifier.labels(features)[0]
+    rows, objects = table.members(features, asked, np.zeros(5000, np.int32))
+    taken = np.flatnonzero(np.isin(labels, asked))  # whom the classifier takes for them, whatever the rivals
+    assert len(taken) > 50 and np.isin(taken, rows).all()
+    np.testing.assert_array_equal(objects[np.isin(rows, taken)], labels[taken])
+    # With the likeliest other class as the rival, those are all.
+    logits = table.classifier.logits(features)
+    logits[:, np.isin(table.classifier.class_ids, asked)] = -np.inf
+    rivals = table.classifier.class_ids[logits.argmax(1)].astype(np.int32)
+    rows, objects = table.members(features, asked, rivals)
+    np.testing.assert_array_equal(rows, taken)
+    np.testing.assert_array_equal(objects, labels[taken])
+
+
+def test_many_merges_at_once_are_those_one_after_another() -> None:
+    outcomes = []
+    for pairs in ([[(2, 300), (2, 1)]], [[(2, 300)], [(2, 1)]]):
+        mapper = trained(pictures())
+        assert mapper.identity is not None
+        for some in pairs:
+            mapper.identity.merge(mapper.map, some)
+        labels = mapper.identity.classifier.labels(mapper.map.features.numpy())[0]
+        outcomes.append((labels, mapper.map.vote_ids.clone(), mapper.map.vote_weights.clone()))
+    assert set(np.unique(outcomes[0][0])) <= {0, 2}
+    for first, second in zip(*outcomes, strict=True):
+        np.testing.assert_array_equal(np.asarray(first), np.asarray(second))
 
 
 def test_votes_that_name_one_object_after_a_merge_are_added() -> None:

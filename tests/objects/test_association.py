@@ -170,6 +170,35 @@ def test_pieces_cut_off_at_random_do_not_become_objects() -> None:
         assert result.created == []
 
 
+def test_an_object_that_nobody_finds_again_is_forgotten_and_one_that_came_twice_stays() -> None:
+    associator = started(scene(1, 2, 2), AssociationSettings(mode="always", patience=4))
+    speck, twice = np.s_[5:9, 20:26], np.s_[5:9, 80:86]
+    results = []
+    for frame in range(7):
+        raw, seen, depth = scene(1, 2, 2), scene(1, 2, 2), DEPTH.copy()
+        if frame == 0:  # a speck of noise in front of the wall, once
+            raw[speck], depth[speck] = 50, 1.2
+        if frame < 2:  # and one that the map shows when it comes again
+            raw[twice], depth[twice] = 60 + frame, 1.2
+            if frame:
+                seen[twice] = 60
+        results.append(associator.associate(raw, shown(seen, depth if frame else DEPTH), depth))
+    assert sorted(results[0].created) == [50, 60]
+    assert [result.forgotten for result in results] == [[], [], [], [], [], [50], []]
+    assert 50 not in associator.sightings and associator.sightings[60] == 2
+
+
+def test_what_was_forgotten_has_no_part_in_a_map_that_still_shows_it() -> None:
+    associator = started(scene(1, 2, 2), AssociationSettings(mode="always", patience=1))
+    seen = scene(1, 2, 2)
+    associator.associate(scene(1, 2, 50), shown(seen), np.where(scene(0, 0, 1) > 0, 1.2, DEPTH).astype(np.float32))
+    for _ in range(2):
+        gone = associator.associate(scene(1, 2, 2), shown(seen), DEPTH).forgotten
+    assert gone == [50]
+    result = associator.associate(scene(1, 2, 60), shown(scene(1, 2, 50)), DEPTH)
+    assert 50 not in result.ids and result.created == [60]
+
+
 def stripes(ids: tuple[int, ...], shift: int) -> np.ndarray:
     """Eight vertical stripes with the ids in turn, moved by `shift` pixels."""
     image = np.repeat(np.resize(np.array(ids, np.uint16), 8), SHAPE[1] // 8)

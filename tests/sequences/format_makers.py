@@ -191,6 +191,21 @@ def make_stray(folder: Path) -> Path:
     return folder
 
 
+def make_scanner_app(folder: Path) -> Path:
+    """3D Scanner App with colour of every frame; poses and intrinsics row by row."""
+    for i in range(FRAMES):
+        write_color(folder / f"frame_{i:05d}.jpg", i, (128, 96))
+        write_depth(folder / f"depth_{i:05d}.png", i, 1000)
+        assert cv2.imwrite(str(folder / f"conf_{i:05d}.png"), confidence())
+        content = {
+            "cameraPoseARFrame": opengl(i).ravel().tolist(), "frame_index": i, "time": 7 + i / 60,
+            "intrinsics": [120.0, 0, 63.5, 0, 124.0, 47.5, 0, 0, 1],
+        }  # fmt: skip
+        (folder / f"frame_{i:05d}.json").write_text(json.dumps(content))
+    (folder / "info.json").write_text("{}")
+    return folder
+
+
 class BagMessages:
     """Messages in the layout of realsense-ros; colour and depth compressed or raw, depth in millimetres or metres."""
 
@@ -299,6 +314,7 @@ def write_bag(
 MORE_MAKERS: dict[str, Callable[[Path], Path]] = {
     "vmap": make_vmap, "icl-nuim": make_icl_nuim, "nerfstudio": make_nerfstudio, "nerfcapture": make_nerfcapture,
     "scannet++": make_scannetpp_dslr, "scannet++ iphone": make_scannetpp_iphone, "record3d": make_record3d,
-    "polycam": make_polycam, "strayscanner": make_stray, "ros1": lambda folder: write_bag(folder / "walk.bag", False),
+    "polycam": make_polycam, "strayscanner": make_stray, "3dscannerapp": make_scanner_app,
+    "ros1": lambda folder: write_bag(folder / "walk.bag", False),
     "ros2": lambda folder: write_bag(folder / "walk", True),
 }  # fmt: skip

@@ -17,6 +17,8 @@ from tiny_recordings import FRAMES, MAKERS, pose, write_depth
 from ggslam.errors import SequenceError
 from ggslam.sequences import FORMATS, open_sequence, recognise_format
 
+FINER = ("strayscanner", "3dscannerapp")
+"""Those with colour four times as fine as depth, which comes out at the size of colour."""
 MORE_OPTIONS = {"ros1": {"topics": ["pose=/poses"]}, "ros2": {"topics": ["pose=/poses"]}}
 
 
@@ -40,19 +42,20 @@ def test_frames_of_every_format(make_more: Callable[[str], Path], name: str) -> 
     assert recognise_format(place) == format_of(name)
     sequence = open_sequence(place, **MORE_OPTIONS.get(name, {}))
     assert (sequence.format, len(sequence)) == (format_of(name), FRAMES)
-    size = (60, 34) if name == "vmap" else (32, 24)
+    size = {"vmap": (60, 34), **dict.fromkeys(FINER, (128, 96))}.get(name, (32, 24))
+    row, column = size[1] // 2, size[0] // 2
     assert (sequence.camera.width, sequence.camera.height) == size
     assert (np.diff(sequence.timestamps) > 0).all() and sequence.warnings == []
     for i, frame in enumerate(sequence.stream()):
         assert frame.color.shape == (size[1], size[0], 3) and frame.color.dtype == np.uint8
-        assert np.abs(frame.color[12, 16].astype(int) - (10 * i, 100, 200)).max() <= 4  # JPEG, video
+        assert np.abs(frame.color[row, column].astype(int) - (10 * i, 100, 200)).max() <= 4  # JPEG, video
         assert frame.depth.dtype == np.float32 and frame.depth[0, 0] == 0
-        assert frame.depth[12, 16] == pytest.approx(1 + i / 10, abs=2e-4)
+        assert frame.depth[row, column] == pytest.approx(1 + i / 10, abs=2e-4)
         assert frame.T_world_camera is not None
         np.testing.assert_allclose(frame.T_world_camera, pose(i), atol=2e-5)
-    backwards = [sequence.frame(i).depth[12, 16] for i in (4, 0, 3)]
+    backwards = [sequence.frame(i).depth[row, column] for i in (4, 0, 3)]
     np.testing.assert_allclose(backwards, (1.4, 1.0, 1.3), atol=2e-4)
-    reds = [float(sequence.frame(i).color[12, 16, 0]) for i in (3, 0, 4)]
+    reds = [float(sequence.frame(i).color[row, column, 0]) for i in (3, 0, 4)]
     np.testing.assert_allclose(reds, (30, 0, 40), atol=4)
 
 
@@ -78,25 +81,26 @@ def test_table_of_loaders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     ("name", "expected"),
     [
         ("icl-nuim", (24.06, 24.0)), ("nerfstudio", (30, 31)), ("nerfcapture", (30, 31)), ("scannet++", (30, 31)),
-        ("scannet++ iphone", (30, 30)), ("record3d", (30, 31)), ("polycam", (30, 31)), ("strayscanner", (30, 31)),
-        ("ros1", (30, 31)), ("ros2", (30, 31)),
+        ("scannet++ iphone", (30, 30)), ("record3d", (30, 31)), ("polycam", (30, 31)), ("strayscanner", (120, 124)),
+        ("3dscannerapp", (120, 124)), ("ros1", (30, 31)), ("ros2", (30, 31)),
     ],
 )  # fmt: skip
 def test_intrinsics(make_more: Callable[[str], Path], name: str, expected: tuple[float, float]) -> None:
     camera = open_sequence(make_more(name)).camera
     assert (camera.fx, camera.fy) == pytest.approx(expected)
-    if name not in ("icl-nuim", "scannet++ iphone", "record3d", "polycam", "strayscanner"):
+    if name not in ("icl-nuim", "scannet++ iphone", "record3d", "polycam", "strayscanner", "3dscannerapp"):
         assert (camera.cx, camera.cy) == (15, 11)
 
 
-@pytest.mark.parametrize("name", ["record3d", "polycam", "strayscanner"])
+@pytest.mark.parametrize("name", ["record3d", "polycam", "strayscanner", "3dscannerapp"])
 def test_confidence(make_more: Callable[[str], Path], name: str) -> None:
     place = make_more(name)
     for least, first_seen in ((None, 1), (0, 0), (1, 1), (2, 2)):
         sequence = open_sequence(place, min_confidence=least)
         assert sequence.min_confidence == (1 if least is None else least)
-        depth = sequence.frame(1).depth[5]
-        assert np.flatnonzero(depth)[0] == first_seen
+        finer = 4 if name in FINER else 1
+        depth = sequence.frame(1).depth[5 * finer]
+        assert np.flatnonzero(depth)[0] == first_seen * finer
     with pytest.raises(SequenceError, match="min_confidence: expected 0, 1 or 2, found 3"):
         open_sequence(place, min_confidence=3)
 
@@ -175,12 +179,12 @@ def test_video_frames_are_found_by_number(make_more: Callable[[str], Path]) -> N
     with_intrinsics = [lines[0] + ", fx, fy, cx, cy", *(line + ", 120, 120, 63.5, 47.5" for line in lines[1:])]
     (folder / "odometry.csv").write_text("\n".join(with_intrinsics))
     sequence = open_sequence(folder)
-    assert len(sequence) == FRAMES - 1 and sequence.camera.fy == 30
-    assert [round(float(f.color[12, 16, 0]) / 10) for f in sequence.stream()] == [0, 2, 3, 4]
+    assert len(sequence) == FRAMES - 1 and sequence.camera.fy == 120
+    assert [round(float(f.color[48, 64, 0]) / 10) for f in sequence.stream()] == [0, 2, 3, 4]
     for path in sorted((folder / "depth").iterdir()):
         np.save(path.with_suffix(".npy"), cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
         path.unlink()
-    assert open_sequence(folder).frame(1).depth[12, 16] == pytest.approx(1.2)
+    assert open_sequence(folder).frame(1).depth[48, 64] == pytest.approx(1.2)
 
 
 def test_long_video_in_any_order(tmp_path: Path) -> None:

@@ -13,9 +13,13 @@ import numpy as np
 import pytest
 
 from ggslam.errors import SequenceError
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences import inspect_sequence, open_sequence
 from ggslam.sequences.alignment import measure_alignment
+from ggslam.sequences.scale_doubts import floor_height
+from ggslam.sequences.verdicts import ScaleSigns, judge_scale_signs
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -48,6 +52,37 @@ def test_healthy(room: Path) -> None:
 def test_healthy_shared_recordings(shared_data: Path) -> None:
     for name in ("livingroom", "redkitchen", "rgbd_dataset_freiburg3_cabinet", "shelf"):
         assert warnings_of(shared_data / name, scale=0.5) == [], name
+
+
+@pytest.mark.parametrize(("scale", "told"), [(5000.0, 0), (25000.0, 1), (1000.0, 1)])
+def test_depth_scale_by_the_size_of_things(copy: Path, scale: float, told: int) -> None:
+    """The room's depth has 5000 units a metre. A doll's house has everything small: depth, floor, and motion."""
+    (copy / "poses.txt").unlink()
+    found = [text for text in warnings_of(copy, depth_scale=scale) if "depth scale" in text]
+    assert len(found) == told
+    if scale > 5000:
+        assert f"depth scale {scale:g} is doubtful if this is a room" in found[0] and "above the floor" in found[0]
+
+
+def test_what_is_small_is_not_doubted_unless_all_of_it_is() -> None:
+    doll = ScaleSigns(near=0.12, median=0.37, far=0.72, floor=0.14, speed=0.17)
+    assert "try `depth_scale` 1000" in judge_scale_signs(5000, doll)[0].text
+    assert judge_scale_signs(1000, doll) == []  # millimetres of something near
+    for change in ({"near": 0.4, "floor": None}, {"far": 2.0}, {"floor": 1.2}, {"speed": 0.8}, {"median": 1.0}):
+        assert judge_scale_signs(5000, dataclasses.replace(doll, **change)) == []  # type: ignore[arg-type]
+    hall = ScaleSigns(near=2.0, median=5.5, far=18.0, floor=None, speed=None)
+    assert "try `depth_scale` 4000" in judge_scale_signs(1000, hall)[0].text
+    assert judge_scale_signs(1000, dataclasses.replace(hall, floor=1.3)) == []
+
+
+def test_the_floor_is_found_at_its_height() -> None:
+    camera = Camera(64, 48, 50, 50, 31.5, 23.5)
+    rays = camera.rays()
+    depth = np.where(rays[..., 1] > 0.1, 1.4 / np.maximum(rays[..., 1], 1e-6), 3.0).astype(np.float32)
+    frame = Frame(0, 0, 0.0, np.zeros((48, 64, 3), np.uint8), depth, camera)
+    assert floor_height(frame) == pytest.approx(1.4, rel=0.01)
+    frame.depth[24:] = 3.0  # a wall alone
+    assert floor_height(frame) is None
 
 
 @pytest.mark.parametrize("factor", [5.0, 0.2, 6.5535])

@@ -203,6 +203,20 @@ def test_folder_with_matrix_poses_and_other_names(make: Make) -> None:
     assert sequence.instance_names == {1: "wall"}
 
 
+def test_poses_whose_times_go_backwards_are_told_of(make: Make) -> None:
+    folder = make("folder")
+    with (folder / "camera.yaml").open("a") as calibration:
+        calibration.write("\nframe_rate: 10\n")
+    assert open_sequence(folder).warnings == []
+    lines = (folder / "poses.txt").read_text().splitlines()
+    (folder / "poses.txt").write_text("\n".join(reversed(lines)))
+    sequence = open_sequence(folder)
+    assert sequence.warnings == [
+        f"{folder / 'poses.txt'}: times do not increase; the poses are taken in the order of the lines"
+    ]
+    np.testing.assert_allclose(sequence.ground_truth[0], expected_pose(4), atol=1e-6)
+
+
 def test_a_missing_colour_image_shifts_no_pose_of_a_folder(make: Make) -> None:
     folder = make("folder")
     lines = [" ".join(map(str, [i / 30, *expected_pose(i)[:3, 3], 0, 0, 0, 1])) for i in range(5)]

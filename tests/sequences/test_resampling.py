@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ggslam.scene.camera import Camera
 from ggslam.sequences.resampling import resize_color, resize_depth, resize_mask
 
 
@@ -30,7 +31,7 @@ def test_depth_never_lies_between_surfaces() -> None:
     z = np.full((30, 45), 1.0, np.float32)
     z[:, 20:] = 3.0
     for size in ((15, 10), (30, 20), (31, 17), (7, 5)):
-        assert set(np.unique(resize_depth(z, *size))) <= {np.float32(1.0), np.float32(3.0)}
+        assert set(np.unique(resize_depth(z, *size).round(5))) <= {np.float32(1.0), np.float32(3.0)}
 
 
 @pytest.mark.parametrize("size", [(15, 10), (9, 6), (30, 20), (44, 29), (45, 30), (90, 60)])
@@ -58,3 +59,36 @@ def test_masks_keep_their_ids() -> None:
     np.testing.assert_array_equal(resize_mask(mask, 10, 20), mask[:, 1::3])
     np.testing.assert_array_equal(resize_mask(mask, 60, 40)[1::2, ::2], mask)
     assert set(np.unique(resize_mask(mask, 17, 13))) <= set(np.unique(mask))
+
+
+@pytest.mark.parametrize("factor", [0.9, 0.8, 0.7, 0.6, 0.55, 0.4, 0.37, 0.33])
+def test_a_plane_keeps_its_depth_at_any_factor(factor: float) -> None:
+    """Depth of a slanted plane on fewer pixels is what a camera of so many pixels sees of it, to a hundredth of a
+    millimetre; by samples that are not of the pixels' centres it was off by 0.3 to 0.7 mm."""
+    camera = Camera(320, 240, 240, 241, 158.3, 121.7)
+    normal = np.array([0.35, -0.25, 0.9])
+
+    def seen_by(camera: Camera) -> np.ndarray:
+        return (2 / (camera.rays().astype(np.float64) @ normal)).astype(np.float32)
+
+    small = camera.scale(factor)
+    error = resize_depth(seen_by(camera), small.width, small.height) - seen_by(small)
+    assert np.abs(error).max() < 1e-5
+
+
+@pytest.mark.parametrize("factor", [0.8, 0.6, 0.4])
+def test_any_factor_keeps_holes_and_edges(factor: float) -> None:
+    """A pixel is of one surface, the nearest that covers a part of it; where more than half is a hole, it is one."""
+    z = np.full((60, 90), 1.0, np.float32)
+    z[:, 41:] = 3.0
+    z[20:31] = 0
+    width, height = round(90 * factor), round(60 * factor)
+    small = resize_depth(z, width, height)
+    assert set(np.unique(small.round(5))) == {np.float32(0), np.float32(1), np.float32(3)}
+    rows, columns = (np.arange(height) + 0.5) / factor, (np.arange(width) + 0.5) / factor
+    half = 0.5 / factor
+    inside = (rows > 20 + half) & (rows < 31 - half)
+    outside = (rows < 20 - half) | (rows > 31 + half)
+    assert (small[inside] == 0).all() and (small[outside] > 0).all()
+    assert (small[outside][:, columns < 41 - half].round(5) == 1).all()
+    assert (small[outside][:, columns > 41 + half].round(5) == 3).all()

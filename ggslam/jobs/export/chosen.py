@@ -16,6 +16,9 @@ from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
 
+Prepare = Callable[[GaussianMap], None]
+"""Changes Gaussians in place before they are exported."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ChosenGaussians:
@@ -26,20 +29,23 @@ class ChosenGaussians:
         min_opacity: fainter ones are left out.
         ids: of the objects whose Gaussians are wanted; None: all.
         found: of each block of rows, how many are opaque enough, by object id.
+        prepare: changes Gaussians that were read; None: they are exported as they are.
     """
 
     rows: GaussianRows
     min_opacity: float
     ids: Sequence[int] | None
     found: Sequence[Counter[int]]
+    prepare: Prepare | None = None
 
     @staticmethod
     def of(
-        folder: RunFolder, rows: GaussianRows, min_opacity: float, ids: Sequence[int] | None = None
-    ) -> ChosenGaussians:
+        folder: RunFolder, rows: GaussianRows, min_opacity: float, ids: Sequence[int] | None = None,
+        prepare: Prepare | None = None,
+    ) -> ChosenGaussians:  # fmt: skip
         """Finds out how many there are; raises RunFolderError if there is none."""
         found = [Counter(b.object_id[b.opacities >= min_opacity].tolist()) for b in rows.blocks()]
-        chosen = ChosenGaussians(rows, min_opacity, ids, found)
+        chosen = ChosenGaussians(rows, min_opacity, ids, found, prepare)
         if not chosen.count:
             raise RunFolderError(f"{folder.path}: no Gaussian is at least {min_opacity} opaque; nothing to export")
         return chosen
@@ -71,6 +77,8 @@ class ChosenGaussians:
             part = self.rows.block(number)
             wanted = part.opacities >= self.min_opacity
             part.keep(wanted if self.ids is None else wanted & torch.isin(part.object_id, torch.tensor(self.ids)))
+            if self.prepare is not None:
+                self.prepare(part)
             change(part)
             yield part
 

@@ -21,11 +21,15 @@ from ggslam.jobs.export.streams import stream_run, stream_store
 from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.stores import is_store
+from ggslam.rendering.zoom import ZoomWidening
 from ggslam.runs.folder import RunFolder
 
 _SCENES = (ExportFormat.gltf, ExportFormat.sog, ExportFormat.usd)
 _WITH_OBJECTS = (ExportFormat.ply, ExportFormat.segmented, ExportFormat.mesh, ExportFormat.streamed_sog, *_SCENES)
 _WITH_VIEWS = (ExportFormat.colmap, ExportFormat.nerfstudio)
+_WITHOUT_GAUSSIANS = (
+    ExportFormat.mesh, ExportFormat.points, ExportFormat.pcd, ExportFormat.trajectory, *_WITH_VIEWS
+)  # fmt: skip
 
 
 def export_run(
@@ -40,6 +44,7 @@ def export_run(
     keyframes: bool = False,
     recording: str | Path | None = None,
     rendered: bool = False,
+    zoom: float = 1.0,
     observer: Observer | None = None,
 ) -> str:
     """Writes a run in a form that other programs take, as `ggslam export` does; returns a line that says what was
@@ -60,6 +65,9 @@ def export_run(
         keyframes: colmap, nerfstudio: only keyframes and held-out frames.
         recording: where the recording is now, if it was moved (colmap, nerfstudio, mesh).
         rendered: mesh: from depth rendered from the map, even if the recording is there.
+        zoom: formats of Gaussians: how many times larger than the training views they will be drawn (of a map trained
+            at 320x240, 4 for a window of 1280x960). Widens them as far as renderers will then widen them less: seen at
+            that size they are sharper and without seams, at the training views' size softer.
         observer: receives progress updates of meshes and streamed SOG.
 
     Raises:
@@ -70,43 +78,53 @@ def export_run(
     """
     place = Path(out)
     kind = choose_format(None if format is None else _format_named(format), place, objects)
-    _refuse_ignored(kind, objects, keyframes, recording, rendered)
+    _refuse_ignored(kind, objects, keyframes, recording, rendered, zoom)
     if not isinstance(run, RunFolder) and is_store(Path(run)):
-        return _export_store(Path(run), place, kind, objects, min_opacity, observer)
+        return _export_store(Path(run), place, kind, objects, min_opacity, zoom, observer)
     folder = run if isinstance(run, RunFolder) else RunFolder.open(Path(run))
     images, points = None if recording is None else Path(recording), 0.01 if voxel is None else voxel
+    prepare = None if zoom == 1 else _widening(folder, zoom)
     if kind is ExportFormat.mesh:
         return export_mesh(folder, place, MeshRequest(voxel, objects, rendered, images), observer)
     if kind in _WITH_VIEWS:
         write = export_colmap if kind is ExportFormat.colmap else export_nerfstudio
         return write(folder, place, points, keyframes, images)
     if kind is ExportFormat.segmented:
-        return export_segmented(folder, place, objects, min_opacity, plain)
+        return export_segmented(folder, place, objects, min_opacity, plain, prepare)
     if kind in _SCENES:
-        return export_scene(folder, place, kind.value, objects, min_opacity, plain)
+        return export_scene(folder, place, kind.value, objects, min_opacity, plain, prepare)
     if kind is ExportFormat.streamed_sog:
-        return stream_run(folder, place, objects, min_opacity, plain, observer)
+        return stream_run(folder, place, objects, min_opacity, plain, observer, prepare)
     if kind is ExportFormat.ply and objects is not None:
-        return export_objects(folder, place, objects, min_opacity, plain)
+        return export_objects(folder, place, objects, min_opacity, plain, prepare)
     if kind is ExportFormat.ply:
-        return export_splats(folder, place, min_opacity, plain)
+        return export_splats(folder, place, min_opacity, plain, prepare)
     if kind is ExportFormat.points:
         return export_points(folder, place, points, min_opacity)
     if kind is ExportFormat.pcd:
         return export_pcd(folder, place, points, min_opacity)
     if kind is ExportFormat.trajectory:
         return export_trajectory(folder, place)
-    return export_packed(folder, place, kind.value, min_opacity)
+    return export_packed(folder, place, kind.value, min_opacity, prepare)
 
 
 def _export_store(
-    path: Path, out: Path, kind: ExportFormat, objects: str | None, min_opacity: float, observer: Observer | None
-) -> str:
+    path: Path, out: Path, kind: ExportFormat, objects: str | None, min_opacity: float, zoom: float,
+    observer: Observer | None,
+) -> str:  # fmt: skip
     if kind is not ExportFormat.streamed_sog:
         raise ConfigError(f"{path}: is a grid store, of which `format` streamed-sog can be written, not {kind.value}")
+    if zoom != 1:
+        raise ConfigError(f"{path}: is a grid store, which has no keyframes: leave out `zoom`")
     if objects is not None:
         raise ConfigError(f"{path}: is a grid store, which has no table of objects: leave out `objects`")
     return stream_store(path, out, min_opacity, observer)
+
+
+def _widening(folder: RunFolder, zoom: float) -> ZoomWidening:
+    record = folder.keyframes()
+    poses, numbers = record.poses(), record.keyframe_numbers()
+    return ZoomWidening(folder.sequence().camera, [poses[i] for i in sorted(poses) if i in numbers], zoom)
 
 
 def _format_named(name: str) -> ExportFormat:
@@ -118,7 +136,7 @@ def _format_named(name: str) -> ExportFormat:
 
 
 def _refuse_ignored(
-    kind: ExportFormat, objects: str | None, keyframes: bool, recording: str | Path | None, rendered: bool
+    kind: ExportFormat, objects: str | None, keyframes: bool, recording: str | Path | None, rendered: bool, zoom: float
 ) -> None:
     """Raises ConfigError for an argument that this format leaves without effect."""
     if objects is not None and kind not in _WITH_OBJECTS:
@@ -128,5 +146,7 @@ def _refuse_ignored(
         raise ConfigError(f"`keyframes` goes with `format` colmap or nerfstudio, not {kind.value}")
     if recording is not None and kind not in (*_WITH_VIEWS, ExportFormat.mesh):
         raise ConfigError(f"`recording` goes with `format` colmap, nerfstudio or mesh, not {kind.value}")
+    if zoom != 1 and kind in _WITHOUT_GAUSSIANS:
+        raise ConfigError(f"`zoom` goes with formats of Gaussians, not {kind.value}")
     if rendered and kind is not ExportFormat.mesh:
         raise ConfigError(f"`rendered` goes with `format` mesh, not {kind.value}")

@@ -14,7 +14,7 @@ from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.point_ply import write_points_in_parts
 from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.formats.trajectory import write_tum
-from ggslam.jobs.export.chosen import ChosenGaussians
+from ggslam.jobs.export.chosen import ChosenGaussians, Prepare
 from ggslam.objects.table import ObjectRecord
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MapInParts
@@ -27,14 +27,16 @@ OBJECT_EXTRAS = ("object_id", "identity")
 """Properties of a 3DGS PLY that say which object a Gaussian belongs to."""
 
 
-def export_splats(folder: RunFolder, path: Path, min_opacity: float = 0.0, plain: bool = False) -> str:
+def export_splats(
+    folder: RunFolder, path: Path, min_opacity: float = 0.0, plain: bool = False, prepare: Prepare | None = None
+) -> str:
     """Writes the Gaussians that are at least this opaque as a 3DGS PLY; returns a line that says so.
 
     A run with objects writes each Gaussian's object id and identity vector, too, and the classifier beside the file
-    (`NAME_classifier.npz`), unless `plain`.
+    (`NAME_classifier.npz`), unless `plain`. `prepare` changes them first.
     """
     with_objects = folder.has_objects() and not plain
-    chosen = ChosenGaussians.of(folder, folder.map_in_parts().rows, min_opacity)
+    chosen = ChosenGaussians.of(folder, folder.map_in_parts().rows, min_opacity, prepare=prepare)
     make_folder(path.parent)
     count = chosen.write(path, OBJECT_EXTRAS if with_objects else ())
     if not with_objects:
@@ -44,7 +46,8 @@ def export_splats(folder: RunFolder, path: Path, min_opacity: float = 0.0, plain
 
 
 def export_objects(
-    folder: RunFolder, path: Path, objects: str, min_opacity: float = 0.0, plain: bool = False
+    folder: RunFolder, path: Path, objects: str, min_opacity: float = 0.0, plain: bool = False,
+    prepare: Prepare | None = None,
 ) -> str:  # fmt: skip
     """Writes each of some objects as a 3DGS PLY of its own (`ID_NAME.ply`), their lines of the table as objects.json
     and, unless `plain`, the classifier of the identities into the folder `path`; or a single object into the file
@@ -56,6 +59,7 @@ def export_objects(
         objects: names or ids, "mug,7", or "all".
         min_opacity: leave out fainter Gaussians.
         plain: leave out object ids and identities.
+        prepare: changes the Gaussians first.
 
     Raises:
         ConfigError: an object is not there, or several are for one file.
@@ -71,7 +75,7 @@ def export_objects(
             f"`out` {path}: is the name of one file, but `objects` {objects} are {len(chosen)}, each with a file of "
             "its own: name a folder"
         )
-    opaque, total = ChosenGaussians.of(folder, scene.map.rows, min_opacity), 0
+    opaque, total = ChosenGaussians.of(folder, scene.map.rows, min_opacity, prepare=prepare), 0
     if to_file:
         return _export_object(opaque, path, chosen[0], None if plain else scene.classifier)
     make_folder(path)
@@ -94,22 +98,23 @@ def _export_object(
 
 
 def export_segmented(
-    folder: RunFolder, path: Path, objects: str | None = None, min_opacity: float = 0.0, plain: bool = False
-) -> str:
+    folder: RunFolder, path: Path, objects: str | None = None, min_opacity: float = 0.0, plain: bool = False,
+    prepare: Prepare | None = None,
+) -> str:  # fmt: skip
     """Writes a 3DGS PLY whose Gaussians keep their shapes and opacities but have the colours of their objects.
 
     Args:
         folder: of a run with objects.
         path: file to write; the classifier goes beside it, unless `plain`.
         objects: only these, as in `export_objects`; None: the whole map, unlabelled Gaussians in grey.
-        min_opacity, plain: as in `export_objects`.
+        min_opacity, plain, prepare: as in `export_objects`.
 
     Raises:
         ConfigError, RunFolderError: as in `export_objects`.
     """
     scene = ObjectsInParts.of(folder)
     ids = None if objects is None else scene.table.select(objects)
-    chosen = ChosenGaussians.of(folder, scene.map.rows, min_opacity, ids)
+    chosen = ChosenGaussians.of(folder, scene.map.rows, min_opacity, ids, prepare)
     make_folder(path.parent)
     palette = torch.from_numpy(scene.table.palette())
     count = chosen.write(path, () if plain else OBJECT_EXTRAS, lambda part: _color_by_object(part, palette))

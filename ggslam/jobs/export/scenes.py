@@ -10,7 +10,7 @@ from ggslam.errors import FormatError
 from ggslam.formats.gaussian_gltf import write_gaussian_gltf
 from ggslam.formats.gaussian_usd import USD_ENDINGS, usd_package, write_gaussian_usd
 from ggslam.formats.sog import META, write_sog
-from ggslam.jobs.export.chosen import ChosenGaussians
+from ggslam.jobs.export.chosen import ChosenGaussians, Prepare
 from ggslam.runs.folder import RunFolder
 from ggslam.system.atomic import make_folder
 
@@ -19,8 +19,9 @@ SCENE_ENDINGS = {"gltf": (".glb",), "sog": (".sog",), "usd": USD_ENDINGS}
 
 
 def export_scene(
-    folder: RunFolder, path: Path, kind: str, objects: str | None = None, min_opacity: float = 0.0, plain: bool = False
-) -> str:
+    folder: RunFolder, path: Path, kind: str, objects: str | None = None, min_opacity: float = 0.0,
+    plain: bool = False, prepare: Prepare | None = None,
+) -> str:  # fmt: skip
     """Writes the Gaussians of a run; returns a line that says so.
 
     Args:
@@ -30,6 +31,7 @@ def export_scene(
         objects: only these, names or ids, "mug,7", or "all"; None: the whole map.
         min_opacity: leave out fainter Gaussians.
         plain: leave out object ids and names, which are written of runs with objects.
+        prepare: changes the Gaussians first.
 
     Raises:
         ConfigError: an object is not there.
@@ -42,7 +44,7 @@ def export_scene(
         usd_package(path)
     table = folder.object_table() if objects is not None or folder.has_objects() else None
     ids = None if table is None or objects is None else table.select(objects)
-    chosen = ChosenGaussians.of(folder, folder.map_in_parts().rows, min_opacity, ids)
+    chosen = ChosenGaussians.of(folder, folder.map_in_parts().rows, min_opacity, ids, prepare)
     names = None if table is None or plain else {i: table.record(i).name or "" for i in ids or table.ids()}
     make_folder(path.parent)
     size = _write(path, kind, chosen, names)

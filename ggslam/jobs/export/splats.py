@@ -13,6 +13,7 @@ from ggslam.formats.packed_splats import spz_packages, write_spz
 from ggslam.formats.point_cloud import write_point_cloud
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.splat_file import write_splat
+from ggslam.jobs.export.chosen import Prepare
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import make_folder
@@ -21,7 +22,9 @@ ENDINGS = {"compressed-ply": ".ply", "spz": ".spz", "spz4": ".spz", "splat": ".s
 """How a file of each kind is named, so that other programs know it."""
 
 
-def export_packed(folder: RunFolder, path: Path, kind: str, min_opacity: float = 0.0) -> str:
+def export_packed(
+    folder: RunFolder, path: Path, kind: str, min_opacity: float = 0.0, prepare: Prepare | None = None
+) -> str:
     """Writes the Gaussians that are at least this opaque; returns a line that says so.
 
     Args:
@@ -29,6 +32,7 @@ def export_packed(folder: RunFolder, path: Path, kind: str, min_opacity: float =
         path: file to write; its ending must be that of the kind.
         kind: "compressed-ply", "spz" (version 3), "spz4" (version 4) or "splat".
         min_opacity: leave out fainter Gaussians.
+        prepare: changes the Gaussians first.
 
     Raises:
         FormatError: another ending.
@@ -39,7 +43,7 @@ def export_packed(folder: RunFolder, path: Path, kind: str, min_opacity: float =
     if kind in ("spz", "spz4"):
         spz_packages(path, 4 if kind == "spz4" else 3)
     make_folder(path.parent)
-    parts = _some(_parts(folder, min_opacity, whole=kind != "splat"), folder, min_opacity)
+    parts = _some(_parts(folder, min_opacity, kind != "splat", prepare), folder, min_opacity)
     if kind == "splat":
         count = write_splat(path, parts)
     else:
@@ -81,7 +85,9 @@ def _check_ending(path: Path, kind: str) -> None:
         raise FormatError(f"{path}: a file of the format {kind} ends in {ENDINGS[kind]}")
 
 
-def _parts(folder: RunFolder, min_opacity: float, whole: bool) -> Iterator[GaussianMap]:
+def _parts(
+    folder: RunFolder, min_opacity: float, whole: bool, prepare: Prepare | None
+) -> Iterator[GaussianMap]:
     """The Gaussians that are opaque enough; unless `whole`, cell by cell where the map was written so."""
     stored = None if whole else folder.map_in_parts()
     maps = iter([folder.gaussians()]) if stored is None else (stored.read([cell]) for cell in stored.cells())
@@ -89,6 +95,8 @@ def _parts(folder: RunFolder, min_opacity: float, whole: bool) -> Iterator[Gauss
         if min_opacity > 0:
             part.keep(part.opacities >= min_opacity)
         if len(part):
+            if prepare is not None:
+                prepare(part)
             yield part
 
 

@@ -12,7 +12,7 @@ import torch
 from ggslam.errors import RunFolderError
 from ggslam.formats.point_sampling import MapPart
 from ggslam.formats.streamed_sog import INDEX, StreamedSize, write_streamed_sog
-from ggslam.jobs.export.chosen import ChosenGaussians
+from ggslam.jobs.export.chosen import ChosenGaussians, Prepare
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.submaps.stores import GAUSSIANS, gaussians_of_cell
 from ggslam.runs.folder import RunFolder
@@ -23,7 +23,7 @@ from ggslam.system.atomic import make_empty_folder
 
 def stream_run(
     folder: RunFolder, out: Path, objects: str | None = None, min_opacity: float = 0.0, plain: bool = False,
-    observer: Observer | None = None,
+    observer: Observer | None = None, prepare: Prepare | None = None,
 ) -> str:  # fmt: skip
     """Writes a run's map as streamed SOG, cell by cell where it was written so; returns a line that says so.
 
@@ -34,6 +34,7 @@ def stream_run(
         min_opacity: leave out fainter Gaussians.
         plain: leave out object ids and names, which are written of runs with objects.
         observer: receives progress updates.
+        prepare: changes the Gaussians first.
 
     Raises:
         ConfigError: an object is not there.
@@ -43,7 +44,7 @@ def stream_run(
     table = folder.object_table() if objects is not None or folder.has_objects() else None
     ids = None if table is None or objects is None else table.select(objects)
     stored = folder.map_in_parts()
-    chosen = ChosenGaussians.of(folder, stored.rows, min_opacity, ids)
+    chosen = ChosenGaussians.of(folder, stored.rows, min_opacity, ids, prepare)
     names = None if table is None or plain else {i: table.record(i).name or "" for i in ids or table.ids()}
     parts = [MapPart(part.low, part.high, partial(_of_part, chosen, part)) for part in stored.parts()]
     whole = [MapPart(stored.index.low[0], stored.index.high[0], chosen.whole)]
@@ -69,6 +70,8 @@ def _of_part(chosen: ChosenGaussians, part: MapPart) -> GaussianMap:
     gaussians = _opaque(part.load(), chosen.min_opacity)
     if chosen.ids is not None:
         gaussians.keep(torch.isin(gaussians.object_id, torch.tensor(chosen.ids)))
+    if chosen.prepare is not None:
+        chosen.prepare(gaussians)
     return gaussians
 
 

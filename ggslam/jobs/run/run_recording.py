@@ -62,7 +62,7 @@ def run_recording(
 
 
 def _request(path: Path, selection: dict[str, Any]) -> SequenceRequest:
-    for name in ("masks", "depth_camera"):
+    for name in ("masks", "depth_camera", "camera"):
         if selection.get(name) is not None:
             selection[name] = Path(selection[name])
     try:

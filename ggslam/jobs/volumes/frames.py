@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,6 +20,9 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, is_valid_pose
 from ggslam.sequences import Sequence
+
+FAR_M, FAR_TIMES = 1000.0, 100.0
+"""A frame is far from the others at so many metres, and so many times their median distance, from their middle."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,11 @@ def frames_of_run(
     lacking = len(sequence) - len(source.poses)
     if lacking:
         source.notes.append(f"{lacking} frames that the run did not locate are left out")
+    far = far_away(source.poses)
+    if far:
+        which = f"{len(far)}, the first of frame {far[0]}"
+        source.notes.append(f"poses far from all others are left out as damaged: {which}")
+        source.poses = {frame: T for frame, T in source.poses.items() if frame not in far}
     if folder.mark().edits:
         source.notes.append("the run was edited; volumes show what was recorded")
     if objects and folder.has_objects():
@@ -101,6 +109,13 @@ def frames_of_run(
             keyframes = record.keyframe_numbers()
             source.label = _RenderedIds(segmented, folder.sequence().camera, keyframes)
     return source
+
+
+def far_away(poses: Mapping[int, np.ndarray]) -> list[int]:
+    """Frames at which the camera was much farther from the rest than anybody walks, of poses [4, 4] by frame."""
+    frames, places = list(poses), np.array([T[:3, 3] for T in poses.values()], np.float64)
+    off = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    return [frames[k] for k in np.flatnonzero(off > max(FAR_M, FAR_TIMES * float(np.median(off))))]
 
 
 def frames_of_recording(request: SequenceRequest, objects: bool = True) -> FrameSource:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
-from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
+from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
 
 
 class CpuClassTable:
@@ -72,6 +72,32 @@ class CpuClassTable:
         weights = self._rows[: self.count, :-1]
         codes = CODE_LENGTH * weights / np.maximum(np.linalg.norm(weights, axis=1, keepdims=True), 1e-12)
         return np.concatenate([codes, np.zeros((1, self._channels), np.float32)])[number]
+
+    def members(
+        self, features: np.ndarray, object_ids: np.ndarray, rivals: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Vectors that are more probably one of some objects than nothing and than a rival of their own. Costs what
+        these objects cost, however many classes there are.
+
+        Args:
+            features: float32 [N, F].
+            object_ids: with classes, [K].
+            rivals: object id for each vector, [N]; without a class: none.
+
+        Returns:
+            Rows int64 [M] and the likeliest of `object_ids` [M].
+        """
+        best, which = np.full(len(features), NOTHING_LOGIT, np.float32), np.zeros(len(features), np.int64)
+        for k, number in enumerate(self._numbers.of(object_ids)):
+            logits = features @ self._rows[number, :-1] + self._rows[number, -1]
+            which[logits > best] = k
+            np.maximum(best, logits, out=best)
+        rows = np.flatnonzero(best > NOTHING_LOGIT)
+        rival = self._numbers.of(rivals[rows])
+        weights = self._rows[rival]
+        of_rival = np.einsum("nf,nf->n", features[rows], weights[:, :-1]) + weights[:, -1]
+        rows = rows[(rival < 0) | (of_rival < best[rows])]
+        return rows, object_ids[which[rows]]
 
     def step(self, classes: np.ndarray, gradient: np.ndarray, rate: float) -> None:
         """Adam (0.9, 0.999) on the rows `classes` [M] with gradient [M, F + 1] (weights, then bias)."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
 from ggslam.mapping.cpu.pixel_pool import draw_pool
-from ggslam.mapping.identity import BIRTH_VOTE, MIN_WEIGHT, TERMS, IdentityLearner, MaskedKeyframe
+from ggslam.mapping.identity import BIRTH_VOTE, MIN_WEIGHT, SPLIT_STRIDE, TERMS, IdentityLearner, MaskedKeyframe
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.votes import merge_votes, vote_labels
 from ggslam.rendering.cpu import CpuRasterizer
@@ -46,29 +47,33 @@ class CpuIdentityLearner(IdentityLearner):
     def _merge_votes(self, gaussians: GaussianMap) -> None:
         merge_votes(gaussians, torch.from_numpy(self._alias.astype(np.int32)))
 
-    def _dissolve(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
-        labels = vote_labels(gaussians).numpy()
-        wrong = self.table.classifier.labels(gaussians.features.numpy())[0] == dropped
-        self.table.remove(dropped)
-        gaussians.features.numpy()[wrong] = self.table.codes(np.where(labels[wrong] > 0, labels[wrong], kept))
+    def _dissolve(self, gaussians: GaussianMap, dropped: Sequence[int]) -> None:
+        features, voted = gaussians.features.numpy(), vote_labels(gaussians).numpy()
+        rows, were = self.table.members(features, np.array(dropped), voted)
+        for object_id in dropped:
+            self.table.remove(object_id)
+        features[rows] = self.table.codes(np.where(voted[rows] > 0, voted[rows], self._alias[were]))
 
     def split(
-        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, mask: np.ndarray, whole: int, part: int
+        self, gaussians: GaussianMap, rasterizer: CpuRasterizer, mask: np.ndarray, splits: Sequence[tuple[int, int]]
     ) -> None:
-        whole, part = int(self._alias[whole]), int(self._alias[part])
-        if not self._split_off(whole, part):
+        splits = self._split_off(splits)
+        if not splits:
             return
-        terms = rasterizer.pixel_terms(np.arange(mask.size))
-        inside = self.current(mask.reshape(-1)) == part
+        seen = np.arange(mask.size).reshape(mask.shape)[::SPLIT_STRIDE, ::SPLIT_STRIDE].reshape(-1)
+        terms = rasterizer.pixel_terms(seen)
         used = np.arange(terms.weights.shape[1]) < terms.counts[:, None]
-        weights = np.where(used, terms.weights, 0)
-        size = len(gaussians)
-        here = np.bincount(terms.gaussians[inside][used[inside]], terms.weights[inside][used[inside]], size)
-        everywhere = np.bincount(terms.gaussians[used], weights[used], size)
-        rows = np.flatnonzero(here > 0.5 * np.maximum(everywhere, 1e-9))
-        ids = gaussians.vote_ids.numpy()
-        ids[rows] = np.where(ids[rows] == whole, part, ids[rows])
+        gaussian, weight, size = terms.gaussians[used], terms.weights[used], len(gaussians)
+        seen_as = np.repeat(self.current(mask.reshape(-1)[seen]), terms.counts)
+        everywhere = np.maximum(np.bincount(gaussian, weight, size), 1e-9)
+        ids, changed = gaussians.vote_ids.numpy(), []
+        for whole, part in splits:
+            inside = seen_as == part
+            rows = np.flatnonzero(np.bincount(gaussian[inside], weight[inside], size) > 0.5 * everywhere)
+            ids[rows] = np.where(ids[rows] == whole, part, ids[rows])
+            changed.append(rows)
         self._merge_votes(gaussians)
+        rows = np.concatenate(changed)
         if self.settings.initialisation == "votes" and len(rows):
             gaussians.features.numpy()[rows] = self.table.codes(vote_labels(gaussians).numpy()[rows])
 

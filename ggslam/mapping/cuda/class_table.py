@@ -132,6 +132,22 @@ class CudaClassTable:
             out[begin : begin + part] = torch.where(something, self.ids[best], 0)
         return out
 
+    def members(
+        self, features: torch.Tensor, object_ids: np.ndarray, rivals: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Vectors [N, F] that are more probably one of some objects (with classes, [K]) than nothing and than a rival
+        of their own (int32 [N]; without a class: none): bool [N], and the likeliest of `object_ids`, int32 [N]."""
+        best = torch.full((len(features),), NOTHING_LOGIT, device=self._device)
+        which = torch.zeros(len(features), dtype=torch.int32, device=self._device)
+        for object_id, number in zip(object_ids.tolist(), self._numbers.of(object_ids).tolist(), strict=True):
+            logits = torch.mv(features, self._rows[number, :-1]) + self._rows[number, -1]
+            which.masked_fill_(logits > best, object_id)
+            best = torch.maximum(best, logits)
+        rival = self.class_of[rivals.long()].long()
+        rows = self.rows[rival.clamp_min(0)]
+        of_rival = (features * rows[:, :-1]).sum(1) + rows[:, -1]
+        return (best > NOTHING_LOGIT) & ((rival < 0) | (of_rival < best)), which
+
     # --- training -----------------------------------------------------------------------------------------------------
 
     def cross_entropy(

@@ -9,7 +9,7 @@ classes, and neighbours are those of the map as it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -24,6 +24,7 @@ from ggslam.mapping.identity import (
     BIRTH_VOTE,
     IDS,
     MIN_WEIGHT,
+    SPLIT_STRIDE,
     TERMS,
     IdentityLearner,
     MaskedKeyframe,
@@ -111,32 +112,39 @@ class CudaIdentityLearner(IdentityLearner):
     def _merge_votes(self, gaussians: GaussianMap) -> None:
         merge_votes(gaussians, self._device_alias)
 
-    def _dissolve(self, gaussians: GaussianMap, kept: int, dropped: int) -> None:
-        labels = vote_labels(gaussians)
-        wrong = self.table.labels(gaussians.features) == dropped
-        self.table.remove(dropped)
-        codes = self.table.codes(torch.where(labels > 0, labels, kept))
-        gaussians.features.copy_(torch.where(wrong[:, None], codes, gaussians.features))
+    def _dissolve(self, gaussians: GaussianMap, dropped: Sequence[int]) -> None:
+        voted = vote_labels(gaussians)
+        member, were = self.table.members(gaussians.features, np.array(dropped), voted)
+        for object_id in dropped:
+            self.table.remove(object_id)
+        codes = self.table.codes(torch.where(voted > 0, voted, self._device_alias[were.long()]))
+        gaussians.features.copy_(torch.where(member[:, None], codes, gaussians.features))
 
     def split(
-        self, gaussians: GaussianMap, rasterizer: CudaRasterizer, mask: np.ndarray, whole: int, part: int
+        self, gaussians: GaussianMap, rasterizer: CudaRasterizer, mask: np.ndarray, splits: Sequence[tuple[int, int]]
     ) -> None:
-        whole, part = int(self._alias[whole]), int(self._alias[part])
-        if not self._split_off(whole, part):
+        splits = self._split_off(splits)
+        if not splits:
             return
-        inside = torch.from_numpy((self.current(mask.reshape(-1)) == part).astype(np.float32)).to(self.device)
-        here, everywhere = (torch.zeros(len(gaussians), device=self.device) for _ in range(2))
-        for begin in range(0, mask.size, SPLIT_PIXELS):
-            pixels = torch.arange(begin, min(begin + SPLIT_PIXELS, mask.size), dtype=torch.int32, device=self.device)
+        grid = np.arange(mask.size, dtype=np.int32).reshape(mask.shape)[::SPLIT_STRIDE, ::SPLIT_STRIDE].reshape(-1)
+        seen = torch.from_numpy(grid).to(self.device)
+        seen_as = torch.from_numpy(self.current(mask.reshape(-1)[grid]).astype(np.int32)).to(self.device)
+        everywhere, *here = (torch.zeros(len(gaussians), device=self.device) for _ in range(1 + len(splits)))
+        for begin in range(0, len(seen), SPLIT_PIXELS):
+            pixels = seen[begin : begin + SPLIT_PIXELS].contiguous()
             terms = rasterizer.pixel_terms(pixels, SPLIT_TERMS, SPLIT_MIN_WEIGHT)
-            here += terms.weight_sums(len(gaussians), inside[begin : begin + SPLIT_PIXELS])
             everywhere += terms.weight_sums(len(gaussians))
-        chosen = (here > 0.5 * everywhere.clamp_min(1e-9))[:, None]
-        gaussians.vote_ids.masked_fill_(chosen & (gaussians.vote_ids == whole), part)
+            for k, (_, part) in enumerate(splits):
+                here[k] += terms.weight_sums(len(gaussians), (seen_as[begin : begin + SPLIT_PIXELS] == part).float())
+        changed = torch.zeros(len(gaussians), dtype=torch.bool, device=self.device)
+        for k, (whole, part) in enumerate(splits):
+            chosen = here[k] > 0.5 * everywhere.clamp_min(1e-9)
+            gaussians.vote_ids.masked_fill_(chosen[:, None] & (gaussians.vote_ids == whole), part)
+            changed |= chosen
         self._merge_votes(gaussians)
         if self.settings.initialisation == "votes":
             codes = self.table.codes(vote_labels(gaussians))
-            gaussians.features.copy_(torch.where(chosen, codes, gaussians.features))
+            gaussians.features.copy_(torch.where(changed[:, None], codes, gaussians.features))
 
     def _as_mapped(self, gaussians: GaussianMap, terms: CudaPixelTerms, labels: torch.Tensor) -> torch.Tensor:
         """Labels of pixels, those of a whole replaced by its part's where the map shows the part."""

@@ -39,6 +39,8 @@ class OpenRecord(Record):
     min_confidence: int | None = None
     topics: list[str] = []
     pose_convention: str | None = None
+    camera: str | None = None
+    intrinsics: str | None = None
 
 
 class SkippedRecord(Record):

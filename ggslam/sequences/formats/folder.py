@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,8 @@ class FolderFormat:
         return (folder / "camera.yaml").is_file()
 
     def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
-        settings = read_calibration(folder / "camera.yaml")
+        path, own = folder / "camera.yaml", options.own_camera
+        settings = {} if own is not None and not path.exists() else read_calibration(path)
         colors = image_files(folder / "rgb")
         if not colors:
             raise SequenceError(f"{folder / 'rgb'}: no images")
@@ -61,14 +63,14 @@ class FolderFormat:
         if (folder / "masks").is_dir():
             masks = find_masks(folder / "masks", colors)
         files = [FrameFiles(*pair) for pair in zip(colors, _depth_files(folder, colors), masks, strict=True)]
-        path = folder / "camera.yaml"
-        camera = camera_entry(path, settings)
-        distortion, fisheye = distortion_entry(path, settings)
+        camera = camera_entry(path, settings) if own is None else None
+        distortion, fisheye = distortion_entry(path, settings) if own is None else (None, False)
+        unknown = own is not None and "depth_scale" not in settings  # then a user has to tell it
         depth_camera = depth_camera_entry(path, settings["depth_camera"]) if "depth_camera" in settings else None
         timestamps, time_source = _timestamps(folder, colors, settings)
         left_out = _without_color(folder, files)
         recording = Recording(
-            self.name, folder, files, timestamps, number_entry(path, settings, "depth_scale"),
+            self.name, folder, files, timestamps, math.nan if unknown else number_entry(path, settings, "depth_scale"),
             camera, distortion=distortion, fisheye=fisheye, depth_camera=depth_camera,
             time_source=time_source, instance_names=_instances(path, settings), problems=missing_depth_problems(files),
             warnings=left_out,
@@ -177,6 +179,8 @@ def _add_poses(recording: Recording, path: Path) -> None:
             poses = poses_at(recording.timestamps, times, poses)
         elif recording.time_source.startswith("nominal"):
             recording.timestamps, recording.time_source = times, path.name
+        elif (np.diff(times) < 0).any():
+            recording.warnings.append(f"{path}: times do not increase; the poses are taken in the order of the lines")
     else:
         poses, problems = read_matrix_rows(path)
         if len(poses) != count:

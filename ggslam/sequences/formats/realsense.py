@@ -239,7 +239,7 @@ class RealSenseCamera:
             metres = depth.astype(np.float32) / np.float32(self._device.depth_scale)
             yield Frame(
                 index=index, source_index=index, timestamp=time, color=self._geometry.color(color),
-                depth=self._geometry.depth(metres), camera=self.camera,
+                depth=self._geometry.depth(metres, color), camera=self.camera,
             )  # fmt: skip
 
     def close(self) -> None:

@@ -3,7 +3,9 @@
 
 Depth are float32 metres and confidence uint8 (0 low to 2 high), row by row, each compressed with LZFSE. `K` is written
 column by column and belongs to the size w x h; perFrameIntrinsicCoeffs are fx fy cx cy of each frame. `poses` are qx qy
-qz qw tx ty tz, camera to world with ARKit's camera axes (y up, z backwards).
+qz qw tx ty tz, camera to world with ARKit's camera axes (y up, z backwards). `dw` and `dh` are the size of depth; until
+2022 the app wrote h, w, fps, K and poses alone, so the size is told by how many numbers an image of depth holds, and by
+the shape of the colour image, which it shares.
 """
 
 from __future__ import annotations
@@ -55,7 +57,8 @@ class Record3DFormat:
             raise SequenceError(f"{path}: holds no rgbd/*.depth: a recording without depth cannot be used")
         lzfse_decompress()
         cameras = _cameras(place, metadata, len(colors))
-        files = [_frame(archive, metadata, place, name, camera) for name, camera in zip(colors, cameras, strict=True)]
+        size = _depth_size(archive, metadata, place, colors)
+        files = [_frame(archive, size, name, camera) for name, camera in zip(colors, cameras, strict=True)]
         times, source = _times(place, metadata, len(colors))
         recording = Recording(self.name, path, files, times, 1.0, cameras[0], time_source=source)
         recording.problems = {
@@ -67,8 +70,35 @@ class Record3DFormat:
         return recording
 
 
-def _frame(archive: Archive, metadata: dict[str, Any], place: str, color: str, camera: Camera) -> FrameFiles:
-    size = (int(number_of(place, metadata, "dh")), int(number_of(place, metadata, "dw")))
+def _depth_size(archive: Archive, metadata: dict[str, Any], place: str, colors: list[str]) -> tuple[int, int]:
+    """(rows, columns) of the images of depth: as the metadata tells, else of the first one that can be read."""
+    if "dh" in metadata or "dw" in metadata:
+        return int(number_of(place, metadata, "dh")), int(number_of(place, metadata, "dw"))
+    width, height = number_of(place, metadata, "w"), number_of(place, metadata, "h")
+    reason = "none can be read"
+    for name in (f"{color.removesuffix('.jpg')}.depth" for color in colors):
+        try:
+            content = archive.read(name)
+            count = len(content if _is_plain(content) else _decompress(f"{archive.path}, {name}", content)) // 4
+        except SequenceError as error:
+            reason = str(error)
+            continue
+        rows = round((count * height / width) ** 0.5) if width > 0 and height > 0 else 0
+        if not 0 < 4 * count <= LARGEST_IMAGE or rows < 1 or rows * (count // rows) != count:
+            reason = (
+                f"the {count} numbers of {name} are no image of the shape of the colour image, {width:g}x{height:g}"
+            )
+            break
+        return rows, count // rows
+    raise SequenceError(f"{place}: entries 'dh' and 'dw' are missing (as in recordings of 2022), and {reason}")
+
+
+def _is_plain(content: bytes) -> bool:
+    """Whether an image is stored as it is: LZFSE begins with the name of its first block."""
+    return not content.startswith(b"bvx")
+
+
+def _frame(archive: Archive, size: tuple[int, int], color: str, camera: Camera) -> FrameFiles:
     base = color.removesuffix(".jpg")
     confidence = f"{base}.conf"
     return FrameFiles(

@@ -41,7 +41,7 @@ class ScanNetFormat:
             raise SequenceError(f"{root / 'color'}: no images")
         masks = self._masks(folder, root, colors)
         files = [FrameFiles(c, root / "depth" / f"{c.stem}.png", m) for c, m in zip(colors, masks, strict=True)]
-        calibration, depth_calibration, warnings = self._calibrations(root)
+        calibration, depth_calibration, warnings = self._calibrations(root, options.own_camera is not None)
         recording = Recording(
             self.name, folder, files, nominal_timestamps(len(files)), 1000.0, calibration=calibration,
             depth_calibration=depth_calibration, problems=missing_depth_problems(files), warnings=warnings,
@@ -56,8 +56,11 @@ class ScanNetFormat:
                     return find_masks(place, colors)
         return [None] * len(colors)
 
-    def _calibrations(self, root: Path) -> tuple[Calibration, Calibration | None, list[str]]:
+    def _calibrations(self, root: Path, own: bool) -> tuple[Calibration | None, Calibration | None, list[str]]:
+        """Of colour and of depth; `own`: a user tells that of colour."""
         color, depth = root / "intrinsic" / "intrinsic_color.txt", root / "intrinsic" / "intrinsic_depth.txt"
+        if own:
+            return None, read_intrinsics(depth) if depth.is_file() else None, []
         if not color.is_file():
             raise SequenceError(f"{color}: file is missing; ScanNet's intrinsics of the colour camera are needed")
         if depth.is_file():

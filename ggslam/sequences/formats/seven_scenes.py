@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.sequences.calibration import depth_camera_entry, read_calibration
 from ggslam.sequences.pose_files import invalid_pose_reason, read_intrinsics, read_matrix
 from ggslam.sequences.recording import (
     NO_OPTIONS,
@@ -24,6 +25,8 @@ DEPTH_CALIBRATION = (585.0, 585.0, 320.0, 240.0)
 """Of the depth camera, as published with 7-Scenes."""
 COLOR_CALIBRATION = (525.0, 525.0, 320.0, 240.0)
 """Of the colour camera, for depth that somebody has registered to it (`.depth.proj.png`)."""
+
+UNREGISTERED = "; intrinsics 585 585 320 240 of the depth camera are used"
 
 
 class SevenScenesFormat:
@@ -43,10 +46,18 @@ class SevenScenesFormat:
         registered = bool(bases) and not raw and all(Path(f"{base}.depth.proj.png").is_file() for base in bases)
         suffix = ".depth.proj.png" if registered else ".depth.png"
         files = [self._files(color, base, suffix) for color, base in zip(colors, bases, strict=True)]
-        calibration, warnings = self._calibration(folder, frames, registered or raw)
+        calibration, source, warnings = DEPTH_CALIBRATION, "", list[str]()
+        if options.own_camera is None:
+            calibration, source = self._calibration(folder, frames, registered, options.depth_camera)
+        if not (registered or raw) and (options.own_camera is not None or source.startswith("published")):
+            warnings.append(
+                "plain 7-Scenes depth is not registered to the colour image (two cameras, several centimetres apart): "
+                f"colours are off by some pixels{UNREGISTERED if options.own_camera is None else ''} "
+                "(`depth_camera` registers it)"
+            )
         recording = Recording(
             self.name, folder, files, nominal_timestamps(len(files)), 1000.0, calibration=calibration,
-            invalid_depth=65535, problems=missing_depth_problems(files), warnings=warnings,
+            invalid_depth=65535, problems=missing_depth_problems(files), warnings=warnings, camera_source=source,
         )  # fmt: skip
         self._add_poses(recording, bases)
         return recording
@@ -64,18 +75,20 @@ class SevenScenesFormat:
         mask = Path(f"{base}.segm.png")
         return FrameFiles(color, Path(f"{base}{suffix}"), mask if mask.is_file() else None)
 
-    def _calibration(self, folder: Path, frames: Path, registered: bool) -> tuple[Calibration, list[str]]:
+    def _calibration(
+        self, folder: Path, frames: Path, registered: bool, depth_camera: Path | None
+    ) -> tuple[Calibration, str]:
+        """Intrinsics of the colour images, and what tells them; of the depth images, where nothing brings them to
+        colour."""
         places = [p for where in dict.fromkeys((frames, folder)) for p in sorted(where.glob("camera-intrinsics*.txt"))]
+        if depth_camera is not None:  # a file may be of the depth camera alone then
+            places = [p for p in places if "depth" not in p.name and not _is_of(p, depth_camera)]
         if places:
-            return read_intrinsics(next((p for p in places if "color" in p.name), places[0])), []
-        if registered:
-            return COLOR_CALIBRATION, []
-        warning = (
-            "plain 7-Scenes depth is not registered to the colour image (two cameras, several centimetres apart): "
-            "colours are off by some pixels; intrinsics 585 585 320 240 of the depth camera are used "
-            "(`depth_camera` registers it)"
-        )
-        return DEPTH_CALIBRATION, [warning]
+            place = next((p for p in places if "color" in p.name), places[0])
+            return read_intrinsics(place), place.name
+        if registered or depth_camera is not None:
+            return COLOR_CALIBRATION, "published, of colour"
+        return DEPTH_CALIBRATION, "published, of depth"
 
     def _add_poses(self, recording: Recording, bases: list[Path]) -> None:
         poses = np.full((len(bases), 4, 4), np.nan)
@@ -94,3 +107,10 @@ class SevenScenesFormat:
         if found:
             recording.poses = poses
             recording.pose_source = "frame-*.pose.txt"
+
+
+def _is_of(place: Path, depth_camera: Path) -> bool:
+    """Whether intrinsics are those of a depth camera, and so not of colour."""
+    camera = depth_camera_entry(depth_camera, read_calibration(depth_camera)).camera
+    same = np.allclose(read_intrinsics(place)[:2], (camera.fx, camera.fy), rtol=5e-3)
+    return "color" not in place.name and bool(same)

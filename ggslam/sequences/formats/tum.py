@@ -29,6 +29,7 @@ CALIBRATIONS = {
 }
 """Published calibration of the three cameras: (fx, fy, cx, cy) and (k1, k2, p1, p2, k3)."""
 DEFAULT_CALIBRATION = (525.0, 525.0, 319.5, 239.5)
+CAMERA_IN_NAME = re.compile(r"(?:freiburg|fr)([123])")
 
 
 class TumFormat:
@@ -46,24 +47,35 @@ class TumFormat:
         pairs, warnings = pair_images(folder, color_times, depth_times, ("rgb.txt", "depth.txt"))
         files = [FrameFiles(folder / color_files[i], folder / depth_files[j]) for i, j in pairs]
         times = color_times[[i for i, _ in pairs]]
-        calibration, distortion = self._calibration(folder, warnings)
+        calibration, distortion, source = DEFAULT_CALIBRATION, None, ""
+        if options.own_camera is None:
+            calibration, distortion, source = self._calibration(folder, warnings)
         recording = Recording(
             self.name, folder, files, times, DEPTH_SCALE, calibration=calibration, distortion=distortion,
-            time_source="rgb.txt", problems=missing_depth_problems(files), warnings=warnings,
+            time_source="rgb.txt", problems=missing_depth_problems(files), warnings=warnings, camera_source=source,
         )  # fmt: skip
         self._add_poses(recording)
         return recording
 
-    def _calibration(self, folder: Path, warnings: list[str]) -> tuple[Calibration, np.ndarray | None]:
-        camera = re.search(r"(?:freiburg|fr)([123])", folder.resolve().name)
-        if camera is None:
+    def _calibration(self, folder: Path, warnings: list[str]) -> tuple[Calibration, np.ndarray | None, str]:
+        """Published calibration of the camera that the folder's name tells, and by which name. A link's own name comes
+        before that of the folder it leads to."""
+        given, true = folder.absolute().name, folder.resolve().name
+        named = [(name, found[1]) for name in dict.fromkeys((given, true)) if (found := CAMERA_IN_NAME.search(name))]
+        if not named:
+            names = f"'{true}'" if given == true else f"'{given}', a link to '{true}',"
             warnings.append(
-                f"the folder's name '{folder.resolve().name}' does not say freiburg1, 2 or 3: default intrinsics "
-                "525 525 319.5 239.5 without distortion are used"
+                f"the folder's name {names} does not say freiburg1, 2 or 3: default intrinsics "
+                "525 525 319.5 239.5 without distortion are used; `intrinsics` or `camera` tell others"
             )
-            return DEFAULT_CALIBRATION, None
-        calibration, distortion = CALIBRATIONS[camera.group(1)]
-        return calibration, None if distortion is None else np.array(distortion)
+            return DEFAULT_CALIBRATION, None, "default: the folder's name tells no camera"
+        name, number = named[0]
+        source = f"freiburg{number}, by the name '{name}'"
+        if named[-1][1] != number:
+            source += f" (the folder it leads to says freiburg{named[-1][1]})"
+            warnings.append(f"intrinsics are of {source}; `intrinsics` or `camera` tell others")
+        calibration, distortion = CALIBRATIONS[number]
+        return calibration, None if distortion is None else np.array(distortion), source
 
     def _add_poses(self, recording: Recording) -> None:
         path = recording.path / "groundtruth.txt"

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map as it has to be to look right where it is drawn larger than it was trained.
+
+A renderer widens every projected Gaussian by `LOW_PASS`, a variance in its own pixels. Drawn at twice the size that
+is a quarter of what the map was trained with: splats come out thin, with seams between them. Mip-Splatting (Yu et al.,
+CVPR 2024) limits the frequencies of a Gaussian by the closest view that saw it; here what is missing of the low-pass is
+put into the Gaussians themselves, by the same closest view, so that any renderer draws them as trained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ggslam.errors import ConfigError
+from ggslam.rendering.types import LOW_PASS
+from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import inverse
+
+MOST_VIEWS = 300
+"""So many views are asked, evenly chosen: the closest among them is nearly the closest of all."""
+_NEAR_M = 0.05
+
+
+@dataclass(frozen=True)
+class ZoomWidening:
+    """Widens Gaussians for a renderer whose pixels are `zoom` times smaller than those of the training views.
+
+    Attributes:
+        camera: of the training views.
+        T_world_camera: their poses, each [4, 4].
+        zoom: at least 1.
+
+    Raises:
+        ConfigError: no views, or an impossible zoom.
+    """
+
+    camera: Camera
+    T_world_camera: Sequence[np.ndarray]
+    zoom: float
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.zoom <= 1000:
+            raise ConfigError(f"`zoom`: expected 1 to 1000, found {self.zoom:g}")
+        if not len(self.T_world_camera):
+            raise ConfigError("`zoom`: the map has no keyframes, so the size that it was trained at is not known")
+
+    @property
+    def variance(self) -> float:
+        """What is added to the variances of a Gaussian, in pixels^2 of its closest view."""
+        return LOW_PASS * (1 - 1 / self.zoom**2)
+
+    def __call__(self, gaussians: GaussianMap) -> None:
+        """Changes the scales of `gaussians` in place."""
+        if len(gaussians):
+            pixel = self.closest_depths(gaussians.means.numpy()) / np.sqrt(self.camera.fx * self.camera.fy)
+            added = torch.from_numpy(self.variance * pixel**2).to(gaussians.log_scales.dtype)
+            gaussians.log_scales[:] = 0.5 * torch.log(torch.exp(2 * gaussians.log_scales) + added[:, None])
+
+    def closest_depths(self, points: np.ndarray) -> np.ndarray:
+        """Smallest depth, float64 [N], in metres, at which a view has each of the points [N, 3] in its image; of
+        points in no image, their distance from the nearest camera."""
+        chosen = np.unique(np.linspace(0, len(self.T_world_camera) - 1, MOST_VIEWS).round().astype(int))
+        depth, distance = np.full(len(points), np.inf), np.full(len(points), np.inf)
+        c = self.camera
+        for T in (self.T_world_camera[i] for i in chosen):
+            R, t = inverse(T)[:3, :3], inverse(T)[:3, 3]
+            seen = points @ R.T + t
+            z = np.maximum(seen[:, 2], _NEAR_M)
+            u, v = c.fx * seen[:, 0] / z + c.cx, c.fy * seen[:, 1] / z + c.cy
+            inside = (seen[:, 2] > _NEAR_M) & (u > -0.5) & (v > -0.5) & (u < c.width - 0.5) & (v < c.height - 0.5)
+            depth[inside] = np.minimum(depth[inside], z[inside])
+            distance = np.minimum(distance, np.linalg.norm(seen, axis=1))
+        return np.where(np.isfinite(depth), depth, np.maximum(distance, _NEAR_M))

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussians that are widened for a renderer with smaller pixels than the map was trained with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ggslam.errors import ConfigError
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.rendering.types import LOW_PASS
+from ggslam.rendering.zoom import ZoomWidening
+from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+
+
+def wall(spacing: float, depth: float = 2.0) -> GaussianMap:
+    """A wall of small splats, a grid with alternating grey values."""
+    x, y = np.meshgrid(np.arange(-2, 2, spacing), np.arange(-1.6, 1.6, spacing))
+    means = np.stack([x.ravel(), y.ravel(), np.full(x.size, depth)], 1).astype(np.float32)
+    grey = np.where((np.arange(x.size) // 7) % 2, 0.8, 0.3).astype(np.float32)
+    gaussians = GaussianMap(0, 0)
+    gaussians.insert(
+        torch.from_numpy(means), torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
+        torch.full((len(means), 3), float(np.log(0.2 * spacing))), torch.full((len(means),), 2.0),
+        torch.from_numpy(np.repeat(grey[:, None], 3, 1)),
+    )  # fmt: skip
+    return gaussians
+
+
+def drawn(gaussians: GaussianMap, size: int) -> np.ndarray:
+    """Rendered at `size` times the size, averaged down to the size of CAMERA."""
+    c = CAMERA
+    camera = Camera(
+        size * c.width, size * c.height, size * c.fx, size * c.fy, size * (c.cx + 0.5) - 0.5, size * (c.cy + 0.5) - 0.5
+    )
+    image = CpuRasterizer(1).forward(gaussians, camera, np.eye(4), features=False, as_3dgs=True).image.numpy()
+    return image.reshape(3, c.height, size, c.width, size).mean((2, 4))
+
+
+@pytest.mark.parametrize("zoom", [2, 4])
+def test_widened_gaussians_look_in_large_as_they_did_in_small(zoom: int) -> None:
+    gaussians = wall(spacing=2.0 / 60)  # a splat a pixel, as maps have them
+    small = drawn(gaussians, 1)
+    before = np.abs(drawn(gaussians, zoom) - small).mean()
+    ZoomWidening(CAMERA, [np.eye(4)], zoom)(gaussians)
+    after = np.abs(drawn(gaussians, zoom) - small).mean()
+    assert after < 0.25 * before and before > 0.05
+
+
+def test_what_is_added_is_the_low_pass_that_a_larger_image_lacks() -> None:
+    gaussians = wall(0.2, depth=3.0)
+    before = torch.exp(2 * gaussians.log_scales).clone()
+    nearer = np.eye(4)
+    nearer[2, 3] = 1.0
+    away = np.diag([-1.0, 1.0, -1.0, 1.0])  # looks the other way: nothing in its image
+    widening = ZoomWidening(CAMERA, [np.eye(4), nearer, away], 2)
+    widening(gaussians)
+    added = (torch.exp(2 * gaussians.log_scales) - before).numpy()
+    seen = np.abs(gaussians.means.numpy()[:, 0]) < 0.9  # in the image of the nearer view
+    assert seen.any()
+    middle = added[seen & (np.abs(gaussians.means.numpy()[:, 1]) < 0.7)]
+    np.testing.assert_allclose(middle, 0.75 * LOW_PASS * (2.0 / 60) ** 2, rtol=1e-3)
+
+
+def test_points_in_no_image_take_the_distance_of_the_nearest_camera() -> None:
+    widening = ZoomWidening(CAMERA, [np.eye(4)], 2)
+    np.testing.assert_allclose(widening.closest_depths(np.array([[0, 0, -3.0], [0, 0, 5.0]])), [3, 5])
+
+
+def test_zoom_one_adds_nothing_and_others_are_refused() -> None:
+    gaussians = wall(0.2)
+    before = gaussians.log_scales.clone()
+    ZoomWidening(CAMERA, [np.eye(4)], 1)(gaussians)
+    torch.testing.assert_close(gaussians.log_scales, before)
+    for zoom in (0.5, float("nan"), 1e6):
+        with pytest.raises(ConfigError, match="zoom"):
+            ZoomWidening(CAMERA, [np.eye(4)], zoom)
+    with pytest.raises(ConfigError, match="no keyframes"):
+        ZoomWidening(CAMERA, [], 2)
