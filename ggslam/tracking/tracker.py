@@ -31,7 +31,7 @@ class TrackingStatus(enum.Enum):
     RECOVERED = "recovered"
     """Constant velocity failed, another start succeeded; `reason` says which."""
     DOUBTED = "doubted"
-    """Located as well as can be, but the image does not agree: the camera may be elsewhere; `reason` has the numbers."""
+    """Located as well as can be, but the image does not agree: the camera may be elsewhere; `reason` says more."""
     LOST = "lost"
 
 
