@@ -26,6 +26,10 @@ class FeatureSettings:
     min_inliers: int = setting(12, 6, 10**5)
     """Matches that agree on a pose at least; else there is none."""
 
+    def limit(self, camera: Camera) -> float:
+        """`reprojection` in pixels of a camera's images."""
+        return self.reprojection * camera.width / 320
+
 
 @dataclass(frozen=True)
 class Features:
@@ -107,6 +111,67 @@ class FeaturePose:
     inliers: int
 
 
+@dataclass(frozen=True)
+class ViewMatches:
+    """Features of a view that match those of a located one.
+
+    Attributes:
+        points: float64 [m, 3], where the located view saw them, in its camera's frame, metres.
+        pixels: float64 [m, 2], where the view sees them.
+        T_world_known: float64 [4, 4], pose of the located view.
+    """
+
+    points: np.ndarray
+    pixels: np.ndarray
+    T_world_known: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def explained(self, T_world_camera: np.ndarray, camera: Camera, settings: FeatureSettings) -> int:
+        """How many the view sees where they have to be if it is at a pose [4, 4]."""
+        T = inverse(T_world_camera) @ self.T_world_known
+        x, y, z = (self.points @ T[:3, :3].T + T[:3, 3]).T
+        ahead = np.where(z > 0.05, z, np.inf)
+        off = np.hypot(
+            camera.fx * x / ahead + camera.cx - self.pixels[:, 0], camera.fy * y / ahead + camera.cy - self.pixels[:, 1]
+        )
+        return int((np.isfinite(ahead) & (off < settings.limit(camera))).sum())
+
+    def pose(self, camera: Camera, settings: FeatureSettings) -> FeaturePose | None:
+        """The pose most of them agree on; None without enough of them. The same matches give the same pose."""
+        if len(self) < settings.min_inliers:
+            return None
+        cv2.setRNGSeed(0)
+        ok, rotation, translation, inliers = cv2.solvePnPRansac(
+            self.points, self.pixels, camera.matrix(), None, iterationsCount=300,
+            reprojectionError=settings.limit(camera), confidence=0.999, flags=cv2.SOLVEPNP_EPNP,
+        )  # fmt: skip
+        if not ok or inliers is None or len(inliers) < settings.min_inliers:
+            return None
+        chosen = inliers[:, 0]
+        rotation, translation = cv2.solvePnPRefineLM(
+            self.points[chosen], self.pixels[chosen], camera.matrix(), None, rotation, translation
+        )
+        T_view_known = np.eye(4)
+        T_view_known[:3, :3] = cv2.Rodrigues(rotation)[0]
+        T_view_known[:3, 3] = translation[:, 0]
+        return FeaturePose(self.T_world_known @ inverse(T_view_known), len(self), len(chosen))
+
+
+def match_views(view: FeatureView, known: FeatureView, camera: Camera, settings: FeatureSettings) -> ViewMatches:
+    """Features of a view (whose own pose and depth are not used) that match those of a located one with depth."""
+    known_features, found = known.features(settings), view.features(settings)
+    if len(known_features.pixels) == 0 or len(found.pixels) == 0:
+        return ViewMatches(np.zeros((0, 3)), np.zeros((0, 2)), known.T_world_camera)
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(known_features.descriptors, found.descriptors)
+    matches = [m for m in matches if m.distance <= settings.max_hamming]
+    pixels = known_features.pixels[[m.queryIdx for m in matches]].reshape(-1, 2)
+    targets = found.pixels[[m.trainIdx for m in matches]].reshape(-1, 2)
+    points = features_in_space(pixels, known.depth, camera)
+    return ViewMatches(points[points[:, 2] > 0], targets[points[:, 2] > 0], known.T_world_camera)
+
+
 def pose_from_matches(
     view: FeatureView, known: FeatureView, camera: Camera, settings: FeatureSettings
 ) -> FeaturePose | None:
@@ -117,29 +182,4 @@ def pose_from_matches(
     Returns:
         None without enough inliers.
     """
-    known_features, found = known.features(settings), view.features(settings)
-    if len(known_features.pixels) == 0 or len(found.pixels) == 0:
-        return None
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(known_features.descriptors, found.descriptors)
-    matches = [m for m in matches if m.distance <= settings.max_hamming]
-    pixels = known_features.pixels[[m.queryIdx for m in matches]].reshape(-1, 2)
-    targets = found.pixels[[m.trainIdx for m in matches]].reshape(-1, 2)
-    points = features_in_space(pixels, known.depth, camera)
-    points, targets = points[points[:, 2] > 0], targets[points[:, 2] > 0]
-    if len(points) < settings.min_inliers:
-        return None
-    cv2.setRNGSeed(0)
-    ok, rotation, translation, inliers = cv2.solvePnPRansac(
-        points, targets, camera.matrix(), None, iterationsCount=300,
-        reprojectionError=settings.reprojection * camera.width / 320, confidence=0.999, flags=cv2.SOLVEPNP_EPNP,
-    )  # fmt: skip
-    if not ok or inliers is None or len(inliers) < settings.min_inliers:
-        return None
-    chosen = inliers[:, 0]
-    rotation, translation = cv2.solvePnPRefineLM(
-        points[chosen], targets[chosen], camera.matrix(), None, rotation, translation
-    )
-    T_view_known = np.eye(4)
-    T_view_known[:3, :3] = cv2.Rodrigues(rotation)[0]
-    T_view_known[:3, 3] = translation[:, 0]
-    return FeaturePose(known.T_world_camera @ inverse(T_view_known), len(points), len(chosen))
+    return match_views(view, known, camera, settings).pose(camera, settings)

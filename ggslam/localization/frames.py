@@ -31,6 +31,7 @@ _OUTCOMES = {
     TrackingStatus.OK: LocalizationStatus.OK,
     TrackingStatus.DEGENERATE: LocalizationStatus.DEGENERATE,
     TrackingStatus.RECOVERED: LocalizationStatus.FOUND,
+    TrackingStatus.DOUBTED: LocalizationStatus.FOUND,
     TrackingStatus.LOST: LocalizationStatus.LOST,
 }
 

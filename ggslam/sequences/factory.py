@@ -55,6 +55,8 @@ FORMATS: tuple[RecordingFormat, ...] = (
     Ros2Format(),
 )
 """Known formats in the order in which they are tried."""
+SMALLEST_SCALE = 1e-6
+"""Units of depth images a metre, and one over it the largest: nobody counts in others, and float32 bears them."""
 
 
 def open_sequence(
@@ -147,9 +149,9 @@ def _read_recording(
         if recording.poses is None:
             raise SequenceError(f"{folder}: tells no poses, so there are none to convert from {pose_convention}")
         recording.poses = convert_poses(recording.poses, pose_convention)
-    if not (math.isfinite(recording.depth_scale) and recording.depth_scale > 0):
+    if not SMALLEST_SCALE <= recording.depth_scale <= 1 / SMALLEST_SCALE:
         told = "none" if math.isnan(recording.depth_scale) and depth_scale is None else f"{recording.depth_scale}"
-        raise SequenceError(f"{folder}: depth scale must be a positive number, found {told}")
+        raise SequenceError(f"{folder}: depth scale must be a positive number of usual size, found {told}")
     return recording
 
 

@@ -182,7 +182,7 @@ RULES: Rules = {
     RunObjects: _but("_masks"),
     ObjectMasks: _but("settings", "_segment"),
     # tracking
-    GicpTracker: _but("_given_engine"),
+    GicpTracker: _but("_given_engine", "_features"),
     FeatureTracker: _but("features", "_extractor"),
     TrackerState: _but("camera", "context", "target"),
     CameraMotion: _but("reference"),

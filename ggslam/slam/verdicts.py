@@ -27,7 +27,8 @@ LONGER, LONGEST_ERROR, FEWEST_POSES = 1.4, 0.35, 10
 
 def judge_run(result: SlamResult) -> list[Verdict]:
     """What was measured while the run was made."""
-    return [*_judge_motion(result), *_judge_exposure(result), *_judge_lost(result), *_judge_dropped(result)]
+    checks = (_judge_motion, _judge_exposure, _judge_doubted, _judge_lost, _judge_dropped)
+    return [verdict for check in checks for verdict in check(result)]
 
 
 def _judge_motion(result: SlamResult) -> list[Verdict]:
@@ -77,6 +78,18 @@ def _judge_exposure(result: SlamResult) -> list[Verdict]:
         "fix exposure and white balance if the camera lets you"
     )
     return [Verdict("exposure", "doubtful", text)]
+
+
+def _judge_doubted(result: SlamResult) -> list[Verdict]:
+    """Whether there are frames whose image contradicts the pose that was found for them."""
+    doubted = [f.frame_index for f in result.frames if f.status == TrackingStatus.DOUBTED.value]
+    if not doubted:
+        return []
+    text = (
+        f"the camera may have jumped: in {len(doubted)} of {len(result.frames)} frames (the first: {doubted[0]}) most "
+        "of the features shared with the frame before lie elsewhere than the pose found has them; move slower there"
+    )
+    return [Verdict("jump", "doubtful", text)]
 
 
 def _judge_lost(result: SlamResult) -> list[Verdict]:

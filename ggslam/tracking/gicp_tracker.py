@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from ggslam.features.orb import FeatureView, pose_from_matches
+from ggslam.features.orb import FeatureView
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -18,6 +18,7 @@ from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import DepthNoise, PhotometricMode, TrackerSettings
+from ggslam.tracking.shared_features import SharedFeatures
 from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, TrackingStatus
 
 MIN_TEXTURED = 200
@@ -47,6 +48,8 @@ class GicpTracker(Tracker):
         super().__init__(TrackerState.begin(camera, settings, context, T_world_camera))
         self._given_engine = engine
         self._median_depth: float | None = None
+        self._features: SharedFeatures | None = None
+        """Of the frame at hand, once they were asked for."""
 
     @classmethod
     def with_state(cls, state: TrackerState) -> GicpTracker:
@@ -71,14 +74,19 @@ class GicpTracker(Tracker):
         if target is None:
             return self._begin(view, points)
         self.noise = noise  # what could not be measured before the first keyframe is taken as usual
+        self._features = None
         found, reason = self._locate(view, points, target)
         if not self._is_acceptable(found):
             return self._give_up(points, found)
         T = orthonormalize(found.T_world_camera)
+        doubt = self._features.contradict(T) if self._features is not None else ""
+        self._features = None
         motion.follow(view, T)
         motion.remember(view, points, self.settings)
         status = TrackingStatus.DEGENERATE if found.degenerate else TrackingStatus.OK
         status = TrackingStatus.RECOVERED if reason else status
+        if doubt:
+            status, reason = TrackingStatus.DOUBTED, f"only {doubt}"
         return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, found)
 
     # --- parts -------------------------------------------------------------------------------------------------------
@@ -105,6 +113,8 @@ class GicpTracker(Tracker):
         if photometric is not None and not self._explains_greys(found) and not found.degenerate:
             # Images that do not agree (too far apart, shutters out of step) must not pull at good geometry.
             found = self._align(points, target, guess, None)
+            if self._shared(view).contradict(found.T_world_camera):
+                return self._retry(view, points, target, found, photometric)
         if self._is_convincing(found) and not (found.degenerate and mode != "never"):
             return found, ""
         if photometric is None and found.degenerate and mode != "never":
@@ -175,6 +185,13 @@ class GicpTracker(Tracker):
         seen = found.photometric_share >= recovery.min_share
         return seen and found.photometric_residual <= tolerance * recovery.convincing_residual
 
+    def _shared(self, view: FeatureView) -> SharedFeatures:
+        """Features that the view shares with the last located ones; matched once."""
+        if self._features is None:
+            earlier, settings = self.state.motion.views, self.settings.recovery.features
+            self._features = SharedFeatures(view, earlier, self.camera, settings)
+        return self._features
+
     def _retry(
         self, view: FeatureView, points: PointSource, target: GicpTarget, found: AlignmentResult,
         photometric: PhotometricPart | None,
@@ -185,26 +202,30 @@ class GicpTracker(Tracker):
         if photometric is not None and found.photometric_share == 0:  # all starts are compared by the same measure
             best = self._align(points, target, self.state.motion.predict(), photometric)
         # Feature matches are good to a centimetre or two; the coarse level would slide off along a bare wall.
-        starts = [("last pose", self.state.motion.T_world_camera, True)]
-        for number, earlier in enumerate(self.state.motion.views):
-            pose = pose_from_matches(view, earlier, self.camera, self.settings.recovery.features)
-            if pose is not None:
-                starts.append((f"features of view {number}", pose.T_world_camera, False))
+        starts, shared = [("last pose", self.state.motion.T_world_camera, True)], self._shared(view)
+        starts += [(name, pose, False) for name, pose in shared.starts()]
         for name, guess, coarse in starts:
             candidate = self._align(points, target, guess, photometric, coarse)
-            if self._is_better(candidate, best):
+            if self._is_better(candidate, best, shared):
                 best, reason = candidate, name
+        if best.photometric_share > 0 and not self._explains_greys(best) and not best.degenerate:
+            plain = self._align(points, target, best.T_world_camera, None, coarse=False)
+            best = best if shared.prefer(best.T_world_camera, plain.T_world_camera) else plain
         return best, reason
 
     @staticmethod
-    def _is_better(candidate: AlignmentResult, best: AlignmentResult) -> bool:
+    def _is_better(candidate: AlignmentResult, best: AlignmentResult, shared: SharedFeatures) -> bool:
         """Whether an alignment of the same points beats another.
 
-        With grey values the joint cost decides: sliding along a bare wall keeps all the overlap. Without them more
-        overlap is better, and a loose fit costs a little.
+        The features that the frame shares with the last ones tell poses apart that geometry and grey values alone do
+        not. Where they see no difference: with grey values the joint cost decides, for sliding along a bare wall
+        keeps all the overlap; without them more overlap is better, and a loose fit costs a little.
         """
         if candidate.status is AlignmentStatus.LOST or best.status is AlignmentStatus.LOST:
             return candidate.status is not AlignmentStatus.LOST
+        preferred = shared.prefer(candidate.T_world_camera, best.T_world_camera)
+        if preferred is not None:
+            return preferred
         if candidate.photometric_share > 0 and best.photometric_share > 0:
             return candidate.cost < best.cost
         return candidate.overlap - 2.0 * candidate.rmse > best.overlap - 2.0 * best.rmse

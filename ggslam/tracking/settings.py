@@ -90,7 +90,7 @@ class AlignSettings:
     """Iterations at the coarse level; 0: fine level only."""
     coarse_points: int = setting(1500, 50, 10**6)
     """Points used at the coarse level."""
-    fine_iterations: int = setting(12, 1, 1000)
+    fine_iterations: int = setting(30, 1, 1000)
     """Iterations at the fine level."""
     translation_tolerance: float = setting(1e-4, 0, 1, "m")
     """The iteration stops at a step below this and `rotation_tolerance`."""

@@ -30,6 +30,8 @@ class TrackingStatus(enum.Enum):
     """Located, but some direction of motion is not seen by the geometry."""
     RECOVERED = "recovered"
     """Constant velocity failed, another start succeeded; `reason` says which."""
+    DOUBTED = "doubted"
+    """Located as well as can be, but the image does not agree: the camera may be elsewhere; `reason` says more."""
     LOST = "lost"
 
 
@@ -42,7 +44,7 @@ class TrackingResult:
         status: outcome.
         overlap: share of the frame's points with a match near enough (`AlignmentResult.overlap`).
         rmse_m: root mean square point-to-plane distance of those, metres.
-        reason: why it was lost or how it was recovered, else empty.
+        reason: why it was lost or is doubted, or how it was recovered, else empty.
         points: of the frame; what a keyframe adds to a `MeasuredSurface`.
         alignment: everything G-ICP says; None for the first frame.
     """

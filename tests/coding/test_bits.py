@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ggslam.coding.bits import BitReader, BitWriter
@@ -36,6 +36,7 @@ def test_signed_fields_have_the_sign_last() -> None:
     assert written("s", 4, -5) == "01011"
 
 
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])  # a busy machine is no fault of the bits
 @given(
     st.lists(
         st.one_of(

@@ -126,6 +126,12 @@ def test_dropped_and_lost_frames(well: SlamResult) -> None:
     assert [v.code for v in judge_run(replace(well, frames=lost))] == ["lost"]
 
 
+def test_a_jump_is_said(well: SlamResult) -> None:
+    frames = [replace(f, status="doubted") if k == 7 else f for k, f in enumerate(well.frames)]
+    (verdict,) = judge_run(replace(well, frames=frames))
+    assert verdict.code == "jump" and f"(the first: {frames[7].frame_index})" in verdict.text
+
+
 def test_degenerate_frames(well: SlamResult) -> None:
     frames = [replace(f, status="degenerate") for f in well.frames]
     assert [v.code for v in judge_run(replace(well, frames=frames))] == ["degenerate"]

@@ -143,6 +143,7 @@ def test_no_recording(tmp_path: Path) -> None:
         ({"scale": 0.0}, "`scale`: expected"),
         ({"scale": 2.0}, "`scale`: expected"),
         ({"depth_scale": 0.0}, "depth scale must be a positive number"),
+        ({"depth_scale": 1e-320}, "depth scale must be a positive number"),
         ({"masks": "/nowhere/at/all"}, "masks folder /nowhere/at/all does not exist"),
         ({"on_bad_frame": "ignore"}, "`on_bad_frame`: expected 'error' or 'skip'"),
     ],

@@ -17,6 +17,7 @@ from ggslam.tracking.engine import CpuTrackingEngine
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.settings import DepthNoise, PhotometricSettings, RecoverySettings, TrackerSettings
+from ggslam.tracking.shared_features import SharedFeatures
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import TrackingStatus
 
@@ -172,3 +173,43 @@ def test_noise_given_is_not_measured() -> None:
     tracker = GicpTracker(CAMERA, TrackerSettings(noise=DepthNoise(0.01, 0.0)), NativeContext(1))
     tracker.track(wall_view(STILL, True))
     assert tracker.noise == DepthNoise(0.01, 0.0)
+
+
+NOISY = TrackerSettings(noise=DepthNoise(0.002, 0.0))
+"""Noise from which on grey values are always compared."""
+
+
+def test_a_step_of_20_cm_and_15_degrees_is_tracked() -> None:
+    poses = [STILL, STILL, se3_exp(np.array([0.17, -0.1, 0.03, 0.0, np.radians(13), np.radians(7)]))]
+    result = run(poses, True, NOISY)[-1]
+    assert result.status in (TrackingStatus.OK, TrackingStatus.RECOVERED)
+    assert error_m(result.T_world_camera, poses[-1]) < 5e-3
+
+
+def test_a_pose_that_the_image_contradicts_is_doubted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Geometry that slides 15 cm along a shelf with all its overlap, from every start: the path jumps, and says so."""
+    poses, align = [STILL, STILL, se3_exp(np.array([0.02, 0, 0, 0, 0, 0]))], CpuTrackingEngine.align
+    assert run(poses, True, NOISY)[-1].status is TrackingStatus.OK
+    aside = se3_exp(np.array([0.15, 0, 0, 0, 0, 0]))
+
+    def slid(engine: CpuTrackingEngine, points: Any, target: Any, guess: np.ndarray, *more: Any) -> Any:
+        found = align(engine, points, target, guess, *more)
+        T = aside @ poses[-1]
+        return replace(found, T_world_camera=T, photometric_residual=0.2)
+
+    monkeypatch.setattr(CpuTrackingEngine, "align", slid)
+    result = run(poses, True, NOISY)[-1]
+    assert result.status is TrackingStatus.DOUBTED
+    assert "features shared with the last frame" in result.reason
+
+
+def test_shared_features_tell_a_pose_from_another() -> None:
+    truth = se3_exp(np.array([0.1, -0.05, 0.05, 0.03, 0.1, -0.1]))
+    one, two = wall_view(STILL, True), wall_view(truth, True)
+    views = [FeatureView(frame.color, frame.depth, T) for frame, T in ((two, truth), (one, STILL))]
+    shared = SharedFeatures(views[0], views[1:], CAMERA, FeatureSettings())
+    assert shared.contradict(truth) == "" and shared.contradict(STILL)
+    assert shared.prefer(truth, STILL) is True and shared.prefer(STILL, truth) is False
+    assert shared.prefer(truth, truth) is None
+    nothing = SharedFeatures(views[0], [], CAMERA, FeatureSettings())
+    assert nothing.contradict(STILL) == "" and nothing.prefer(truth, STILL) is None

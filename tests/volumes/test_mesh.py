@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from volumes.field_maps import block_grid, box_room, field_map, plane, sphere, torus, voxel_centers
 
-from ggslam.native.loader import NativeContext
+from ggslam.native.loader import NativeContext, available_instruction_sets
 from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, VOXELS, TsdfMap
@@ -187,7 +187,7 @@ def test_small_pieces_are_left_out() -> None:
 
 def test_threads_and_instruction_sets_do_not_matter() -> None:
     meshes = []
-    for threads, isa in [(1, None), (2, None), (2, "baseline")]:
+    for threads, isa in [(1, None), (2, None), *((2, name) for name in available_instruction_sets())]:
         meshes.append(extract_mesh(field_map(torus(0.3, 0.12), -3, 3, VOXEL, context=NativeContext(threads, isa))))
     for other in meshes[1:]:
         for name in ("vertices", "normals", "colors", "labels", "triangles"):

@@ -70,7 +70,7 @@ class RunOutcome:
         parts = [f"{len(r.frames)} frames", *([f"{rate:.1f} frames/s"] if np.isfinite(rate) else []),
                  f"{len(r.keyframes)} keyframes", f"{r.gaussian_count} Gaussians"]  # fmt: skip
         counts = Counter(frame.status for frame in r.frames)
-        parts += [f"{counts[status]} frames {status}" for status in ("recovered", "lost") if counts[status]]
+        parts += [f"{counts[status]} frames {status}" for status in ("recovered", "doubted", "lost") if counts[status]]
         parts += [f"{len(r.dropped_frames)} frames dropped"] if r.dropped_frames else []
         closed = sum(event.kind == "closed" for event in r.loop_events)
         parts += [f"{closed} loop{'s' if closed > 1 else ''} closed"] if closed else []
