@@ -228,6 +228,7 @@ class Slam:
             SequenceError: the frame is of another camera, or not what `Frame` says.
         """
         check_frame(frame, self.camera)
+        self.mapper.valid = frame.valid
         start = time.perf_counter()
         self._follow_moves()
         if not len(self.surface):
