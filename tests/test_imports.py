@@ -29,7 +29,7 @@ JOBS = (
     {"volumes"},
     {"run"},
     {"report"},
-    {"score", "edit", "localize", "compare", "code", "render", "doctor"},
+    {"score", "edit", "localize", "compare", "code", "render", "doctor", "batch"},
     {"submaps"},
     {"progress"},
 )

@@ -71,7 +71,7 @@ def inspect(
         depth_scale=depth_scale, depth_camera=depth_camera, min_confidence=min_confidence, topics=topics or (),
         pose_convention=pose_convention, camera=camera, intrinsics=intrinsics,
     )  # fmt: skip
-    report = inspect_sequence(recording, samples=samples)
+    report = inspect_sequence(recording, samples=samples, clocks=True)
     for name, value in _lines(report):
         console.print(f"[bold]{name:<13}[/] {escape(value)}", highlight=False)
     for reason in report.damaged:
@@ -131,6 +131,11 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
     ]  # fmt: skip
     if r.native_camera != r.camera:
         lines.insert(3, ("stored as", _camera(r.native_camera)))
+    if r.clocks is not None:
+        side = "after" if r.clocks.seconds > 0 else "before"
+        apart, error = 1e3 * abs(r.clocks.seconds), 1e3 * r.clocks.error
+        words = f"depth {apart:.1f} ms {side} colour (to {error:.1f} ms, by the motion in {r.clocks.frames} frames)"
+        lines.append(("clocks", words))
     if r.motion is not None:
         step, turn = r.motion.step_m, r.motion.turn_deg
         lines.append(("motion", f"path {r.motion.path_m:.2f} m; a frame: {step[0] * 100:.1f} cm and {turn[0]:.1f} deg "

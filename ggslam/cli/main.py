@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 
 from ggslam import __version__
 from ggslam.cli import (
+    batch_command,
     compare_command,
     decode_command,
     doctor_command,
@@ -78,6 +79,7 @@ def _options(
 _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "run": (run_command.run, run_command.EPILOG), "eval": (eval_command.evaluate, eval_command.EPILOG),
     "render": (render_command.render, render_command.EPILOG), "export": (export_command.export, export_command.EPILOG),
+    "batch": (batch_command.batch, batch_command.EPILOG),
     "report": (report_command.report, report_command.EPILOG),
     "compare": (compare_command.compare, compare_command.EPILOG),
     "doctor": (doctor_command.doctor, doctor_command.EPILOG), "edit": (edit_command.edit, edit_command.EPILOG),

@@ -77,7 +77,9 @@ Record = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Keep the frames of a live camera in this folder, as a recording.")
 ]
 Iterations = Annotated[int | None, typer.Option(help="Mapping iterations per frame (default 4).")]
-Refine = Annotated[int | None, typer.Option(help="Mapping iterations after the last frame (default 0).")]
+Refine = Annotated[
+    int | None, typer.Option(help="Mapping iterations after the last frame (default: 15 % of those before).")
+]
 Realtime = Annotated[
     float | None, typer.Option(metavar="FPS", help="Deliver frames at this rate; tracker and mapper run side by side.")
 ]

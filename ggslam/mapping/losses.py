@@ -50,12 +50,14 @@ class LossTarget(Generic[Array]):
         depth: uint16 or float32 [H, W]; 0, negative, infinite or NaN: none.
         depth_scale: metres per unit of `depth`.
         exposure: float [3, 2] (float32 on a device), gain and offset applied to the rendered R, G, B; None: (1, 0).
+        valid: bool [H, W], False where `color` shows nothing, which counts for nothing; None: all of it counts.
     """
 
     color: Array
     depth: Array
     depth_scale: float
     exposure: Array | None = None
+    valid: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ def reference_loss(
 
     exposed = exposure[:, 0, None, None] * image + exposure[:, 1, None, None]
     x = torch.where(valid, exposed, settings.no_depth_weight * exposed + (1 - settings.no_depth_weight) * y)
+    if target.valid is not None:
+        x = torch.where(torch.from_numpy(target.valid), x, y)
     l1 = (x - y).abs().mean()
     color = l1
     if settings.color_kind == "charbonnier":

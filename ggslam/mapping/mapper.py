@@ -17,7 +17,7 @@ from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.extra_loss import ExtraLoss, add_extra_loss, uses_features
 from ggslam.mapping.identity import IdentityLearner
-from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
 from ggslam.mapping.losses import LossGradients
 from ggslam.mapping.pruning import prune
@@ -113,6 +113,8 @@ class Mapper(ABC):
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
         self.residency: Residency | None = None
         """Keeps a part of the map on disk; None: all of it is in memory."""
+        self.valid: np.ndarray | None = None
+        """Where images of this recording show something, bool [H, W]; None: everywhere. Nothing else is trained on."""
         self.extra_loss: ExtraLoss | None = None
         """A loss of the user's own, added to the mapper's; on the CPU only."""
         self._rasterizer: TrainingRasterizer
@@ -154,6 +156,7 @@ class Mapper(ABC):
             labeller: tells the keyframe's object mask, if objects are learned.
         """
         start = time.perf_counter()
+        self.valid = frame.valid
         keyframe = self._new_keyframe(frame, T_world_camera)
         self._insert(keyframe, T_world_camera, labeller)
         self.keyframes.append(keyframe)
@@ -220,6 +223,11 @@ class Mapper(ABC):
         numbers = self._trainable()
         for _ in range(iterations):
             self.iterate(self._draw(numbers))
+
+    def _valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
+        """What `valid` says of a keyframe: nothing of those of other recordings."""
+        of_this = keyframe.frame_index != ELSEWHERE and self.valid is not None
+        return self.valid if of_this and self.valid.shape == keyframe.color.shape[:2] else None  # type: ignore[union-attr]
 
     def _trainable(self) -> Sequence[int]:
         return range(len(self.keyframes)) if self.residency is None else self.residency.trainable()

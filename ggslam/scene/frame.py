@@ -25,6 +25,8 @@ class Frame:
         mask: uint16 [H, W] instance ids, 0 = unlabelled; None when the recording has none, or it was not read.
         T_world_camera: float64 [4, 4] true pose if the recording has it. Used for scores only, never for tracking.
         mask_loader: reads the mask on demand; see `load_mask`.
+        valid: bool [H, W], False where colour shows nothing (beyond the border of an undistorted image); the same array
+            for all frames of a recording; None: all of it shows something.
     """
 
     index: int
@@ -36,6 +38,7 @@ class Frame:
     mask: np.ndarray | None = None
     T_world_camera: np.ndarray | None = None
     mask_loader: Callable[[], np.ndarray | None] | None = field(default=None, repr=False, compare=False)
+    valid: np.ndarray | None = field(default=None, repr=False, compare=False)
 
     def load_mask(self) -> np.ndarray | None:
         """The mask; reads it from disk on every call if it did not come with the frame.

@@ -12,6 +12,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences.alignment import Alignment, measure_alignment
+from ggslam.sequences.clock_offset import ClockOffset, measure_clock_offset
 from ggslam.sequences.focal_doubts import doubt_focal_length
 from ggslam.sequences.pose_conventions import CONVENTIONS, OURS
 from ggslam.sequences.pose_doubts import PoseDoubt, doubt_poses, pairs_apart
@@ -65,6 +66,7 @@ class SequenceReport:
         mask_kinds: how the masks of all frames are stored ("grey", "palette", "RGB-coded", ...) -> number of frames.
         masked_frames: share of sampled frames with a mask; mask_ids: ids seen in them; labelled_share: of their pixels.
         named_ids: how many ids have names.
+        clocks: by how much time depth and colour are apart; None when it cannot be told, or was not asked for.
         damaged: reasons of sampled frames that could not be read.
         verdicts: what seems wrong by the numbers.
         warnings: everything that looks wrong or needs to be known, the texts of the verdicts among it.
@@ -97,6 +99,7 @@ class SequenceReport:
     labelled_share: float = 0.0
     named_ids: int = 0
     camera_source: str = ""
+    clocks: ClockOffset | None = None
     damaged: list[str] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -107,8 +110,11 @@ class SequenceReport:
         self.warnings += [verdict.text for verdict in verdicts]
 
 
-def inspect_sequence(sequence: Sequence, samples: int = 8, masks: bool = True) -> SequenceReport:
-    """Reads `samples` frames spread over the sequence, with or without their masks, and reports what they hold."""
+def inspect_sequence(
+    sequence: Sequence, samples: int = 8, masks: bool = True, clocks: bool = False
+) -> SequenceReport:
+    """Reads `samples` frames spread over the sequence, with or without their masks, and reports what they hold; with
+    `clocks` also by how much time depth and colour are apart, for which it reads some 50 frames more."""
     times = sequence.timestamps
     intervals = np.diff(times)
     report = SequenceReport(
@@ -133,6 +139,7 @@ def inspect_sequence(sequence: Sequence, samples: int = 8, masks: bool = True) -
     _check_alignment(report)
     _check_camera(report, pairs)
     _check_steps(report, sequence)
+    report.clocks = measure_clock_offset(sequence) if clocks else None
     _warn(report, times, frames)
     if not report.posed_frames and not any(verdict.code == "depth_scale" for verdict in report.verdicts):
         signs = measure_scale_signs(sequence, frames)

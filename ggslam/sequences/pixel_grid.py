@@ -12,6 +12,7 @@ from ggslam.sequences.recording import FrameFiles, ImageFile, Recording
 from ggslam.sequences.registration import DepthRegistration
 from ggslam.sequences.resampling import resize_color, resize_depth, resize_mask
 from ggslam.sequences.upsampling import upsample_depth
+from ggslam.sequences.valid_pixels import within_source
 
 FINER = 2.5
 """Colour with so many times as many columns as depth is not cut to the size of depth: depth is brought to colour."""
@@ -51,6 +52,7 @@ class ImageGeometry:
         native_camera: the same before scaling.
         scale: of one to the other; None was given: 1, of much finer colour what leaves `USUAL_PIXELS`.
         finer: whether depth is brought to finer colour.
+        valid: bool [H, W], where images of `camera` show something; None: everywhere.
         color_size, depth_size: sizes (width, height) that every stored image must have.
     """
 
@@ -86,6 +88,29 @@ class ImageGeometry:
         # Finer colour is brought to its last size first: it may have many times as many pixels.
         self._work = self.camera if self.finer else self.native_camera
         self._maps = _undistortion(self._work, recording.distortion, recording.fisheye)
+        self._filled = False
+        self.valid: np.ndarray | None = self._valid()
+
+    def _valid(self, filled: np.ndarray | None = None) -> np.ndarray | None:
+        """Pixels of `camera` that show something; `filled`: bool, pixels of `_work` that do not."""
+        valid = np.ones((self._work.height, self._work.width), bool) if self._seen is None else self._seen.copy()
+        if filled is not None:
+            valid &= ~filled
+        if self._maps is not None:
+            if not valid.all():
+                valid = cv2.remap(valid.astype(np.uint8), *self._maps, interpolation=cv2.INTER_NEAREST) > 0
+            valid &= within_source(*self._maps)
+        if valid.all():
+            return None
+        size = (self.camera.width, self.camera.height)
+        return cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 1 - 1e-3
+
+    def leave_out(self, fill: np.ndarray) -> None:
+        """Pixels of the stored colour images, bool [H, W], show nothing: nor does depth count there."""
+        around = cv2.dilate(fill.astype(np.uint8), np.ones((3, 3), np.uint8))  # compression bleeds
+        size = (self._work.width, self._work.height)
+        filled = cv2.resize(around.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 1e-3
+        self._filled, self.valid = True, self._valid(filled)
 
     def _register(self, recording: Recording, depth_size: Size, files: FrameFiles) -> Camera:
         """Prepares registration of depth; returns the colour camera at about the depth image's resolution."""
@@ -157,8 +182,10 @@ class ImageGeometry:
 
     def depth(self, depth: np.ndarray, color: np.ndarray) -> np.ndarray:
         """Depth float32 [H, W] metres as stored, with the colour image as stored -> image of `camera`."""
-        if self.finer:
-            return self._depth_on_color(depth, color)
+        found = self._depth_on_color(depth, color) if self.finer else self._depth_of_camera(depth)
+        return np.where(self.valid, found, np.float32(0)) if self._filled and self.valid is not None else found
+
+    def _depth_of_camera(self, depth: np.ndarray) -> np.ndarray:
         if self._registration is not None:
             return resize_depth(self._registration(depth), self.camera.width, self.camera.height)
         depth = resize_depth(depth, self.native_camera.width, self.native_camera.height)

@@ -25,11 +25,14 @@ from ggslam.sequences.masks import MaskReader
 from ggslam.sequences.pixel_grid import ImageGeometry, image_size
 from ggslam.sequences.recording import FrameFiles, Recording
 from ggslam.sequences.stream import ReadAhead
+from ggslam.sequences.valid_pixels import common_fill, fill_of
 
 OnBadFrame = Literal["error", "skip"]
 ReadMasks = bool | Literal["lazy"]
 """True: masks are read with the frame; "lazy": when `Frame.load_mask` is called; False: never."""
 
+FILL_LOOKS = 4
+"""Images that are compared with the first one where that is of one colour from a corner on."""
 SMALLEST_SIDE = 8
 """Pixels that `scale` has to leave of both sides of an image: windows of trackers and filters need so many."""
 
@@ -61,6 +64,7 @@ class Sequence:
         native_camera: the same before `scale`.
         scale: of the delivered images to the native ones.
         finer: whether colour is much finer than depth, which is brought to colour.
+        valid: bool [H, W], where delivered images show something; None: everywhere.
         depth_scale: units per metre of the stored depth images.
         color_size, depth_size: (width, height) of the stored images.
         lens: distortion that is undone and intrinsics that change, in words; "" for a pinhole camera that stays one.
@@ -129,6 +133,7 @@ class Sequence:
             raise SequenceError(f"`scale`: {self.scale:g} leaves images of {size}, {needed}")
         self.native_camera: Camera = self._geometry.native_camera
         self.finer: bool = self._geometry.finer
+        self.valid: np.ndarray | None = self._geometry.valid
 
     def _select(self, selection: range) -> int:
         """Takes these frames of the recording; returns how many of them have masks."""
@@ -255,6 +260,7 @@ class Sequence:
             camera=self.camera,
             mask=self._mask(index) if masks is True else None,
             T_world_camera=pose.copy() if pose is not None and np.isfinite(pose).all() else None,
+            valid=self.valid,
             mask_loader=partial(self._mask, index) if masks == "lazy" and files.mask is not None else None,
         )
 
@@ -319,6 +325,21 @@ class Sequence:
             depth[confidence < self._recording.min_confidence] = 0
         return read_color(files.color), depth
 
+    def _look_for_fill(self, geometry: ImageGeometry, color: np.ndarray) -> None:
+        """Leaves out what is of one colour from a corner on in all images, if it is so in the first one."""
+        fill = fill_of(color)
+        if fill is None:
+            return
+        others = []
+        for source in self._selection[:: max(1, len(self._selection) // FILL_LOOKS)][1 : FILL_LOOKS + 1]:
+            try:
+                others.append(read_color(self._recording.files[source].color))
+            except SequenceError:
+                continue
+        found = common_fill(color, fill, others)
+        if found is not None:
+            geometry.leave_out(found)
+
     def _measure(self, scale: float | None) -> ImageGeometry:
         """Sizes and cameras from the first readable frame."""
         first_error: SequenceError | None = None
@@ -333,7 +354,9 @@ class Sequence:
                 first_error = first_error or error
                 continue
             files = self._recording.files[source]
-            return ImageGeometry(self._recording, files, image_size(color), image_size(depth), scale)
+            geometry = ImageGeometry(self._recording, files, image_size(color), image_size(depth), scale)
+            self._look_for_fill(geometry, color)
+            return geometry
         reason = first_error or self._recording.problems[self._selection[0]]
         raise SequenceError(f"{self.path}: none of {len(self)} frames can be read; the first: {reason}")
 

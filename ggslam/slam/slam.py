@@ -27,7 +27,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.frame_checks import check_frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
-from ggslam.slam.config import Config
+from ggslam.slam.config import REFINE_SHARE, Config
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.parts import device_name, make_parts
@@ -164,10 +164,18 @@ class Slam:
         """Gaussians of the map, in memory and on disk."""
         return self.map.count + (0 if self.pager is None else self.pager.on_disk)
 
+    @property
+    def refinement_steps(self) -> int:
+        """Optimisation steps that `finish` makes, those of a run that was cut off among them."""
+        if not self.mapper.keyframes or not self.growing:
+            return 0
+        asked, before = self.config.refine_iterations, self.mapper.times.iterations - self.refine_iterations
+        return asked if asked >= 0 else round(REFINE_SHARE * before)
+
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
-        """Final refinement (`refine_iterations`), then the result. `progress(done, total)` is called now and then."""
+        """Final refinement (`refinement_steps`), then the result. `progress(done, total)` is called now and then."""
         start, before = time.perf_counter() - self.times.refinement, self.mapper.times.iterations
-        begin = self.refine_iterations  # by a run that was cut off
+        begin, steps = self.refine_iterations, self.refinement_steps  # `begin`: by a run that was cut off
 
         def note(done: int, total: int) -> None:
             self.refine_iterations = begin + self.mapper.times.iterations - before
@@ -176,8 +184,8 @@ class Slam:
                 progress(done, total)
 
         try:
-            if self.config.refine_iterations and self.mapper.keyframes and self.growing:
-                self.mapper.refine(self.config.refine_iterations, note, begin)
+            if steps:
+                self.mapper.refine(steps, note, begin)
         finally:  # an interrupted refinement counts for what it did
             self.refine_iterations = begin + self.mapper.times.iterations - before
             self.times.refinement = time.perf_counter() - start
@@ -221,6 +229,7 @@ class Slam:
             SequenceError: the frame is of another camera, or not what `Frame` says.
         """
         check_frame(frame, self.camera)
+        self.mapper.valid = frame.valid
         start = time.perf_counter()
         self._follow_moves()
         if not len(self.surface):

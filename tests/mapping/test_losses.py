@@ -118,6 +118,31 @@ def test_no_depth_anywhere(name: str) -> None:
     assert np.isfinite(result.values.total) and not result.d_depth.any() and not result.d_alpha.any()
 
 
+@pytest.mark.parametrize("instruction_set", available_instruction_sets())
+@pytest.mark.parametrize("name", SETTINGS)
+def test_what_shows_nothing_counts_for_nothing(name: str, instruction_set: str) -> None:
+    view, target = make_case(37, 53)
+    valid = np.ones((37, 53), bool)
+    valid[:, :6], valid[30:, 40:] = False, False
+    target = replace(target, valid=valid)
+    loss = CpuImageLoss(NativeContext(2, instruction_set))
+    result = loss.evaluate(view, target, SETTINGS[name])
+    assert_agrees(result, view, target, SETTINGS[name])
+    gradient, total = result.d_image.clone(), result.values.total
+    assert not gradient[:, ~valid].any() and gradient[:, valid].any()
+    black = replace(target, color=np.where(valid[..., None], target.color, 0).astype(np.uint8))
+    again = loss.evaluate(view, black, replace(SETTINGS[name], dssim_weight=0.0))
+    other = loss.evaluate(view, target, replace(SETTINGS[name], dssim_weight=0.0))
+    assert again.values.color == pytest.approx(other.values.color) and np.isfinite(total)
+
+
+def test_valid_pixels_of_another_size_are_refused() -> None:
+    view, target = make_case(9, 9)
+    for valid in (np.ones((9, 8), bool), np.ones((9, 9), np.uint8)):
+        with pytest.raises(RenderError, match="target valid: expected bool"):
+            CpuImageLoss(NativeContext(1)).evaluate(view, replace(target, valid=valid), LossSettings())
+
+
 def test_perfect_view_has_no_loss() -> None:
     _, target = make_case(37, 53, exposure=None)
     depth = torch.from_numpy(target.depth.astype(np.float32) * np.float32(target.depth_scale))

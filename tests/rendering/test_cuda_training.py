@@ -70,7 +70,8 @@ def make_case(height: int, width: int, float_depth: bool = False) -> tuple[Rende
 def moved_target(target: LossTarget, device: torch.device) -> LossTarget:
     exposure = None if target.exposure is None else torch.from_numpy(target.exposure).float().to(device)
     color, depth = torch.from_numpy(target.color).to(device), torch.from_numpy(target.depth).to(device)
-    return LossTarget(color, depth, target.depth_scale, exposure)
+    valid = None if target.valid is None else torch.from_numpy(target.valid).to(device)
+    return LossTarget(color, depth, target.depth_scale, exposure, valid)
 
 
 def check_loss(loss: CudaImageLoss, view: RenderBuffers, target: LossTarget, settings: LossSettings) -> None:
@@ -108,6 +109,9 @@ def test_loss_of_other_inputs(cuda_library: CudaLibrary) -> None:
     view, target = make_case(37, 53, float_depth=True)
     check_loss(loss, view, target, LOSSES["all"])
     check_loss(loss, view, replace(target, exposure=None), LOSSES["all"])
+    shown = np.arange(37 * 53).reshape(37, 53) % 53 > 8
+    for name in ("default", "all"):
+        check_loss(loss, view, replace(target, valid=shown), LOSSES[name])
     for name in ("default", "all"):
         check_loss(loss, view, replace(target, depth=np.zeros_like(target.depth)), LOSSES[name])
 

@@ -38,6 +38,18 @@ def test_five_lines_of_python(room: Path) -> None:
     assert result.trajectory().shape == (6, 4, 4) and len(result.gaussians) > 1000 and len(result.keyframes) >= 1
 
 
+@pytest.mark.parametrize(("asked", "steps"), [(-1, 3), (0, 0), (7, 7)])
+def test_a_run_ends_with_some_more_steps(frames: list[Frame], asked: int, steps: int) -> None:
+    slam = new_slam(frames, f"refine_iterations={asked}")
+    for frame in frames:
+        slam.step(frame)
+    before, told = slam.mapper.times.iterations, []
+    assert before == 21 and slam.refinement_steps == steps
+    result = slam.finish(lambda done, total: told.append((done, total)))
+    assert result.refine_iterations == steps == slam.mapper.times.iterations - before
+    assert told[-1:] == ([(steps, steps)] if steps else [])
+
+
 def test_a_frame_without_depth_is_lost_and_the_next_one_is_found(frames: list[Frame]) -> None:
     slam = new_slam(frames)
     for i, frame in enumerate(frames):

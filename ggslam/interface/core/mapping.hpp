@@ -17,6 +17,7 @@ struct ImageLossJob {
   // Target: colour [H, W, 3] interleaved, depth [H, W] (uint16 or float, see target_depth_is_float), 0 = none.
   const uint8_t* target_color;
   const void* target_depth;
+  const uint8_t* target_valid;  // [H, W], 0 where the target shows nothing: its colour does not count; may be null
   // Gradients of the loss, shaped like the rendered images.
   float* d_image;
   float* d_depth;

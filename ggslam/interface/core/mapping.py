@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_void
 from typing import Any
 
 HEADER = "core/mapping.hpp"
-HEADER_SHA256 = "9896fce84a21308a6e3dff32a347c27aafdce5d46b0002c0a001f4b38889ca30"
+HEADER_SHA256 = "31ac22453a8885aabf09b206fc5cafd9d219a9f2603d7b8197ec238890fba1db"
 
 
 class ImageLossJob(Structure):
@@ -16,10 +16,10 @@ class ImageLossJob(Structure):
 
     _fields_ = [
         ("image", c_void_p), ("depth", c_void_p), ("alpha", c_void_p), ("target_color", c_void_p),
-        ("target_depth", c_void_p), ("d_image", c_void_p), ("d_depth", c_void_p), ("d_alpha", c_void_p),
-        ("height", c_int32), ("width", c_int32), ("target_depth_is_float", c_int32), ("normalised_depth", c_int32),
-        ("charbonnier", c_int32), ("depth_scale", c_float), ("exposure", c_float * 6), ("dssim_weight", c_float),
-        ("depth_weight", c_float), ("opacity_weight", c_float), ("no_depth_weight", c_float),
+        ("target_depth", c_void_p), ("target_valid", c_void_p), ("d_image", c_void_p), ("d_depth", c_void_p),
+        ("d_alpha", c_void_p), ("height", c_int32), ("width", c_int32), ("target_depth_is_float", c_int32),
+        ("normalised_depth", c_int32), ("charbonnier", c_int32), ("depth_scale", c_float), ("exposure", c_float * 6),
+        ("dssim_weight", c_float), ("depth_weight", c_float), ("opacity_weight", c_float), ("no_depth_weight", c_float),
         ("minimum_alpha", c_float), ("charbonnier_epsilon", c_float), ("total", c_double), ("color", c_double),
         ("l1", c_double), ("ssim", c_double), ("depth_term", c_double), ("opacity_term", c_double),
         ("depth_l1_m", c_double), ("psnr", c_double), ("valid_pixels", c_double), ("exposure_gradient", c_double * 6),

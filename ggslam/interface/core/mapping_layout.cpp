@@ -11,9 +11,9 @@ using ggslam::ImageLossJob;
 namespace {
 constexpr std::size_t kLayout[] = {
     sizeof(ImageLossJob), offsetof(ImageLossJob, image), offsetof(ImageLossJob, depth), offsetof(ImageLossJob, alpha),
-    offsetof(ImageLossJob, target_color), offsetof(ImageLossJob, target_depth), offsetof(ImageLossJob, d_image),
-    offsetof(ImageLossJob, d_depth), offsetof(ImageLossJob, d_alpha), offsetof(ImageLossJob, height),
-    offsetof(ImageLossJob, width), offsetof(ImageLossJob, target_depth_is_float),
+    offsetof(ImageLossJob, target_color), offsetof(ImageLossJob, target_depth), offsetof(ImageLossJob, target_valid),
+    offsetof(ImageLossJob, d_image), offsetof(ImageLossJob, d_depth), offsetof(ImageLossJob, d_alpha),
+    offsetof(ImageLossJob, height), offsetof(ImageLossJob, width), offsetof(ImageLossJob, target_depth_is_float),
     offsetof(ImageLossJob, normalised_depth), offsetof(ImageLossJob, charbonnier), offsetof(ImageLossJob, depth_scale),
     offsetof(ImageLossJob, exposure), offsetof(ImageLossJob, dssim_weight), offsetof(ImageLossJob, depth_weight),
     offsetof(ImageLossJob, opacity_weight), offsetof(ImageLossJob, no_depth_weight),

@@ -17,6 +17,7 @@ struct ImageLossJob {
   // Target: colour [H, W, 3], depth [H, W] (uint16 or float, see target_depth_is_float), 0 = none.
   const std::uint8_t* target_color;
   const void* target_depth;
+  const std::uint8_t* target_valid;  // [H, W], 0 where the target shows nothing: its colour does not count; may be null
   const float* exposure;  // [3][2], gain and offset of R, G, B; null: 1 and 0
   // Gradients of the loss, shaped like the rendered images.
   float *d_image, *d_depth, *d_alpha;

@@ -11,7 +11,7 @@ from enum import IntEnum
 from typing import Any
 
 HEADER = "cuda/mapping.hpp"
-HEADER_SHA256 = "951928322397e5d88b44bb077f19a545c96553f0c68dd2fe09a88e269761f6c7"
+HEADER_SHA256 = "e7dfb0bec0f283079c152978404a80e68392f0e677620dc80d29674b71ff8e7a"
 MOST_NEIGHBOURS = 32
 
 
@@ -35,12 +35,12 @@ class ImageLossJob(Structure):
 
     _fields_ = [
         ("image", c_void_p), ("depth", c_void_p), ("alpha", c_void_p), ("target_color", c_void_p),
-        ("target_depth", c_void_p), ("exposure", c_void_p), ("d_image", c_void_p), ("d_depth", c_void_p),
-        ("d_alpha", c_void_p), ("results", c_void_p), ("workspace", c_void_p), ("stream", c_void_p),
-        ("device", c_int32), ("height", c_int32), ("width", c_int32), ("target_depth_is_float", c_int32),
-        ("normalised_depth", c_int32), ("charbonnier", c_int32), ("depth_scale", c_float), ("dssim_weight", c_float),
-        ("depth_weight", c_float), ("opacity_weight", c_float), ("no_depth_weight", c_float),
-        ("minimum_alpha", c_float), ("charbonnier_epsilon", c_float),
+        ("target_depth", c_void_p), ("target_valid", c_void_p), ("exposure", c_void_p), ("d_image", c_void_p),
+        ("d_depth", c_void_p), ("d_alpha", c_void_p), ("results", c_void_p), ("workspace", c_void_p),
+        ("stream", c_void_p), ("device", c_int32), ("height", c_int32), ("width", c_int32),
+        ("target_depth_is_float", c_int32), ("normalised_depth", c_int32), ("charbonnier", c_int32),
+        ("depth_scale", c_float), ("dssim_weight", c_float), ("depth_weight", c_float), ("opacity_weight", c_float),
+        ("no_depth_weight", c_float), ("minimum_alpha", c_float), ("charbonnier_epsilon", c_float),
     ]
 
 

@@ -111,7 +111,7 @@ class SlamLoop:
         self.stop.raise_if_any()
 
     def _refine(self, slam: Slam) -> SlamResult:
-        wanted = self.config.refine_iterations
+        wanted = slam.refinement_steps
         if wanted:
             self.observer.begin("refine", wanted)
 

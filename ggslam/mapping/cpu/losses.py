@@ -71,6 +71,8 @@ class CpuImageLoss:
         color, depth = np.ascontiguousarray(target.color), np.ascontiguousarray(target.depth)
         job.target_color, job.target_depth = color.ctypes.data, depth.ctypes.data
         job.target_depth_is_float = depth.dtype == np.float32
+        valid = None if target.valid is None else np.ascontiguousarray(target.valid)
+        job.target_valid = None if valid is None else valid.ctypes.data
         job.depth_scale = target.depth_scale
         job.exposure[:] = _exposure(target).ravel().tolist()
         job.normalised_depth = settings.depth_kind == "normalised"
@@ -106,6 +108,9 @@ def _target_size(target: LossTarget[np.ndarray]) -> tuple[int, int]:
             f"target depth: expected uint16 or float32 [{height}, {width}] (the size of color), "
             f"found {depth.dtype} {list(depth.shape)}"
         )
+    if target.valid is not None and (target.valid.shape != (height, width) or target.valid.dtype != np.bool_):
+        found = f"{target.valid.dtype} {list(target.valid.shape)}"
+        raise RenderError(f"target valid: expected bool [{height}, {width}] (the size of color), found {found}")
     if not (np.isfinite(target.depth_scale) and target.depth_scale > 0):
         raise RenderError(f"depth_scale: expected a number above 0, found {target.depth_scale!r}")
     return height, width

@@ -143,7 +143,8 @@ class CpuMapper(Mapper):
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> CpuLossResult:
         exposure = keyframe.exposure if self._is_exposed(keyframe) else None
-        target = LossTarget(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
+        valid = self._valid_of(keyframe)
+        target = LossTarget(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure, valid)
         return self._loss.evaluate(view, target, self.settings.loss)
 
     def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:

@@ -81,6 +81,7 @@ class CudaImageLoss:
             setattr(job, name, tensor.data_ptr())
         job.target_color, job.target_depth = target.color.data_ptr(), target.depth.data_ptr()
         job.target_depth_is_float = target.depth.dtype == torch.float32
+        job.target_valid = None if target.valid is None else target.valid.data_ptr()
         job.exposure = None if target.exposure is None else target.exposure.data_ptr()
         job.normalised_depth = settings.depth_kind == "normalised"
         job.charbonnier = settings.color_kind == "charbonnier"
@@ -103,6 +104,8 @@ class CudaImageLoss:
         height, width = target.color.shape[:2] if target.color.ndim == 3 and target.color.numel() else (0, 0)
         self._check("target color", target.color, (torch.uint8,), (height, width, 3))
         self._check("target depth", target.depth, (torch.uint16, torch.float32), (height, width))
+        if target.valid is not None:
+            self._check("target valid", target.valid, (torch.bool,), (height, width))
         if target.exposure is not None:
             self._check("exposure", target.exposure, (torch.float32,), (3, 2))
         if not (np.isfinite(target.depth_scale) and target.depth_scale > 0):

@@ -63,6 +63,7 @@ class CudaMapper(Mapper):
         self._overflows = HostMirror(self._rasterizer.overflows)
         self._pace = Pace(self.device)
         self._repeated = 0
+        self._valid_on_device: tuple[np.ndarray, torch.Tensor] | None = None
 
     @property
     def losses(self) -> LossSums:
@@ -176,7 +177,11 @@ class CudaMapper(Mapper):
         assert isinstance(keyframe, CudaKeyframe)
         images, s = keyframe.device_images, self.settings
         exposure = self._states.exposure(keyframe.index) if s.exposure.enabled else None
-        target = LossTarget(images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, exposure)
+        valid = self._valid_of(keyframe)
+        if valid is not None and (self._valid_on_device is None or self._valid_on_device[0] is not valid):
+            self._valid_on_device = (valid, torch.from_numpy(valid).to(self.device))
+        shown = None if valid is None or self._valid_on_device is None else self._valid_on_device[1]
+        target = LossTarget(images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, exposure, shown)
         return self._loss.evaluate(view, target, s.loss)
 
     def _finish_step(self, keyframe: Keyframe, twist: torch.Tensor, loss: CudaLossResult, pose_rate: float) -> None:

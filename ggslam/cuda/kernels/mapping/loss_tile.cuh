@@ -66,6 +66,7 @@ __device__ inline ColorPair color_pair(const ImageLossJob& job, const Exposure& 
   p.target = static_cast<float>(job.target_color[3 * pixel + channel]) * (1.0f / 255);
   p.depth = target_depth(job, pixel);
   p.weight = p.depth > 0.0f ? 1.0f : job.no_depth_weight;
+  if (job.target_valid != nullptr && job.target_valid[pixel] == 0) p.weight = 0.0f;
   p.corrected = exposure.gain * p.rendered + exposure.offset;
   p.residual = p.weight * (p.corrected - p.target);
   return p;

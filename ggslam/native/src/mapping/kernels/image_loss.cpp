@@ -254,6 +254,11 @@ void metric_depth(const Unit* __restrict units, float scale, float* __restrict d
   for (int x = 0; x < width; ++x) depth[x] = known_depth(units[x]) * scale;
 }
 
+// What a target does not show counts for nothing.
+void drop_invalid(const uint8_t* __restrict valid, float* __restrict weight, int width) {
+  for (int x = 0; x < width; ++x) weight[x] = valid[x] != 0 ? weight[x] : 0.f;
+}
+
 // Returns the number of pixels with depth.
 int color_weight(const float* __restrict depth, float no_depth_weight, float* __restrict weight, int width) {
   int count = 0;
@@ -278,6 +283,7 @@ long long image_loss_prepare(const ImageLossJob& job, const ImageLossPlanes& pla
       metric_depth(static_cast<const uint16_t*>(job.target_depth) + in, job.depth_scale, planes.depth + out, width);
     }
     count += color_weight(planes.depth + out, job.no_depth_weight, planes.weight + out, width);
+    if (job.target_valid != nullptr) drop_invalid(job.target_valid + in, planes.weight + out, width);
   }
   return count;
 }

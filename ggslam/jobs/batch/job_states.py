@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far each run of a batch is, and what is remembered of it: a file beside its folder, `jobs/NAME.json`."""
+
+from __future__ import annotations
+
+import enum
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from ggslam.errors import GgslamError
+from ggslam.jobs.batch.manifest import BatchJob, Manifest, option
+from ggslam.runs.checkpoints import has_checkpoints
+from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.record import RecordFile
+from ggslam.system.atomic import make_folder
+
+_log = logging.getLogger(__name__)
+
+
+class State(enum.Enum):
+    """Of a run."""
+
+    WAITING = "waiting"
+    RUNNING = "running"
+    DONE = "done"
+    SKIPPED = "was done"
+    """Finished by an earlier call."""
+    FAILED = "failed"
+
+
+class JobRecord(RecordFile):
+    """What became of a run: its arguments, exit code, seconds and last line."""
+
+    FILE: ClassVar[str] = "job.json"
+    words: list[str]
+    exit_code: int
+    seconds: float
+    line: str = ""
+
+
+@dataclass
+class JobState:
+    """A run of a batch.
+
+    Attributes:
+        job: which.
+        out: folder of the batch.
+        state: how far it is.
+        line: why it failed.
+        seconds: that it took.
+    """
+
+    job: BatchJob
+    out: Path
+    state: State = State.WAITING
+    line: str = ""
+    seconds: float = 0.0
+
+    @property
+    def run(self) -> Path:
+        """Folder of the run."""
+        return self.out / "runs" / self.job.name
+
+    @property
+    def log(self) -> Path:
+        """What the run printed."""
+        return self._beside / "log.txt"
+
+    @property
+    def _beside(self) -> Path:
+        return self.out / "jobs" / self.job.name
+
+    def memory(self) -> JobRecord | None:
+        """What an earlier call noted of a run with the same arguments."""
+        try:
+            record = JobRecord.read_if_there(self._beside)
+        except GgslamError as error:
+            _log.warning("warning: %s; the run is made again", error)
+            return None
+        return record if record is not None and tuple(record.words) == self.job.words else None
+
+    def is_whole(self) -> bool:
+        """Whether the run's folder has all that was asked for, scores too."""
+        try:
+            mark = RunRecord.read_if_there(self.run)
+            return mark is not None and mark.complete and MetricsRecord.read_if_there(self.run) is not None
+        except GgslamError:
+            return False
+
+    def arguments(self) -> list[str]:
+        """Of `ggslam`: to go on with a run that was cut off, else to make it anew."""
+        if self.memory() is None and has_checkpoints(self.run) and self._began_alike():
+            return ["run", option("resume"), str(self.run)]
+        return ["run", *self.job.words, option("out"), str(self.run), option("overwrite")]
+
+    def begin(self) -> None:
+        """Notes what is begun."""
+        make_folder(self._beside)
+        (self._beside / JobRecord.FILE).unlink(missing_ok=True)
+        (self._beside / "begun.txt").write_text("\n".join(self.job.words), encoding="utf-8")
+        self.state = State.RUNNING
+
+    def end(self, exit_code: int, seconds: float, line: str) -> None:
+        """Notes what became of it."""
+        self.seconds, whole = seconds, exit_code in (0, 3) and self.is_whole()
+        self.state, self.line = (State.DONE, "") if whole else (State.FAILED, line or f"exit code {exit_code}")
+        JobRecord.of(
+            {"words": list(self.job.words), "exit_code": exit_code, "seconds": seconds, "line": self.line}
+        ).write(self._beside)
+
+    def _began_alike(self) -> bool:
+        """Whether the run that was cut off had the same arguments."""
+        path = self._beside / "begun.txt"
+        return path.is_file() and tuple(path.read_text(encoding="utf-8").split("\n")) == self.job.words
+
+
+def states_of(manifest: Manifest, retry: bool) -> list[JobState]:
+    """All runs of a batch: those that are done are skipped, those that failed stay failed unless `retry`."""
+    states = [JobState(job, manifest.out) for job in manifest.jobs]
+    for state in states:
+        record = state.memory()
+        if record is None:
+            continue
+        if record.exit_code in (0, 3) and state.is_whole():
+            state.state, state.seconds = State.SKIPPED, record.seconds
+        elif not retry and record.exit_code not in (0, 3):
+            state.state, state.line = State.FAILED, record.line
+    return states

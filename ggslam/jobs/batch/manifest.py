@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which runs a batch makes: recordings x settings x seeds, from a manifest or a folder of recordings."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ggslam.errors import ConfigError
+from ggslam.sequences import recognise_format
+from ggslam.system.foreign import read_foreign_text
+from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
+
+REPLICA = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
+"""Replica's scenes in the order in which papers list them."""
+_KEYS = {"out", "options", "recordings", "settings", "seeds"}
+_OURS = ("out", "seed", "resume", "overwrite", "view", "rerun", "no-eval", "localize-only", "help")
+"""Names of options of `ggslam run` that a batch gives itself, or that make no sense in it."""
+
+
+@dataclass(frozen=True)
+class BatchJob:
+    """One run.
+
+    Attributes:
+        recording, settings: names, for the table.
+        seed: of the run.
+        words: arguments of `ggslam run` but for the output folder.
+    """
+
+    recording: str
+    settings: str
+    seed: int
+    words: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Path of the run's folder within the batch's."""
+        return f"{_file_name(self.recording)}/{_file_name(self.settings)}/seed{self.seed}"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A batch.
+
+    Attributes:
+        title: of its table.
+        out: folder of its runs and tables.
+        jobs: its runs, in the order of the table.
+    """
+
+    title: str
+    out: Path
+    jobs: list[BatchJob] = field(default_factory=list)
+
+
+def read_manifest(path: str | Path, out: Path | None = None) -> Manifest:
+    """Reads a batch's YAML; recordings in it are relative to it. docs/batch.md describes the file.
+
+    Raises:
+        ConfigError: it is not there, no plain YAML, or says something impossible; names the place.
+    """
+    path = Path(path)
+    try:
+        values = parse_yaml(read_foreign_text(path, ConfigError))
+    except PlainYamlError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    if not isinstance(values, dict) or set(values) - _KEYS or "recordings" not in values:
+        raise ConfigError(f"{path}: expected recordings and no other keys than {', '.join(sorted(_KEYS))}")
+    common = _options(path, "options", values.get("options"))
+    items = _take_list(path, "recordings", values["recordings"])
+    recordings = [_recording(path, k, item) for k, item in enumerate(items)]
+    given = values.get("settings") or {"default": None}
+    if not isinstance(given, dict):
+        raise ConfigError(f"{path}: settings: expected names with options of `ggslam run`, found {given!r}")
+    settings = {str(name): _options(path, f"settings.{name}", words) for name, words in given.items()}
+    seeds = _take_list(path, "seeds", values.get("seeds", [0]))
+    if not all(isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0 for seed in seeds):
+        raise ConfigError(f"{path}: seeds: expected whole numbers from 0 on, found {seeds!r}")
+    folder = out or (path.parent / str(values["out"]) if "out" in values else Path("runs") / path.stem)
+    return Manifest(path.stem, folder, _jobs(recordings, settings, seeds, common, str(path)))
+
+
+def manifest_of_folder(
+    folder: str | Path, out: Path | None = None, seeds: Sequence[int] = (0,), options: Sequence[str] = (),
+    only: Iterable[str] | None = None,
+) -> Manifest:  # fmt: skip
+    """All recordings that a folder holds, with the same options.
+
+    Args:
+        folder: its subfolders are looked at.
+        out: folder of the batch; None: `runs/NAME`.
+        seeds: of each recording.
+        options: of `ggslam run`.
+        only: names of subfolders that have to be there (Replica's scenes); None: all that are recognised.
+
+    Raises:
+        ConfigError: no folder, or no recording in it.
+    """
+    folder = Path(folder).absolute()
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder")
+    wanted = sorted(path for path in folder.iterdir() if path.is_dir()) if only is None else [folder / n for n in only]
+    found = [path for path in wanted if path.is_dir() and recognise_format(path)]
+    if not found:
+        names = "" if only is None else f" of the names {', '.join(wanted_name.name for wanted_name in wanted)}"
+        raise ConfigError(f"{folder}: holds no recording{names}")
+    recordings = [(path.name, path, ()) for path in found]
+    name = folder.resolve().name
+    jobs = _jobs(recordings, {"default": ()}, seeds, tuple(_check_words(str(folder), options)), str(folder))
+    return Manifest(name, out or Path("runs") / name, jobs)
+
+
+def option(name: str) -> str:
+    """An option of the command line."""
+    return f"--{name}"
+
+
+def _jobs(
+    recordings: Sequence[tuple[str, Path, tuple[str, ...]]], settings: dict[str, tuple[str, ...]], seeds: Sequence[int],
+    common: tuple[str, ...], where: str,
+) -> list[BatchJob]:  # fmt: skip
+    jobs = [
+        BatchJob(name, setting, seed, (str(path), *common, *own, *words, option("seed"), str(seed)))
+        for name, path, own in recordings for setting, words in settings.items() for seed in seeds
+    ]  # fmt: skip
+    folders = [job.name for job in jobs]
+    twice = sorted({name for name in folders if folders.count(name) > 1})
+    if twice:
+        raise ConfigError(f"{where}: two runs would have the folder {twice[0]}: give recordings and settings own names")
+    if not jobs:
+        raise ConfigError(f"{where}: names no run")
+    return jobs
+
+
+def _recording(path: Path, number: int, item: Any) -> tuple[str, Path, tuple[str, ...]]:
+    where = f"recordings[{number}]"
+    if isinstance(item, str):
+        item = {"path": item}
+    if not isinstance(item, dict) or set(item) - {"path", "name", "options"} or not isinstance(item.get("path"), str):
+        raise ConfigError(f"{path}: {where}: expected a path, or path, name and options, found {item!r}")
+    place = (path.parent / Path(item["path"]).expanduser()).absolute()
+    name = str(item.get("name") or place.resolve().name)
+    return name, place, _options(path, f"{where}.options", item.get("options"))
+
+
+def _options(path: Path, where: str, words: Any) -> tuple[str, ...]:
+    if words is None:
+        return ()
+    if not isinstance(words, str):
+        raise ConfigError(f"{path}: {where}: expected options of `ggslam run` as one text, found {words!r}")
+    try:
+        return tuple(_check_words(f"{path}: {where}", shlex.split(words)))
+    except ValueError as error:
+        raise ConfigError(f"{path}: {where}: {error}") from None
+
+
+def _check_words(where: str, words: Sequence[str]) -> Sequence[str]:
+    ours = [name for word in words for name in [word.partition("=")[0]] if name in map(option, _OURS)]
+    if ours:
+        raise ConfigError(f"{where}: {ours[0]} is not for batches: folders, seeds and scores are theirs")
+    return words
+
+
+def _take_list(path: Path, where: str, values: Any) -> list[Any]:
+    if not isinstance(values, list) or not values:
+        raise ConfigError(f"{path}: {where}: expected a list, found {values!r}")
+    return values
+
+
+def _file_name(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "_"
