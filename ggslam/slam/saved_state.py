@@ -57,6 +57,7 @@ from ggslam.tracking.edges_planes.voxels import FeatureMap
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.keyframes import KeyframeKind, KeyframePolicy
 from ggslam.tracking.motion import CameraMotion
+from ggslam.tracking.residual_noise import ResidualNoise
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface, _Part
 from ggslam.tracking.tracker import TrackerState
@@ -213,8 +214,8 @@ RULES: Rules = {
     NeighbourIndex: Rule(save=_save_index, take=_take_index),
     # plain values
     **dict.fromkeys(
-        (Camera, DepthNoise, KeyframeKind, FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link, Place,
-         Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable,
+        (Camera, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link,
+         Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable,
          ClassNumbers, IdentityClassifier, LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence,
          _Pair, Fragment, FragmentMemory),
         Rule(),

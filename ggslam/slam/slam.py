@@ -87,6 +87,7 @@ class Slam:
         """Whether keyframes are made and the map is trained; off: frames are located in the map as it is."""
         self._corrections = MapCorrections(self.surface, self.mapper, self.pager)
         self._moves_followed = 0
+        self._noise: DepthNoise | None = None
         self._objects = RunObjects(self.masks)
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
@@ -239,11 +240,19 @@ class Slam:
             if found is not None:
                 result, keyframe = found
                 self.poses.anchor_to(keyframe, self.loops.poses[keyframe])
-        if not self.mapper.keyframes and self.tracker.noise is not None:
-            self.mapper.depth_sigma = self.tracker.noise.sigma(result.median_depth_m)
+        self._tell_noise(result.median_depth_m)
         self.times.tracking_by_frame.append(time.perf_counter() - start)
         self.times.tracking += self.times.tracking_by_frame[-1]
         return result
+
+    def _tell_noise(self, median_depth: float) -> None:
+        """The mapper learns what the tracker says of the noise, on the first frame and whenever it says more."""
+        noise = self.tracker.noise
+        if noise is None or noise == self._noise:
+            return
+        if self._noise is not None or not self.mapper.keyframes:  # a map made before keeps what it was trained with
+            self.mapper.depth_sigma = noise.sigma(median_depth)
+        self._noise = noise
 
     def use_scale(self, scale: float) -> None:
         """Fits the tracker to a scene of this size; before the first keyframe."""

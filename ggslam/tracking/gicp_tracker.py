@@ -18,7 +18,7 @@ from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import DepthNoise, PhotometricMode, TrackerSettings
-from ggslam.tracking.shared_features import SharedFeatures
+from ggslam.tracking.shared_features import JUMP_SLACK, SharedFeatures
 from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, TrackingStatus
 
 MIN_TEXTURED = 200
@@ -79,7 +79,8 @@ class GicpTracker(Tracker):
         if not self._is_acceptable(found):
             return self._give_up(points, found)
         T = orthonormalize(found.T_world_camera)
-        doubt = self._features.contradict(T) if self._features is not None else ""
+        self._look_at_residuals(points, found)
+        doubt = self._features.contradict(T, JUMP_SLACK) if self._features is not None else ""
         self._features = None
         motion.follow(view, T)
         motion.remember(view, points, self.settings)
@@ -90,6 +91,11 @@ class GicpTracker(Tracker):
         return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, found)
 
     # --- parts -------------------------------------------------------------------------------------------------------
+
+    def _look_at_residuals(self, points: PointSource, found: AlignmentResult) -> None:
+        """Noise that was measured on the first frame is taken to be larger where frames do not lie on one another."""
+        if self.settings.noise is None and self.noise is not None and self.state.residuals.due():
+            self.noise = self.state.residuals.observe(points.read(), found.matches.read().squared_distances, self.noise)
 
     def _locate(self, view: FeatureView, points: PointSource, target: GicpTarget) -> tuple[AlignmentResult, str]:
         """The best alignment, and which start it came from (empty: constant velocity)."""

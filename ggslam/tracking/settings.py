@@ -168,7 +168,8 @@ class TrackerSettings:
     """Everything the tracker needs to know."""
 
     noise: DepthNoise | None = None
-    """Of the depth camera; None: measured on the first frame (`noise.estimate_noise`)."""
+    """Of the depth camera; None: measured on the first frame (`noise.estimate_noise`), and larger where later frames
+    show that it is (`residual_noise`)."""
     points: PointSettings = field(default_factory=PointSettings)
     target: TargetSettings = field(default_factory=TargetSettings)
     align: AlignSettings = field(default_factory=AlignSettings)

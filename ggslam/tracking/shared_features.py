@@ -14,8 +14,12 @@ import numpy as np
 from ggslam.features.orb import FeatureSettings, FeatureView, ViewMatches, match_views
 from ggslam.scene.camera import Camera
 
-CONTRADICTED_BELOW = 0.3
-"""A pose that explains less than this share of the features shared with the last located frame is contradicted."""
+CONTRADICTED_BELOW = 0.4
+"""A pose is contradicted if it explains less than this share of the features shared with the last located frame, and
+less than this share of what another pose explains."""
+JUMP_SLACK = 3.0
+"""Features this many limits off contradict a pose for good: in fast turns colour and depth that are out of step differ
+by less."""
 CLEARLY_FEWER = 0.7
 """Of two poses one is preferred if the other explains less than this share of what it does."""
 
@@ -44,14 +48,22 @@ class SharedFeatures:
             if pose is not None:
                 yield f"features of view {number}", pose.T_world_camera
 
-    def contradict(self, T_world_camera: np.ndarray) -> str:
-        """Why a pose [4, 4] cannot be right; empty if it can, or if too little is shared with the last view to tell."""
-        if not self.matches or len(self.matches[0]) < 2 * self._settings.min_inliers:
+    def contradict(self, T_world_camera: np.ndarray, slack: float = 1.0) -> str:
+        """Why a pose [4, 4] cannot be right: another one explains far more of what the view shares with the last one.
+        Empty if it can, or if too little is shared to tell; `slack` widens the limit within which it explains them."""
+        if not self.matches:
             return ""
-        total, found = len(self.matches[0]), self.matches[0].explained(T_world_camera, self._camera, self._settings)
-        if found >= CONTRADICTED_BELOW * total:
+        shared, needed = self.matches[0], 2 * self._settings.min_inliers
+        found = shared.explained(T_world_camera, self._camera, self._settings, slack)
+        if len(shared) < needed or found >= CONTRADICTED_BELOW * len(shared):
             return ""
-        return f"{found} of {total} features shared with the last frame lie where this pose has them"
+        best = shared.pose(self._camera, self._settings)
+        if best is None or best.inliers < needed or found >= CONTRADICTED_BELOW * best.inliers:
+            return ""
+        return (
+            f"{found} of {len(shared)} features shared with the last frame lie where this pose has them, "
+            f"{best.inliers} with another"
+        )
 
     def prefer(self, T_one: np.ndarray, T_other: np.ndarray) -> bool | None:
         """Whether one pose [4, 4] explains clearly more of the features than another; None: there is no clear

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import enum
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from ggslam.scene.poses import orthonormalize
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.points import PointSource
+from ggslam.tracking.residual_noise import ResidualNoise
 from ggslam.tracking.settings import DepthNoise, TrackerSettings
 
 
@@ -73,7 +74,9 @@ class TrackerState:
         context: threads to work on; the tracker's own, so that it does not wait for other users.
         motion: of the camera, as far as it is known.
         target: what frames are aligned to; None until the first keyframe is in.
-        noise: of the depth camera; measured on the first frame if the settings leave it open.
+        noise: of the depth camera; measured on the first frame if the settings leave it open, and held to the
+            residuals of the frames that follow.
+        residuals: what these say.
     """
 
     camera: Camera
@@ -82,6 +85,7 @@ class TrackerState:
     motion: CameraMotion
     target: GicpTarget | None = None
     noise: DepthNoise | None = None
+    residuals: ResidualNoise = field(default_factory=ResidualNoise)
 
     @staticmethod
     def begin(

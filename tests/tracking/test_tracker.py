@@ -198,7 +198,7 @@ def test_a_pose_that_the_image_contradicts_is_doubted(monkeypatch: pytest.Monkey
         return replace(found, T_world_camera=T, photometric_residual=0.2)
 
     monkeypatch.setattr(CpuTrackingEngine, "align", slid)
-    result = run(poses, True, NOISY)[-1]
+    result = run(poses, True, NOISY)[1]
     assert result.status is TrackingStatus.DOUBTED
     assert "features shared with the last frame" in result.reason
 

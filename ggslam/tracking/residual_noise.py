@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What tracking says of the depth camera's noise.
+
+Errors that neighbouring pixels share are not seen in one image: depth of a phone is smooth, and wrong by a centimetre.
+They show where a frame is laid onto the surface that frames before have measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ggslam.tracking.points import FramePoints
+from ggslam.tracking.settings import DepthNoise
+
+EVERY = 2
+"""Every so many frames are looked at."""
+LATEST, FEWEST = 12, 4
+"""So many looks count, the latest ones, and so many there have to be."""
+DISHONEST = 2.5
+"""The noise is taken to be larger when residuals are this many times as large as it, and as the surface's own."""
+SURFACE_SIGMA = 1e-3
+"""Metres by which points of an exact camera miss a surface gathered in voxels."""
+_MEDIAN_OF_NORMAL = 0.6745
+
+
+@dataclass
+class ResidualNoise:
+    """Holds a noise model to the residuals of tracking, frame after frame.
+
+    Attributes:
+        residuals: of the latest frames looked at: median depth, and robust standard deviation of the distances of the
+            points to the surface, metres.
+        frames: seen so far.
+    """
+
+    residuals: list[tuple[float, float]] = field(default_factory=list)
+    frames: int = 0
+
+    def due(self) -> bool:
+        """Whether the next frame is looked at; counts it."""
+        self.frames += 1
+        return self.frames % EVERY == 0
+
+    def observe(self, points: FramePoints, squared_distances: np.ndarray, noise: DepthNoise) -> DepthNoise:
+        """The noise that agrees with the residuals so far: the one given, or a larger one of the same shape.
+
+        Args:
+            points: of a frame that was located.
+            squared_distances: of each to the surface, square metres, infinite without a match.
+            noise: as known so far.
+        """
+        matched = np.isfinite(squared_distances)
+        if matched.sum() < 100:
+            return noise
+        sigma = float(np.sqrt(np.median(squared_distances[matched]))) / _MEDIAN_OF_NORMAL
+        self.residuals = [*self.residuals[1 - LATEST :], (float(np.median(points.points[matched, 2])), sigma)]
+        if len(self.residuals) < FEWEST:
+            return noise
+        ratios = [sigma / max(noise.sigma(z), SURFACE_SIGMA) for z, sigma in self.residuals]
+        factor = float(np.median(ratios))
+        if factor < DISHONEST:
+            return noise
+        depth, found = (float(np.median(values)) for values in zip(*self.residuals, strict=True))
+        self.residuals = []
+        return larger_noise(noise, depth, found)
+
+
+def larger_noise(noise: DepthNoise, depth: float, sigma: float) -> DepthNoise:
+    """Noise with the standard deviation `sigma` at a depth, both in metres, half of it growing with depth squared."""
+    return DepthNoise(max(noise.constant, 0.5 * sigma), max(noise.square, 0.5 * sigma / depth**2))
