@@ -221,15 +221,21 @@ class RecordingFormat(Protocol):
         ...
 
 
+MOST_DIGITS = 1000
+"""Of a number in a name; Python refuses to read some thousands."""
+
+
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sorting key that puts "frame2" before "frame10"."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+    parts = [part for part in re.split(r"(\d+)", name) if part]  # numbers of any length: by digits, then by value
+    return [(0, len(part.lstrip("0")), part.lstrip("0")) if part.isdigit() else (1, 0, part) for part in parts]
 
 
 def last_number(name: str) -> int | None:
-    """The last run of digits in a name as a number: 12 for "frame-000012.color.png"; None when there is none."""
+    """The last run of digits in a name as a number: 12 for "frame-000012.color.png"; None when there is none, or a
+    number that no camera counts to."""
     digits = re.findall(r"\d+", name)
-    return int(digits[-1]) if digits else None
+    return int(digits[-1]) if digits and len(digits[-1]) <= MOST_DIGITS else None
 
 
 def image_files(folder: Path, suffixes: tuple[str, ...] = COLOR_SUFFIXES) -> list[Path]:

@@ -12,6 +12,7 @@ import pytest
 
 from ggslam.errors import SequenceError
 from ggslam.sequences import open_sequence
+from ggslam.sequences.recording import last_number, natural_key
 
 Make = Callable[[str], Path]
 
@@ -248,3 +249,9 @@ def test_masks_that_belong_to_nothing(make: Make, tmp_path: Path) -> None:
     assert cv2.imwrite(str(masks / "900.png"), np.zeros((24, 32), np.uint8))
     with pytest.raises(SequenceError, match=r"no mask is named like frame000000\.jpg; found 900\.png"):
         open_sequence(make("replica"), masks=masks)
+
+
+def test_numbers_in_names_may_be_of_any_length() -> None:
+    names = ["f10.png", "f" + "9" * 5000 + ".png", "f2.png", "f02.png", "a²b.png", "²"]
+    assert sorted(names, key=natural_key)[2:5] == ["f2.png", "f02.png", "f10.png"]
+    assert last_number("f" + "9" * 5000) is None and last_number("frame-000012.color") == 12
