@@ -128,7 +128,7 @@ class ViewMatches:
     def __len__(self) -> int:
         return len(self.points)
 
-    def explained(
+    def count_explained(
         self, T_world_camera: np.ndarray, camera: Camera, settings: FeatureSettings, slack: float = 1.0
     ) -> int:
         """How many the view sees where they have to be if it is at a pose [4, 4]; `slack` widens the limit."""

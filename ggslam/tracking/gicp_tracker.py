@@ -119,7 +119,7 @@ class GicpTracker(Tracker):
         if photometric is not None and not self._explains_greys(found) and not found.degenerate:
             # Images that do not agree (too far apart, shutters out of step) must not pull at good geometry.
             found = self._align(points, target, guess, None)
-            if self._shared(view).contradict(found.T_world_camera):
+            if self._share(view).contradict(found.T_world_camera):
                 return self._retry(view, points, target, found, photometric)
         if self._is_convincing(found) and not (found.degenerate and mode != "never"):
             return found, ""
@@ -191,7 +191,7 @@ class GicpTracker(Tracker):
         seen = found.photometric_share >= recovery.min_share
         return seen and found.photometric_residual <= tolerance * recovery.convincing_residual
 
-    def _shared(self, view: FeatureView) -> SharedFeatures:
+    def _share(self, view: FeatureView) -> SharedFeatures:
         """Features that the view shares with the last located ones; matched once."""
         if self._features is None:
             earlier, settings = self.state.motion.views, self.settings.recovery.features
@@ -208,7 +208,7 @@ class GicpTracker(Tracker):
         if photometric is not None and found.photometric_share == 0:  # all starts are compared by the same measure
             best = self._align(points, target, self.state.motion.predict(), photometric)
         # Feature matches are good to a centimetre or two; the coarse level would slide off along a bare wall.
-        starts, shared = [("last pose", self.state.motion.T_world_camera, True)], self._shared(view)
+        starts, shared = [("last pose", self.state.motion.T_world_camera, True)], self._share(view)
         starts += [(name, pose, False) for name, pose in shared.starts()]
         for name, guess, coarse in starts:
             candidate = self._align(points, target, guess, photometric, coarse)

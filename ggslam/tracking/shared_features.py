@@ -54,7 +54,7 @@ class SharedFeatures:
         if not self.matches:
             return ""
         shared, needed = self.matches[0], 2 * self._settings.min_inliers
-        found = shared.explained(T_world_camera, self._camera, self._settings, slack)
+        found = shared.count_explained(T_world_camera, self._camera, self._settings, slack)
         if len(shared) < needed or found >= CONTRADICTED_BELOW * len(shared):
             return ""
         best = shared.pose(self._camera, self._settings)
@@ -69,7 +69,7 @@ class SharedFeatures:
         """Whether one pose [4, 4] explains clearly more of the features than another; None: there is no clear
         difference."""
         one, other = (
-            sum(shared.explained(T, self._camera, self._settings) for shared in self.matches) for T in (T_one, T_other)
+            sum(shared.count_explained(T, self._camera, self._settings) for shared in self.matches) for T in (T_one, T_other)
         )
         if max(one, other) < self._settings.min_inliers or min(one, other) >= CLEARLY_FEWER * max(one, other):
             return None
