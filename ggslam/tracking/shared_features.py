@@ -69,7 +69,8 @@ class SharedFeatures:
         """Whether one pose [4, 4] explains clearly more of the features than another; None: there is no clear
         difference."""
         one, other = (
-            sum(shared.count_explained(T, self._camera, self._settings) for shared in self.matches) for T in (T_one, T_other)
+            sum(shared.count_explained(T, self._camera, self._settings) for shared in self.matches)
+            for T in (T_one, T_other)
         )
         if max(one, other) < self._settings.min_inliers or min(one, other) >= CLEARLY_FEWER * max(one, other):
             return None

@@ -83,7 +83,7 @@ def export_run(
         return _export_store(Path(run), place, kind, objects, min_opacity, zoom, observer)
     folder = run if isinstance(run, RunFolder) else RunFolder.open(Path(run))
     images, points = None if recording is None else Path(recording), 0.01 if voxel is None else voxel
-    prepare = None if zoom == 1 else _widening_of(folder, zoom)
+    prepare = None if zoom == 1 else _widen_for(folder, zoom)
     if kind is ExportFormat.mesh:
         return export_mesh(folder, place, MeshRequest(voxel, objects, rendered, images), observer)
     if kind in _WITH_VIEWS:
@@ -121,7 +121,7 @@ def _export_store(
     return stream_store(path, out, min_opacity, observer)
 
 
-def _widening_of(folder: RunFolder, zoom: float) -> ZoomWidening:
+def _widen_for(folder: RunFolder, zoom: float) -> ZoomWidening:
     record = folder.keyframes()
     poses, numbers = record.poses(), record.keyframe_numbers()
     return ZoomWidening(folder.sequence().camera, [poses[i] for i in sorted(poses) if i in numbers], zoom)
