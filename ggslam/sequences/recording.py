@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -251,8 +252,8 @@ def missing_depth_problems(files: Iterable[FrameFiles]) -> dict[int, str]:
     problems = {}
     for i, entry in enumerate(files):
         for kind, path in (("colour", entry.color), ("depth", entry.depth)):
-            if isinstance(path, Path) and not path.is_file():
-                what = "is not a regular file" if path.exists() else "is missing"
+            if isinstance(path, Path) and not os.path.isfile(path):  # noqa: PTH113 (Path's raises for impossible names)
+                what = "is not a regular file" if os.path.exists(path) else "is missing"  # noqa: PTH110
                 problems[i] = f"frame {i}: {kind} file {path} {what}"
     return problems
 
