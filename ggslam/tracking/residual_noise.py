@@ -14,8 +14,8 @@ import numpy as np
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
 
-EVERY = 2
-"""Every so many frames are looked at."""
+EVERY, BEGINNING, LATER = 2, 24, 16
+"""Every so many frames are looked at, up to a frame, and every so many later: on a GPU a look waits for the device."""
 LATEST, FEWEST = 12, 4
 """So many looks count, the latest ones, and so many there have to be."""
 DISHONEST = 2.5
@@ -41,7 +41,7 @@ class ResidualNoise:
     def due(self) -> bool:
         """Whether the next frame is looked at; counts it."""
         self.frames += 1
-        return self.frames % EVERY == 0
+        return self.frames % (EVERY if self.frames <= BEGINNING else LATER) == 0
 
     def observe(self, points: FramePoints, squared_distances: np.ndarray, noise: DepthNoise) -> DepthNoise:
         """The noise that agrees with the residuals so far: the one given, or a larger one of the same shape.

@@ -132,6 +132,7 @@ def test_eval_render_export(finished: Path, tmp_path: Path) -> None:
     assert len(read_tum(tmp_path / "t.txt")) == 24
 
 
+@pytest.mark.long("runs as long as the recording lasts")
 def test_realtime_keeps_pace(room: Path, tmp_path: Path) -> None:
     done = ggslam("run", room, "--out", tmp_path / "run", "--realtime", 6, "--stop", 14, "--no-eval")
     assert done.returncode == 0, done.stderr

@@ -72,7 +72,7 @@ def test_other_arguments_are_another_run(batch: Manifest, tmp_path: Path) -> Non
     assert told(states_of(same, retry=False)) == [State.WAITING]
 
 
-@pytest.mark.long("a run that is cut off, and goes on")
+@pytest.mark.slow
 def test_a_batch_that_was_killed_goes_on(tmp_path: Path) -> None:
     write_synthetic_sequence(tmp_path / "slow", frames=24, width=64, height=48, seed=0)
     (tmp_path / "batch.yaml").write_text("options: --checkpoint-every 2\nrecordings: [slow]\nout: table\n")

@@ -76,6 +76,7 @@ def test_objects_are_learned(frames: list[Frame], cuda_library: CudaLibrary) -> 
     assert shares[0] == pytest.approx(shares[1], abs=0.02)
 
 
+@pytest.mark.long("the whole loop under emulation")
 def test_refinement_and_real_time(frames: list[Frame], cuda_library: CudaLibrary) -> None:
     settings = config("refine_iterations=4", "identity.enabled=false")
     slam = Slam(frames[0].camera, settings, has_masks=True, library=cuda_library)

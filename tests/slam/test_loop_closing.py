@@ -249,6 +249,7 @@ def test_damaged_places_are_named(
         played(room, tmp_path / "a", stop=2, map=tmp_path / "map", localize_only=True)
 
 
+@pytest.mark.long("a second whole run")
 def test_the_first_run_must_be_there_still(room: Path, first_half: Path, tmp_path: Path) -> None:
     shutil.copytree(first_half, tmp_path / "a")
     assert played(room, tmp_path / "b", start=12, stop=16, map=tmp_path / "a").error is None

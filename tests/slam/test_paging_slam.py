@@ -83,6 +83,7 @@ def test_a_limit_that_is_not_reached_changes_nothing(turning: Path, unlimited: R
     bound.close()
 
 
+@pytest.mark.long("a whole run")
 def test_a_limit_that_is_reached_keeps_the_map(turning: Path, unlimited: RunOutcome, limited: RunOutcome) -> None:
     paging = json.loads((limited.folder.path / "timing.json").read_text())["paging"]
     assert paging["moved_out"] > 500
@@ -142,6 +143,7 @@ def test_real_time(turning: Path, tmp_path: Path) -> None:
     assert len(read_gaussian_ply(outcome.folder.path / "map.ply")) == outcome.result.gaussian_count > 2000
 
 
+@pytest.mark.long("a whole run")
 def test_gaussians_on_disk_follow_a_correction(turning: Path) -> None:
     """All keyframes are moved, each its own way: what is on disk moves as what is in memory does."""
     slam = slam_over(turning, *LESS, stop=BEGINNING)
