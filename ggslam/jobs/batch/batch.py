@@ -14,6 +14,7 @@ from ggslam.jobs.batch.job_states import JobState, State, states_of
 from ggslam.jobs.batch.local_engine import run_locally, shares
 from ggslam.jobs.batch.manifest import Manifest
 from ggslam.jobs.batch.scores_table import ScoresTable
+from ggslam.runs.environment import processor
 from ggslam.system.atomic import make_folder, write_text
 from ggslam.system.folder_lock import folder_lock
 
@@ -70,9 +71,4 @@ def run_batch(
 
 def _machine() -> str:
     """Version and machine, for the table's last note."""
-    try:
-        models = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
-        model = models[0].partition(":")[2].strip() if models else platform.processor()
-    except OSError:
-        model = platform.processor()
-    return f"ggslam {__version__}, {os.cpu_count()} processors ({model or platform.machine()}), {platform.system()}"
+    return f"ggslam {__version__}, {os.cpu_count()} processors ({processor()}), {platform.system()}"

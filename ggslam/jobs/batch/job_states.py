@@ -32,12 +32,12 @@ class State(enum.Enum):
 
 
 class JobRecord(RecordFile):
-    """What became of a run: its arguments, exit code, seconds and last line."""
+    """What became of a run: its arguments, exit code (None: it has begun), seconds and last line."""
 
     FILE: ClassVar[str] = "job.json"
     words: list[str]
-    exit_code: int
-    seconds: float
+    exit_code: int | None = None
+    seconds: float = 0.0
     line: str = ""
 
 
@@ -92,15 +92,15 @@ class JobState:
 
     def arguments(self) -> list[str]:
         """Of `ggslam`: to go on with a run that was cut off, else to make it anew."""
-        if self.memory() is None and has_checkpoints(self.run) and self._began_alike():
+        record = self.memory()
+        if record is not None and record.exit_code is None and has_checkpoints(self.run):
             return ["run", option("resume"), str(self.run)]
         return ["run", *self.job.words, option("out"), str(self.run), option("overwrite")]
 
     def begin(self) -> None:
         """Notes what is begun."""
         make_folder(self._beside)
-        (self._beside / JobRecord.FILE).unlink(missing_ok=True)
-        (self._beside / "begun.txt").write_text("\n".join(self.job.words), encoding="utf-8")
+        JobRecord.of({"words": list(self.job.words)}).write(self._beside)
         self.state = State.RUNNING
 
     def end(self, exit_code: int, seconds: float, line: str) -> None:
@@ -111,18 +111,13 @@ class JobState:
             {"words": list(self.job.words), "exit_code": exit_code, "seconds": seconds, "line": self.line}
         ).write(self._beside)
 
-    def _began_alike(self) -> bool:
-        """Whether the run that was cut off had the same arguments."""
-        path = self._beside / "begun.txt"
-        return path.is_file() and tuple(path.read_text(encoding="utf-8").split("\n")) == self.job.words
-
 
 def states_of(manifest: Manifest, retry: bool) -> list[JobState]:
     """All runs of a batch: those that are done are skipped, those that failed stay failed unless `retry`."""
     states = [JobState(job, manifest.out) for job in manifest.jobs]
     for state in states:
         record = state.memory()
-        if record is None:
+        if record is None or record.exit_code is None:
             continue
         if record.exit_code in (0, 3) and state.is_whole():
             state.state, state.seconds = State.SKIPPED, record.seconds

@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -186,15 +187,12 @@ def _value(metrics: MetricsRecord, column: Column, set_name: str) -> float:
 def _mean(values: Sequence[float], whole: bool = False) -> float:
     """Of those that are there; with `whole` NaN unless all are."""
     there = [value for value in values if not math.isnan(value)]
-    return sum(there) / len(there) if there and (not whole or len(there) == len(values)) else math.nan
+    return statistics.fmean(there) if there and (not whole or len(there) == len(values)) else math.nan
 
 
 def _spread(values: Sequence[float]) -> float:
     there = [value for value in values if not math.isnan(value)]
-    if len(there) < 2:
-        return math.nan
-    mean = sum(there) / len(there)
-    return math.sqrt(sum((value - mean) ** 2 for value in there) / (len(there) - 1))
+    return statistics.stdev(there) if len(there) > 1 else math.nan
 
 
 def _text(mean: float, spread: float, digits: int, plus_minus: str) -> str:
