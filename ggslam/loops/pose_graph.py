@@ -76,8 +76,11 @@ class PoseGraph:
             self._tree = OdometryTree.root()
         return len(self.poses) - 1
 
-    def add_odometry(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> None:
+    def add_odometry(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray, found: bool = False) -> None:
         """The motion from an earlier node i to the newest node j. It is never doubted.
+
+        Args:
+            found: the camera was lost on the way, and found at node i.
 
         Raises:
             ValueError: j is not the newest node, has odometry already, or i is not before it.
@@ -88,6 +91,7 @@ class PoseGraph:
         turn = float(np.linalg.norm(so3_log(T_i_j[:3, :3])))
         path = max(float(np.linalg.norm(T_i_j[:3, 3])) + s.turn_length * turn, _SHORTEST)
         drift = _isotropic(s.translation_drift * path**0.5, s.rotation_drift_deg * path**0.5)
+        drift += _isotropic(s.found_translation, s.found_rotation_deg) if found else 0.0
         self._tree.add(i, np.array(T_i_j, float), covariance_of(information, covariance_in_frame(drift, T_i_j)))
 
     def add_loop(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> int:
@@ -98,10 +102,20 @@ class PoseGraph:
         """
         if i == j or not (0 <= i < len(self.poses) and 0 <= j < len(self.poses)):
             raise ValueError(f"closure from {i} to {j}: expected two different ones of {len(self.poses)} nodes")
+        self.loops.append(Link(i, j, np.array(T_i_j, float), self._loop_covariance(T_i_j, information)))
+        return len(self.loops) - 1
+
+    def discrepancy(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> float:
+        """How far two nodes are from where a closure, taken as `add_loop` does, has them: the Mahalanobis length of
+        the motion between, in units of the limit that closures which agree stay below."""
+        twist = se3_log(T_i_j @ inverse(inverse(self.poses[i]) @ self.poses[j]))
+        squared = float(twist @ np.linalg.solve(self._loop_covariance(T_i_j, information), twist))
+        return (squared / chi_squared_limit(self.settings.inlier_probability)) ** 0.5
+
+    def _loop_covariance(self, T_i_j: np.ndarray, information: np.ndarray) -> np.ndarray:
         s = self.settings
         added = covariance_in_frame(_isotropic(s.loop_translation, s.loop_rotation_deg), T_i_j)
-        self.loops.append(Link(i, j, np.array(T_i_j, float), covariance_of(information, added)))
-        return len(self.loops) - 1
+        return covariance_of(information, added)
 
     def optimise(self) -> GraphResult:
         """Judges all closures, also those rejected before, and moves the nodes to agree with the believed ones.

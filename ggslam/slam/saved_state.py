@@ -21,6 +21,7 @@ from ggslam.loops.condensed import Link
 from ggslam.loops.odometry import OdometryTree
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.loops.pose_graph import PoseGraph
+from ggslam.loops.revisits import Revisits
 from ggslam.mapping.class_numbers import ClassNumbers
 from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.exposure import ExposureAdam
@@ -195,7 +196,7 @@ RULES: Rules = {
     FeatureMap: _but("settings", "_shift", "_mask", "_corners", "_ones", "_isotropic"),
     # loops
     LoopCloser: _but(
-        "settings", "_camera", "_surface", "_tracker", "_context", "_lock", "_helper", "_begun",
+        "settings", "comparison", "_camera", "_surface", "_tracker", "_lock", "_helper", "_begun",
         growing=_names("events"),
     ),
     PoseGraph: _but("settings", growing=_names("loops")),
@@ -205,6 +206,7 @@ RULES: Rules = {
         growing=_names("_places"), after=PlaceIndex.list_again,
     ),
     ActiveKeyframes: _but("settings"),
+    Revisits: _but("settings"),
     # mapping
     CpuMapper: _but("settings", "residency", "extra_loss", "_rasterizer", "_loss", "_standard_adam"),
     GaussianMap: Rule(save=_save_map, take=_take_map),
