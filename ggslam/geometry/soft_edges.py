@@ -9,7 +9,10 @@ sides; inverse depth, which is linear on planes, tells the two apart.
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
+_STRONG = 0.2
+"""Share by which inverse depth changes across an outline that tells how sharp outlines are."""
 _LEAST_STEP = 0.04
 """Share by which inverse depth changes across a slope that counts."""
 _BETWEEN = 0.15
@@ -28,6 +31,33 @@ def soft_edges(depth: np.ndarray, reach: int) -> np.ndarray:
     known = depth > 0
     inverse = np.where(known, 1 / np.maximum(depth, 1e-6), 0).astype(np.float32)
     return known & (_slopes(inverse, reach) | _slopes(inverse.T, reach).T)
+
+
+def edge_sharpness(depth: np.ndarray, reach: int) -> tuple[float, int]:
+    """How sharp outlines are: of the change across each the share that lies between two neighbouring pixels.
+
+    Args:
+        depth: float32 [H, W], metres, 0 where unknown.
+        reach: half the width of a slope, pixels.
+
+    Returns:
+        The median, 1 if there are none; and the number of pixels that told it.
+    """
+    inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0).astype(np.float32)
+    shares = np.concatenate([_sharpness(inverse, reach), _sharpness(np.ascontiguousarray(inverse.T), reach)])
+    return (float(np.median(shares)) if len(shares) else 1.0), len(shares)
+
+
+def _sharpness(inverse: np.ndarray, reach: int) -> np.ndarray:
+    """Of each row's pixel [n] in the middle of a strong change from row to row the largest step's share of it."""
+    if len(inverse) <= 2 * reach:
+        return np.zeros(0, np.float32)
+    inside = slice(reach, len(inverse) - reach)
+    change = np.abs(inverse[2 * reach :] - inverse[: -2 * reach])
+    strong = (change > _STRONG * inverse[inside]) & (minimum_filter1d(inverse, 2 * reach + 1, 0)[inside] > 0)
+    steps = np.abs(np.diff(inverse, axis=0, append=inverse[-1:]))  # from each row to the next
+    largest = maximum_filter1d(steps, 2 * reach, 0)[inside]
+    return (largest[strong] / change[strong]).clip(0, 1)
 
 
 def _slopes(inverse: np.ndarray, reach: int) -> np.ndarray:

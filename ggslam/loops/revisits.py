@@ -27,8 +27,8 @@ class RevisitSettings:
     """And those from which the camera has gone this many times the median depth since they were compared; a turn by
     one radian counts as a metre."""
     near: float = setting(0.6, 0, 1e3)
-    """And those that saw about the same: both cameras, and what lies in the middle of their images, are nearer than this
-    many times the mean of the median depths."""
+    """And those that saw about the same: both cameras, and what lies in the middle of their images, are nearer than
+    this many times the mean of the median depths."""
     turned: float = setting(40.0, 0, 180, "deg")
     """And in about the same direction."""
     rest: int = setting(0, 0, 10**6, "keyframes")

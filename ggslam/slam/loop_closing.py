@@ -7,24 +7,23 @@ import threading
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from ggslam.features.orb import FeatureView
-from ggslam.loops.activity import ActiveKeyframes, ActivitySettings
+from ggslam.loops.activity import ActiveKeyframes
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.loops.pose_graph import PoseGraph
-from ggslam.loops.revisits import Revisits, RevisitSettings
-from ggslam.loops.settings import GraphSettings, PlaceSettings, VerificationSettings
+from ggslam.loops.revisits import Revisits
 from ggslam.loops.uncertainty import information_in_frame
 from ggslam.loops.verification import Verification
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
+from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.place_comparison import PlaceComparison
-from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.surface import MeasuredSurface
@@ -32,33 +31,6 @@ from ggslam.tracking.tracker import Tracker, TrackingResult
 
 _FIRM = 1e6 * np.eye(6)
 """Information of a motion that is sure to a millimetre and a milliradian."""
-
-
-@settings_class(frozen=True)
-class LoopSettings:
-    """When loops are looked for, and when they are believed."""
-
-    enabled: bool = setting(True, basic=True)
-    """Whether loops are closed and lost frames are looked up among all keyframes."""
-    candidates: int = setting(3, 1, 1000)
-    """Old keyframes that are tried for a new one, and for a frame that is lost, the likeliest first."""
-    confirmations: int = setting(2, 1, 100)
-    """A loop is closed when so many keyframes in a row have found the same correction."""
-    confirmation_gap: int = setting(5, 1, 10**6, "keyframes")
-    """In a row: no more than so many keyframes apart."""
-    agreement_m: float = setting(0.05, 0, 1e3, "m")
-    """Two corrections are the same if they move the camera to places nearer than this and within `agreement_deg`."""
-    agreement_deg: float = setting(2.0, 0, 180, "deg")
-    """Two corrections are the same if they turn the camera to directions nearer than this and within `agreement_m`."""
-    neighbourhood: int = setting(3, 0, 1000, "keyframes")
-    """Keyframes before and after an old one whose points make its local map."""
-    repair_iterations: int = setting(40, 0, 10**6)
-    """Optimisation steps after a closure, on the keyframes at both of its ends."""
-    activity: ActivitySettings = field(default_factory=ActivitySettings)
-    revisits: RevisitSettings = field(default_factory=RevisitSettings)
-    places: PlaceSettings = field(default_factory=PlaceSettings)
-    verification: VerificationSettings = field(default_factory=VerificationSettings)
-    graph: GraphSettings = field(default_factory=GraphSettings)
 
 
 @dataclass(frozen=True)
@@ -216,7 +188,7 @@ class LoopCloser:
     def _look_back(self, frame: Frame, place: Place, tracking: TrackingResult) -> Correction | None:
         number, s = len(self.poses) - 1, self.settings
         known = self.activity.active | self.activity.spare
-        waiting = self._waiting()
+        waiting = self._unconfirmed()
         if waiting is not None:  # the same correction is looked for at the same place
             reach, T = s.confirmation_gap, waiting.T_correction @ self.poses[-1]
             near = {k for k in range(number) if abs(k - waiting.old_keyframe) <= reach}
@@ -260,7 +232,7 @@ class LoopCloser:
             self.revisits.tie(old, number)
         return None
 
-    def _waiting(self) -> _Found | None:
+    def _unconfirmed(self) -> _Found | None:
         """A correction that waits to be confirmed."""
         if self._verified and len(self.poses) - 1 - self._verified[-1].keyframe <= self.settings.confirmation_gap:
             return self._verified[-1]
@@ -270,7 +242,7 @@ class LoopCloser:
         """Compares the newest keyframe with an old one, expected at `T` [4, 4]."""
         T_old_new, needed = inverse(self.poses[old]) @ T, self.settings.revisits.min_witnesses
         matches = self.comparison.matches(place, self.places[old])
-        if self.comparison.agreeing(matches, T_old_new, slack=4) >= needed:
+        if self.comparison.count_agreeing(matches, T_old_new, slack=4) >= needed:
             return self.comparison.confirm(source, place, self.places, self.poses, old, matches, T_old_new, needed)
         return self._compare(source, place, old)[0]
 

@@ -66,7 +66,7 @@ class PlaceComparison:
         """Features that two places share."""
         return match(old.landmarks, place.landmarks, self.settings.registration)
 
-    def agreeing(self, matches: Matches, T_old_new: np.ndarray, slack: float = 1.0) -> int:
+    def count_agreeing(self, matches: Matches, T_old_new: np.ndarray, slack: float = 1.0) -> int:
         """How many of the matches a motion [4, 4] explains; `slack` widens the limits."""
         return int(matches.agree(T_old_new, self._camera, self.settings.registration, slack).sum())
 

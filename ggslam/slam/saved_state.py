@@ -42,6 +42,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config
+from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.loop_closing import LoopCloser, LoopEvent, _Found
 from ggslam.slam.map_corrections import MapCorrections
@@ -216,10 +217,10 @@ RULES: Rules = {
     NeighbourIndex: Rule(save=_save_index, take=_take_index),
     # plain values
     **dict.fromkeys(
-        (Camera, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link,
-         Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable,
-         ClassNumbers, IdentityClassifier, LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence,
-         _Pair, Fragment, FragmentMemory),
+        (Camera, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame, StepLog, LoopEvent,
+         _Found, Link, Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes,
+         CpuClassTable, ClassNumbers, IdentityClassifier, LearnedObjects, Observation, Associator, ConsistencyJudge,
+         PairEvidence, _Pair, Fragment, FragmentMemory),
         Rule(),
     ),
 }  # fmt: skip

@@ -11,7 +11,7 @@ STEP = se3_exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 def walked(steps: int, step: np.ndarray = STEP, **settings: float) -> Revisits:
     """A camera that made so many keyframes, ten centimetres apart."""
-    revisits = Revisits(RevisitSettings(**{"gap": 5, "least_way": 0.95, "rest": 2, "near": 1.0, "turned": 45.0, **settings}))
+    revisits = Revisits(RevisitSettings(**{"gap": 5, "least_way": 0.95, "rest": 2, **settings}))
     for _ in range(steps):
         revisits.add(step)
     return revisits
@@ -36,7 +36,7 @@ def test_what_was_compared_is_near() -> None:
     assert revisits.candidates(1.0).tolist() == []  # all are less than a metre from one of the ends
     for _ in range(6):
         revisits.add(STEP)
-    assert revisits.candidates(1.0).tolist() == [5, 6, 7, 8, 9, 10]  # about the middle of the way from 0 to 14
+    assert revisits.candidates(1.0).tolist() == [4, 5, 6, 7, 8, 9, 10]  # about the middle of the way from 0 to 14
 
 
 def test_after_a_failure_there_is_rest() -> None:

@@ -28,7 +28,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import Config, load_config
-from ggslam.slam.loop_closing import LoopSettings
+from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.slam import Slam
 from ggslam.tracking.points import extract_points
 from ggslam.tracking.settings import DepthNoise
@@ -44,7 +44,7 @@ def frames(room: Path) -> list[Frame]:
 
 FORGETFUL = LoopSettings(activity=ActivitySettings(forget_after=0.05, near=0.15, batch=1, spread=0))
 """Whatever the camera has not seen for a step is put aside."""
-IN_VIEW = LoopSettings(revisits=RevisitSettings(gap=4, least_way=0.1))
+IN_VIEW = LoopSettings(revisits=RevisitSettings(gap=4, least_way=0.1), repair_iterations=5)
 """Nothing is put aside in a room as small as this."""
 
 
