@@ -188,7 +188,7 @@ class LoopCloser:
     def _look_back(self, frame: Frame, place: Place, tracking: TrackingResult) -> Correction | None:
         number, s = len(self.poses) - 1, self.settings
         known = self.activity.active | self.activity.spare
-        waiting = self._unconfirmed()
+        waiting = self._correction_to_confirm()
         if waiting is not None:  # the same correction is looked for at the same place
             reach, T = s.confirmation_gap, waiting.T_correction @ self.poses[-1]
             near = {k for k in range(number) if abs(k - waiting.old_keyframe) <= reach}
@@ -232,7 +232,7 @@ class LoopCloser:
             self.revisits.tie(old, number)
         return None
 
-    def _unconfirmed(self) -> _Found | None:
+    def _correction_to_confirm(self) -> _Found | None:
         """A correction that waits to be confirmed."""
         if self._verified and len(self.poses) - 1 - self._verified[-1].keyframe <= self.settings.confirmation_gap:
             return self._verified[-1]
