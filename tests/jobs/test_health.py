@@ -202,7 +202,8 @@ def test_changes_of_exposure_are_compensated(
     more: list[str],
 ) -> None:  # fmt: skip
     recording = dimmed(room, tmp_path / "recording", gain)
-    outcome = execute(RunRequest(SequenceRequest(recording, scale=0.5), out=tmp_path / "run", overrides=[*STEPS, *more]))
+    dimmed_request = SequenceRequest(recording, scale=0.5)
+    outcome = execute(RunRequest(dimmed_request, out=tmp_path / "run", overrides=[*STEPS, *more]))
     assert [verdict.code for verdict in outcome.verdicts] == ["exposure"]
     assert outcome.metrics is not None and outcome.metrics.images.all is not None
     dim, well = outcome.metrics.images.all, scores_of_the_room

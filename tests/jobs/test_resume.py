@@ -70,10 +70,8 @@ class KillAt(SilentObserver):
 
 
 def request(room: Path, out: Path, every: int | None = 3, **more: Any) -> RunRequest:
-    settings = [*FEW, REFINE]
-    return RunRequest(
-        SequenceRequest(room, stop=14, scale=0.5), out, overrides=settings, checkpoint_every=every, **{"evaluate": False, **more}
-    )
+    settings, sequence = [*FEW, REFINE], SequenceRequest(room, stop=14, scale=0.5)
+    return RunRequest(sequence, out, overrides=settings, checkpoint_every=every, **{"evaluate": False, **more})
 
 
 @pytest.fixture(scope="module")
