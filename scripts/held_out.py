@@ -15,4 +15,6 @@ def held_out_poses(folder: RunFolder) -> dict[int, np.ndarray]:
     poses, keyframes = record.poses(), record.keyframe_numbers()
     evaluation = folder.config().evaluation
     others = [index for index in sorted(poses) if index not in keyframes]
-    return {index: inverse(poses[index]) for index in [i for i in others if evaluation.is_held_out(i)] or others}
+    number = folder.sequence().own_number
+    held_out = [i for i in others if evaluation.is_held_out(number(i))]
+    return {index: inverse(poses[index]) for index in held_out or others}

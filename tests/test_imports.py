@@ -14,7 +14,7 @@ FLOORS = (
     {"cli"},
     {"jobs"},
     {"runs"},
-    {"slam", "localization"},
+    {"slam", "localization", "merging"},
     {"tracking", "mapping", "loops", "objects", "volumes", "submaps", "coding", "evaluation", "viewer", "reporting"},
     {"rendering", "sequences", "formats", "features", "synthetic", "geometry"},
     {"scene", "native", "cuda"},
@@ -29,7 +29,7 @@ JOBS = (
     {"volumes"},
     {"run"},
     {"report"},
-    {"score", "edit", "localize", "compare", "code", "render", "doctor", "batch"},
+    {"score", "edit", "localize", "compare", "code", "render", "doctor", "batch", "merge"},
     {"submaps"},
     {"progress"},
 )

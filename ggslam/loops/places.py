@@ -87,6 +87,10 @@ class PlaceIndex:
     def __getitem__(self, number: int) -> Place:
         return self._places[self._positions[number]]
 
+    def with_words(self, place: Place) -> Place:
+        """A place of this index or another one with the words that it is looked up by here."""
+        return replace(place, words=self._words(place.landmarks.descriptors))
+
     def describe(self, view: FeatureView) -> Place:
         """What a view is known by; for `add`, `query`, or both."""
         landmarks = view.landmarks(self.camera, self.settings.features)

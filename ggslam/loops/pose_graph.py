@@ -26,6 +26,22 @@ from ggslam.scene.poses import inverse, se3_log, so3_log
 
 _SHORTEST = 0.01
 """Metres: standing still counts as a path of this length, so that no motion is held to be exact."""
+SURE_INFORMATION = 1e6 * np.eye(6)
+"""Of a motion that is sure to a millimetre and a milliradian: then drift is all that is unsure of it."""
+
+
+def odometry_covariance(T_i_j: np.ndarray, information: np.ndarray, settings: GraphSettings) -> np.ndarray:
+    """Covariance [6, 6] of a motion by odometry, left twist in frame i: its own and what the path drifts."""
+    turn = float(np.linalg.norm(so3_log(T_i_j[:3, :3])))
+    path = max(float(np.linalg.norm(T_i_j[:3, 3])) + settings.turn_length * turn, _SHORTEST)
+    drift = _isotropic(settings.translation_drift * path**0.5, settings.rotation_drift_deg * path**0.5)
+    return covariance_of(information, covariance_in_frame(drift, T_i_j))
+
+
+def closure_covariance(T_i_j: np.ndarray, information: np.ndarray, settings: GraphSettings) -> np.ndarray:
+    """Covariance [6, 6] of a motion by a closure, left twist in frame i."""
+    added = _isotropic(settings.loop_translation, settings.loop_rotation_deg)
+    return covariance_of(information, covariance_in_frame(added, T_i_j))
 
 
 @dataclass(frozen=True)
@@ -87,12 +103,10 @@ class PoseGraph:
         """
         if j != len(self.poses) - 1 or len(self._tree) != j or not 0 <= i < j:
             raise ValueError(f"odometry {i} to {j}: expected from an older node to the newest, which has none yet")
-        s = self.settings
-        turn = float(np.linalg.norm(so3_log(T_i_j[:3, :3])))
-        path = max(float(np.linalg.norm(T_i_j[:3, 3])) + s.turn_length * turn, _SHORTEST)
-        drift = _isotropic(s.translation_drift * path**0.5, s.rotation_drift_deg * path**0.5)
-        drift += _isotropic(s.found_translation, s.found_rotation_deg) if found else 0.0
-        self._tree.add(i, np.array(T_i_j, float), covariance_of(information, covariance_in_frame(drift, T_i_j)))
+        s, covariance = self.settings, odometry_covariance(T_i_j, information, self.settings)
+        if found:
+            covariance += covariance_in_frame(_isotropic(s.found_translation, s.found_rotation_deg), T_i_j)
+        self._tree.add(i, np.array(T_i_j, float), covariance)
 
     def add_loop(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> int:
         """A closure between two nodes; returns its number. Whether it is believed, `optimise` decides.
@@ -102,20 +116,15 @@ class PoseGraph:
         """
         if i == j or not (0 <= i < len(self.poses) and 0 <= j < len(self.poses)):
             raise ValueError(f"closure from {i} to {j}: expected two different ones of {len(self.poses)} nodes")
-        self.loops.append(Link(i, j, np.array(T_i_j, float), self._loop_covariance(T_i_j, information)))
+        self.loops.append(Link(i, j, np.array(T_i_j, float), closure_covariance(T_i_j, information, self.settings)))
         return len(self.loops) - 1
 
     def discrepancy(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> float:
         """How far two nodes are from where a closure, taken as `add_loop` does, has them: the Mahalanobis length of
         the motion between, in units of the limit that closures which agree stay below."""
         twist = se3_log(T_i_j @ inverse(inverse(self.poses[i]) @ self.poses[j]))
-        squared = float(twist @ np.linalg.solve(self._loop_covariance(T_i_j, information), twist))
+        squared = float(twist @ np.linalg.solve(closure_covariance(T_i_j, information, self.settings), twist))
         return (squared / chi_squared_limit(self.settings.inlier_probability)) ** 0.5
-
-    def _loop_covariance(self, T_i_j: np.ndarray, information: np.ndarray) -> np.ndarray:
-        s = self.settings
-        added = covariance_in_frame(_isotropic(s.loop_translation, s.loop_rotation_deg), T_i_j)
-        return covariance_of(information, added)
 
     def optimise(self) -> GraphResult:
         """Judges all closures, also those rejected before, and moves the nodes to agree with the believed ones.

@@ -12,8 +12,9 @@ import numpy as np
 
 from ggslam.errors import RunFolderError, SequenceError
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.records.sequence import OpenRecord, SequenceRecord
+from ggslam.runs.records.sequence import OpenRecord, PartRecord, SequenceRecord
 from ggslam.sequences import Sequence, open_sequence
+from ggslam.sequences.joined import JoinedPart, JoinedSequence
 from ggslam.sequences.live import LiveSequence, is_live, open_live
 from ggslam.system.json_files import json_ready
 
@@ -126,7 +127,7 @@ def request_in(record: OpenRecord, path: Path | None = None, masks: Path | None 
 def open_recording_of(
     folder: RunFolder, path: Path | None = None, masks: Path | None = None, scale: float | None = None
 ) -> Sequence:
-    """Opens the recording of a run again, as the run did.
+    """Opens the recording of a run again, as the run did; of a merged run all its recordings as one.
 
     Args:
         folder: of the run.
@@ -139,6 +140,26 @@ def open_recording_of(
         RunFolderError: the run does not say which it was.
     """
     record = folder.sequence()
+    if record.parts is None:
+        return _open_as(folder, record, path, masks, scale)
+    if len({part.open.path for part in record.parts}) > 1 and (path is not None or masks is not None):
+        what = "`sequence`" if path is not None else "`masks`"
+        raise RunFolderError(f"{folder.path}: was merged from runs of several recordings; {what} cannot be all of them")
+    return JoinedSequence([_open_part(folder, part, path, masks, scale) for part in record.parts])
+
+
+def _open_part(
+    folder: RunFolder, part: PartRecord, path: Path | None, masks: Path | None, scale: float | None
+) -> JoinedPart:
+    sequence = _open_as(folder, part, path, masks, scale)
+    T = np.eye(4) if part.T_joint_truth is None else part.T_joint_truth
+    return JoinedPart(sequence, part.time_shift_s, T, None if masks is not None else part.mask_ids)
+
+
+def _open_as(
+    folder: RunFolder, record: SequenceRecord | PartRecord, path: Path | None, masks: Path | None, scale: float | None
+) -> Sequence:
+    """A recording as a record says, with another place of recording or masks, or at another scale."""
     request = request_in(record.open, path, masks)
     if is_live(request.path):
         raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (`record`)")

@@ -16,6 +16,7 @@ from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.objects.segmented_map import ObjectVotes
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.map_index import MAP_INDEX, write_map_index
+from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.slam.result import SlamResult
 from ggslam.system.atomic import write_bytes
 
@@ -50,3 +51,8 @@ def save_points(folder: Path, result: SlamResult) -> None:
     else:
         parts = [MapPart(*cells.box(key), partial(cells.read, key)) for key in cells.sorted_keys()]
     write_points_in_parts(folder, sample_parts(parts, with_object_id=result.objects is not None))
+
+
+def save_points_of_map(folder: Path, gaussians: GaussianMap, with_object_id: bool) -> None:
+    """Writes the same two files of a map that is in memory."""
+    write_points_in_parts(folder, sample_parts([MapPart.of(gaussians)], with_object_id=with_object_id))

@@ -34,7 +34,8 @@ class OtherImagesError(Exception):
     """The map was made with images of another size."""
 
 
-def _camera(row: np.ndarray) -> Camera:
+def camera_of(row: np.ndarray) -> Camera:
+    """The camera of a row of places.npz."""
     return Camera(int(row[0]), int(row[1]), *(float(value) for value in row[2:]))
 
 
@@ -80,23 +81,23 @@ def _load(
         raise ValueError(f"keyframe_poses: expected numbers [K, 4, 4], found {list(poses.shape)}")
     if birth.max(initial=-1) >= len(poses) or birth.min(initial=0) < -1:
         raise ValueError(f"birth: expected keyframes up to {len(poses) - 1}, found {birth.min()} to {birth.max()}")
-    camera, (constant, square) = _camera(arrays["camera"]), arrays["noise"].tolist()
+    camera, (constant, square) = camera_of(arrays["camera"]), arrays["noise"].tolist()
     if (camera.width, camera.height) != (slam.camera.width, slam.camera.height):
         raise OtherImagesError(
             f"it was made with images of {camera.width}x{camera.height}, these are "
             f"{slam.camera.width}x{slam.camera.height}"
         )
     gaussians.birth_keyframe[:] = torch.from_numpy(birth.astype(np.int32))
-    slam.use_scale(_scale(arrays))
-    slam.surface.load(_part(arrays, "surface_"))
-    loops.load(_part(arrays, "loops_"))
+    slam.use_scale(scale_of(arrays))
+    slam.surface.load(arrays_with_prefix(arrays, "surface_"))
+    loops.load(arrays_with_prefix(arrays, "loops_"))
     if len(loops.poses) != len(poses) or not np.isfinite(np.array(loops.poses)).all():
         raise ValueError(f"expected numbers for the poses of {len(poses)} keyframes")
     slam.tracker.noise = DepthNoise(constant, square)
     return gaussians, [_bare_keyframe(k, T, slam.camera) for k, T in enumerate(poses)]
 
 
-def _scale(arrays: dict[str, Any]) -> float:
+def scale_of(arrays: dict[str, Any]) -> float:
     """Size of the scene; runs of before it was measured lack it."""
     scale = float(arrays.get("scale", 1.0))
     if not 1e-3 <= scale <= 1e3:
@@ -192,5 +193,6 @@ def ancestors(folder: RunFolder) -> list[Path]:
     return paths
 
 
-def _part(arrays: dict[str, Any], prefix: str) -> dict[str, np.ndarray]:
+def arrays_with_prefix(arrays: dict[str, Any], prefix: str) -> dict[str, np.ndarray]:
+    """Those whose name begins so, by the rest of their names."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}

@@ -42,7 +42,7 @@ def saved_places_to_bytes(
     arrays = {f"surface_{name}": values for name, values in surface.to_arrays().items()}
     arrays |= {f"loops_{name}": values for name, values in loops.to_arrays().items()}
     arrays |= {
-        "camera": _camera_row(camera),
+        "camera": camera_row(camera),
         "noise": np.array([noise.constant, noise.square]),
         "scale": np.array(scale),
         "keyframe_poses": keyframe_poses,
@@ -51,5 +51,6 @@ def saved_places_to_bytes(
     return arrays_to_bytes(**arrays)
 
 
-def _camera_row(camera: Camera) -> np.ndarray:
+def camera_row(camera: Camera) -> np.ndarray:
+    """A camera as six numbers: width, height, fx, fy, cx, cy."""
     return np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy], float)

@@ -102,9 +102,11 @@ def export_nerfstudio(
 def _views(folder: RunFolder, keyframes_only: bool, recording: Path | None) -> _Views:
     record, evaluation = folder.keyframes(), folder.config().evaluation
     keyframes = record.keyframe_numbers()
-    views = []
+    read, views = folder.sequence(), []
+    if len({part.camera for part in read.parts or []}) > 1:
+        raise ConfigError(f"{folder.path}: was merged from recordings of several cameras, and these formats know one")
     for index, T_world_camera in sorted(record.poses().items()):
-        held_out = evaluation.is_held_out(index) and index not in keyframes
+        held_out = evaluation.is_held_out(read.own_number(index)) and index not in keyframes
         if held_out or index in keyframes or not keyframes_only:
             views.append(_View(index, T_world_camera, held_out))
     if not views:

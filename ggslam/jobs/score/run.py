@@ -117,7 +117,8 @@ def _sets(folder: RunFolder, record: KeyframesRecord, every: int) -> dict[str, s
     keyframes = record.keyframe_numbers()
     evaluation = folder.config().evaluation
     chosen = {i for i in range(max(record.poses(), default=-1) + 1) if i % every == 0}
-    held_out = {i for i in chosen if evaluation.is_held_out(i) and i not in keyframes}
+    own_number = folder.sequence().own_number
+    held_out = {i for i in chosen if evaluation.is_held_out(own_number(i)) and i not in keyframes}
     return {"keyframes": keyframes & chosen, "held_out": held_out, "all": chosen}
 
 

@@ -26,6 +26,26 @@ class VerdictRecord(Record):
     text: str
 
 
+class MergedRecord(Record):
+    """One of the runs that a merged run was made of.
+
+    Attributes:
+        run: its folder.
+        fingerprint: tells it from another run in the same folder, see `runs.recordings.fingerprint`.
+        frames, keyframes, gaussians: numbers of them in the run.
+        double: of its Gaussians, those left out because an earlier run's map shows the same surface.
+        objects: what its object ids are called now.
+    """
+
+    run: str
+    fingerprint: str
+    frames: int
+    keyframes: int
+    gaussians: int
+    double: int
+    objects: dict[int, int] | None = None
+
+
 class RunRecord(RecordFile):
     """The mark of a run's folder.
 
@@ -39,6 +59,7 @@ class RunRecord(RecordFile):
         environment: versions and machine, see `runs.environment`; older runs have none.
         edits: what was done to the map since, as sentences.
         displaced: objects that edits moved, as `Displacement.to_json` gives them.
+        merged: the runs that this one was merged from; None: it was made of one recording.
     """
 
     FILE: ClassVar[str] = "run.json"
@@ -51,6 +72,7 @@ class RunRecord(RecordFile):
     environment: dict[str, str | int | float | None] | None = None
     edits: list[str] = []
     displaced: dict[str, list[list[float]] | None] = {}
+    merged: list[MergedRecord] | None = None
 
     @pydantic.field_validator("displaced", mode="before")
     @classmethod
@@ -80,4 +102,6 @@ class RunRecord(RecordFile):
         notes = [f"the run stopped early: {self.stopped_by}"] if self.stopped_by else []
         notes += [f"asked for, but not there: {', '.join(self.missing)}"] if self.missing else []
         notes += [f"{verdict.severity}: {verdict.text}" for verdict in self.verdicts]
+        if self.merged:
+            notes.append(f"merged from {', '.join(part.run for part in self.merged)}")
         return notes + ([f"the map was edited: {'; '.join(self.edits)}"] if self.edits else [])

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 import pydantic
 
-from ggslam.runs.records.record import Number, NumberOrNone, Record, RecordFile
+from ggslam.runs.records.record import Array, Number, NumberOrNone, Record, RecordFile
 from ggslam.scene.camera import Camera
 
 
@@ -51,6 +51,27 @@ class SkippedRecord(Record):
     reason: str
 
 
+class PartRecord(Record):
+    """One of the recordings of a run that was merged from several.
+
+    Attributes:
+        run: folder of the run of it.
+        open, format, camera, frames: as of `SequenceRecord`.
+        time_shift_s: seconds added to its times, so that those of the whole rise.
+        T_joint_truth: [4, 4], brings its true poses into the world of the first recording's.
+        mask_ids: what its mask ids are called in the merged run; None: as they are.
+    """
+
+    run: str
+    open: OpenRecord
+    format: str | None = None
+    camera: Annotated[Camera, pydantic.PlainValidator(_camera), pydantic.PlainSerializer(asdict)]
+    frames: int
+    time_shift_s: Number = 0.0
+    T_joint_truth: Array | None = None
+    mask_ids: dict[int, int] | None = None
+
+
 class SequenceRecord(RecordFile):
     """The recording of a run.
 
@@ -62,6 +83,7 @@ class SequenceRecord(RecordFile):
         warnings, skipped, mask_problems: what was wrong with it; problems by file or frame.
         map: folder of the run whose map this one began with.
         map_fingerprint: of that run, see `recordings.fingerprint`.
+        parts: of a merged run its recordings; `open`, `format` and `camera` are the first one's then, `frames` are all.
     """
 
     FILE: ClassVar[str] = "sequence.json"
@@ -74,6 +96,15 @@ class SequenceRecord(RecordFile):
     mask_problems: dict[str, str] | None = None
     map: str | None = None
     map_fingerprint: str | None = None
+    parts: list[PartRecord] | None = None
+
+    def own_number(self, frame: int) -> int:
+        """Number of a frame in its own recording; of a run with one recording the number itself."""
+        for part in self.parts or []:
+            if frame < part.frames:
+                break
+            frame -= part.frames
+        return frame
 
     def notes(self) -> list[str]:
         """What a user should know of frames and masks besides the warnings, a line each."""

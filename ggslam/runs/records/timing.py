@@ -25,7 +25,8 @@ class MappingTimes(Record):
 
 
 class TimingRecord(RecordFile):
-    """Seconds by part; see `slam.result.SlamTimes`. `peak_rss_mb` is in MB (10^6 bytes)."""
+    """Seconds by part; see `slam.result.SlamTimes`. `peak_rss_mb` is in MB (10^6 bytes). Of a merged run they are the
+    sums over its runs, and `merge_s` says what merging took, `seam_iterations` the steps it made."""
 
     FILE: ClassVar[str] = "timing.json"
     frames: int = 0
@@ -45,6 +46,8 @@ class TimingRecord(RecordFile):
     gaussians: int | None = None
     peak_rss_mb: NumberOrNone = None
     paging: dict[str, NumberOrNone] | None = None
+    merge_s: dict[str, Number] | None = None
+    seam_iterations: int | None = None
 
     @staticmethod
     def of_result(result: SlamResult) -> TimingRecord:

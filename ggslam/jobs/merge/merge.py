@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finished runs as one: what `ggslam merge` does, usable from Python."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import ConfigError
+from ggslam.jobs.merge.merged_run import MergedRun
+from ggslam.jobs.merge.seams import SeamTraining, keyframes_of
+from ggslam.jobs.merge.sources import MergeSource, read_sources
+from ggslam.jobs.progress import Observer, SilentObserver
+from ggslam.merging.common_ground import CommonGround, find_common_ground
+from ggslam.merging.coverage import Coverage, PlacedRun, without_rows
+from ggslam.merging.joint_graph import JointPoses, Pair, attachment_order, solve_joint_graph
+from ggslam.merging.moving import append_map, move_map, with_channels
+from ggslam.merging.objects import UnitedObjects
+from ggslam.merging.settings import MergeSettings
+from ggslam.native.loader import NativeContext
+from ggslam.runs.folder import RunFolder
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IDENTITY_CHANNELS
+from ggslam.system.folder_lock import folder_lock
+from ggslam.system.interrupts import delay_interrupts
+
+
+@dataclass
+class MergeOutcome:
+    """What came of a merge.
+
+    Attributes:
+        folder: the merged run.
+        poses: what became of the links between the runs.
+        gaussians: of the merged map.
+        doubles: Gaussians of each run that were left out, because an earlier run's map shows the same surface.
+        united: (id, number of the run, its own id there) of objects that an earlier run has as well.
+        trained: keyframes at the seams that were trained on.
+        steps: optimisation steps made on them.
+        seconds: by part: read, ground, graph, join, train, write.
+        notes: what the user should know.
+    """
+
+    folder: RunFolder
+    poses: JointPoses
+    gaussians: int = 0
+    doubles: list[int] = field(default_factory=list)
+    united: list[tuple[int, int, int]] = field(default_factory=list)
+    trained: int = 0
+    steps: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def merge_runs(
+    runs: ListOf[str | Path], out: str | Path, *, overwrite: bool = False, settings: MergeSettings | None = None,
+    observer: Observer | None = None,
+) -> MergeOutcome:  # fmt: skip
+    """Merges finished runs into one, in the world of the first one.
+
+    Args:
+        runs: folders of two runs or more. What the runs have in common is the first one's that has it.
+        out: folder of the merged run.
+        overwrite: replace a run that is already at `out`.
+        settings: see there.
+        observer: receives progress updates.
+
+    Returns:
+        What came of it.
+
+    Raises:
+        ConfigError: fewer than two runs, one given twice, `out` is one of them, or a run has too little ground in
+            common with the others; the message names it and the best that was found.
+        RunFolderError: a run is damaged or has no places, or `out` cannot be written.
+        MissingDependency: gtsam is not installed.
+    """
+    out, settings = Path(out), settings or MergeSettings()
+    if any(out.resolve() in (Path(run).resolve(), *Path(run).resolve().parents) for run in runs):
+        raise ConfigError(f"`out` {out}: is one of the runs that are merged, or holds it; choose another folder")
+    clock, context = _Clock(), NativeContext(None)
+    sources = read_sources([Path(run) for run in runs], context)
+    clock.lap("read")
+    folder = RunFolder.create(out, overwrite)
+    try:
+        with folder_lock(folder.path):
+            return _Merge(sources, folder, settings, observer or SilentObserver(), context, clock).run()
+    except BaseException:
+        folder.discard()
+        raise
+
+
+class _Clock:
+    """Seconds by part."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, part: str) -> None:
+        now = time.perf_counter()
+        self.seconds[part] = self.seconds.get(part, 0.0) + now - self._last
+        self._last = now
+
+
+@dataclass
+class _Merge:
+    """A merge on its way."""
+
+    sources: list[MergeSource]
+    folder: RunFolder
+    settings: MergeSettings
+    observer: Observer
+    context: NativeContext
+    clock: _Clock
+
+    def run(self) -> MergeOutcome:
+        """From places to a run folder."""
+        sources, notes = self.sources, list[str]()
+        poses = self._find_poses()
+        outcome = MergeOutcome(self.folder, poses, seconds=self.clock.seconds, notes=notes)
+        placed = self._place(poses)
+        objects = UnitedObjects(self.settings.uniting)
+        seams = self._find_seams(placed)
+        gaussians = self._join(placed, objects, outcome)
+        self.clock.lap("join")
+        with_masks = objects.supervision == "masks"
+        keyframes, seam = keyframes_of(sources, [p.T_world_camera for p in placed], seams, with_masks, objects)
+        missing = [source for source in sources if source.sequence is None]
+        notes += [f"{s.name}: not trained on, its recording is not there: {s.reason}" for s in missing]
+        if seam and self.settings.steps:
+            sigma = max(s.known.noise.sigma(self._median_depth()) for s in sources)
+            learned = objects if with_masks and objects.supervision is not None else None
+            config = replace(sources[0].folder.config(), sh_degree=gaussians.sh_degree)
+            training = SeamTraining(gaussians, keyframes, seam, learned, config, sigma)
+            training.run(self.settings.steps, self.context, self.observer)
+            outcome.trained, outcome.steps = len(seam), self.settings.steps
+        self.clock.lap("train")
+        notes += objects.notes
+        outcome.gaussians, outcome.united = len(gaussians), objects.united
+        merged = MergedRun(sources, poses, keyframes, gaussians, objects, outcome.doubles, outcome.steps)
+        with delay_interrupts():
+            merged.save(self.folder, self.clock.seconds)
+        notes += merged.notes
+        self.clock.lap("write")
+        return outcome
+
+    def _find_poses(self) -> JointPoses:
+        """Common ground of all pairs of runs, and where their keyframes are by it.
+
+        Raises:
+            ConfigError: a run has too little in common with the others.
+        """
+        runs = [source.known for source in self.sources]
+        needed = min(self.settings.confirmations, *(len(run) for run in runs))
+        grounds: dict[Pair, CommonGround] = {}
+        for b in range(1, len(runs)):
+            for a in range(b):
+                self.observer.begin(f"common ground of {a + 1} and {b + 1}", min(len(runs[b]), self.settings.queries))
+                found = find_common_ground(runs[a], runs[b], self.settings, self.context, self.observer.advance)
+                grounds[a, b] = found
+        self.clock.lap("ground")
+        order = attachment_order(len(runs), grounds, needed)
+        joined = {0, *(new for _, new in order)}
+        for alone in range(len(runs)):
+            if alone not in joined:
+                raise ConfigError(self._refusal(alone, joined, grounds, needed))
+        poses = solve_joint_graph(runs, grounds, order, needed, self.settings)
+        self.clock.lap("graph")
+        return poses
+
+    def _refusal(self, alone: int, joined: set[int], grounds: dict[Pair, CommonGround], needed: int) -> str:
+        """Why a run cannot be merged, by the run that has most in common with it."""
+        tried = {other: grounds[min(alone, other), max(alone, other)] for other in joined}
+        other = max(tried, key=lambda k: (len(tried[k].agreeing), len(tried[k].links), tried[k].score))
+        return (
+            f"{self.sources[alone].name}: no common ground with {self.sources[other].name}: "
+            f"{tried[other].verdict(needed)}"
+        )
+
+    def _median_depth(self) -> float:
+        """Of what keyframes measured, metres."""
+        return float(np.median(np.concatenate([p[:, 2] for s in self.sources for p in s.known.points])))
+
+    def _place(self, poses: JointPoses) -> list[PlacedRun]:
+        """All maps in the first run's world, with the same channels."""
+        for source in self.sources:
+            source.read_map()
+        degree = max(source.gaussians.sh_degree for source in self.sources)
+        channels = IDENTITY_CHANNELS if any(source.objects is not None for source in self.sources) else 0
+        placed = []
+        for source, T_new_old in zip(self.sources, poses.T_new_old, strict=True):
+            move_map(source.gaussians, T_new_old)
+            source.gaussians = with_channels(source.gaussians, degree, channels)
+            T_world_camera = T_new_old @ source.known.keyframe_poses
+            placed.append(PlacedRun(source.gaussians, source.known.cameras, T_world_camera))
+        return placed
+
+    def _find_seams(self, placed: list[PlacedRun]) -> list[np.ndarray]:
+        """Which keyframes of each run see what another run's map shows, bool [K] each."""
+        coverage, seams = Coverage(self.settings.double, self.context), []
+        for number, run in enumerate(placed):
+            shares = [coverage.shared_views(other.gaussians, run) for k, other in enumerate(placed) if k != number]
+            seams.append(np.max(shares, axis=0) >= self.settings.seam_share)
+        return seams
+
+    def _join(self, placed: list[PlacedRun], objects: UnitedObjects, outcome: MergeOutcome) -> GaussianMap:
+        """One map of all: of each run what the ones before do not show."""
+        coverage = Coverage(self.settings.double, self.context)
+        base = GaussianMap(placed[0].gaussians.sh_degree, placed[0].gaussians.feature_channels)
+        for source, run in zip(self.sources, placed, strict=True):
+            objects.add(base, run.gaussians, source.run_objects())
+            dropped = coverage.doubles(base, run)
+            outcome.doubles.append(without_rows(run.gaussians, dropped))
+            append_map(base, run.gaussians, source.first_keyframe)
+        return base

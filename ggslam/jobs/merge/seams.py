@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training where the maps of several runs meet, on keyframes of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ggslam.jobs.merge.sources import MergeSource
+from ggslam.jobs.progress import Observer
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
+from ggslam.mapping.mapper import Mapper
+from ggslam.mapping.pruning import prune
+from ggslam.merging.objects import UnitedObjects
+from ggslam.native.loader import NativeContext
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import inverse
+from ggslam.slam.config import Config
+from ggslam.slam.parts import make_mapper
+
+_GROWN_UP = 100
+"""Steps that a Gaussian of a finished map counts as having seen: its first ones are not longer than others."""
+
+
+@dataclass
+class SeamTraining:
+    """A merged map about to be trained.
+
+    Attributes:
+        gaussians: the map; changed.
+        keyframes: of all runs, those without images among them; their poses follow.
+        seam: numbers of the keyframes to train on, which have images.
+        objects: of the map; its classifier follows. None: none are learned any further.
+        config: settings.
+        sigma: standard deviation of depth at the scene's median depth, metres.
+    """
+
+    gaussians: GaussianMap
+    keyframes: list[Keyframe]
+    seam: list[int]
+    objects: UnitedObjects | None
+    config: Config
+    sigma: float
+
+    def run(self, steps: int, context: NativeContext, observer: Observer) -> None:
+        """Trains with falling rates, by turns on all keyframes at the seams; then prunes."""
+        mapper = make_mapper(replace(self.config, device="cpu"), self.objects is not None, context, None)
+        self.gaussians.updates[:] = _GROWN_UP
+        self.gaussians.feature_updates[:] = _GROWN_UP
+        mapper.adopt(self.gaussians, self.keyframes)
+        mapper.depth_sigma = self.sigma
+        if self.objects is not None and mapper.identity is not None:
+            mapper.identity.resume(self.objects.classifier)
+        self._train(mapper, steps, observer)
+        prune(mapper.map, self.config.mapping.pruning)
+        if self.objects is not None and mapper.identity is not None:
+            mapper.finish_identity()
+            self.objects.classifier = mapper.identity.classifier
+
+    def _train(self, mapper: Mapper, steps: int, observer: Observer) -> None:
+        random, turn = np.random.default_rng(self.config.seed), list[int]()
+        observer.begin("train at the seams", steps)
+        for step in range(steps):
+            turn = turn or random.permutation(self.seam).tolist()
+            factor = self.config.mapping.refine_decay ** (step / max(1, steps - 1))
+            mapper.iterate(self.keyframes[turn.pop()], factor)
+            observer.advance(step + 1, steps)
+
+
+def keyframes_of(
+    sources: ListOf[MergeSource], poses: ListOf[np.ndarray], seam: ListOf[np.ndarray], with_masks: bool,
+    objects: UnitedObjects,
+) -> tuple[list[Keyframe], list[int]]:  # fmt: skip
+    """The keyframes of all runs, and the numbers of those at the seams whose recording is there; they have images.
+
+    Args:
+        sources: the runs.
+        poses: T_world_camera of each run's keyframes in the common world, float64 [K, 4, 4].
+        seam: whether each of them is at a seam, bool [K].
+        with_masks: whether objects are learned from the recordings' masks.
+        objects: what the runs' object ids are called.
+    """
+    keyframes, trained = list[Keyframe](), list[int]()
+    for number, source in enumerate(sources):
+        table = _mask_table(objects.ids[number]) if with_masks else None
+        for k, record in enumerate(source.record.keyframes):
+            index, T, camera = source.first_keyframe + k, poses[number][k], source.known.cameras[k]
+            no_color, no_depth = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.uint16)
+            keyframe = Keyframe(index, ELSEWHERE, float("nan"), camera, no_color, no_depth, inverse(T))
+            if seam[number][k] and source.sequence is not None and record.frame != ELSEWHERE:
+                frame = source.sequence.frame(record.frame, masks=with_masks)
+                mask = frame.mask if table is None or frame.mask is None else table[frame.mask]
+                keyframe = make_keyframe(index, replace(frame, index=source.first_frame + record.frame, mask=mask), T)
+                trained.append(index)
+            keyframes.append(keyframe)
+    return keyframes, trained
+
+
+def _mask_table(ids: dict[int, int]) -> np.ndarray:
+    table = np.zeros(1 << 16, np.uint16)
+    table[list(ids)] = list(ids.values())
+    return table

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every number of merging, documented."""
+
+from __future__ import annotations
+
+from dataclasses import field
+
+from ggslam.loops.settings import GraphSettings, VerificationSettings
+from ggslam.system.settings import setting, settings_class
+
+
+@settings_class(frozen=True)
+class UnitingSettings:
+    """When objects of two maps are one thing."""
+
+    voxel: float = setting(0.04, 1e-3, 10, "m")
+    """Edge of the voxels in which objects are compared."""
+    min_shared: int = setting(12, 1, 10**9)
+    """Voxels that two objects have in common at least."""
+    min_share: float = setting(0.08, 0, 1)
+    """Share of the smaller object's voxels that they have in common at least: things that only touch have less."""
+    min_overlap: float = setting(0.3, 0, 1)
+    """Of the voxels that both maps know and either object fills, so many are filled by both."""
+    min_contained: float = setting(0.6, 0, 1)
+    """Or so many of the voxels of the object that is smaller there, as long as `max_size_ratio` is kept."""
+    max_size_ratio: float = setting(4.0, 1, 1e6)
+    """A piece is the whole only if that is at most so many times larger: a cup on a table is no piece of it."""
+
+
+@settings_class(frozen=True)
+class DoubleSettings:
+    """What is double where two maps show the same surface."""
+
+    alpha: float = setting(0.6, 0, 1)
+    """The map that stays has to be so opaque there."""
+    tolerance_m: float = setting(0.05, 0, 1e3, "m")
+    """And its surface so near, in depth."""
+    tolerance_relative: float = setting(0.03, 0, 1)
+    """As `tolerance_m`, a share of the depth; the larger of the two counts."""
+
+
+@settings_class(frozen=True)
+class MergeSettings:
+    """How runs are merged."""
+
+    candidates: int = setting(3, 1, 1000)
+    """Keyframes of one run that are tried for one of the other, the likeliest first."""
+    queries: int = setting(150, 1, 10**6)
+    """Keyframes of a run that are looked up in another one at most, spread evenly."""
+    neighbourhood: int = setting(3, 0, 1000, "keyframes")
+    """Keyframes before and after one that is tried whose points make its local map."""
+    confirmations: int = setting(3, 1, 10**6)
+    """Keyframes that have to agree on how two runs lie to each other."""
+    seam_share: float = setting(0.1, 0, 1)
+    """A keyframe is at the seam if another run's map covers this share of its view."""
+    steps: int = setting(300, 0, 10**7)
+    """Optimisation steps at the seams."""
+    verification: VerificationSettings = field(default_factory=VerificationSettings)
+    graph: GraphSettings = field(default_factory=GraphSettings)
+    uniting: UnitingSettings = field(default_factory=UnitingSettings)
+    double: DoubleSettings = field(default_factory=DoubleSettings)
