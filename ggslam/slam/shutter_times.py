@@ -45,7 +45,7 @@ class ShutterTimes:
             return frame
         share = frame.depth_delay / self.interval
         known = frame.depth[frame.depth > 0]
-        if abs(share) > LARGEST_SHARE or not len(known):
+        if not abs(share) <= LARGEST_SHARE or not len(known):  # not a number neither
             return frame
         T_color_depth = se3_exp(share * se3_log(self.motion))
         if largest_shift(T_color_depth, frame.camera, float(np.median(known))) < LEAST_SHIFT:
