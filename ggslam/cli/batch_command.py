@@ -4,9 +4,13 @@
 from __future__ import annotations
 
 import shlex
+import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -16,8 +20,12 @@ from ggslam.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rich.live import Live
+
     from ggslam.jobs.batch.batch import BatchOutcome
+    from ggslam.jobs.batch.batch import Engine as RunEngine
     from ggslam.jobs.batch.job_states import JobState
+    from ggslam.jobs.batch.manifest import Manifest
 
 EPILOG = """
 [bold]Examples[/]
@@ -29,7 +37,20 @@ EPILOG = """
   ggslam batch recordings/ --options "--scale 0.5" --seeds 0,1,2
 
   ggslam batch --replica data/Replica
+
+  ggslam batch experiments.yaml --engine ray --address auto
+
+  ggslam batch experiments.yaml --engine slurm --write-only > array.sh
 """
+
+
+class EngineName(str, Enum):
+    """What makes the runs."""
+
+    local = "local"
+    ray = "ray"
+    slurm = "slurm"
+
 
 Source = Annotated[
     Path | None,
@@ -45,6 +66,19 @@ Out = Annotated[
 Options = Annotated[str, typer.Option(help="Of a folder: options of `ggslam run` for all recordings, as one text.")]
 Seeds = Annotated[str, typer.Option(help="Of a folder: seeds, by commas.")]
 Workers = Annotated[int | None, typer.Option(help="Runs at a time; default: one for every two processors.")]
+Engine = Annotated[
+    EngineName,
+    typer.Option(help="local: processes on this machine; ray: tasks of a Ray cluster; slurm: a script of a job array."),
+]
+Address = Annotated[
+    str | None,
+    typer.Option(help="Of the Ray cluster, auto: the one this machine belongs to; default: one on this machine."),
+]
+WriteOnly = Annotated[bool, typer.Option("--write-only", help="Print the script of --engine slurm, submit nothing.")]
+TableOnly = Annotated[bool, typer.Option("--table-only", help="Make no run: write the table of those that are done.")]
+Only = Annotated[
+    int | None, typer.Option(help="Make one run, by its number from 0 on, and no table: an element of a job array.")
+]
 Retry = Annotated[bool, typer.Option("--retry", help="Make runs again that failed.")]
 
 
@@ -56,30 +90,67 @@ def batch(
     seeds: Seeds = "0",
     workers: Workers = None,
     retry: Retry = False,
+    engine: Engine = EngineName.local,
+    address: Address = None,
+    write_only: WriteOnly = False,
+    table_only: TableOnly = False,
+    only: Only = None,
 ) -> None:
     """Run recordings x settings x seeds, each into a folder of its own, and write one table of their scores.
 
     Runs that are done are skipped and those that were cut off go on, so the same command can be given again. Exit
     code 1 if a run failed."""
-    from ggslam.jobs.batch.batch import run_batch
+    from ggslam.jobs.batch.batch import run_batch, run_one
+
+    jobs = _manifest(manifest, replica, out, options, seeds)
+    if write_only != (engine is EngineName.slurm):
+        raise ConfigError("--engine slurm needs --write-only, and only it has that: ggslam does not submit jobs itself")
+    if address is not None and engine is not EngineName.ray:
+        raise ConfigError("--address is for --engine ray")
+    if write_only:
+        from ggslam.jobs.batch.slurm_script import slurm_script
+
+        words = _words(manifest, replica, jobs.out, options, seeds)
+        print(slurm_script(jobs, words, "--only", "--table-only"), end="")
+        return
+    if only is not None:
+        state = run_one(jobs, only, retry)
+        _Lines().note([state])
+        failed = bool(state.line)
+    else:
+        with _progress() as told:
+            chosen = cast("RunEngine", "none" if table_only else engine.value)
+            outcome = run_batch(jobs, workers, retry, told.note, chosen, address)
+        _show(outcome)
+        failed = bool(outcome.failures)
+    if failed:
+        raise typer.Exit(1)
+
+
+def _manifest(
+    manifest: Path | None, replica: Path | None, out: Path | None, options: str, seeds: str
+) -> Manifest:
     from ggslam.jobs.batch.manifest import REPLICA, manifest_of_folder, read_manifest
 
     if (manifest is None) == (replica is None):
         raise ConfigError("expected a MANIFEST (or a folder of recordings), or --replica with a folder")
     words, numbers = _split(options), _numbers(seeds)
     if replica is not None:
-        jobs = manifest_of_folder(replica, out, numbers, ["--config", "replica", *words], REPLICA)
-    elif manifest is not None and manifest.is_dir():
-        jobs = manifest_of_folder(manifest, out, numbers, words)
-    elif manifest is not None:
-        if options or seeds != "0":
-            raise ConfigError("--options and --seeds are for folders; a manifest says its own")
-        jobs = read_manifest(manifest, out)
-    told = _Told()
-    outcome = run_batch(jobs, workers, retry, told.note)
-    _show(outcome)
-    if outcome.failures:
-        raise typer.Exit(1)
+        return manifest_of_folder(replica, out, numbers, ["--config", "replica", *words], REPLICA)
+    assert manifest is not None
+    if manifest.is_dir():
+        return manifest_of_folder(manifest, out, numbers, words)
+    if options or seeds != "0":
+        raise ConfigError("--options and --seeds are for folders; a manifest says its own")
+    return read_manifest(manifest, out)
+
+
+def _words(manifest: Path | None, replica: Path | None, out: Path, options: str, seeds: str) -> list[str]:
+    """Arguments of `ggslam batch` that lead to the same runs from any folder."""
+    source = [str(manifest.absolute())] if manifest is not None else []
+    source += ["--replica", str(replica.absolute())] if replica is not None else []
+    given = [("--options", options, ""), ("--seeds", seeds, "0")]
+    return [*source, "--out", str(out.absolute()), *(w for name, v, d in given if v != d for w in (name, v))]
 
 
 def _split(options: str) -> list[str]:
@@ -96,7 +167,7 @@ def _numbers(seeds: str) -> list[int]:
     return [int(word) for word in words]
 
 
-class _Told:
+class _Lines:
     """Says what changes: a line for every run that begins or ends."""
 
     def __init__(self) -> None:
@@ -107,11 +178,50 @@ class _Told:
         for state in states:
             name, word = state.job.name, state.state.value
             if self._shown.get(name, "waiting") != word:
-                counts = Counter(other.state.value for other in states)
-                rest = ", ".join(f"{counts[k]} {k}" for k in ("running", "waiting") if counts[k])
+                rest = ", ".join(_counts(states, ("running", "waiting")))
                 why = f": {state.line}" if state.line else f" in {state.seconds:.0f} s" if state.seconds else ""
                 console.print(f"{name}: {word}{why}" + (f"  ({rest})" if rest else ""), highlight=False, markup=False)
             self._shown[name] = word
+
+
+class _LiveTable:
+    """Shows the runs as a table that changes in place: those at work with what they say, the others by number."""
+
+    def __init__(self, live: Live) -> None:
+        self._live, self._lines = live, _Lines()
+
+    def note(self, states: Sequence[JobState]) -> None:
+        """Redraws the table; runs that end get a line above it."""
+        from rich.markup import escape
+        from rich.table import Table
+
+        ended = [state for state in states if state.state.value not in ("waiting", "running")]
+        self._lines.note(ended)
+        shown = Table(title=", ".join(_counts(states, [s.value for s in type(states[0].state)])), title_justify="left")
+        for heading in ("at work", "minutes", "says"):
+            shown.add_column(heading, justify="right" if heading == "minutes" else "left")
+        for state in states:
+            if state.state.value == "running":
+                minutes = f"{(time.time() - state.begun) / 60:.1f}"
+                shown.add_row(escape(state.job.name), minutes, escape(state.last_line()))
+        self._live.update(shown, refresh=True)
+
+
+@contextmanager
+def _progress() -> Iterator[_Lines | _LiveTable]:
+    """What is told how far the runs are: a table on a terminal, lines elsewhere."""
+    if not console.is_terminal:
+        yield _Lines()
+        return
+    from rich.live import Live
+
+    with Live(console=console, transient=True, auto_refresh=False) as live:
+        yield _LiveTable(live)
+
+
+def _counts(states: Sequence[JobState], words: Sequence[str]) -> list[str]:
+    counts = Counter(state.state.value for state in states)
+    return [f"{counts[word]} {word}" for word in words if counts[word]]
 
 
 def _show(outcome: BatchOutcome) -> None:

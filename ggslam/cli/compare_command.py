@@ -23,6 +23,8 @@ EPILOG = """
 
   ggslam compare runs/with_loops runs/without_loops
 
+  ggslam compare runs/room0 room0_mesh.ply --align truth
+
   ggslam compare runs/kitchen scan_of_kitchen.ply --align icp
 
   ggslam compare runs/a runs/b --align trajectory --thresholds 0.01,0.03 --out difference.json
@@ -32,7 +34,9 @@ EPILOG = """
 class AlignmentName(str, Enum):
     """How A is brought into the frame of B."""
 
+    auto = "auto"
     none = "none"
+    truth = "truth"
     icp = "icp"
     trajectory = "trajectory"
 
@@ -46,9 +50,10 @@ def compare(
     b: ReferencePath,
     align: Annotated[
         AlignmentName,
-        typer.Option(help="none: both share a world, as runs of one recording do; icp: register A onto B; "
-                     "trajectory: align camera positions at common times."),
-    ] = AlignmentName.none,
+        typer.Option(help="none: both share a world, as runs of one recording do; truth: by the true poses that a run "
+                     "kept, meshes and clouds lying in their world; icp: register A onto B; trajectory: align camera "
+                     "positions at common times; auto: truth where that clearly fits better than none."),
+    ] = AlignmentName.auto,
     max_distance: Annotated[
         float, typer.Option(help="Farthest partners that fitness, RMSE and ICP count, metres.")
     ] = 0.05,
@@ -80,6 +85,8 @@ def _numbers(text: str) -> list[float]:
 def _print(c: Comparison, max_distance: float) -> None:
     for name, side in (("A", c.a), ("B", c.b)):
         console.print(f"{name}: {side.path}, {len(side.points)} points", highlight=False, markup=False)
+    if c.align != "none":
+        console.print(f"A is moved into the frame of B: {_ALIGNED[c.align]}", highlight=False)
     console.print(table(f"overlap within {100 * max_distance:g} cm", ["", "fitness", "inlier RMSE"], _overlaps(c)))
     if c.icp is not None:
         console.print(
@@ -99,6 +106,11 @@ def _print(c: Comparison, max_distance: float) -> None:
     rows = _metric_rows(c.a.metrics, c.b.metrics)
     if rows:
         console.print(table("scores", ["", "A", "B"], rows))
+
+
+_ALIGNED = {
+    "truth": "by the true poses", "icp": "by ICP", "trajectory": "by camera positions at common times",
+}  # fmt: skip
 
 
 def _overlaps(c: Comparison) -> list[list[str]]:

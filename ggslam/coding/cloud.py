@@ -32,6 +32,11 @@ class PointCloud:
         """Positions float64 [N, 3] in metres; of integers that nothing is said about, in their unit."""
         return self.quantization.restore(self.grid_points)
 
+    @property
+    def colors(self) -> np.ndarray | None:
+        """uint8 [N, 3], the attribute `color`, as a cloud that `read_point_cloud` gives has it; None without."""
+        return self.attributes.get("color")
+
     def __len__(self) -> int:
         return len(self.grid_points)
 

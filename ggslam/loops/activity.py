@@ -15,6 +15,9 @@ import numpy as np
 
 from ggslam.system.settings import setting, settings_class
 
+_SHARE = 8
+"""Of the active keyframes so small a part is put aside at least: the cost of gathering the others goes with them."""
+
 
 @settings_class(frozen=True)
 class ActivitySettings:
@@ -27,7 +30,8 @@ class ActivitySettings:
     """The camera looks at a keyframe's surface if the middles of what both see are nearer than this many times the
     mean of their median depths."""
     batch: int = setting(8, 1, 10**6)
-    """Keyframes are put aside so many at a time: each time the surface is gathered anew."""
+    """Keyframes are put aside so many at a time, or an eighth of the active ones where that is more: each time the
+    surface is gathered anew."""
     spread: int = setting(3, 0, 10**6)
     """A keyframe near the camera is taken back if one of so many before or after it is active: neighbours in time lie
     right to each other."""
@@ -53,6 +57,8 @@ class ActiveKeyframes:
         self._middles = np.empty((0, 3))
         self._seen = np.empty(0)
         self._path = 0.0
+        self._waiting = 0
+        """Keyframes made since there are some to take back."""
 
     def __len__(self) -> int:
         return len(self._depths)
@@ -79,23 +85,33 @@ class ActiveKeyframes:
         s, before = self.settings, set(self.active)
         limit = s.forget_after * float(np.median(self._depths[-20:]))
         stale = {k for k in self.active if self._path - self._seen[k] > limit}
-        if len(stale) >= s.batch:
+        if len(stale) >= max(s.batch, len(self.active) // _SHARE):
             self.active -= stale
         if self.spare:
             self.spare = {k for k in self.spare if self._path - self._seen[k] <= limit}
         around = set(np.flatnonzero(self._near(-1)).tolist())
         near = around - self.active
         if len(self.active) < s.most or len(around) - len(near) < s.most // 4:
-            while found := self._around(near):
+            found = self._reachable(near)
+            self._waiting = self._waiting + 1 if found else 0
+            # One by one they would have the surface gathered at every keyframe.
+            if len(found) + self._waiting > s.batch // 2 or self.active != before:
                 self._take_back(found)
-                near -= found
+                near, self._waiting = near - found, 0
         self._put_aside_spare(near)
         return self.active != before
 
-    def _around(self, numbers: set[int]) -> set[int]:
-        """Those of some numbers that have an active (or spare) keyframe among their neighbours in time."""
-        reach = range(-self.settings.spread, self.settings.spread + 1)
-        return {k for k in numbers if any(k + d in self.active or k + d in self.spare for d in reach)}
+    def _reachable(self, near: set[int]) -> set[int]:
+        """Those of some numbers that lie right to the active ones, by way of others of them, too."""
+        reachable = set[int]()
+        while found := {k for k in near - reachable if self._has_neighbour(k, reachable)}:
+            reachable |= found
+        return reachable
+
+    def _has_neighbour(self, number: int, others: set[int]) -> bool:
+        """Whether one of its neighbours in time is active, spare or among the others."""
+        reach = range(number - self.settings.spread, number + self.settings.spread + 1)
+        return any(k in self.active or k in self.spare or k in others for k in reach)
 
     def _put_aside_spare(self, near: set[int]) -> None:
         """Where more than enough are active, those go that were seen longest ago, and among equals the newer ones,
@@ -103,8 +119,8 @@ class ActiveKeyframes:
         same reason lie right as well."""
         most = self.settings.most
         if len(self.active) >= most:
-            self.spare |= self._around(near)
-        if len(self.active) > most + most // 8:
+            self.spare |= {k for k in near if self._has_neighbour(k, set())}
+        if len(self.active) > most + most // _SHARE:
             newest = len(self) - most // 4
             order = sorted(self.active, key=lambda k: (k >= newest, self._seen[k], -k))
             aside = set(order[: len(self.active) - most])
@@ -134,6 +150,22 @@ class ActiveKeyframes:
     def inactive(self) -> set[int]:
         """Numbers of the keyframes put aside for being out of sight."""
         return set(range(len(self))) - self.active - self.spare
+
+    def alike(self, share: float, degrees: float) -> set[int]:
+        """Numbers of the keyframes that saw about what the newest sees: cameras and the middles of what they saw are
+        nearer than this share of the mean of both median depths, and directions differ by fewer degrees."""
+        directions = self._middles - self._cameras
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+        apart = np.maximum(*(np.linalg.norm(at - at[-1], axis=1) for at in (self._middles, self._cameras)))
+        near = apart < share * 0.5 * (self._depths + self._depths[-1])
+        return set(np.flatnonzero(near & (directions @ directions[-1] > np.cos(np.radians(degrees)))).tolist())
+
+    def visits(self, old: int) -> tuple[set[int], set[int]]:
+        """Those that look where the newest or keyframe `old` looks: of the first visit and of the one now, which are
+        parted halfway between the two."""
+        there = set(np.flatnonzero(self._near(-1) | self._near(old)).tolist())
+        first = {k for k in there if k <= (old + len(self) - 1) // 2}
+        return first, there - first
 
     def _take_back(self, numbers: set[int]) -> None:
         self.active |= numbers

@@ -19,6 +19,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 
 Rows = Mapping[str, torch.Tensor]
 """What `GaussianMap.take` gives."""
+_DTYPES = {np.dtype(name).str for name in ("float32", "float64", "int32", "int64", "uint8", "bool")}
 
 
 def encode_rows(rows: Rows) -> bytes:
@@ -38,6 +39,8 @@ def decode_rows(data: bytes, source: str) -> dict[str, torch.Tensor]:
         begin = end = data.index(b"\n") + 1
         rows: dict[str, torch.Tensor] = {}
         for name, code, shape in json.loads(data[:begin]):
+            if code not in _DTYPES:  # numpy would parse it as a program
+                raise ValueError(f"{name}: {str(code)[:20]!r} is no type of numbers of a Gaussian")
             dtype, count = np.dtype(code), math.prod(shape)
             rows[name] = torch.from_numpy(np.frombuffer(data, dtype, count, end).reshape(shape).copy())
             end += dtype.itemsize * count

@@ -75,9 +75,8 @@ class MeasuredSurface:
         """Numbers of the keyframes that take part."""
         self.target: GicpTarget | None = None
         """What has been gathered so far; None before the first keyframe. Each change makes a new one."""
-        self._arranged: list[int] = []
-        self._arranged_of = 0
-        """The keyframes that were gathered together last, and how many there were then; later ones joined singly."""
+        self._joined: list[list[int]] = []
+        """The keyframes of the target, in the groups in which they joined it."""
 
     def __len__(self) -> int:
         return len(self._parts)
@@ -85,9 +84,14 @@ class MeasuredSurface:
     def add(self, points: PointSource, T_world_camera: np.ndarray) -> GicpTarget:
         """Adds the points of a keyframe seen from `T_world_camera` [4, 4]; returns the new target."""
         read = points.read()
-        part = self._append(read.points.copy(), read.normals.copy(), np.array(T_world_camera, float))
-        self.active.add(len(self._parts) - 1)
-        self.target = self._gather([part], self.target)
+        self._append(read.points.copy(), read.normals.copy(), np.array(T_world_camera, float))
+        return self._join([len(self._parts) - 1])
+
+    def _join(self, numbers: list[int]) -> GicpTarget:
+        """These keyframes take part, too."""
+        self.active |= set(numbers)
+        self._joined.append(numbers)
+        self.target = self._gather([self._parts[number] for number in numbers], self.target)
         return self.target
 
     def _append(self, points: np.ndarray, normals: np.ndarray, T_world_camera: np.ndarray) -> _Part:
@@ -112,23 +116,25 @@ class MeasuredSurface:
 
     def arrange(self, active: set[int], T_world_camera: np.ndarray | None = None) -> GicpTarget:
         """Chooses the keyframes that take part, and with `T_world_camera` [K, 4, 4] where keyframes are; returns the
-        new target."""
+        new target. Where keyframes only join, the cost goes with them; else with all that take part."""
         if T_world_camera is not None:
             for part, T in zip(self._parts, T_world_camera, strict=True):
                 part.T_world_camera = np.array(T, float)
-        self.active = set(active)
+        elif self.target is not None and self.active <= active:
+            joining = sorted(active - self.active)
+            return self._join(joining) if joining else self.target
         before = self.target if self._archive is None else None  # where memory is short it goes before the next is made
-        self.target = None
-        self._arranged, self._arranged_of = sorted(self.active), len(self._parts)
-        self.target = self._gather([self._parts[number] for number in self._arranged], None, before)
+        self.target, self.active, numbers = None, set(active), sorted(active)
+        self._joined = [numbers]
+        self.target = self._gather([self._parts[number] for number in numbers], None, before)
         return self.target
 
     def gather_again(self) -> None:
         """Makes the target from the keyframes in the order in which it came to be, so that it is the same bit for
         bit."""
-        self.target = self.of(self._arranged) if self._arranged_of else None
-        for part in self._parts[self._arranged_of :]:
-            self.target = self._gather([part], self.target)
+        self.target = None
+        for numbers in self._joined:
+            self.target = self._gather([self._parts[number] for number in numbers], self.target)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Everything, for a file: points to 1/32767 of the farthest of a keyframe, normals to half a degree."""

@@ -78,7 +78,7 @@ def test_a_run_against_itself(run: Path, tmp_path: Path) -> None:
 @pytest.mark.long("ICP on the clouds of two runs, twice")
 @pytest.mark.parametrize("align", ["icp", "trajectory"])
 def test_a_moved_run_is_brought_back(run: Path, shifted: Path, tmp_path: Path, align: str) -> None:
-    loose, text = compared(shifted, run, "--thresholds", "0.005 0.02", out=tmp_path)
+    loose, text = compared(shifted, run, "--align", "none", "--thresholds", "0.005 0.02", out=tmp_path)
     tight, _ = compared(shifted, run, "--align", align, "--thresholds", "0.005 0.02", out=tmp_path)
     np.testing.assert_allclose(np.array(tight["T_b_a"]) @ T_SHIFT, np.eye(4), atol=2e-4)
     assert loose["T_b_a"] == np.eye(4).tolist() and loose["icp"]["moved_m"] > 0.02
@@ -88,6 +88,59 @@ def test_a_moved_run_is_brought_back(run: Path, shifted: Path, tmp_path: Path, a
     assert loose["icp"]["a_on_b"]["fitness"] == pytest.approx(1.0, abs=1e-3)
     assert loose["trajectory"]["ate_rmse_m"] < 1e-6  # the shape of the path is the same
     assert loose["a"]["metrics"] is None and "after ICP" in text and "PSNR" in text
+
+
+T_TRUE = se3_exp(np.array([2.0, -1.0, 0.5, 0.4, 1.2, -0.8]))
+"""Of the first camera in a world that true poses may be told in."""
+
+
+def _with_truth(run: Path, folder: Path, T: np.ndarray = T_TRUE) -> Path:
+    """A run that kept true poses, which are its own in a world of which the first camera lies at `T`."""
+    other = Path(shutil.copytree(run, folder))
+    trajectory = read_tum(run / "trajectory.txt")
+    write_tum(other / "ground_truth.txt", trajectory.timestamps, T @ trajectory.T_world_camera)
+    accept_files(other)
+    return other
+
+
+@pytest.mark.long("clouds of runs are compared five times")
+def test_true_poses_bring_worlds_together(run: Path, shifted: Path, tmp_path: Path) -> None:
+    """A cloud in the world of the true poses, and a run that began elsewhere; by default, too."""
+    known = _with_truth(run, tmp_path / "known")
+    cloud = read_point_cloud(run / "points.ply").points
+    write_point_cloud(tmp_path / "true.ply", cloud @ T_TRUE[:3, :3].T + T_TRUE[:3, 3], {})
+    found, text = compared(known, tmp_path / "true.ply", "--align", "truth", out=tmp_path)
+    np.testing.assert_allclose(found["T_b_a"], T_TRUE, atol=1e-6)
+    assert found["geometry"]["thresholds"][0]["f1"] > 0.99 and "by the true poses" in text
+    by_default, _ = compared(known, tmp_path / "true.ply", out=tmp_path)
+    assert by_default["align"] == "truth" and by_default["T_b_a"] == found["T_b_a"]
+    other = _with_truth(shifted, tmp_path / "other", T_TRUE @ np.linalg.inv(T_SHIFT))
+    both, _ = compared(other, known, "--align", "truth", out=tmp_path)
+    np.testing.assert_allclose(np.array(both["T_b_a"]) @ T_SHIFT, np.eye(4), atol=1e-6)
+    # What a run exported lies in the run's own world, whatever its true poses say.
+    write_point_cloud(tmp_path / "own.ply", cloud, {})
+    own, text = compared(known, tmp_path / "own.ply", out=tmp_path)
+    assert own["align"] == "none" and own["geometry"]["thresholds"][0]["f1"] == 1 and "by the true" not in text
+
+
+def test_nonsense_is_refused(run: Path, tmp_path: Path) -> None:
+    """No true poses, true poses of another trajectory, and a registration under which nothing lies on anything."""
+    other = Path(shutil.copytree(run, tmp_path / "wrong"))
+    (other / "ground_truth.txt").unlink()
+    accept_files(other)
+    one_error(ggslam("compare", run, other, "--align", "truth"), "wrong has no ground_truth.txt")
+    times = read_tum(run / "trajectory.txt").timestamps
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, 0, 3] = 5.0 * (np.arange(len(times)) % 2)
+    write_tum(other / "ground_truth.txt", times, poses)
+    accept_files(other)
+    one_error(ggslam("compare", other, run, "--align", "truth"), "wrong", "does not fit its true poses")
+    cloud = read_point_cloud(run / "points.ply").points
+    write_point_cloud(tmp_path / "a.ply", cloud, {})
+    one_error(ggslam("compare", tmp_path / "a.ply", tmp_path / "a.ply", "--align", "truth"), "expected a run")
+    fog = np.random.default_rng(0).uniform(cloud.min(0), cloud.max(0), (3000, 3))
+    write_point_cloud(tmp_path / "fog.ply", fog, {})
+    one_error(ggslam("compare", tmp_path / "fog.ply", run, "--align", "icp"), "fog.ply", "by ICP", "30% needed")
 
 
 def test_a_run_against_a_cloud(run: Path, tmp_path: Path) -> None:

@@ -149,9 +149,10 @@ def test_damaged_rows_are_refused(cells_for) -> None:
     cells = cells_for(gaussians)
     cells.move_out(gaussians, cells.cells_of(gaussians))
     key = cells.sorted_keys()[0]
-    cells.store.put(key, {PART: b"no rows"})
-    with pytest.raises(FormatError, match="no Gaussians"):
-        cells.read(key)
+    for damaged in (b"no rows", b'[["means", "<f4", [1, 3]]]\nshort', b'[["means", "<%s", [1]]]\n' % (b"9" * 5000)):
+        cells.store.put(key, {PART: damaged})
+        with pytest.raises(FormatError, match="no Gaussians"):
+            cells.read(key)
 
 
 def test_what_a_camera_sees_is_needed(cells_for) -> None:

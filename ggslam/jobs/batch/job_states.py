@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import enum
 import logging
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -16,8 +17,11 @@ from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.record import RecordFile
 from ggslam.system.atomic import make_folder
+from ggslam.system.foreign import printable
 
 _log = logging.getLogger(__name__)
+_TAIL, _LINE = 8192, 300
+"""Bytes at the end of a log that are looked at, and characters of a line that are shown."""
 
 
 class State(enum.Enum):
@@ -51,6 +55,7 @@ class JobState:
         state: how far it is.
         line: why it failed.
         seconds: that it took.
+        begun: when it was seen to be at work first, seconds since 1970.
     """
 
     job: BatchJob
@@ -58,6 +63,7 @@ class JobState:
     state: State = State.WAITING
     line: str = ""
     seconds: float = 0.0
+    begun: float = 0.0
 
     @property
     def run(self) -> Path:
@@ -72,6 +78,19 @@ class JobState:
     @property
     def _beside(self) -> Path:
         return self.out / "jobs" / self.job.name
+
+    def last_line(self) -> str:
+        """The error that the run printed, or else the last thing it said."""
+        try:
+            with self.log.open("rb") as file:
+                file.seek(max(0, self.log.stat().st_size - _TAIL))
+                text = file.read().decode(errors="replace")
+        except OSError:
+            return ""
+        lines = [line.strip() for line in text.splitlines()]
+        errors = [line.removeprefix("error:").strip() for line in lines if line.startswith("error:")]
+        said = errors or [line for line in lines if line]
+        return printable(said[-1][:_LINE]) if said else ""
 
     def memory(self) -> JobRecord | None:
         """What an earlier call noted of a run with the same arguments."""
@@ -101,7 +120,12 @@ class JobState:
         """Notes what is begun."""
         make_folder(self._beside)
         JobRecord.of({"words": list(self.job.words)}).write(self._beside)
-        self.state = State.RUNNING
+        self.see_begun()
+
+    def see_begun(self) -> None:
+        """The run is at work, here or elsewhere."""
+        if self.state is not State.RUNNING:
+            self.state, self.begun = State.RUNNING, time.time()
 
     def end(self, exit_code: int, seconds: float, line: str) -> None:
         """Notes what became of it."""

@@ -6,46 +6,37 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.evaluation.geometry import THRESHOLDS_M, CloudScores, score_cloud
-from ggslam.evaluation.trajectory import FEWEST_POSES, TrajectoryScores, align_points, associate, score_trajectory
+from ggslam.evaluation.trajectory import TrajectoryScores, score_trajectory
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.point_sampling import sample_points
-from ggslam.formats.trajectory import Trajectory
+from ggslam.formats.trajectory import read_tum
 from ggslam.formats.triangle_mesh import read_mesh
 from ggslam.geometry.clouds import Cloud, Overlap, overlap
 from ggslam.geometry.icp import CloudRegistration, register
+from ggslam.jobs.compare.alignment import (
+    Alignment,
+    Side,
+    best_of_truth_and_none,
+    by_trajectory,
+    by_truth,
+    check_registration,
+    common_poses,
+)
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.writing import TRUTH_FILE
 from ggslam.scene.poses import inverse
 from ggslam.system.json_files import json_ready
 
-Alignment = Literal["none", "icp", "trajectory"]
 MESH_SPACING = 0.01
 """Metres: a mesh is sampled with one point per square of this side..."""
 MOST_SAMPLES = 2_000_000
 """...but with no more points than this."""
-
-
-@dataclass(frozen=True)
-class Side:
-    """One of the two things compared.
-
-    Attributes:
-        path: a run's folder or a file.
-        points: float64 [N, 3] metres. Of a run: its map sampled on a grid of 1 cm (points.ply).
-        trajectory: of a run.
-        metrics: of a run that was scored.
-    """
-
-    path: Path
-    points: np.ndarray
-    trajectory: Trajectory | None = None
-    metrics: MetricsRecord | None = None
 
 
 @dataclass(frozen=True)
@@ -99,31 +90,36 @@ class Comparison:
 
 
 def compare(
-    a: Path, b: Path, align: Alignment = "none", max_distance: float = 0.05, thresholds: Sequence[float] = THRESHOLDS_M,
+    a: Path, b: Path, align: Alignment = "auto", max_distance: float = 0.05, thresholds: Sequence[float] = THRESHOLDS_M,
     seed: int = 0,
 ) -> Comparison:  # fmt: skip
     """Compares A with B, B being the reference. Each is the folder of a run, or a PLY or PCD file with a cloud or mesh.
 
     Args:
         a, b: what to compare.
-        align: "none": both are in one frame already, as runs of one recording are (the first camera's); "icp": A is
-            registered upon B; "trajectory": the positions at common times are laid upon one another (Umeyama, without
-            scale).
+        align: "none": both are in one frame already, as runs of one recording are (the first camera's); "truth": by
+            the true poses that a run kept, files lying in their world; "icp": A is registered upon B; "trajectory": the
+            positions at common times are laid upon one another (Umeyama, without scale); "auto": "truth" where that
+            clearly brings them nearer than "none".
         max_distance: metres up to which points are partners, for fitness, inlier RMSE and the last stage of ICP.
         thresholds: metres, for precision, recall and F1.
         seed: of the samples of meshes and of ICP.
 
     Raises:
-        ConfigError: a distance that is none, or an alignment that the two do not allow.
+        ConfigError: a distance that is none, an alignment that the two do not allow, or one that is nonsense.
         RunFolderError, FormatError: a side cannot be read or has no points.
     """
     if not all(0 < d < np.inf for d in (max_distance, *thresholds)):
         raise ConfigError(f"expected positive distances in metres, found {max_distance} and {list(thresholds)}")
     one, other = read_side(a, seed), read_side(b, seed)
-    pairs = _common(one, other)
+    pairs = common_poses(one, other)
     T_b_a = np.eye(4)
     if align == "trajectory":
-        T_b_a = _by_trajectory(one, other, pairs)
+        T_b_a = by_trajectory(one, other, pairs)
+    elif align == "truth":
+        T_b_a = by_truth(one, other)
+    elif align == "auto":
+        align, T_b_a = best_of_truth_and_none(one, other, max_distance, seed)
     cloud_a, cloud_b = Cloud(one.points), Cloud(other.points)
     distances = [max(max_distance, d) for d in (0.25, 0.10)] + [max_distance]
     icp = None
@@ -132,11 +128,12 @@ def compare(
     except ValueError as error:
         if align == "icp":
             raise ConfigError(f"{a} cannot be registered upon {b} by ICP: {error}") from None
-    if align == "icp" and icp is not None:
-        T_b_a = icp.T_target_source
     after = None
     if icp is not None:
         after = overlap(cloud_b, cloud_a, max_distance, inverse(icp.T_target_source), seed)
+        if align == "icp":
+            check_registration(one, other, icp, after.fitness)
+            T_b_a = icp.T_target_source
     return Comparison(
         a=one, b=other, align=align, T_b_a=T_b_a, trajectory=_trajectory_scores(one, other, pairs),
         common_poses=len(pairs), a_on_b=overlap(cloud_a, cloud_b, max_distance, T_b_a, seed),
@@ -170,27 +167,8 @@ def _read_run(path: Path) -> Side:
     points = read_point_cloud(cloud).points if cloud.is_file() else sample_points(folder.gaussians()).points
     if not len(points):
         raise RunFolderError(f"{path}: the map has no points to compare")
-    return Side(path, np.asarray(points, np.float64), folder.trajectory(), folder.metrics())
-
-
-def _common(a: Side, b: Side) -> np.ndarray:
-    """Rows [M, 2] of poses at the same times."""
-    if a.trajectory is None or b.trajectory is None:
-        return np.empty((0, 2), np.int64)
-    return associate(a.trajectory.timestamps, b.trajectory.timestamps)
-
-
-def _by_trajectory(a: Side, b: Side, pairs: np.ndarray) -> np.ndarray:
-    if a.trajectory is None or b.trajectory is None:
-        lacking = a if a.trajectory is None else b
-        raise ConfigError(f"`align` trajectory: {lacking.path} is a file and has no trajectory; use icp or none")
-    if len(pairs) < FEWEST_POSES:
-        raise ConfigError(
-            f"`align` trajectory: {a.path} and {b.path} have {len(pairs)} poses at common times, expected at least "
-            f"{FEWEST_POSES}"
-        )
-    source, target = a.trajectory.T_world_camera[pairs[:, 0]], b.trajectory.T_world_camera[pairs[:, 1]]
-    return align_points(source[:, :3, 3], target[:, :3, 3])[0]
+    truth = read_tum(path / TRUTH_FILE) if (path / TRUTH_FILE).is_file() else None
+    return Side(path, np.asarray(points, np.float64), folder.trajectory(), folder.metrics(), truth)
 
 
 def _trajectory_scores(a: Side, b: Side, pairs: np.ndarray) -> TrajectoryScores | None:
