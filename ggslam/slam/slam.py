@@ -86,7 +86,7 @@ class Slam:
         self.steps = StepLog()
         self.growing = True
         """Whether keyframes are made and the map is trained; off: frames are located in the map as it is."""
-        self._corrections = MapCorrections(self.surface, self.mapper, self.pager)
+        self._corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
         self._moves_followed = 0
         self._noise: DepthNoise | None = None
         self._objects = RunObjects(self.masks)
