@@ -72,11 +72,12 @@ def points_in_voxels_of(size: float) -> Iterator[None]:
 
 @contextmanager
 def light_maps_kept() -> Iterator[None]:
-    """Light maps of large scenes are computed once, until what computes them changes: half a generated recording."""
+    """Light maps of scenes with many things are computed once, until what computes them changes: most of what a small
+    recording takes, and the same for all that show one scene."""
     from ggslam.synthetic import lighting, raycast
 
     def bake(scene: Scene) -> lighting.LightMaps:
-        if len(scene.shapes) < 100:
+        if len(scene.shapes) < 20:
             return lighting.bake(scene)
         bare = [dataclasses.replace(shape, material=None, faces={}) for shape in scene.shapes]  # type: ignore[arg-type]
         precision = (lighting.PATCH, lighting.LARGEST_MAP, lighting.AMBIENT_RAYS)

@@ -151,6 +151,22 @@ class ActiveKeyframes:
         """Numbers of the keyframes put aside for being out of sight."""
         return set(range(len(self))) - self.active - self.spare
 
+    def alike(self, share: float, degrees: float) -> set[int]:
+        """Numbers of the keyframes that saw about what the newest sees: cameras and the middles of what they saw are
+        nearer than this share of the mean of both median depths, and directions differ by fewer degrees."""
+        directions = self._middles - self._cameras
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+        apart = np.maximum(*(np.linalg.norm(at - at[-1], axis=1) for at in (self._middles, self._cameras)))
+        near = apart < share * 0.5 * (self._depths + self._depths[-1])
+        return set(np.flatnonzero(near & (directions @ directions[-1] > np.cos(np.radians(degrees)))).tolist())
+
+    def visits(self, old: int) -> tuple[set[int], set[int]]:
+        """Those that look where the newest or keyframe `old` looks: of the first visit and of the one now, which are
+        parted halfway between the two."""
+        there = set(np.flatnonzero(self._near(-1) | self._near(old)).tolist())
+        first = {k for k in there if k <= (old + len(self) - 1) // 2}
+        return first, there - first
+
     def _take_back(self, numbers: set[int]) -> None:
         self.active |= numbers
         self.spare -= numbers

@@ -92,15 +92,21 @@ class PoseGraph:
             self._tree = OdometryTree.root()
         return len(self.poses) - 1
 
-    def add_odometry(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> None:
+    def add_odometry(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray, found: bool = False) -> None:
         """The motion from an earlier node i to the newest node j. It is never doubted.
+
+        Args:
+            found: the camera was lost on the way, and found at node i.
 
         Raises:
             ValueError: j is not the newest node, has odometry already, or i is not before it.
         """
         if j != len(self.poses) - 1 or len(self._tree) != j or not 0 <= i < j:
             raise ValueError(f"odometry {i} to {j}: expected from an older node to the newest, which has none yet")
-        self._tree.add(i, np.array(T_i_j, float), odometry_covariance(T_i_j, information, self.settings))
+        s, covariance = self.settings, odometry_covariance(T_i_j, information, self.settings)
+        if found:
+            covariance += covariance_in_frame(_isotropic(s.found_translation, s.found_rotation_deg), T_i_j)
+        self._tree.add(i, np.array(T_i_j, float), covariance)
 
     def add_loop(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> int:
         """A closure between two nodes; returns its number. Whether it is believed, `optimise` decides.
@@ -112,6 +118,13 @@ class PoseGraph:
             raise ValueError(f"closure from {i} to {j}: expected two different ones of {len(self.poses)} nodes")
         self.loops.append(Link(i, j, np.array(T_i_j, float), closure_covariance(T_i_j, information, self.settings)))
         return len(self.loops) - 1
+
+    def discrepancy(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray) -> float:
+        """How far two nodes are from where a closure, taken as `add_loop` does, has them: the Mahalanobis length of
+        the motion between, in units of the limit that closures which agree stay below."""
+        twist = se3_log(T_i_j @ inverse(inverse(self.poses[i]) @ self.poses[j]))
+        squared = float(twist @ np.linalg.solve(closure_covariance(T_i_j, information, self.settings), twist))
+        return (squared / chi_squared_limit(self.settings.inlier_probability)) ** 0.5
 
     def optimise(self) -> GraphResult:
         """Judges all closures, also those rejected before, and moves the nodes to agree with the believed ones.

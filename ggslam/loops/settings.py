@@ -29,6 +29,11 @@ class GraphSettings:
     """Standard deviation of the translation per axis that is added to a closure's own."""
     loop_rotation_deg: float = setting(0.3, 1e-4, 90, "deg")
     """Standard deviation of the rotation per axis that is added to a closure's own."""
+    found_translation: float = setting(0.02, 1e-5, 10, "m")
+    """Standard deviation of the translation per axis that is added where a camera that was lost is found again: it is
+    located by one frame alone."""
+    found_rotation_deg: float = setting(0.7, 1e-4, 90, "deg")
+    """Standard deviation of the rotation per axis that is added there."""
     drift_probability: float = setting(0.999, 0.5, 1 - 1e-12)
     """A closure is dismissed when drift stays below its correction with this probability."""
     inlier_probability: float = setting(0.99, 0.5, 1 - 1e-12)

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ggslam.features.orb import Landmarks
-from ggslam.features.registration import Registration, pixels_of, register
+from ggslam.features.registration import Matches, Registration, pixels_of, register
 from ggslam.loops.settings import VerificationSettings
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
@@ -118,7 +118,14 @@ def verify(
         return _refusal(reason, registration)
     refined = align(registration.T_old_new)
     kept = registration.matches.agree(refined.T_world_camera, camera, settings.registration, slack=2.0)
-    agreeing = int((kept & registration.inliers).sum())
+    return _judge(old, new, registration, refined, int((kept & registration.inliers).sum()), sigma, settings)
+
+
+def _judge(
+    old: LocalMap, new: LocalMap, registration: Registration, refined: Refinement, agreeing: int,
+    sigma: Callable[[float], float], settings: VerificationSettings,
+) -> Verification:  # fmt: skip
+    """What the geometry says, `agreeing` of the inliers being where the refined pose has them."""
     depth = float(np.median(new.points[:, 2])) if len(new.points) else 0.0
     noise = sigma(depth)
     overlap = voxel_overlap(
@@ -133,6 +140,34 @@ def verify(
         not reason, reason, refined.T_world_camera, len(registration.matches), registration.count, agreeing,
         refined.overlap, refined.rmse, overlap, refined.information,
     )  # fmt: skip
+
+
+def verify_expected(
+    old: LocalMap,
+    new: LocalMap,
+    matches: Matches,
+    T_expected: np.ndarray,
+    camera: Camera,
+    sigma: Callable[[float], float],
+    align: Callable[[np.ndarray], Refinement],
+    settings: VerificationSettings,
+    min_witnesses: int,
+) -> Verification:
+    """As `verify`, where the motion T_old_new [4, 4] is known to about a hand's breadth. Then far fewer matches tell
+    that it is right: hardly any that are wrong agree with a given pose.
+
+    Args:
+        matches: of the landmarks.
+        T_expected: where the alignment starts.
+        min_witnesses: matches that have to agree with the refined pose.
+    """
+    refined = align(T_expected)
+    kept = matches.agree(refined.T_world_camera, camera, settings.registration, slack=2.0)
+    registration = Registration(T_expected, matches, kept)
+    if registration.count < min_witnesses:
+        reason = f"{registration.count} of {len(matches)} matches agree with the expected pose, {min_witnesses} needed"
+        return _refusal(reason, registration)
+    return _judge(old, new, registration, refined, registration.count, sigma, settings)
 
 
 def voxel_overlap(old: np.ndarray, new: np.ndarray, voxel: float) -> float:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 import pydantic
+from scipy.linalg import svd
 
 Number = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 Vector = tuple[Number, Number, Number]
@@ -39,13 +40,10 @@ def middle_of(points: np.ndarray, weights: np.ndarray) -> Vector:
 def oriented_box(points: np.ndarray) -> OrientedBox:
     """Box along the principal axes of points [M, 3], M >= 1, without the farthest (`TRIMMED`). Fewer than three points
     leave axes undetermined: these are chosen along the coordinates."""
-    from sklearn.decomposition import PCA  # slow to import
-
     inner = points[_inlier_mask(points)].astype(np.float64)
     axes = np.eye(3)
     if len(inner) >= 3:
-        with np.errstate(invalid="ignore"):  # points that are all one have no variance to share out
-            axes = PCA(3, svd_solver="full").fit(inner).components_
+        axes = svd(inner - inner.mean(0), full_matrices=False)[2]
     elif len(inner) == 2 and np.any(inner[1] != inner[0]):
         axes = np.linalg.qr(np.column_stack([inner[1] - inner[0], np.eye(3)]))[0].T
     # Signs are free: make each axis' largest part positive, and the three right-handed.

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.linalg import svd
 
 from ggslam.errors import RenderError, RunFolderError
 from ggslam.rendering.types import RenderBuffers
@@ -68,19 +69,23 @@ class IdentityColors:
     """
 
     def __init__(self, features: np.ndarray) -> None:
-        from sklearn.decomposition import PCA  # slow to import
-
         sample = features[:: max(1, len(features) // FITTED)]
         if len(sample) < 3:  # too few to have components
             sample = np.concatenate([sample, np.zeros((3, features.shape[1]), np.float32)])
-        with np.errstate(invalid="ignore"):  # vectors that are all one have no variance to share out
-            self._pca = PCA(min(3, *sample.shape), svd_solver="full").fit(sample)
-        self._low, self._high = np.percentile(self._pca.transform(sample), [1, 99], axis=0)
+        self._mean = sample.mean(0)
+        axes = svd(sample - self._mean, full_matrices=False)[2]
+        axes = axes * np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(1)])[:, None]  # signs are free
+        self._axes = axes[: min(3, *sample.shape)]
+        self._low, self._high = np.percentile(self._components(sample), [1, 99], axis=0)
+
+    def _components(self, vectors: np.ndarray) -> np.ndarray:
+        """Principal components [M, 3] of vectors [M, F]."""
+        return vectors @ self._axes.T - self._mean[None] @ self._axes.T
 
     def picture(self, features: np.ndarray, alpha: np.ndarray, min_alpha: float = 0.5) -> np.ndarray:
         """Colours uint8 [H, W, 3] of a rendered identity image [F, H, W]; black where alpha [H, W] is too low."""
         vectors = (features / np.maximum(alpha, 1e-3)).reshape(len(features), -1).T
-        level = (self._pca.transform(vectors) - self._low) / np.maximum(self._high - self._low, 1e-6)
+        level = (self._components(vectors) - self._low) / np.maximum(self._high - self._low, 1e-6)
         picture = np.zeros((*alpha.shape, 3), np.uint8)
         values = (255 * np.clip(level, 0, 1) + 0.5).astype(np.uint8).reshape(*alpha.shape, -1)
         picture[..., : values.shape[2]] = values

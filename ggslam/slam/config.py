@@ -19,7 +19,7 @@ import yaml
 from ggslam.errors import ConfigError
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.settings import MapperSettings
-from ggslam.slam.loop_closing import LoopSettings
+from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.object_masks import MaskSettings
 from ggslam.submaps.paging_settings import PagingSettings
 from ggslam.system.atomic import write_text

@@ -7,56 +7,30 @@ import threading
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ggslam.features.orb import FeatureView
-from ggslam.loops.activity import ActiveKeyframes, ActivitySettings
+from ggslam.loops.activity import ActiveKeyframes
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.loops.pose_graph import PoseGraph
-from ggslam.loops.settings import GraphSettings, PlaceSettings, VerificationSettings
+from ggslam.loops.revisits import Revisits
 from ggslam.loops.uncertainty import information_in_frame
-from ggslam.loops.verification import LocalMap, Verification, verify
+from ggslam.loops.verification import Verification
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, separation, transform_points
-from ggslam.system.settings import setting, settings_class
-from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
-from ggslam.tracking.points import FramePoints, PointSource
-from ggslam.tracking.settings import DepthNoise
+from ggslam.scene.poses import inverse, separation
+from ggslam.slam.loop_settings import LoopSettings
+from ggslam.slam.place_comparison import PlaceComparison
+from ggslam.tracking.gicp import AlignmentResult
+from ggslam.tracking.points import PointSource
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult
 
 _FIRM = 1e6 * np.eye(6)
 """Information of a motion that is sure to a millimetre and a milliradian."""
-
-
-@settings_class(frozen=True)
-class LoopSettings:
-    """When loops are looked for, and when they are believed."""
-
-    enabled: bool = setting(True, basic=True)
-    """Whether loops are closed and lost frames are looked up among all keyframes."""
-    candidates: int = setting(3, 1, 1000)
-    """Old keyframes that are tried for a new one, and for a frame that is lost, the likeliest first."""
-    confirmations: int = setting(2, 1, 100)
-    """A loop is closed when so many keyframes in a row have found the same correction."""
-    confirmation_gap: int = setting(5, 1, 10**6, "keyframes")
-    """In a row: no more than so many keyframes apart."""
-    agreement_m: float = setting(0.05, 0, 1e3, "m")
-    """Two corrections are the same if they move the camera to places nearer than this and within `agreement_deg`."""
-    agreement_deg: float = setting(2.0, 0, 180, "deg")
-    """Two corrections are the same if they turn the camera to directions nearer than this and within `agreement_m`."""
-    neighbourhood: int = setting(3, 0, 1000, "keyframes")
-    """Keyframes before and after an old one whose points make its local map."""
-    repair_iterations: int = setting(40, 0, 10**6)
-    """Optimisation steps after a closure, on the keyframes at both of its ends."""
-    activity: ActivitySettings = field(default_factory=ActivitySettings)
-    places: PlaceSettings = field(default_factory=PlaceSettings)
-    verification: VerificationSettings = field(default_factory=VerificationSettings)
-    graph: GraphSettings = field(default_factory=GraphSettings)
 
 
 @dataclass(frozen=True)
@@ -101,9 +75,11 @@ class Correction:
 
 @dataclass(frozen=True)
 class _Found:
-    """A verified loop: the newer keyframe, what moves it to where the older end has it, and where it was."""
+    """A verified loop: the newer keyframe, the older, what moves the newer to where the older has it, and where it
+    was."""
 
     keyframe: int
+    old_keyframe: int
     T_correction: np.ndarray
     T_world_camera: np.ndarray
 
@@ -133,7 +109,11 @@ class LoopCloser:
         self.activity = ActiveKeyframes(settings.activity)
         self.poses: list[np.ndarray] = []
         """T_world_camera of the keyframes as tracked and corrected (the mapper refines its own on top)."""
-        self._camera, self._surface, self._tracker, self._context = camera, surface, tracker, context
+        self.revisits = Revisits(settings.revisits)
+        self.comparison = PlaceComparison(
+            camera, settings.verification, settings.neighbourhood, surface, tracker, context
+        )
+        self._camera, self._surface, self._tracker = camera, surface, tracker
         self._verified: list[_Found] = []
         self._found_at: tuple[int, int] | None = None
         """Frame at which a lost camera was found, and the keyframe it was found at; until its first keyframe is in."""
@@ -194,56 +174,82 @@ class LoopCloser:
         """The new keyframe's node, tied to the one before it, or to where a lost camera was found again."""
         T, number = tracking.T_world_camera, len(self.poses)
         self.graph.add_node(T)
-        before = number - 1
-        if self._found_at is not None and not belated:
+        before, found = number - 1, self._found_at is not None and not belated
+        if self._found_at is not None and found:
             before, self._found_at = self._found_at[1], None
+        self.revisits.add(inverse(self.poses[before]) @ T if before >= 0 else np.eye(4))
         if before >= 0:
             T_before_world = inverse(self.poses[before])
             information = _FIRM  # without an alignment, what drift allows for is all that is unsure
             if tracking.alignment is not None:
                 information = information_in_frame(tracking.alignment.information, T_before_world)
-            self.graph.add_odometry(before, number, T_before_world @ T, information)
+            self.graph.add_odometry(before, number, T_before_world @ T, information, found)
 
     def _look_back(self, frame: Frame, place: Place, tracking: TrackingResult) -> Correction | None:
         number, s = len(self.poses) - 1, self.settings
         known = self.activity.active | self.activity.spare
-        if len(known) == len(self.poses):
-            return None  # everything is in view of the tracker: there is nothing to come back to
-        for match in self.places.query(place, s.candidates, known.__contains__):
-            found, _ = self._verify(tracking.points, place, match.number)
-            if not found.accepted:
+        waiting = self._correction_to_confirm()
+        if waiting is not None:  # the same correction is looked for at the same place
+            reach, T = s.confirmation_gap, waiting.T_correction @ self.poses[-1]
+            near = {k for k in range(number) if abs(k - waiting.old_keyframe) <= reach}
+            return self._revisit(frame, place, tracking, near, T)
+        if len(known) < len(self.poses):  # there is something to come back to
+            for match in self.places.query(place, s.candidates, known.__contains__):
+                found, _ = self._compare(tracking.points, place, match.number)
+                if found.accepted:
+                    return self._believe(frame, match.number, found)
                 if found.inliers >= s.verification.min_inliers:  # others were never likely
                     self.events.append(LoopEvent("refused", frame.index, number, match.number, found.reason))
+        chosen = known.intersection(self.revisits.candidates(tracking.median_depth_m).tolist())
+        chosen &= self.activity.alike(s.revisits.near, s.revisits.turned)
+        return self._revisit(frame, place, tracking, chosen, self.poses[-1])
+
+    def _believe(self, frame: Frame, old: int, found: Verification) -> Correction | None:
+        """A comparison with an old keyframe says that the newest lies elsewhere."""
+        number = len(self.poses) - 1
+        reason = f"{found.inliers} features, {found.overlap:.0%} of the voxels, RMSE {1e3 * found.rmse:.1f} mm"
+        self.events.append(LoopEvent("verified", frame.index, number, old, reason))
+        loop = self.graph.add_loop(old, number, found.T_old_new, found.information)
+        correction = self.poses[old] @ found.T_old_new @ inverse(self.poses[number])
+        self._verified.append(_Found(number, old, correction, self.poses[number]))
+        return self._close(frame, old, loop) if self._is_confirmed() else None
+
+    def _revisit(
+        self, frame: Frame, place: Place, tracking: TrackingResult, chosen: set[int], T_expected: np.ndarray
+    ) -> Correction | None:
+        """Compares the newest keyframe, expected at a pose [4, 4], with the likeliest of the old ones chosen."""
+        number = len(self.poses) - 1
+        for match in self.places.query(place, 1, lambda k: k not in chosen):
+            old, found = match.number, self._compare_expected(tracking.points, place, match.number, T_expected)
+            if not found.accepted:
+                self.revisits.pause()
                 continue
-            reason = f"{found.inliers} features, {found.overlap:.0%} of the voxels, RMSE {1e3 * found.rmse:.1f} mm"
-            self.events.append(LoopEvent("verified", frame.index, number, match.number, reason))
-            loop = self.graph.add_loop(match.number, number, found.T_old_new, found.information)
-            correction = self.poses[match.number] @ found.T_old_new @ inverse(self.poses[number])
-            self._verified.append(_Found(number, correction, self.poses[number]))
-            return self._close(frame, match.number, loop) if self._is_confirmed() else None
+            off = self.graph.discrepancy(old, number, found.T_old_new, found.information)
+            if off > 1:
+                return self._believe(frame, old, found)
+            self.events.append(LoopEvent("agreed", frame.index, number, old, f"{off:.2f} of what noise explains"))
+            self.graph.add_loop(old, number, found.T_old_new, found.information)
+            self.revisits.tie(old, number)
         return None
 
-    def _verify(
+    def _correction_to_confirm(self) -> _Found | None:
+        """A correction that waits to be confirmed."""
+        if self._verified and len(self.poses) - 1 - self._verified[-1].keyframe <= self.settings.confirmation_gap:
+            return self._verified[-1]
+        return None
+
+    def _compare_expected(self, source: PointSource, place: Place, old: int, T: np.ndarray) -> Verification:
+        """Compares the newest keyframe with an old one, expected at `T` [4, 4]."""
+        T_old_new, needed = inverse(self.poses[old]) @ T, self.settings.revisits.min_witnesses
+        matches = self.comparison.matches(place, self.places[old])
+        if self.comparison.count_agreeing(matches, T_old_new, slack=4) >= needed:
+            return self.comparison.confirm(source, place, self.places, self.poses, old, matches, T_old_new, needed)
+        return self._compare(source, place, old)[0]
+
+    def _compare(
         self, source: PointSource, place: Place, old: int
     ) -> tuple[Verification, AlignmentResult | None]:
-        """Whether a frame sees what keyframe `old` saw, and the last alignment to the surface there."""
-        points = source.read()
-        around = self._around(old)
-        T_world_old, last = self.poses[old], None
-        T_old_world = inverse(T_world_old)
-
-        def align_at(T_old_new: np.ndarray) -> AlignmentResult:
-            nonlocal last  # most candidates are refused before it comes to this: the target is gathered here
-            last = self._align(points, self._surface.of(around), T_world_old @ T_old_new)
-            information = information_in_frame(last.information, T_old_world)
-            return replace(last, T_world_camera=T_old_world @ last.T_world_camera, information=information)
-
-        surface = transform_points(self._surface.points(around), T_old_world)
-        found = verify(
-            LocalMap(self.places[old].landmarks, surface), LocalMap(place.landmarks, points.points),
-            self._camera, self._noise().sigma, align_at, self.settings.verification,
-        )  # fmt: skip
-        return found, last
+        return self.comparison.find(source, place, self.places, self.poses, old)
 
     def _is_confirmed(self) -> bool:
         """Whether the last loops found agree on the correction."""
@@ -263,14 +269,18 @@ class LoopCloser:
             reason = f"the pose graph does not believe it: {result.rejected[loop]}"
             self.events.append(LoopEvent("refused", frame.index, number, old, reason))
             self.graph.poses = list(before)
+            self.revisits.pause()
             return None
         poses = result.poses
         T_new_old = poses @ inverse(np.array(self.poses))
         kept, doubted = self.activity.inactive(), self.activity.active | self.activity.spare
+        if old in doubted:
+            kept, doubted = self.activity.visits(old)
         moved = float(np.linalg.norm(poses[-1][:3, 3] - self.poses[-1][:3, 3]))
         reason = f"{len(result.accepted)} of {len(self.graph.loops)} closures believed, {result.seconds:.2f} s"
         self.events.append(LoopEvent("closed", frame.index, number, old, reason, moved))
         self.activity.activate_around(old)
+        self.revisits.tie(old, number)
         return Correction(poses, T_new_old, kept, doubted, set(self.activity.active))
 
     # --- lost frames -------------------------------------------------------------------------------------------------
@@ -293,7 +303,7 @@ class LoopCloser:
         view = FeatureView(frame.color, frame.depth, lost.T_world_camera)
         place = self.places.describe(view)
         for match in self.places.query(place, self.settings.candidates):
-            found, alignment = self._verify(lost.points, place, match.number)
+            found, alignment = self._compare(lost.points, place, match.number)
             if not found.accepted or alignment is None:
                 continue
             old = match.number
@@ -324,6 +334,7 @@ class LoopCloser:
         self.places = PlaceIndex.from_arrays(self._camera, places, self.settings.places)
         for number, (T, depth) in enumerate(zip(arrays["poses"], arrays["median_depths"], strict=True)):
             self.graph.add_node(T)
+            self.revisits.add(inverse(self.poses[-1]) @ T if number else np.eye(4))
             if number:
                 self.graph.add_odometry(number - 1, number, inverse(self.poses[-1]) @ T, _FIRM)
             self.poses.append(T.astype(float))
@@ -331,15 +342,3 @@ class LoopCloser:
         if not len(self.poses) == len(self.places) == len(self._surface):
             raise ValueError("places, poses and surfaces are not of the same keyframes")
         self.activity.active = set()
-
-    # --- parts -------------------------------------------------------------------------------------------------------
-
-    def _around(self, number: int) -> list[int]:
-        reach = self.settings.neighbourhood
-        return list(range(max(0, number - reach), min(len(self.poses), number + reach + 1)))
-
-    def _noise(self) -> DepthNoise:
-        return self._tracker.noise or DepthNoise()
-
-    def _align(self, points: FramePoints, target: GicpTarget, guess: np.ndarray) -> AlignmentResult:
-        return align(points, target, guess, self._tracker.settings.align, self._noise(), self._context)

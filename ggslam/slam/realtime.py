@@ -76,6 +76,7 @@ class RealtimeSlam:
     def _step(self, frame: Frame) -> StepReport:
         slam, start = self.slam, time.perf_counter()
         slam.times.start()
+        frame = slam.receive(frame)
         with self._beside_mapper:
             tracking = slam.track(frame)
         is_keyframe = self._jobs.qsize() < MAX_WAITING and slam.wants_keyframe(frame, tracking)

@@ -21,6 +21,7 @@ from ggslam.loops.condensed import Link
 from ggslam.loops.odometry import OdometryTree
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.loops.pose_graph import PoseGraph
+from ggslam.loops.revisits import Revisits
 from ggslam.mapping.class_numbers import ClassNumbers
 from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.exposure import ExposureAdam
@@ -41,6 +42,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config
+from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.loop_closing import LoopCloser, LoopEvent, _Found
 from ggslam.slam.map_corrections import MapCorrections
@@ -195,7 +197,7 @@ RULES: Rules = {
     FeatureMap: _but("settings", "_shift", "_mask", "_corners", "_ones", "_isotropic"),
     # loops
     LoopCloser: _but(
-        "settings", "_camera", "_surface", "_tracker", "_context", "_lock", "_helper", "_begun",
+        "settings", "comparison", "_camera", "_surface", "_tracker", "_lock", "_helper", "_begun",
         growing=_names("events"),
     ),
     PoseGraph: _but("settings", growing=_names("loops")),
@@ -205,6 +207,7 @@ RULES: Rules = {
         growing=_names("_places"), after=PlaceIndex.list_again,
     ),
     ActiveKeyframes: _but("settings"),
+    Revisits: _but("settings"),
     # mapping
     CpuMapper: _but("settings", "residency", "extra_loss", "_rasterizer", "_loss", "_standard_adam"),
     GaussianMap: Rule(save=_save_map, take=_take_map),
@@ -214,10 +217,10 @@ RULES: Rules = {
     NeighbourIndex: Rule(save=_save_index, take=_take_index),
     # plain values
     **dict.fromkeys(
-        (Camera, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link,
-         Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable,
-         ClassNumbers, IdentityClassifier, LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence,
-         _Pair, Fragment, FragmentMemory),
+        (Camera, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame, StepLog, LoopEvent,
+         _Found, Link, Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes,
+         CpuClassTable, ClassNumbers, IdentityClassifier, LearnedObjects, Observation, Associator, ConsistencyJudge,
+         PairEvidence, _Pair, Fragment, FragmentMemory),
         Rule(),
     ),
 }  # fmt: skip

@@ -28,6 +28,7 @@ from ggslam.scene.frame_checks import check_frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.slam.config import REFINE_SHARE, Config
+from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.parts import device_name, make_parts
@@ -94,6 +95,7 @@ class Slam:
         self._moves_followed = 0
         self._noise: DepthNoise | None = None
         self._objects = RunObjects(self.masks)
+        self._depth_edges = DepthEdges()
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
         """Starts in a map made before; `surface` and `loops` hold its keyframes already. The camera counts as lost
@@ -128,6 +130,7 @@ class Slam:
         """
         start = time.perf_counter()
         self.times.start()
+        frame = self.receive(frame)
         tracking = self.track(frame)
         is_keyframe = self.wants_keyframe(frame, tracking)
         if is_keyframe:
@@ -228,6 +231,15 @@ class Slam:
             self.pager.close()
 
     # --- its parts, also used by the real-time loop ------------------------------------------------------------------
+
+    def receive(self, frame: Frame) -> Frame:
+        """The frame as the run uses it: without depth that hangs between two surfaces.
+
+        Raises:
+            SequenceError: the frame is of another camera, or not what `Frame` says.
+        """
+        check_frame(frame, self.camera)
+        return self._depth_edges.clean(frame)
 
     def track(self, frame: Frame) -> TrackingResult:
         """Locates one frame against the current target; a lost one is looked up among all keyframes.

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -21,16 +22,18 @@ COMMANDS = {"pip install", "ggslam ", "run --", "limit a run", "--device cuda", 
 EDITS = {"move", "duplicate", "merge", "rename", "remove", "keep", "recolor"}
 
 
+@lru_cache(maxsize=1)
 def messages() -> list[tuple[str, str]]:
     """Strings of the library that are no docstrings, with where they stand."""
     found = []
     for path in sorted(ROOT.rglob("*.py")):
         if path.relative_to(ROOT).parts[0] == "cli":
             continue
-        tree = ast.parse(path.read_text())
-        documents = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documents:
+        documents = set()  # the walk comes to statements before their parts
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Expr):
+                documents.add(id(node.value))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documents:
                 found.append((node.value, f"{path.relative_to(ROOT)}:{node.lineno}"))
     return found
 

@@ -46,7 +46,7 @@ def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder of the generated room."""
     out = tmp_path_factory.mktemp("runs") / "room"
     with points_in_voxels_of(0.01):  # as users have it
-        done = ggslam("run", room, "--out", out, "--refine", 20, "--threads", 2)
+        done = ggslam("run", room, "--scale", 0.5, "--out", out, "--refine", 20, "--threads", 2)
     assert done.returncode == 0, done.stderr
     return out
 
@@ -106,7 +106,7 @@ def test_held_out_frames_are_never_keyframes(finished: Path) -> None:
 
 @pytest.mark.long("a whole run, to the bit: every stage has to take part")
 def test_the_same_run_again_is_the_same_to_the_bit(finished: Path, room: Path, tmp_path: Path) -> None:
-    done = ggslam("run", room, "--out", tmp_path / "again", "--refine", 20, "--no-eval", "--threads", 1)
+    done = ggslam("run", room, "--scale", 0.5, "--out", tmp_path / "again", "--refine", 20, "--no-eval", "--threads", 1)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "again" / "map.ply").read_bytes() == (finished / "map.ply").read_bytes()
     assert (tmp_path / "again" / "trajectory.txt").read_bytes() == (finished / "trajectory.txt").read_bytes()
@@ -134,12 +134,13 @@ def test_eval_render_export(finished: Path, tmp_path: Path) -> None:
 
 @pytest.mark.long("runs as long as the recording lasts")
 def test_realtime_keeps_pace(room: Path, tmp_path: Path) -> None:
-    done = ggslam("run", room, "--out", tmp_path / "run", "--realtime", 6, "--stop", 14, "--no-eval")
+    done = ggslam("run", room, "--out", tmp_path / "run", "--scale", 0.5, "--realtime", 12, "--stop", 14,
+                  "--no-eval")  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert ggslam("eval", tmp_path / "run", "--no-lpips", "--every", 4).returncode == 0
     m = json.loads((tmp_path / "run" / "metrics.json").read_text())
     frames = json.loads((tmp_path / "run" / "keyframes.json").read_text())["frames"]
-    assert m["speed"]["frames_per_s"] < 8
+    assert m["speed"]["frames_per_s"] < 16
     assert len(frames) + m["speed"]["dropped_frames"] == 14
     assert m["images"]["held_out"]["psnr"] > 20
 
@@ -194,7 +195,7 @@ def test_truncated_png_stops_the_run_but_keeps_what_was_done(room: Path, tmp_pat
     folder = copy_of(room, tmp_path / "room")
     victim = depth_files(folder)[10]
     victim.write_bytes(victim.read_bytes()[:-200])
-    few = ["--iterations", 1]
+    few = ["--iterations", 1, "--scale", 0.5]
     refuse(ggslam("run", folder, "--out", tmp_path / "run", *few), victim.name)
     assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == 10
     assert json.loads((tmp_path / "run" / "run.json").read_text())["complete"] is False
@@ -268,7 +269,7 @@ def test_a_stopped_run_can_be_scored(room: Path, tmp_path: Path) -> None:
     folder = copy_of(room, tmp_path / "room")
     victim = depth_files(folder)[8]
     victim.write_bytes(victim.read_bytes()[:-200])
-    refuse(ggslam("run", folder, "--out", tmp_path / "run", "--iterations", 1), victim.name)
+    refuse(ggslam("run", folder, "--out", tmp_path / "run", "--iterations", 1, "--scale", 0.5), victim.name)
     done = ggslam("eval", tmp_path / "run", "--no-lpips")
     assert done.returncode == 0, done.stderr
     m = json.loads((tmp_path / "run" / "metrics.json").read_text())
@@ -277,7 +278,7 @@ def test_a_stopped_run_can_be_scored(room: Path, tmp_path: Path) -> None:
 
 
 def test_other_shares_of_held_out_frames(room: Path, tmp_path: Path) -> None:
-    done = ggslam("run", room, "--out", tmp_path / "run", "--stop", 9, "--iterations", 1, "--no-loops",
+    done = ggslam("run", room, "--out", tmp_path / "run", "--scale", 0.5, "--stop", 9, "--iterations", 1, "--no-loops",
                   "--set", "evaluation.held_out_every=4")  # fmt: skip
     assert done.returncode == 0, done.stderr
     m = json.loads((tmp_path / "run" / "metrics.json").read_text())

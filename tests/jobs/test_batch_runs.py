@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import succeed
 
 from ggslam.errors import ConfigError
 from ggslam.jobs.batch.batch import run_batch
@@ -45,10 +46,7 @@ def test_runs_are_made_once_and_what_fails_is_said(batch: Manifest) -> None:
     assert "first | default | 1" in (batch.out / "table.md").read_text()
     run, before = batch.out / "runs/first/default/seed0", time.time_ns()
     alone = batch.out.parent / "alone"
-    subprocess.run(
-        [sys.executable, "-m", "ggslam", "run", *batch.jobs[0].words, "--out", str(alone), "--no-eval"],
-        env=os.environ | {"OMP_NUM_THREADS": "1"}, check=True, capture_output=True,
-    )  # fmt: skip
+    succeed("run", *batch.jobs[0].words, "--out", alone, "--no-eval")
     for name in ("map.ply", "trajectory.txt"):
         assert (run / name).read_bytes() == (alone / name).read_bytes()
 

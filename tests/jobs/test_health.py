@@ -114,7 +114,7 @@ def test_time_that_goes_back_or_jumps() -> None:
 @pytest.fixture(scope="module")
 def well(room: Path, tmp_path_factory: pytest.TempPathFactory) -> SlamResult:
     out = tmp_path_factory.mktemp("well")
-    outcome = execute(RunRequest(SequenceRequest(room), out=out / "run", overrides=FAST, evaluate=False))
+    outcome = execute(RunRequest(SequenceRequest(room, scale=0.5), out=out / "run", overrides=FAST, evaluate=False))
     assert outcome.verdicts == [] and outcome.folder.mark().verdicts == []
     return outcome.result
 
@@ -185,7 +185,7 @@ STEPS = ["mapping.iterations_per_frame=8"]
 @pytest.fixture(scope="module")
 def scores_of_the_room(room: Path, tmp_path_factory: pytest.TempPathFactory) -> ImageScoresRecord:
     out = tmp_path_factory.mktemp("scored") / "run"
-    outcome = execute(RunRequest(SequenceRequest(room), out=out, overrides=STEPS))
+    outcome = execute(RunRequest(SequenceRequest(room, scale=0.5), out=out, overrides=STEPS))
     assert outcome.verdicts == [] and outcome.metrics is not None and outcome.metrics.images.all is not None
     assert all((k.exposure == [1.0, 0.0]).all() for k in outcome.result.keyframes)
     return outcome.metrics.images.all
@@ -202,7 +202,8 @@ def test_changes_of_exposure_are_compensated(
     more: list[str],
 ) -> None:  # fmt: skip
     recording = dimmed(room, tmp_path / "recording", gain)
-    outcome = execute(RunRequest(SequenceRequest(recording), out=tmp_path / "run", overrides=[*STEPS, *more]))
+    dimmed_request = SequenceRequest(recording, scale=0.5)
+    outcome = execute(RunRequest(dimmed_request, out=tmp_path / "run", overrides=[*STEPS, *more]))
     assert [verdict.code for verdict in outcome.verdicts] == ["exposure"]
     assert outcome.metrics is not None and outcome.metrics.images.all is not None
     dim, well = outcome.metrics.images.all, scores_of_the_room

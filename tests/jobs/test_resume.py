@@ -70,10 +70,8 @@ class KillAt(SilentObserver):
 
 
 def request(room: Path, out: Path, every: int | None = 3, **more: Any) -> RunRequest:
-    settings = [*FEW, REFINE]
-    return RunRequest(
-        SequenceRequest(room, stop=14), out, overrides=settings, checkpoint_every=every, **{"evaluate": False, **more}
-    )
+    settings, sequence = [*FEW, REFINE], SequenceRequest(room, stop=14, scale=0.5)
+    return RunRequest(sequence, out, overrides=settings, checkpoint_every=every, **{"evaluate": False, **more})
 
 
 @pytest.fixture(scope="module")
@@ -357,7 +355,8 @@ def test_two_runs_into_one_folder(room: Path, cut: Path, tmp_path: Path) -> None
 @pytest.mark.long("a process of its own, killed by the system's signal")
 def test_a_real_kill(room: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    words = ["run", room, "--out", out, "--stop", 14, "--no-eval", "--checkpoint-every", 1]
+    words = ["run", room, "--out", out, "--stop", 14, "--scale", 0.5, "--no-eval",
+             "--checkpoint-every", 1]  # fmt: skip
     settings = [word for setting in (*FEW, REFINE) for word in ("--set", setting)]
     process = subprocess.Popen([sys.executable, "-m", "ggslam", *map(str, words), *settings])
     deadline = time.monotonic() + 120

@@ -13,6 +13,7 @@ import struct
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -23,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from ggslam.scene.camera import Camera
 from ggslam.synthetic.raycast import RayCaster
 from ggslam.synthetic.room import furnished_room
+from ggslam.synthetic.scene import Scene
 from ggslam.synthetic.trajectory import camera_path
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -63,21 +65,27 @@ def phone_frames(
         color_later: colour is taken so many frames later than depth and pose.
         focal: focal length in widths of the image.
     """
-    scene = furnished_room(0)
+    scene, caster = _furnished()
     poses = camera_path(scene, frames, "loop", 0)
-    caster = RayCaster(scene, 0)
     camera = Camera(*size, focal * size[0], focal * size[0], size[0] / 2 + 1.25, size[1] / 2 - 2.5)
     small = camera.resize(*depth_size)
     taken = []
     for i in range(count):
-        seen = caster.render(small, poses[i])
+        depth, _ = caster.measure(small, poses[i])
         later = poses[i] if not color_later else _between(poses, i + color_later)
         color = caster.render(camera, later).color
-        confidence = np.full(seen.depth.shape, 2, np.uint8)
-        confidence[seen.depth > 4] = 1
+        confidence = np.full(depth.shape, 2, np.uint8)
+        confidence[depth > 4] = 1
         confidence[:, :2] = 0
-        taken.append(PhoneFrame(7000 + i / 60, color, seen.depth.astype(np.float32), confidence, camera, poses[i]))
+        taken.append(PhoneFrame(7000 + i / 60, color, depth.astype(np.float32), confidence, camera, poses[i]))
     return taken
+
+
+@cache
+def _furnished() -> tuple[Scene, RayCaster]:
+    """The room, furnished once."""
+    scene = furnished_room(0)
+    return scene, RayCaster(scene, 0)
 
 
 def _between(poses: np.ndarray, at: float) -> np.ndarray:

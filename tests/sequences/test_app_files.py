@@ -27,8 +27,8 @@ from ggslam.sequences.pose_doubts import doubt_poses, pairs_apart
 
 @pytest.fixture(scope="module")
 def frames() -> list[PhoneFrame]:
-    """Colour of a fourth of a phone's size; the walk turns by a degree a frame."""
-    return phone_frames(10, (480, 360), (256, 192), frames=240)
+    """Colour of a sixth of a phone's size; the walk turns by a degree a frame."""
+    return phone_frames(10, (320, 240), (256, 192), frames=240)
 
 
 def assert_true(sequence: Sequence, frames: list[PhoneFrame]) -> None:

@@ -13,7 +13,7 @@ from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam
 from ggslam.tracking.residual_noise import ResidualNoise
 
-SETTINGS = ["device=cuda", "mapping.iterations_per_frame=2", "mapping.first_frame_iterations=4", "identity.every=1",
+SETTINGS = ["device=cuda", "mapping.iterations_per_frame=1", "mapping.first_frame_iterations=2", "identity.every=1",
             "identity.pixels=128", "identity.neighbours.samples=20", "identity.neighbours.every=2",
             "identity.final_passes=1", "evaluation.held_out_every=0", "keyframes.max_gap=3"]  # fmt: skip
 

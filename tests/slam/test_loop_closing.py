@@ -18,6 +18,7 @@ from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.jobs.edit.edits import Edit, edit_run
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
 from ggslam.loops.activity import ActivitySettings
+from ggslam.loops.revisits import RevisitSettings
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
@@ -27,7 +28,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import Config, load_config
-from ggslam.slam.loop_closing import LoopSettings
+from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.slam import Slam
 from ggslam.tracking.points import extract_points
 from ggslam.tracking.settings import DepthNoise
@@ -41,18 +42,23 @@ def frames(room: Path) -> list[Frame]:
     return list(open_sequence(room).stream())
 
 
-def drifting(frames: list[Frame], confirmations: int = 2, keyframes: int = 24) -> tuple[Slam, np.ndarray]:
-    """A camera goes through the room and back again, tracked with drift: 18 cm and 4 degrees in all. Whatever it
-    has not seen for a step is put aside. Gives the run up to a keyframe, which all frames are, and their true poses."""
-    loops = LoopSettings(
-        confirmations=confirmations, activity=ActivitySettings(forget_after=0.05, near=0.15, batch=1, spread=0)
-    )
+FORGETFUL = LoopSettings(activity=ActivitySettings(forget_after=0.05, near=0.15, batch=1, spread=0))
+"""Whatever the camera has not seen for a step is put aside."""
+IN_VIEW = LoopSettings(revisits=RevisitSettings(gap=4, least_way=0.1), repair_iterations=5)
+"""Nothing is put aside in a room as small as this."""
+
+
+def drifting(
+    frames: list[Frame], loops: LoopSettings = FORGETFUL, keyframes: int = 24, drift: float = 1.0
+) -> tuple[Slam, np.ndarray]:
+    """A camera goes through the room and back again, tracked with drift: 18 cm and 4 degrees in all. Gives the run up
+    to a keyframe, which all frames are, and their true poses."""
     config = dataclasses.replace(load_config(None, CHEAP), loops=loops)
     slam = Slam(frames[0].camera, config, has_masks=False)
     slam.tracker.noise = DepthNoise()
     order = [*range(0, 24, 2), *range(22, -1, -2)]
     truth = [inverse(frames[0].T_world_camera) @ frames[i].T_world_camera for i in order]
-    step = se3_exp(np.array([0.15, 0.06, -0.09, 0.0, np.radians(4), 0.0]) / len(order))
+    step = se3_exp(drift * np.array([0.15, 0.06, -0.09, 0.0, np.radians(4), 0.0]) / len(order))
     assert slam.loops is not None
     for k, i in enumerate(order[:keyframes]):
         slam._follow_moves()
@@ -73,7 +79,7 @@ def closing(frames: list[Frame]) -> tuple[Slam, np.ndarray]:
 @pytest.fixture(scope="module")
 def unconfirmed(frames: list[Frame]) -> tuple[Slam, np.ndarray]:
     """The same one, which believes no sighting that is not confirmed by a hundred others."""
-    return drifting(frames, confirmations=100)
+    return drifting(frames, dataclasses.replace(FORGETFUL, confirmations=100))
 
 
 def error_of_keyframes(slam: Slam, truth: np.ndarray) -> float:
@@ -98,6 +104,23 @@ def test_a_loop_is_closed_and_everything_follows(
     assert np.abs(view.expected_depth.numpy() - last.depth_m())[seen].mean() < 0.05
     slam._follow_moves()  # the tracker hears of it with the next frame
     assert slam.moves_followed == len(closed) and slam.tracker.target is slam.surface.target
+
+
+def test_a_loop_within_the_view_is_closed(frames: list[Frame], unconfirmed: tuple[Slam, np.ndarray]) -> None:
+    (slam, truth), (unclosed, _) = drifting(frames, IN_VIEW), unconfirmed
+    assert slam.loops is not None and not slam.loops.activity.inactive()
+    kinds = [e.kind for e in slam.loops.events]
+    assert "closed" in kinds, [e.reason for e in slam.loops.events]
+    assert error_of_keyframes(slam, truth) < error_of_keyframes(unclosed, truth) / 3
+    for part, pose in zip(slam.surface.poses, slam.loops.poses, strict=True):
+        np.testing.assert_allclose(part, pose, atol=1e-9)
+
+
+def test_without_drift_old_keyframes_agree_and_nothing_moves(frames: list[Frame]) -> None:
+    slam, truth = drifting(frames, IN_VIEW, drift=0.0)
+    assert slam.loops is not None
+    assert {e.kind for e in slam.loops.events} == {"agreed"} and slam.corrections == 0
+    np.testing.assert_allclose(slam.loops.poses, truth, atol=1e-9)
 
 
 def test_one_sighting_alone_closes_nothing(unconfirmed: tuple[Slam, np.ndarray]) -> None:

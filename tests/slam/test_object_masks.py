@@ -32,14 +32,15 @@ FAST = ["mapping.iterations_per_frame=2", "mapping.first_frame_iterations=10"]
 
 
 def run(
-    recording: Path, out: Path, *overrides: str, masks: Path | None = None, stop: int | None = None
+    recording: Path, out: Path, *overrides: str, masks: Path | None = None, stop: int | None = None,
+    scale: float | None = None,
 ) -> RunOutcome:  # fmt: skip
-    request = SequenceRequest(recording, masks=masks, stop=stop)
+    request = SequenceRequest(recording, masks=masks, stop=stop, scale=scale)
     return execute(RunRequest(request, out, overrides=[*FAST, *overrides], evaluate=False))
 
 
 def scores(outcome: RunOutcome) -> MetricsRecord:
-    return score_run(outcome.folder, open_recording_of(outcome.folder), SilentObserver(), lpips=False)
+    return score_run(outcome.folder, open_recording_of(outcome.folder), SilentObserver(), lpips=False, every=4)
 
 
 def table(folder: Path) -> dict:
@@ -79,7 +80,7 @@ def test_shuffled_ids_become_objects(room: Path, tmp_path: Path) -> None:
     outcome = run(room, tmp_path / "run", masks=tmp_path / "masks")
     assert table(tmp_path / "run")["supervision"] == "associated masks"
     truth = open_recording_of(outcome.folder, masks=room / "masks")
-    metrics = score_run(outcome.folder, truth, SilentObserver(), lpips=False, masks=room / "masks")
+    metrics = score_run(outcome.folder, truth, SilentObserver(), lpips=False, every=2, masks=room / "masks")
     assert metrics.segmentation.matching == "assignment"
     assert metrics.segmentation.all.miou > 0.5  # by one-to-one matching; 24 small frames with large steps
     assert metrics.segmentation.all.accuracy > 0.7
@@ -112,7 +113,7 @@ def test_masks_of_any_kind_are_handled(room: Path, tmp_path: Path, kind: str) ->
         elif number % 2:
             continue
         cv2.imwrite(str(masks / path.name), mask)
-    run(room, tmp_path / "run", masks=masks, stop=12)
+    run(room, tmp_path / "run", masks=masks, stop=12, scale=0.5)
     if kind == "empty":
         assert not (tmp_path / "run" / "objects.json").exists()
         return

@@ -16,7 +16,7 @@ from ggslam.errors import ConfigError, FormatError
 from ggslam.loops.activity import ActivitySettings
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import Config, load_config
-from ggslam.slam.loop_closing import LoopSettings
+from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_state import describe_state, reason_against_saving, restore_state
 from ggslam.slam.slam import Slam

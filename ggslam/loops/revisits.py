@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which old keyframes a camera that stays in view of its map compares itself with.
+
+What the tracker aligns to holds old and new keyframes together, so that drift between them is not seen: the camera
+follows whatever lies nearest. It shows when a frame is compared with the old keyframes alone. How far a keyframe may
+have drifted from an old one goes with the way the camera went between them, less what was compared on it before: a
+comparison that found nothing wrong ties its two ends together.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.scene.poses import so3_log
+from ggslam.system.settings import setting, settings_class
+
+
+@settings_class(frozen=True)
+class RevisitSettings:
+    """When keyframes are compared with old ones that the tracker relies on as well."""
+
+    enabled: bool = setting(True)
+    """Whether they are."""
+    gap: int = setting(15, 1, 10**6, "keyframes")
+    """Old are those so many keyframes ago."""
+    least_way: float = setting(1.0, 0, 1e6)
+    """And those from which the camera has gone this many times the median depth since they were compared; a turn by
+    one radian counts as a metre."""
+    near: float = setting(0.6, 0, 1e3)
+    """And those that saw about the same: both cameras, and what lies in the middle of their images, are nearer than
+    this many times the mean of the median depths."""
+    turned: float = setting(40.0, 0, 180, "deg")
+    """And in about the same direction."""
+    rest: int = setting(0, 0, 10**6, "keyframes")
+    """After a comparison that failed, so many keyframes are compared with none."""
+    min_witnesses: int = setting(8, 3, 10**5)
+    """Feature matches that agree with a pose which is expected already: that of the tracker, or one moved by a
+    correction that waits to be confirmed."""
+
+
+class Revisits:
+    """Remembers how far the camera went, and which keyframes were compared.
+
+    Args:
+        settings: limits.
+    """
+
+    def __init__(self, settings: RevisitSettings | None = None) -> None:
+        self.settings = settings or RevisitSettings()
+        self._way: list[float] = []
+        """How far the camera had gone at each keyframe, metres."""
+        self._ties: list[tuple[int, int]] = []
+        """Keyframes that were compared, the older first."""
+        self._rests_until = 0
+
+    def add(self, T_before_new: np.ndarray) -> None:
+        """The next keyframe, after a motion [4, 4] since the one before it."""
+        turn = float(np.linalg.norm(so3_log(T_before_new[:3, :3])))
+        before = self._way[-1] if self._way else 0.0
+        self._way.append(before + float(np.linalg.norm(T_before_new[:3, 3])) + turn)
+
+    def tie(self, old: int, new: int) -> None:
+        """Two keyframes were compared, and lie right to each other now."""
+        self._ties.append((old, new))
+
+    def pause(self) -> None:
+        """The newest keyframe was compared in vain."""
+        self._rests_until = len(self._way) + self.settings.rest
+
+    def candidates(self, median_depth_m: float) -> np.ndarray:
+        """Numbers of the keyframes that the newest is worth to be compared with, rising."""
+        newest = len(self._way) - 1
+        old = newest + 1 - self.settings.gap
+        if not self.settings.enabled or newest < self._rests_until or old < 1:
+            return np.zeros(0, int)
+        way = np.array(self._way)
+        apart = way[newest] - way[:old]
+        if self._ties:
+            ends = np.array(self._ties)
+            over = np.abs(way[:old, None] - way[ends[:, 0]]) + (way[newest] - way[ends[:, 1]])
+            apart = np.minimum(apart, over.min(1))
+        return np.flatnonzero(apart >= self.settings.least_way * median_depth_m)
