@@ -40,7 +40,7 @@ class Ownership:
         found, where = np.unique(np.concatenate(keys), return_inverse=True)
         index = where.reshape(-1) * len(runs) + np.concatenate(owners)
         measured = np.bincount(index, np.concatenate(weights), len(found) * len(runs)).reshape(-1, len(runs))
-        self._owners = _smoothed(found, measured).argmax(1)
+        self._owners = _smooth(found, measured).argmax(1)
         self._tree = cKDTree(_centres(found, voxel)) if len(found) else None
 
     def of(self, points: np.ndarray) -> np.ndarray:
@@ -61,7 +61,7 @@ def _centres(keys: np.ndarray, voxel: float) -> np.ndarray:
     return (cells + 0.5) * voxel
 
 
-def _smoothed(keys: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _smooth(keys: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Sums [n, R] over each voxel (ascending keys [n]) and its 26 neighbours."""
     out = np.zeros_like(values)
     for x, y, z in product((-1, 0, 1), repeat=3):

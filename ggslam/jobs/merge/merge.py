@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field, replace
@@ -65,7 +66,8 @@ def merge_runs(
     """Merges finished runs into one, in the world of the first one.
 
     Args:
-        runs: folders of two runs or more. What the runs have in common is the first one's that has it.
+        runs: folders of two runs or more, or containers of them (`map.ggz`). What the runs have in common is the first
+            one's that has it.
         out: folder of the merged run.
         overwrite: replace a run that is already at `out`.
         settings: see there.
@@ -84,15 +86,16 @@ def merge_runs(
     if any(out.resolve() in (Path(run).resolve(), *Path(run).resolve().parents) for run in runs):
         raise ConfigError(f"`out` {out}: is one of the runs that are merged, or holds it; choose another folder")
     clock, context = _Clock(), NativeContext(None)
-    sources = read_sources([Path(run) for run in runs], context)
-    clock.lap("read")
-    folder = RunFolder.create(out, overwrite)
-    try:
-        with folder_lock(folder.path):
-            return _Merge(sources, folder, settings, observer or SilentObserver(), context, clock).run()
-    except BaseException:
-        folder.discard()
-        raise
+    with tempfile.TemporaryDirectory(prefix="ggslam-merge-") as unpacked:
+        sources = read_sources([Path(run) for run in runs], context, Path(unpacked))
+        clock.lap("read")
+        folder = RunFolder.create(out, overwrite)
+        try:
+            with folder_lock(folder.path):
+                return _Merge(sources, folder, settings, observer or SilentObserver(), context, clock).run()
+        except BaseException:
+            folder.discard()
+            raise
 
 
 class _Clock:
