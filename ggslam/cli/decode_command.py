@@ -20,12 +20,18 @@ EPILOG = """
   ggslam decode kitchen.bin corner.ply --box "0 0 0 1.5 1 2"
 
   ggslam decode kitchen.bin part.pcd --slice 2
+
+  ggslam decode kitchen.ggz runs/kitchen
 """
 
 
 def decode(
-    source: Annotated[Path, typer.Argument(metavar="STREAM", help="Stream of the first edition of G-PCC.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="PLY or PCD file to write; of Gaussians a 3DGS PLY.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="STREAM", help="Stream of the first edition of G-PCC, or the .ggz of a run.")
+    ],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="PLY or PCD file; of Gaussians a 3DGS PLY; of a .ggz a run folder.")
+    ],
     slice_id: Annotated[int | None, typer.Option("--slice", help="Decode this slice alone.", min=0)] = None,
     box: Annotated[
         str | None, typer.Option(help='Decode the points in a box alone: "x0 y0 z0 x1 y1 z1", metres.')
@@ -35,9 +41,22 @@ def decode(
     """Decode an MPEG G-PCC stream, or one slice or box of it."""
     from ggslam.jobs.code.coding import decode_file
 
+    if source.suffix.lower() == ".ggz":
+        _unpack(source, out, slice_id is not None or box is not None, threads)
+        return
     corners = None if box is None else _corners(box)
     done = decode_file(source, out, slice_id, corners, threads)
     console.print(f"wrote {done.path}: {done.count} {done.what}", highlight=False, markup=False)
+
+
+def _unpack(source: Path, out: Path, in_part: bool, threads: int | None) -> None:
+    """A run folder from a container."""
+    from ggslam.runs.map_container import read_container
+
+    if in_part:
+        raise ConfigError("--slice and --box are for streams; a .ggz is decoded as a whole")
+    folder = read_container(source, out, threads=threads)
+    console.print(f"wrote {folder.path}: a run of {folder.timing().gaussians} Gaussians", highlight=False, markup=False)
 
 
 def _corners(text: str) -> tuple[list[float], list[float]]:

@@ -26,6 +26,8 @@ EPILOG = """
 
   ggslam encode runs/kitchen kitchen_map.bin --preset splat --rate r03
 
+  ggslam encode runs/kitchen kitchen.ggz --slices 4
+
   ggslam encode runs/kitchen study/ --sweep both
 """
 
@@ -67,7 +69,12 @@ def encode(
     source: Annotated[
         Path, typer.Argument(metavar="INPUT", help="PLY, 3DGS PLY or PCD file, or folder that `ggslam run` wrote.")
     ],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Stream to write; with --sweep a folder.")],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT", help="Stream to write; a .ggz: of a run, with all that merging needs; with --sweep a folder."
+        ),
+    ],
     qp: Annotated[
         int, typer.Option(help="Quantiser of colours and reflectance; 6 more double the step.", min=4, max=51)
     ] = 22,
@@ -100,7 +107,8 @@ def encode(
     from ggslam.coding import CodecSettings
     from ggslam.jobs.code.coding import encode_file
 
-    _refuse_ignored(context, preset, sweep)
+    contained = out.suffix.lower() == ".ggz"
+    _refuse_ignored(context, Preset.splat if contained else preset, sweep)
     settings = CodecSettings(
         qp=qp, chroma_offset=chroma_offset, geometry_scale=geometry_scale, voxel_size=voxel, geometry_bits=bits,
         slices=slices, split="cube" if split is Split.by_octree else split.value, threads=threads,
@@ -108,11 +116,31 @@ def encode(
     if sweep is not None:
         _study(source, out, settings, ["qp", "geometry"] if sweep is Sweep.both else [sweep.value], plots)
         return
+    if contained:
+        _contain(source, out, settings, rate)
+        return
     done = encode_file(source, out, settings, preset.value, rate.value, ids)
     _print_report(done.report)
     for note in done.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
     console.print(f"wrote {done.path}", highlight=False, markup=False)
+
+
+def _contain(source: Path, out: Path, settings: CodecSettings, rate: Rate) -> None:
+    """A run in a container."""
+    from ggslam.runs.folder import RunFolder
+    from ggslam.runs.map_container import write_container
+
+    done = write_container(RunFolder.open(source), out, rate.value, settings)
+    total = out.stat().st_size
+    rows = [[name, str(size), f"{size / max(1, done.gaussians):.1f}"] for name, size in done.sizes.items()]
+    rows.append(["the file", str(total), f"{total / max(1, done.gaussians):.1f}"])
+    console.print(table("contained", ["member", "bytes", "bytes a Gaussian"], rows))
+    console.print(
+        f"{done.gaussians} Gaussians; the same files of the run take {done.run_bytes} bytes, "
+        f"{done.run_bytes / max(1, total):.1f} times as many", highlight=False,
+    )  # fmt: skip
+    console.print(f"wrote {out}", highlight=False, markup=False)
 
 
 def _refuse_ignored(context: typer.Context, preset: Preset, sweep: Sweep | None) -> None:

@@ -22,12 +22,17 @@ edit, export, encode, volumes and localize take it.
 
   ggslam merge runs/monday runs/tuesday --out runs/office
 
+  ggslam merge robot1.ggz robot2.ggz --out runs/hall
+
   ggslam merge runs/upstairs runs/stairs runs/downstairs --out runs/house --steps 600
 """
 
 
 def merge(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders that `ggslam run` wrote, two or more.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN...", help="Folders that `ggslam run` wrote, or .ggz files of such; two or more."),
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the merged run.")],
     steps: Annotated[
         int, typer.Option(help="Optimisation steps where the maps meet, if the recordings are there; 0: none.", min=0)

@@ -25,6 +25,8 @@ _LEVELS = (1 << VALUE_BITS) - 1
 RANGES = {"sh": (-4.0, 4.0), "opacity": (-7.0, 18.0), "scale": (-26.0, 4.0), "rotation": (-1.0, 1.0)}
 """Of SH coefficients, opacity logits, natural logarithms of scales, and components of unit quaternions."""
 _SH_CHROMA_OFFSET = 4
+BIRTH = "birth"
+"""Attribute: number of the keyframe that inserted a Gaussian, plus 1; 0: unknown."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +47,14 @@ RATES = {
 }
 
 
-def splat_attributes(gaussians: GaussianMap, with_ids: bool | None = None) -> dict[str, np.ndarray]:
+def splat_attributes(
+    gaussians: GaussianMap, with_ids: bool | None = None, births: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     """The parameters of a map as uint16 attributes of 12 bits, values outside their ranges clipped.
 
     "sh_0" ... "sh_15" [N, 3] by coefficient, "opacity" [N], "scale" [N, 3], "rotation" [N, 3] (x, y, z of the
     quaternion, whose sign is chosen so that w is not negative), "rotation_w" [N]; "object_id" [N] if any is set; of
-    parts of a map as `with_ids` says.
+    parts of a map as `with_ids` says; "birth" [N], one more than `births` (-1: unknown), where these are given.
     """
     quaternions = torch.nn.functional.normalize(gaussians.quaternions.detach(), dim=1).cpu().numpy()
     quaternions = np.where(quaternions[:, :1] < 0, -quaternions, quaternions)
@@ -65,6 +69,8 @@ def splat_attributes(gaussians: GaussianMap, with_ids: bool | None = None) -> di
         if object_id.min(initial=0) < 0 or object_id.max(initial=0) > 65535:
             raise ConfigError(f"object ids from {object_id.min()} to {object_id.max()}: expected 0 to 65535")
         out["object_id"] = object_id.astype(np.uint16)
+    if births is not None:
+        out[BIRTH] = (births.astype(np.int64) + 1).astype(np.uint16)
     return out
 
 
@@ -84,7 +90,7 @@ def splat_settings(settings: CodecSettings, rate: str, attributes: Mapping[str, 
     qps = RATES[rate]
     chosen = {}
     for name in attributes:
-        if name == "object_id":
+        if name in ("object_id", BIRTH):
             chosen[name] = AttributeSettings(lossless=True)
         elif name.startswith("sh_"):
             degree = int(np.sqrt(int(name[3:])))
@@ -128,6 +134,8 @@ def gaussians_of(cloud: PointCloud) -> GaussianMap:
         object_id=torch.from_numpy(values["object_id"].astype(np.int32)) if "object_id" in values else None,
     )  # fmt: skip
     out.sh[rows] = torch.stack([_values(values[name], "sh") for name in coefficients], 1)
+    if BIRTH in values:
+        out.birth_keyframe[rows] = torch.from_numpy(values[BIRTH].astype(np.int32) - 1)
     return out
 
 

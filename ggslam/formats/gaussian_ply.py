@@ -26,6 +26,8 @@ _COLORS = [f"f_dc_{i}" for i in range(3)]
 _SCALES, _ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
 _LARGEST_ID = 2**24
 """Up to here float32 holds whole numbers."""
+_BLOCK = 1 << 16
+"""Rows that are made at a time: a large map is not in memory twice."""
 _REQUIRED = [*_MEANS, *_COLORS, "opacity", *_SCALES, *_ROTATIONS]
 
 
@@ -69,29 +71,36 @@ def write_gaussian_parts(
     if unknown:
         raise InputError(f"unknown extra properties {sorted(unknown)}, expected some of {EXTRAS}")
     empty = GaussianMap(like.sh_degree, like.features.shape[1], with_moments=False)
-    rows = (_vertices(path, part, extra) for part in parts)
+    rows = (
+        _vertices(path, part, extra, slice(begin, min(begin + _BLOCK, len(part))))
+        for part in parts for begin in range(0, len(part), _BLOCK)
+    )  # fmt: skip
     write_ply_parts(path, "vertex", count, rows, _vertices(path, empty, extra).dtype, comments)
 
 
-def _vertices(path: str | Path, gaussians: GaussianMap, extra: Collection[str]) -> np.ndarray:
-    """The rows of a map as they are stored, a structured array [N]."""
-    count, rest = len(gaussians), gaussians.sh.shape[1] - 1
-    quaternions = torch.nn.functional.normalize(gaussians.quaternions, dim=1)
+def _vertices(
+    path: str | Path, gaussians: GaussianMap, extra: Collection[str], rows_of_map: slice = slice(0, 0)
+) -> np.ndarray:
+    """Rows of a map as they are stored, a structured array [n]."""
+    means, sh = gaussians.means[rows_of_map], gaussians.sh[rows_of_map]
+    count, rest = len(means), sh.shape[1] - 1
+    quaternions = torch.nn.functional.normalize(gaussians.quaternions[rows_of_map], dim=1)
     columns: dict[str, np.ndarray] = {}
-    _add(columns, _MEANS, gaussians.means)
+    _add(columns, _MEANS, means)
     _add(columns, _NORMALS, torch.zeros(count, 3))
-    _add(columns, _COLORS, gaussians.sh[:, 0])
-    channel_major = gaussians.sh[:, 1:].transpose(1, 2).reshape(count, 3 * rest)
+    _add(columns, _COLORS, sh[:, 0])
+    channel_major = sh[:, 1:].transpose(1, 2).reshape(count, 3 * rest)
     _add(columns, [f"f_rest_{i}" for i in range(3 * rest)], channel_major)
-    _add(columns, ["opacity"], gaussians.opacity_logits[:, None])
-    _add(columns, _SCALES, gaussians.log_scales)
+    _add(columns, ["opacity"], gaussians.opacity_logits[rows_of_map, None])
+    _add(columns, _SCALES, gaussians.log_scales[rows_of_map])
     _add(columns, _ROTATIONS, quaternions)
     if "object_id" in extra:
-        if count and int(gaussians.object_id.abs().max()) > _LARGEST_ID:
+        ids = gaussians.object_id[rows_of_map]
+        if count and int(ids.abs().max()) > _LARGEST_ID:
             raise FormatError(f"{path}: object ids are at most {_LARGEST_ID} in a PLY of Gaussians")
-        _add(columns, ["object_id"], gaussians.object_id[:, None].float())
+        _add(columns, ["object_id"], ids[:, None].float())
     if "identity" in extra:
-        _add(columns, [f"identity_{i}" for i in range(gaussians.features.shape[1])], gaussians.features)
+        _add(columns, [f"identity_{i}" for i in range(gaussians.features.shape[1])], gaussians.features[rows_of_map])
     rows = np.empty(count, [(name, column.dtype.str) for name, column in columns.items()])
     for name, column in columns.items():
         rows[name] = column

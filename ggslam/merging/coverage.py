@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one map shows where another one's keyframes look: what is double, and which keyframes are at the seam."""
+"""Which keyframes are at a seam: what their own map shows there another run's map shows, too."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
-from ggslam.merging.settings import DoubleSettings
+from ggslam.merging.settings import SeamSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import inverse, transform_points
+from ggslam.scene.poses import inverse
 
 _SEAM_WIDTH = 160
 """Pixels of the small pictures that seams are looked for in."""
@@ -42,22 +41,9 @@ class Coverage:
         context: threads.
     """
 
-    def __init__(self, settings: DoubleSettings, context: NativeContext) -> None:
+    def __init__(self, settings: SeamSettings, context: NativeContext) -> None:
         self._settings = settings
         self._rasterizer = CpuRasterizer(context=context)
-
-    def doubles(self, base: GaussianMap, run: PlacedRun) -> np.ndarray:
-        """Which of a run's Gaussians the map `base` makes needless, bool [N]: where the keyframe that inserted them
-        looks, it shows the same surface. A run that had begun with `base` would not have inserted them."""
-        double = np.zeros(len(run.gaussians), bool)
-        birth, means = run.gaussians.birth_keyframe.numpy(), run.gaussians.means.numpy()
-        for number, (T, camera) in enumerate(zip(run.T_world_camera, run.cameras, strict=True)):
-            rows = np.flatnonzero(birth == number)
-            if len(rows) and len(base):
-                alpha, depth = self._show(base, camera, T)
-                points = transform_points(means[rows].astype(float), inverse(T))
-                double[rows] = self._is_shown(points, camera, alpha, depth)
-        return double
 
     def shared_views(self, base: GaussianMap, run: PlacedRun) -> np.ndarray:
         """Share of each keyframe's view in which the run's map and another one show the same surface, [K]."""
@@ -77,22 +63,6 @@ class Coverage:
         view = self._rasterizer.forward(gaussians, camera, inverse(T_world_camera), features=False)
         return view.alpha.numpy().copy(), view.expected_depth.numpy().copy()
 
-    def _is_shown(self, points: np.ndarray, camera: Camera, alpha: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """Which points [n, 3] of the camera's frame lie on what is rendered, bool [n]."""
-        z = np.maximum(points[:, 2], 1e-6)
-        column = np.rint(camera.fx * points[:, 0] / z + camera.cx).astype(np.int64)
-        row = np.rint(camera.fy * points[:, 1] / z + camera.cy).astype(np.int64)
-        inside = (points[:, 2] > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        pixels = np.where(inside, row * camera.width + column, 0)
-        there = depth.reshape(-1)[pixels]
-        near = np.abs(there - points[:, 2]) <= self._tolerance(there)
-        return inside & near & (alpha.reshape(-1)[pixels] >= self._settings.alpha)
-
     def _tolerance(self, depth: np.ndarray) -> np.ndarray:
         s = self._settings
         return np.maximum(s.tolerance_m, s.tolerance_relative * depth)
-
-
-def without_rows(gaussians: GaussianMap, dropped: np.ndarray) -> int:
-    """Takes Gaussians (bool [N]) out of a map; returns how many that were."""
-    return gaussians.keep(torch.from_numpy(~dropped))

@@ -11,10 +11,10 @@ import torch
 
 from ggslam.errors import ConfigError
 from ggslam.mapping.votes import merge_votes
-from ggslam.merging.settings import UnitingSettings
-from ggslam.merging.uniting import LabelledVoxels, find_counterparts
 from ggslam.objects.encoding import code_of, with_class
+from ggslam.objects.settings import UnitingSettings
 from ggslam.objects.table import ObjectTable, Observation, Supervision
+from ggslam.objects.uniting import LabelledVoxels, find_counterparts
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
 

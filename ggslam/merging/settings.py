@@ -6,35 +6,22 @@ from __future__ import annotations
 from dataclasses import field
 
 from ggslam.loops.settings import GraphSettings, VerificationSettings
+from ggslam.objects.settings import UnitingSettings
 from ggslam.system.settings import setting, settings_class
 
 
 @settings_class(frozen=True)
-class UnitingSettings:
-    """When objects of two maps are one thing."""
+class SeamSettings:
+    """Where maps meet."""
 
-    voxel: float = setting(0.04, 1e-3, 10, "m")
-    """Edge of the voxels in which objects are compared."""
-    min_shared: int = setting(12, 1, 10**9)
-    """Voxels that two objects have in common at least."""
-    min_share: float = setting(0.08, 0, 1)
-    """Share of the smaller object's voxels that they have in common at least: things that only touch have less."""
-    min_overlap: float = setting(0.3, 0, 1)
-    """Of the voxels that both maps know and either object fills, so many are filled by both."""
-    min_contained: float = setting(0.6, 0, 1)
-    """Or so many of the voxels of the object that is smaller there, as long as `max_size_ratio` is kept."""
-    max_size_ratio: float = setting(4.0, 1, 1e6)
-    """A piece is the whole only if that is at most so many times larger: a cup on a table is no piece of it."""
-
-
-@settings_class(frozen=True)
-class DoubleSettings:
-    """What is double where two maps show the same surface."""
-
+    voxel: float = setting(0.1, 1e-3, 10, "m")
+    """Places of this size belong to one run each; in scenes of another size than a room's it goes with that."""
+    share: float = setting(0.1, 0, 1)
+    """A keyframe is at the seam if its own map and another one show the same surface in this share of its view."""
     alpha: float = setting(0.6, 0, 1)
-    """The map that stays has to be so opaque there."""
+    """Both maps have to be so opaque there."""
     tolerance_m: float = setting(0.05, 0, 1e3, "m")
-    """And its surface so near, in depth."""
+    """And their surfaces so near to each other, in depth."""
     tolerance_relative: float = setting(0.03, 0, 1)
     """As `tolerance_m`, a share of the depth; the larger of the two counts."""
 
@@ -51,11 +38,9 @@ class MergeSettings:
     """Keyframes before and after one that is tried whose points make its local map."""
     confirmations: int = setting(3, 1, 10**6)
     """Keyframes that have to agree on how two runs lie to each other."""
-    seam_share: float = setting(0.1, 0, 1)
-    """A keyframe is at the seam if another run's map covers this share of its view."""
     steps: int = setting(300, 0, 10**7)
     """Optimisation steps at the seams."""
     verification: VerificationSettings = field(default_factory=VerificationSettings)
     graph: GraphSettings = field(default_factory=GraphSettings)
     uniting: UnitingSettings = field(default_factory=UnitingSettings)
-    double: DoubleSettings = field(default_factory=DoubleSettings)
+    seams: SeamSettings = field(default_factory=SeamSettings)

@@ -122,6 +122,13 @@ class Associator:
             self.sightings[kept] = max(self.sightings.get(kept, 0), self.sightings.pop(dropped, 0))
         return result if self.uses_own_ids else replace(result, forgotten=self._forget(result.created))
 
+    def unite(self, kept: int, dropped: int) -> None:
+        """Two objects are one, as others found out: the map is relabelled by them."""
+        self._evidence.join(kept, dropped)
+        self._current[self._current == dropped] = kept
+        self._fragments.rename(kept, dropped)
+        self.sightings[kept] = max(self.sightings.get(kept, 0), self.sightings.pop(dropped, 0))
+
     def _forget(self, created: list[int]) -> list[int]:
         """Objects created long ago that no keyframe has found again."""
         self._keyframes += 1

@@ -79,7 +79,7 @@ class PairEvidence:
                 return done
             a, b = max(ripe, key=lambda key: (self._pairs[key].together - self._pairs[key].apart, key))
             kept, dropped = (a, b) if self._largest.get(a, 0) >= self._largest.get(b, 0) else (b, a)
-            self._join(kept, dropped)
+            self.join(kept, dropped)
             done.append((kept, dropped))
 
     def forget(self, object_ids: Collection[int]) -> None:
@@ -93,7 +93,8 @@ class PairEvidence:
         enough = pair.observations >= self._settings.merge_observations
         return enough and pair.together > self._settings.merge_ratio * pair.apart
 
-    def _join(self, kept: int, dropped: int) -> None:
+    def join(self, kept: int, dropped: int) -> None:
+        """What is known of one object is known of another one from now on."""
         self._largest[kept] = self._largest.get(kept, 0) + self._largest.pop(dropped, 0)
         for key in [key for key in self._pairs if dropped in key]:
             pair = self._pairs.pop(key)

@@ -82,3 +82,21 @@ class GeometricSettings:
     """Segments below this share of the image are joined to a neighbour on the same surface, or left unlabelled."""
     max_depth_m: float = setting(8.0, 0.05, 1e4, "m")
     """Farther measurements are left unlabelled."""
+
+
+@settings_class(frozen=True)
+class UnitingSettings:
+    """When objects of two maps, or of both ends of a loop, are one thing."""
+
+    voxel: float = setting(0.04, 1e-3, 10, "m")
+    """Edge of the voxels in which objects are compared."""
+    min_shared: int = setting(12, 1, 10**9)
+    """Voxels that two objects have in common at least."""
+    min_share: float = setting(0.08, 0, 1)
+    """Share of the smaller object's voxels that they have in common at least: things that only touch have less."""
+    min_overlap: float = setting(0.3, 0, 1)
+    """Of the voxels that both maps know and either object fills, so many are filled by both."""
+    min_contained: float = setting(0.6, 0, 1)
+    """Or so many of the voxels of the object that is smaller there, as long as `max_size_ratio` is kept."""
+    max_size_ratio: float = setting(4.0, 1, 1e6)
+    """A piece is the whole only if that is at most so many times larger: a cup on a table is no piece of it."""

@@ -88,8 +88,9 @@ def read_map(folder: RunFolder) -> tuple[GaussianMap, SegmentedMap | None]:
     gaussians = folder.gaussians(with_moments=True)
     birth = read_all_arrays(folder.path / PLACES_FILE, "the places of a run").get("birth")
     keyframes = len(folder.keyframes().keyframes)
-    fits = birth is not None and birth.shape == (len(gaussians),)
-    if not fits or not -1 <= birth.min(initial=-1) <= birth.max(initial=-1) < keyframes:
+    if birth is None or birth.shape != (len(gaussians),) or not (
+        -1 <= birth.min(initial=-1) <= birth.max(initial=-1) < keyframes
+    ):
         raise RunFolderError(f"{folder.path / PLACES_FILE}: not of this map, which has {len(gaussians)} Gaussians")
     gaussians.birth_keyframe[:] = torch.from_numpy(birth.astype(np.int32))
     if segmented is None:

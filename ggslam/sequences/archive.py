@@ -27,7 +27,7 @@ class Archive:
         self.path = path
         try:
             self._zip = zipfile.ZipFile(path)
-        except (OSError, zipfile.BadZipFile) as error:
+        except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError) as error:
             raise SequenceError(f"{path}: not a whole zip archive (truncated?): {error}") from None
         self.names = frozenset(self._zip.namelist())
 

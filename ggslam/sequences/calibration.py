@@ -30,6 +30,7 @@ from ggslam.sequences.recording import DepthCamera, Recording, read_text
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 
 MODELS = ("opencv", "fisheye")
+_LARGEST_NUMBER = 1e300
 FARTHEST_CENTRE = 100.0
 """Image sizes; no principal point, not even that of a picture cut out of a larger one, lies farther off."""
 
@@ -54,7 +55,7 @@ def number_entry(path: Path, settings: dict[str, Any], key: str) -> float:
     if key not in settings:
         raise SequenceError(f"{path}: entry '{key}' is missing")
     value = settings[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _LARGEST_NUMBER:
         raise SequenceError(f"{path}: expected a number for '{key}', found '{value}'")
     return float(value)
 
@@ -86,7 +87,7 @@ def distortion_entry(path: Path, settings: dict[str, Any]) -> tuple[np.ndarray |
     fisheye = model == "fisheye"
     counts = (4,) if fisheye else (4, 5, 8)
     values = distortion if isinstance(distortion, list) else []
-    if len(values) not in counts or not all(isinstance(v, (int, float)) and np.isfinite(v) for v in values):
+    if len(values) not in counts or not all(isinstance(v, (int, float)) and abs(v) < _LARGEST_NUMBER for v in values):
         wanted = "4" if fisheye else "4, 5 or 8"
         raise SequenceError(f"{path}: expected {wanted} numbers for 'distortion', found '{distortion}'")
     return np.array(values, float), fisheye

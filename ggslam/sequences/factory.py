@@ -131,7 +131,10 @@ def _read_recording(
     found = _find_format(folder, format)
     if folder.is_dir():
         refuse_links(folder, SequenceError, links=True)  # people share images between recordings by links
-    recording = found.read(folder, options)
+    try:
+        recording = found.read(folder, options)
+    except OSError as error:  # a name that no file can have, a folder that may not be read
+        raise SequenceError(f"{str(error.filename or folder)[:200]}: {error.strerror or error}") from None
     if not recording.files:
         raise SequenceError(f"{folder}: holds no frames")
     _check_places(recording)

@@ -9,8 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.mapping.mapper import Mapper
+from ggslam.objects.uniting import FAINT, LabelledVoxels
 from ggslam.slam.loop_closing import Correction, LoopCloser
 from ggslam.slam.map_paging import MapPager
+from ggslam.slam.object_masks import ObjectMasks
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import TrackingResult
@@ -23,10 +25,13 @@ class MapCorrections:
         surface: that frames are aligned to.
         mapper: whose map is corrected.
         pager: of the map; None: all of it is in memory.
+        masks: of objects; None: objects that both ends of a loop have mapped stay two.
     """
 
-    def __init__(self, surface: MeasuredSurface, mapper: Mapper, pager: MapPager | None) -> None:
-        self._surface, self._mapper, self._pager = surface, mapper, pager
+    def __init__(
+        self, surface: MeasuredSurface, mapper: Mapper, pager: MapPager | None, masks: ObjectMasks | None = None
+    ) -> None:
+        self._surface, self._mapper, self._pager, self._masks = surface, mapper, pager, masks
         self._moves: list[np.ndarray] = []
         self._publishing = threading.Lock()
 
@@ -52,7 +57,8 @@ class MapCorrections:
             self._surface.add(tracking.points, tracking.T_world_camera)
 
     def apply(self, correction: Correction, loops: LoopCloser) -> None:
-        """Moves the map after its keyframes, takes out what is double now, and trains both ends of the loop."""
+        """Moves the map after its keyframes, unites objects that both ends have mapped, takes out what is double now,
+        and trains both ends of the loop."""
         ends = correction.kept & correction.active
         self._mapper.move_keyframes(correction.T_new_old)
         if self._pager is not None:
@@ -61,4 +67,21 @@ class MapCorrections:
         with self._publishing:
             loops.settle(correction)
             self._moves.append(correction.T_new_old[-1])
+        self._unite_objects(correction)
         self._mapper.mend(sorted(ends), sorted(correction.doubted), loops.settings.repair_iterations)
+
+    def _unite_objects(self, correction: Correction) -> None:
+        """One thing that was mapped when the camera left and again when it came back has two ids: it keeps the older.
+        """
+        mapper, masks = self._mapper, self._masks
+        if masks is None or mapper.identity is None or not len(mapper.map):
+            return
+        gaussians = mapper.map
+        birth, opacities = gaussians.birth_keyframe.cpu().numpy(), gaussians.opacities.detach().cpu().numpy()
+        means, labels = gaussians.means.detach().cpu().numpy(), mapper.vote_labels().astype(np.int64)
+        voxels = []
+        for end in (correction.kept, correction.doubted):
+            rows = np.isin(birth, sorted(end)) & (opacities >= FAINT)
+            voxel = masks.settings.uniting.voxel
+            voxels.append(LabelledVoxels.of(means[rows], labels[rows], opacities[rows], voxel))
+        mapper.identity.merge(gaussians, masks.unite(voxels[0], voxels[1]))

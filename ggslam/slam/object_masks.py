@@ -19,8 +19,9 @@ from ggslam.objects.association import Associator, MapView
 from ggslam.objects.geometric_segmenter import GeometricSegmenter
 from ggslam.objects.onnx_segmenter import OnnxSegmenter, OnnxSegmenterSettings
 from ggslam.objects.segments import boundary_trust, clean_segments
-from ggslam.objects.settings import AssociationSettings, CleaningSettings, GeometricSettings
+from ggslam.objects.settings import AssociationSettings, CleaningSettings, GeometricSettings, UnitingSettings
 from ggslam.objects.table import Observation, Supervision
+from ggslam.objects.uniting import LabelledVoxels, find_counterparts
 from ggslam.scene.frame import Frame
 from ggslam.system.settings import Conflict, setting, settings_class
 
@@ -47,6 +48,7 @@ class MaskSettings:
     association: AssociationSettings = field(default_factory=AssociationSettings)
     geometry: GeometricSettings = field(default_factory=GeometricSettings)
     onnx: OnnxSegmenterSettings = field(default_factory=OnnxSegmenterSettings)
+    uniting: UnitingSettings = field(default_factory=UnitingSettings)
 
     def __post_init__(self) -> None:
         if self.source == "model" and not self.model:
@@ -128,6 +130,19 @@ class ObjectMasks:
         trusted = boundary_trust(found.ids, depth, self.settings.cleaning)
         mask = np.where(trusted, found.ids, 0).astype(np.uint16)
         return KeyframeLabels(mask, found.merges, found.splits, found.forgotten)
+
+    def unite(self, older: LabelledVoxels, newer: LabelledVoxels) -> list[tuple[int, int]]:
+        """Objects that both ends of a closed loop have mapped, (kept, dropped), the older end's being kept. An object
+        that is at the older end itself is not dropped. Ids that are constant in time need none of this."""
+        settings = self.settings.uniting
+        if self._associator.uses_own_ids is not False:
+            return []
+        there = np.bincount(older.labels, minlength=1 << 16) >= settings.min_shared
+        found = find_counterparts(older, newer, settings)
+        pairs = [(pair.first, pair.second) for pair in found if not there[pair.second]]
+        for kept, dropped in pairs:
+            self._associator.unite(kept, dropped)
+        return pairs
 
     def _rests(self, frame: Frame) -> bool:
         """Whether too few frames have passed since the last one that was segmented."""

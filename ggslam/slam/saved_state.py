@@ -182,7 +182,7 @@ RULES: Rules = {
     Slam: _but("camera", "config", "context", "pager", "_notes", "_on_device"),
     SlamTimes: _but("_started", growing=_names("tracking_by_frame"), after=_go_on),
     FramePoses: Rule(growing=_names("frames")),
-    MapCorrections: _but("_surface", "_mapper", "_pager", "_publishing"),
+    MapCorrections: _but("_surface", "_mapper", "_pager", "_masks", "_publishing"),
     RunObjects: _but("_masks"),
     ObjectMasks: _but("settings", "_segment"),
     # tracking

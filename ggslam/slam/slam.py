@@ -38,10 +38,15 @@ from ggslam.slam.saved_places import saved_places_to_bytes
 from ggslam.slam.shutter_times import ShutterTimes
 from ggslam.slam.step_log import StepLog
 from ggslam.submaps.gaussian_cells import GaussianCells
+from ggslam.system.process_memory import trim
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.scale import scale_settings, scene_scale
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
+
+_TRIM_EVERY = 8
+"""Keyframes: the C library keeps a fifth of a run's memory for itself that once held arrays; asking for it back takes
+milliseconds."""
 
 
 class Slam:
@@ -87,7 +92,7 @@ class Slam:
         self.steps = StepLog()
         self.growing = True
         """Whether keyframes are made and the map is trained; off: frames are located in the map as it is."""
-        self._corrections = MapCorrections(self.surface, self.mapper, self.pager)
+        self._corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
         self._moves_followed = 0
         self._noise: DepthNoise | None = None
         self._objects = RunObjects(self.masks)
@@ -135,6 +140,8 @@ class Slam:
                 self.loops.begin(frame)  # beside what the host waits for
             self.insert(frame, tracking, self.moves_followed)
             self.poses.add_keyframe(tracking.T_world_camera)
+            if len(self.mapper.keyframes) % _TRIM_EVERY == 0:
+                trim()
         self.poses.add(frame, tracking)
         if self.mapper.keyframes and self.growing:
             first = is_keyframe and len(self.mapper.keyframes) == 1

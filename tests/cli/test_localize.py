@@ -49,7 +49,8 @@ def one_error(result: Result, *words: str) -> None:
 @pytest.fixture(scope="module")
 def run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "room"
-    done("run", room, "--out", out, "--stop", 12, "--iterations", 1, "--set", "masks.source=none", "--no-eval")
+    done("run", room, "--out", out, "--stop", 12, "--iterations", 1, "--set", "masks.source=none", "--no-eval",
+         "--set", "mapping.first_frame_iterations=2")  # fmt: skip
     return out
 
 

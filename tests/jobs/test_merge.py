@@ -83,8 +83,8 @@ def test_the_merged_run_has_all_frames_in_one_world(halves: Halves) -> None:
 
 def test_what_both_maps_show_is_there_once(halves: Halves) -> None:
     counts = [len(run.gaussians()) for run in (halves.first, halves.second)]
-    assert halves.outcome.doubles[0] == 0 and halves.outcome.doubles[1] > 0.5 * counts[1]
-    assert len(halves.merged.gaussians()) <= sum(counts) - halves.outcome.doubles[1]
+    assert len(halves.merged.gaussians()) == sum(counts) - sum(halves.outcome.doubles)
+    assert max(counts) < len(halves.merged.gaussians()) < 0.8 * sum(counts)
     assert halves.outcome.trained > 0 and halves.outcome.steps == FAST.steps
 
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from ggslam.merging.objects import RunObjects, UnitedObjects
-from ggslam.merging.settings import UnitingSettings
-from ggslam.merging.uniting import LabelledVoxels, find_counterparts
 from ggslam.objects.encoding import code_of, with_class
+from ggslam.objects.settings import UnitingSettings
 from ggslam.objects.table import ObjectTable, Observation
+from ggslam.objects.uniting import LabelledVoxels, find_counterparts
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 

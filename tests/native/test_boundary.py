@@ -361,7 +361,7 @@ try:
     TsdfMap(TsdfSettings(voxel=0.01)).integrate(depth, Camera({camera}), pose_at(0))
 except GgslamError as error:
     print("refused:", error)
-OccupancyMap(0.01).insert_depth(depth, Camera({camera}), pose_at(0))
+OccupancyMap(0.003).insert_depth(depth, Camera({camera}), pose_at(0))
 """
     )
     assert said.count("refused") == 2 and reason in said, said

@@ -70,6 +70,14 @@ def test_record3d_other_damage(tmp_path: Path) -> None:
     assert "walk.r3d: not a whole zip archive (truncated?)" in message_of(path)
 
 
+def test_an_archive_of_a_later_version(tmp_path: Path) -> None:
+    path = make_record3d(tmp_path)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\x01\x02") + 6] = 127  # version that is needed to extract
+    path.write_bytes(bytes(content))
+    assert "walk.r3d: not a whole zip archive" in message_of(path) and "version 12.7" in message_of(path)
+
+
 def test_flipped_bits_inside_an_archive(tmp_path: Path) -> None:
     path = make_record3d(tmp_path)
     content = bytearray(path.read_bytes())

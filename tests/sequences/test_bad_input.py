@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from format_makers import make_icl_nuim, make_nerfcapture
 
 from ggslam.errors import SequenceError
 from ggslam.sequences import open_sequence
@@ -216,6 +218,7 @@ def test_seven_scenes_bad_pose(make: Make) -> None:
         ("[", "not YAML"),
         ("", "expected entries width"),
         ("width: 32\nheight: 24\nfx: wide\nfy: 3\ncx: 1\ncy: 1\n", "expected a number for 'fx', found 'wide'"),
+        (f"width: {'9' * 400}\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\n", "expected a number for 'width'"),
         ("width: 32\nheight: 24\nfx: -3\nfy: 3\ncx: 1\ncy: 1\n", "impossible camera"),
         ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1e7\ncy: 1\n", "impossible principal point 1e.07, 1 of"),
         ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\n", "entry 'depth_scale' is missing"),
@@ -234,6 +237,23 @@ def test_folder_pose_count(make: Make) -> None:
     (folder / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
     with pytest.raises(SequenceError, match=r"poses\.txt: expected 5 poses, one a frame, found 1"):
         open_sequence(folder)
+
+
+def test_icl_nuim_numbers_beyond_counting(tmp_path: Path) -> None:
+    path = make_icl_nuim(tmp_path) / "associations.txt"
+    first = path.read_text().splitlines()[0].split()
+    path.write_text(" ".join([first[0], first[1], "inf", *first[3:]]) + "\n")
+    with pytest.raises(SequenceError, match=r"associations\.txt, line 1: expected 'number"):
+        open_sequence(path.parent)
+
+
+def test_names_that_no_file_can_have(tmp_path: Path) -> None:
+    path = make_nerfcapture(tmp_path) / "transforms.json"
+    content = json.loads(path.read_text())
+    content["frames"][0]["file_path"] = "images/" + "9" * 300
+    path.write_text(json.dumps(content))
+    with pytest.raises(SequenceError, match="9999.*: File name too long"):
+        open_sequence(path.parent)
 
 
 def test_replica_bad_parameters(make: Make) -> None:

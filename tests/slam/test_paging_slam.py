@@ -33,7 +33,7 @@ from ggslam.submaps.grid import GridStore
 PLENTY = "memory_limit_mb=100000"
 SMALL = [PLENTY, "paging.budget_mb=3.0", "paging.cell=0.5", "paging.keep_radius=0.5", "paging.view_margin=1"]
 PLAIN = ["mapping.iterations_per_frame=1", "identity.enabled=false"]
-REFINED = "refine_iterations=60"
+REFINED = "refine_iterations=20"
 BEGINNING = 26
 """Frames until some of what was seen first is on disk, if the map may take..."""
 LESS = [*SMALL, "paging.budget_mb=1.5"]
@@ -125,7 +125,7 @@ def test_a_view_of_the_cells_on_disk_is_the_view_of_the_map(limited: RunOutcome)
 @pytest.mark.long("a whole run, with objects")
 def test_objects_of_a_map_on_disk(turning: Path, tmp_path: Path) -> None:
     """A row more than 100 bytes longer, so with the same budget more has to go."""
-    objects = ["identity.enabled=true", "identity.final_passes=1"]
+    objects = ["identity.enabled=true", "identity.final_passes=1", "identity.pixels=1000"]
     outcome = executed(turning, tmp_path / "objects", *SMALL, *objects, stop=BEGINNING)
     segmented = outcome.folder.segmented_map()
     assert outcome.result.cells is not None and outcome.result.cells.count > 500 and outcome.result.objects is not None
@@ -138,7 +138,7 @@ def test_objects_of_a_map_on_disk(turning: Path, tmp_path: Path) -> None:
 
 @pytest.mark.long("the mapper computes for as long as the recording lasts")
 def test_real_time(turning: Path, tmp_path: Path) -> None:
-    outcome = executed(turning, tmp_path / "live", *LESS, "refine_iterations=5", "realtime_fps=10", stop=BEGINNING)
+    outcome = executed(turning, tmp_path / "live", *LESS, "refine_iterations=5", "realtime_fps=20", stop=BEGINNING)
     assert outcome.error is None and outcome.result.cells is not None
     assert len(read_gaussian_ply(outcome.folder.path / "map.ply")) == outcome.result.gaussian_count > 2000
 

@@ -56,7 +56,7 @@ def assert_same(one: SlamResult, other: SlamResult) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_another_run_goes_on_bit_for_bit(room: Path, kind: str) -> None:
-    sequence = open_sequence(room, stop=14)
+    sequence = open_sequence(room, stop=14, scale=0.5)
     config = load_config(None, [*FEW, *KINDS[kind]])
     slams = [Slam(sequence.camera, config, sequence.has_masks) for _ in range(2)]
     for frame in sequence.stream(masks="lazy"):

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ggslam.errors import ConfigError
 from ggslam.jobs.merge.merged_run import MergedRun
@@ -16,10 +18,11 @@ from ggslam.jobs.merge.seams import SeamTraining, keyframes_of
 from ggslam.jobs.merge.sources import MergeSource, read_sources
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.merging.common_ground import CommonGround, find_common_ground
-from ggslam.merging.coverage import Coverage, PlacedRun, without_rows
+from ggslam.merging.coverage import Coverage, PlacedRun
 from ggslam.merging.joint_graph import JointPoses, Pair, attachment_order, solve_joint_graph
 from ggslam.merging.moving import append_map, move_map, with_channels
 from ggslam.merging.objects import UnitedObjects
+from ggslam.merging.ownership import Ownership
 from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import RunFolder
@@ -37,7 +40,7 @@ class MergeOutcome:
         folder: the merged run.
         poses: what became of the links between the runs.
         gaussians: of the merged map.
-        doubles: Gaussians of each run that were left out, because an earlier run's map shows the same surface.
+        doubles: Gaussians of each run that were left out, because another run measured their places better.
         united: (id, number of the run, its own id there) of objects that an earlier run has as well.
         trained: keyframes at the seams that were trained on.
         steps: optimisation steps made on them.
@@ -63,7 +66,8 @@ def merge_runs(
     """Merges finished runs into one, in the world of the first one.
 
     Args:
-        runs: folders of two runs or more. What the runs have in common is the first one's that has it.
+        runs: folders of two runs or more, or containers of them (`map.ggz`). What the runs have in common is the first
+            one's that has it.
         out: folder of the merged run.
         overwrite: replace a run that is already at `out`.
         settings: see there.
@@ -82,15 +86,16 @@ def merge_runs(
     if any(out.resolve() in (Path(run).resolve(), *Path(run).resolve().parents) for run in runs):
         raise ConfigError(f"`out` {out}: is one of the runs that are merged, or holds it; choose another folder")
     clock, context = _Clock(), NativeContext(None)
-    sources = read_sources([Path(run) for run in runs], context)
-    clock.lap("read")
-    folder = RunFolder.create(out, overwrite)
-    try:
-        with folder_lock(folder.path):
-            return _Merge(sources, folder, settings, observer or SilentObserver(), context, clock).run()
-    except BaseException:
-        folder.discard()
-        raise
+    with tempfile.TemporaryDirectory(prefix="ggslam-merge-") as unpacked:
+        sources = read_sources([Path(run) for run in runs], context, Path(unpacked))
+        clock.lap("read")
+        folder = RunFolder.create(out, overwrite)
+        try:
+            with folder_lock(folder.path):
+                return _Merge(sources, folder, settings, observer or SilentObserver(), context, clock).run()
+        except BaseException:
+            folder.discard()
+            raise
 
 
 class _Clock:
@@ -201,19 +206,23 @@ class _Merge:
 
     def _find_seams(self, placed: list[PlacedRun]) -> list[np.ndarray]:
         """Which keyframes of each run see what another run's map shows, bool [K] each."""
-        coverage, seams = Coverage(self.settings.double, self.context), []
+        coverage, seams = Coverage(self.settings.seams, self.context), []
         for number, run in enumerate(placed):
             shares = [coverage.shared_views(other.gaussians, run) for k, other in enumerate(placed) if k != number]
-            seams.append(np.max(shares, axis=0) >= self.settings.seam_share)
+            seams.append(np.max(shares, axis=0) >= self.settings.seams.share)
         return seams
 
     def _join(self, placed: list[PlacedRun], objects: UnitedObjects, outcome: MergeOutcome) -> GaussianMap:
-        """One map of all: of each run what the ones before do not show."""
-        coverage = Coverage(self.settings.double, self.context)
+        """One map of all, with one set of objects: of each run what lies where it measured best."""
         base = GaussianMap(placed[0].gaussians.sh_degree, placed[0].gaussians.feature_channels)
-        for source, run in zip(self.sources, placed, strict=True):
+        known = [source.known for source in self.sources]
+        poses = [T @ run.poses for T, run in zip(outcome.poses.T_new_old, known, strict=True)]
+        ownership = Ownership(known, poses, self.settings.seams.voxel * known[0].scale)
+        kept = []
+        for number, (source, run) in enumerate(zip(self.sources, placed, strict=True)):
             objects.add(base, run.gaussians, source.run_objects())
-            dropped = coverage.doubles(base, run)
-            outcome.doubles.append(without_rows(run.gaussians, dropped))
+            kept.append(ownership.of(run.gaussians.means.numpy()) == number)
+            outcome.doubles.append(int((~kept[-1]).sum()))
             append_map(base, run.gaussians, source.first_keyframe)
+        base.keep(torch.from_numpy(np.concatenate(kept)))
         return base

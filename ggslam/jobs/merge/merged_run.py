@@ -94,7 +94,7 @@ class MergedRun:
     def _mark(self) -> RunRecord:
         merged = [
             MergedRecord(
-                run=str(source.folder.path.absolute()), fingerprint=fingerprint(source.folder),
+                run=source.place, fingerprint=fingerprint(source.folder),
                 frames=len(source.record.frames), keyframes=len(source.known), gaussians=source.gaussian_count,
                 double=double, objects=ids or None,
             )

@@ -12,7 +12,6 @@ from ggslam.jobs.merge.sources import MergeSource
 from ggslam.jobs.progress import Observer
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
 from ggslam.mapping.mapper import Mapper
-from ggslam.mapping.pruning import prune
 from ggslam.merging.objects import UnitedObjects
 from ggslam.native.loader import NativeContext
 from ggslam.scene.gaussian_map import GaussianMap
@@ -45,7 +44,7 @@ class SeamTraining:
     sigma: float
 
     def run(self, steps: int, context: NativeContext, observer: Observer) -> None:
-        """Trains with falling rates, by turns on all keyframes at the seams; then prunes."""
+        """Trains with falling rates, by turns on all keyframes at the seams."""
         mapper = make_mapper(replace(self.config, device="cpu"), self.objects is not None, context, None)
         self.gaussians.updates[:] = _GROWN_UP
         self.gaussians.feature_updates[:] = _GROWN_UP
@@ -54,7 +53,6 @@ class SeamTraining:
         if self.objects is not None and mapper.identity is not None:
             mapper.identity.resume(self.objects.classifier)
         self._train(mapper, steps, observer)
-        prune(mapper.map, self.config.mapping.pruning)
         if self.objects is not None and mapper.identity is not None:
             mapper.finish_identity()
             self.objects.classifier = mapper.identity.classifier

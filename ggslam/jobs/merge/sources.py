@@ -18,6 +18,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.known_runs import read_known_run, read_map
+from ggslam.runs.map_container import is_container, read_container
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.sequence import PartRecord, SequenceRecord
@@ -59,6 +60,8 @@ class MergeSource:
     time_shift_s: float = 0.0
     gaussian_count: int = 0
     """Of its map as it was read."""
+    origin: Path | None = None
+    """The container that the folder was made of, if it was."""
 
     @staticmethod
     def read(folder: RunFolder, context: NativeContext) -> MergeSource:
@@ -79,7 +82,12 @@ class MergeSource:
     @property
     def name(self) -> str:
         """For people."""
-        return str(self.folder.path)
+        return str(self.origin or self.folder.path)
+
+    @property
+    def place(self) -> str:
+        """The run or its container, for records."""
+        return str((self.origin or self.folder.path).absolute())
 
     @property
     def frame_count(self) -> int:
@@ -100,7 +108,7 @@ class MergeSource:
         if self.recording.parts is not None:
             return list(self.recording.parts)
         values = {name: getattr(self.recording, name) for name in ("open", "format", "camera")}
-        return [PartRecord(run=str(self.folder.path.absolute()), frames=self.frame_count, **values)]
+        return [PartRecord(run=self.place, frames=self.frame_count, **values)]
 
     def run_objects(self) -> RunObjects | None:
         """Its objects, if it has any."""
@@ -135,8 +143,13 @@ class MergeSource:
         return found if np.isfinite(found).all((1, 2)).any() else None
 
 
-def read_sources(paths: ListOf[Path], context: NativeContext) -> list[MergeSource]:
+def read_sources(paths: ListOf[Path], context: NativeContext, unpacked: Path) -> list[MergeSource]:
     """Opens the runs, in their order; frames, keyframes and times of each follow those of the one before.
+
+    Args:
+        paths: of runs, or of containers (`map.ggz`) of some.
+        context: threads.
+        unpacked: folder that containers are unpacked to; it has to stay while the sources are used.
 
     Raises:
         ConfigError: fewer than two runs, one given twice, or runs whose places cannot be compared.
@@ -148,13 +161,21 @@ def read_sources(paths: ListOf[Path], context: NativeContext) -> list[MergeSourc
     twice = [path for k, path in enumerate(paths) if resolved[k] in resolved[:k]]
     if twice:
         raise ConfigError(f"{twice[0]}: was given twice; a run is not merged with itself")
-    sources = [MergeSource.read(RunFolder.open(Path(path)), context) for path in paths]
+    sources = [_open_source(Path(path), context, unpacked / f"{k}") for k, path in enumerate(paths)]
     _check_comparable(sources)
     for before, source in zip(sources, sources[1:], strict=False):
         source.first_frame = before.first_frame + before.frame_count
         source.first_keyframe = before.first_keyframe + len(before.known)
     _shift_times(sources)
     return sources
+
+
+def _open_source(path: Path, context: NativeContext, unpacked: Path) -> MergeSource:
+    if not (is_container(path) and path.is_file()):
+        return MergeSource.read(RunFolder.open(path), context)
+    source = MergeSource.read(read_container(path, unpacked), context)
+    source.origin, source.known.name = path, str(path)
+    return source
 
 
 def _check_comparable(sources: list[MergeSource]) -> None:

@@ -33,7 +33,7 @@ class MergedRecord(Record):
         run: its folder.
         fingerprint: tells it from another run in the same folder, see `runs.recordings.fingerprint`.
         frames, keyframes, gaussians: numbers of them in the run.
-        double: of its Gaussians, those left out because an earlier run's map shows the same surface.
+        double: of its Gaussians, those left out because another run measured their places better.
         objects: what its object ids are called now.
     """
 

@@ -54,14 +54,14 @@ class IclNuimFormat:
         return recording
 
 
-def _frames(folder: Path) -> tuple[np.ndarray, list[FrameFiles]]:
+def _frames(folder: Path) -> tuple[list[int], list[FrameFiles]]:
     path = folder / "associations.txt"
     numbers, files = [], []
     for line_number, line in data_lines(path):
         words = line.split()
         try:
-            _, first, number, second = float(words[0]), words[1], float(words[2]), words[3]
-        except (ValueError, IndexError):
+            _, first, number, second = float(words[0]), words[1], round(float(words[2])), words[3]
+        except (ValueError, IndexError, OverflowError):
             raise SequenceError(
                 f"{path}, line {line_number}: expected 'number depth/0.png number rgb/0.png', found '{line[:60]}'"
             ) from None
@@ -70,16 +70,16 @@ def _frames(folder: Path) -> tuple[np.ndarray, list[FrameFiles]]:
         files.append(FrameFiles(folder / color, folder / depth))
     if not files:
         raise SequenceError(f"{path}: lists no images")
-    return np.array(numbers), files
+    return numbers, files
 
 
-def _add_poses(recording: Recording, path: Path, numbers: np.ndarray) -> None:
+def _add_poses(recording: Recording, path: Path, numbers: list[int]) -> None:
     rows, poses, problems = read_tum_poses(path)
     if problems:
         raise SequenceError(next(iter(problems.values())))
     by_number = dict(zip(rows.round().astype(int).tolist(), MIRROR @ poses @ MIRROR, strict=True))
     unknown = np.full((4, 4), np.nan)
-    recording.poses = np.array([by_number.get(int(round(number)), unknown) for number in numbers])
+    recording.poses = np.array([by_number.get(number, unknown) for number in numbers])
     recording.pose_source = f"{path.name} (y mirrored)"
     without = int(np.isnan(recording.poses[:, 0, 0]).sum())
     if without == len(numbers):

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.merging.settings import UnitingSettings
+from ggslam.objects.settings import UnitingSettings
 from ggslam.scene.gaussian_map import GaussianMap
 
-_FAINT = 0.1
+FAINT = 0.1
 """Gaussians fainter than this say nothing."""
 _OFFSET, _BITS = 1 << 20, 21
 
@@ -43,7 +43,7 @@ class LabelledVoxels:
     def of_map(gaussians: GaussianMap, voxel: float) -> LabelledVoxels:
         """Of a map whose Gaussians have objects."""
         opacities = gaussians.opacities.numpy()
-        seen = opacities >= _FAINT
+        seen = opacities >= FAINT
         labels = gaussians.object_id.numpy()[seen].astype(np.int64)
         return LabelledVoxels.of(gaussians.means.numpy()[seen], labels, opacities[seen], voxel)
 

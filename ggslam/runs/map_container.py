@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`map.ggz`: a run's map in one file that is small enough to send, with all that another machine needs to merge it.
+
+A zip archive whose members are stored as they are:
+
+    container.json   {"format": "ggslam map", "version": 1, "ggslam": version that wrote it, "gaussians": their number,
+                     "rate": of the map, "files": {member: {"bytes", "sha256"}}}
+    map.bin          a G-PCC stream of Gaussians (`ggslam decode` reads it), in slices; attribute `birth` is the number
+                     of the keyframe that inserted a Gaussian, plus 1, `object_id` its object
+    places.npz       of the run, without `birth`
+    run.json, keyframes.json, trajectory.txt, config.yaml, sequence.json, timing.json and, where the run has them,
+    loops.json, ground_truth.txt, objects.json, classifier.npz, as in the run's folder
+
+Votes, clouds, scores and pictures stay behind. Identity vectors become the codes of their objects.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ggslam import __version__
+from ggslam.coding import CodecSettings, decode_cloud
+from ggslam.coding.block_encoder import encode_blocks
+from ggslam.coding.splats import BIRTH, gaussians_of, is_splat_cloud, splat_attributes, splat_settings
+from ggslam.errors import ConfigError, FormatError, RunFolderError
+from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.formats.gaussian_rows import GaussianRows
+from ggslam.objects.encoding import code_of
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.publishing import publish_run
+from ggslam.runs.records.container import CONTAINER_FORMAT, CONTAINER_VERSION, ContainerRecord
+from ggslam.runs.records.keyframes import KeyframesRecord
+from ggslam.runs.records.loops import LoopsRecord
+from ggslam.runs.records.mark import FileRecord, RunRecord
+from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.runs.records.timing import TimingRecord
+from ggslam.runs.saving_parts import save_points_of_map
+from ggslam.runs.writing import RUN_FILES, TRUTH_FILE
+from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IdentityClassifier
+from ggslam.slam.saved_places import PLACES_FILE
+from ggslam.system.atomic import atomic_write, make_folder, write_bytes
+from ggslam.system.foreign import open_foreign
+
+SUFFIX = ".ggz"
+_HEAD, _MAP = "container.json", "map.bin"
+_CLASSIFIER, _TABLE = "classifier.npz", "objects.json"
+_NEEDED = (
+    RunRecord.FILE, KeyframesRecord.FILE, "trajectory.txt", "config.yaml", SequenceRecord.FILE, TimingRecord.FILE,
+)  # fmt: skip
+_PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, _TABLE, _CLASSIFIER)
+_MEMBERS = frozenset((_HEAD, _MAP, PLACES_FILE, *_NEEDED, *_PERHAPS))
+_MOST_KEYFRAMES = (1 << 16) - 2
+
+
+@dataclass(frozen=True)
+class Contained:
+    """A written container.
+
+    Attributes:
+        path: the file.
+        gaussians: of its map.
+        sizes: bytes by member.
+        run_bytes: that map.ply and the same files take in the run's folder.
+    """
+
+    path: Path
+    gaussians: int
+    sizes: dict[str, int] = field(default_factory=dict)
+    run_bytes: int = 0
+
+
+def is_container(path: str | Path) -> bool:
+    """Whether a file is called like one."""
+    return Path(path).suffix.lower() == SUFFIX
+
+
+def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSettings) -> Contained:
+    """Puts a run's map into a file.
+
+    Args:
+        folder: the run.
+        out: the file.
+        rate: quality of the map, r01 to r04.
+        settings: slices and threads.
+
+    Raises:
+        RunFolderError: the run has no places (it was made without loops, or edited since), or the file cannot be
+            written.
+        ConfigError: the run has more keyframes than the file can count.
+    """
+    places_file = folder.path / PLACES_FILE
+    if not places_file.is_file():
+        raise RunFolderError(f"{places_file}: missing: a run made without loops, or edited since, has no places")
+    places = read_all_arrays(places_file, "the places of a run")
+    births = places.pop("birth", None)
+    rows = GaussianRows(folder.path / "map.ply")
+    if births is None or births.shape != (len(rows),) or births.max(initial=0) > _MOST_KEYFRAMES:
+        raise RunFolderError(f"{places_file}: not of this map, which has {len(rows)} Gaussians")
+    with_objects = folder.has_objects()
+    optional = _PERHAPS if with_objects else [name for name in _PERHAPS if name not in (_TABLE, _CLASSIFIER)]
+    names = [*_NEEDED, *(name for name in optional if (folder.path / name).is_file())]
+    make_folder(out.parent)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as name:
+        stream = Path(name) / _MAP
+        _encode_map(rows, births, with_objects, rate, settings, stream)
+        members = {n: (folder.path / n).read_bytes() for n in names}
+        members |= {PLACES_FILE: arrays_to_bytes(**places), _MAP: stream.read_bytes()}
+        head = ContainerRecord(
+            format=CONTAINER_FORMAT, version=CONTAINER_VERSION, ggslam=__version__, gaussians=len(rows), rate=rate,
+            files={n: FileRecord(bytes=len(b), sha256=hashlib.sha256(b).hexdigest()) for n, b in members.items()},
+        )  # fmt: skip
+        with atomic_write(out) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+            for member, content in {_HEAD: head.model_dump_json(indent=1).encode(), **members}.items():
+                archive.writestr(zipfile.ZipInfo(member), content)
+    sizes = {n: len(b) for n, b in members.items()}
+    plain = sum((folder.path / n).stat().st_size for n in (*names, PLACES_FILE, "map.ply"))
+    return Contained(out, len(rows), sizes, plain)
+
+
+def _encode_map(
+    rows: GaussianRows, births: np.ndarray, with_objects: bool, rate: str, settings: CodecSettings, out: Path
+) -> None:
+    chosen = splat_settings(settings, rate, splat_attributes(rows.like, with_objects, births[:0]))
+
+    def blocks() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        begin = 0
+        for block in rows.blocks():
+            own = births[begin : begin + len(block)]
+            begin += len(block)
+            yield block.means.numpy().astype(np.float64), splat_attributes(block, with_objects, own)
+
+    encode_blocks(blocks(), chosen, out)
+
+
+def read_container(path: Path, out: Path, overwrite: bool = False, threads: int | None = None) -> RunFolder:
+    """Makes a run folder of a container.
+
+    Args:
+        path: the file.
+        out: the folder.
+        overwrite: replace a run that is there.
+        threads: to decode with.
+
+    Raises:
+        FormatError: it is none, damaged, or of a later version.
+        RunFolderError: the folder cannot be written.
+    """
+    with open_foreign(path) as file:
+        members = _read_members(path, file)
+    folder = RunFolder.create(out, overwrite)
+
+    def write(staged: Path) -> RunRecord:
+        try:
+            return _write_run(path, members, staged, threads)
+        except (FormatError, RunFolderError) as error:
+            if error.exit_code == 2 and str(staged) in str(error):  # a member that is not what its name says
+                raise FormatError(str(error).replace(f"{staged}/", f"{path}: ")) from None
+            raise
+
+    try:
+        publish_run(folder.path, write, RUN_FILES, f"{out}: the run cannot be written")
+    except BaseException:
+        folder.discard()
+        raise
+    return RunFolder.open(out)
+
+
+def _read_members(path: Path, file: Any) -> dict[str, bytes]:
+    """All members, each what the head says of it. They are stored, so none is larger than the file."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            found = archive.infolist()
+            names = [info.filename for info in found]
+            odd = [n for n in names if n not in _MEMBERS] or [n for n in names if names.count(n) > 1]
+            if odd or any(info.compress_type != zipfile.ZIP_STORED for info in found):
+                raise FormatError(f"{path}: no map of ggslam: holds {odd[0] if odd else 'compressed members'}")
+            members = {info.filename: archive.read(info) for info in found}
+    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError) as error:
+        raise FormatError(f"{path}: no whole container of a map: {error}") from None
+    head = _head(path, members.pop(_HEAD, b""))
+    for name in (_MAP, PLACES_FILE, *_NEEDED):
+        if name not in members:
+            raise FormatError(f"{path}: holds no {name}")
+    for name, content in members.items():
+        told = head.get(name)
+        if told is None or told.sha256 != hashlib.sha256(content).hexdigest():
+            raise FormatError(f"{path}: {name} is damaged: not the content that {_HEAD} tells the checksum of")
+    return members
+
+
+def _head(path: Path, content: bytes) -> Mapping[str, FileRecord]:
+    """What the head says of the members."""
+    try:
+        head = ContainerRecord.parse(content)
+    except ValueError as error:
+        raise FormatError(f"{path}: {_HEAD}: not the head of a map's container: {error}") from None
+    if head.version > CONTAINER_VERSION:
+        known = f"this ggslam reads up to {CONTAINER_VERSION}: use a newer one"
+        raise FormatError(f"{path}: is of version {head.version}; {known}")
+    return head.files
+
+
+def _write_run(path: Path, members: dict[str, bytes], staged: Path, threads: int | None) -> RunRecord:
+    for name in (*_NEEDED, *_PERHAPS):
+        if name in members and name != RunRecord.FILE:
+            write_bytes(staged / name, members[name])
+    try:
+        cloud = decode_cloud(members[_MAP], threads)
+    except (FormatError, ConfigError) as error:
+        raise FormatError(f"{path}: {_MAP}: {error}") from None
+    if not is_splat_cloud(cloud) or BIRTH not in cloud.attributes:
+        raise FormatError(f"{path}: {_MAP}: holds no map with its keyframes' numbers")
+    gaussians, with_objects = gaussians_of(cloud), {_CLASSIFIER, _TABLE} <= set(members)
+    if with_objects:
+        gaussians = _with_codes(gaussians, IdentityClassifier.from_file(staged / _CLASSIFIER))
+    write_gaussian_ply(staged / "map.ply", gaussians, ("object_id", "identity") if with_objects else ())
+    write_bytes(staged / PLACES_FILE, members[PLACES_FILE])
+    arrays = read_all_arrays(staged / PLACES_FILE, "the places of a run")
+    births = gaussians.birth_keyframe.numpy().astype(np.int32)
+    write_bytes(staged / PLACES_FILE, arrays_to_bytes(**{**arrays, "birth": births}))
+    save_points_of_map(staged, gaussians, with_objects)
+    write_bytes(staged / RunRecord.FILE, members[RunRecord.FILE])
+    mark = RunRecord.read(staged)
+    (staged / RunRecord.FILE).unlink()
+    lossy = f"coded for sending ({path.name}) and decoded: places and colours are rounded"
+    return mark.model_copy(update={"files": None, "missing": [], "edits": [*mark.edits, lossy]})
+
+
+def _with_codes(gaussians: GaussianMap, classifier: IdentityClassifier) -> GaussianMap:
+    """The map with an identity vector for each Gaussian that the classifier reads as its object."""
+    out = GaussianMap(gaussians.sh_degree, classifier.weight.shape[1], with_moments=False)
+    g = gaussians
+    rows = out.insert(g.means, g.quaternions, g.log_scales, g.opacity_logits, g.rgb, object_id=g.object_id)
+    out.sh[rows], out.birth_keyframe[rows] = g.sh, g.birth_keyframe
+    for number in classifier.class_ids.tolist():
+        own = out.object_id == number
+        if bool(own.any()):
+            out.features[own] = torch.from_numpy(code_of(out, classifier, number))
+    return out

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run in one file (`map.ggz`): what comes back, what merging makes of it, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kept import build_once, session_folder
+from typer.testing import CliRunner, Result
+
+from ggslam.cli.main import app
+from ggslam.errors import FormatError, GgslamError, RunFolderError
+from ggslam.jobs.run.pipeline import RunRequest, execute
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.map_container import read_container
+from ggslam.runs.recordings import SequenceRequest
+from ggslam.scene.arrays import read_all_arrays
+
+FEW = ["mapping.iterations_per_frame=1", "mapping.first_frame_iterations=4", "refine_iterations=0"]
+
+
+def ggslam(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "120"})
+
+
+@pytest.fixture(scope="module")
+def run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    def build(folder: Path) -> None:
+        request = SequenceRequest(room, stop=8)
+        execute(RunRequest(request, out=folder, overrides=FEW, evaluate=False))
+
+    return RunFolder.open(build_once(session_folder(tmp_path_factory) / "contained" / "run", build))
+
+
+@pytest.fixture(scope="module")
+def container(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("container") / "run.ggz"
+    result = ggslam("encode", run.path, out, "--slices", 2, "--rate", "r04")
+    assert result.exit_code == 0 and "places.npz" in result.output and "times as many" in result.output, result.output
+    return out
+
+
+@pytest.fixture(scope="module")
+def again(container: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    out = tmp_path_factory.mktemp("decoded") / "again"
+    assert ggslam("decode", container, out).exit_code == 0
+    return RunFolder.open(out)
+
+
+def in_order(folder: RunFolder) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places, births and object ids of a map, sorted by place to a centimetre."""
+    gaussians = folder.gaussians()
+    births = read_all_arrays(folder.path / "places.npz", "places")["birth"]
+    means = gaussians.means.numpy()
+    order = np.lexsort((births, *np.rint(20 * means).T))
+    return means[order], births[order], gaussians.object_id.numpy()[order]
+
+
+@pytest.mark.long("a run of a generated room is made")
+def test_a_run_comes_back(run: RunFolder, container: Path, again: RunFolder) -> None:
+    assert container.stat().st_size < 0.5 * sum(f.stat().st_size for f in run.path.glob("[mp]*.[pn][lp][yz]"))
+    for name in ("keyframes.json", "trajectory.txt", "config.yaml", "sequence.json", "objects.json", "classifier.npz"):
+        assert (again.path / name).read_bytes() == (run.path / name).read_bytes()
+    before, after = run.gaussians(), again.gaussians()
+    assert len(before) == len(after)
+    for k in (0, 2):  # births, and ids: of the same number of Gaussians each, wherever they went
+        counts = [np.unique(np.round(in_order(folder)[1 + k // 2], 3), return_counts=True) for folder in (run, again)]
+        np.testing.assert_array_equal(counts[0], counts[1])
+    low, high = before.means.min(0).values, before.means.max(0).values
+    step = float((high - low).max()) / 2**18
+    means = [np.sort(m.means.numpy(), axis=0) for m in (before, after)]
+    np.testing.assert_allclose(means[1], means[0], atol=1.01 * step)
+    mark = again.mark()
+    assert mark.complete and "decoded" in mark.edits[-1] and mark.files is not None and "map.ply" in mark.files
+
+
+def test_identity_vectors_say_the_object(run: RunFolder, again: RunFolder) -> None:
+    scene = again.segmented_map()
+    labels, _ = scene.classifier.labels(scene.gaussians.features.numpy())
+    ids = scene.gaussians.object_id.numpy()
+    known = np.isin(ids, scene.classifier.class_ids)
+    assert known.mean() > 0.5 and (labels[known] == ids[known]).mean() > 0.99
+    assert again.object_table().ids() == run.object_table().ids()
+
+
+@pytest.mark.long("two runs are merged")
+def test_containers_are_merged(container: Path, run: RunFolder, tmp_path: Path) -> None:
+    pytest.importorskip("gtsam")
+    result = ggslam("merge", container, run.path, "--out", tmp_path / "both", "--steps", 0)
+    assert result.exit_code == 0, (result.output, result.exception)
+    merged = RunFolder.open(tmp_path / "both").mark().merged
+    assert merged is not None and [part.run for part in merged] == [str(container), str(run.path)]
+    assert "run.ggz" in result.output
+
+
+def _rewritten(container: Path, out: Path, **changes: bytes | None) -> Path:
+    """The container with other members; the head tells their checksums unless it is given."""
+    with zipfile.ZipFile(container) as archive:
+        members: dict[str, bytes | None] = {name: archive.read(name) for name in archive.namelist()}
+    members |= {name.replace("_json", ".json").replace("_bin", ".bin"): value for name, value in changes.items()}
+    there = {name: value for name, value in members.items() if value is not None}
+    if "container_json" not in changes:
+        head = json.loads(there["container.json"])
+        head["files"] = {
+            name: {"bytes": len(b), "sha256": hashlib.sha256(b).hexdigest()} for name, b in there.items()
+        }
+        there["container.json"] = json.dumps(head).encode()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name, value in there.items():
+            archive.writestr(name, value)
+    return out
+
+
+def test_what_is_damaged_is_refused(container: Path, tmp_path: Path) -> None:
+    content, bad = bytearray(container.read_bytes()), tmp_path / "bad.ggz"
+    with zipfile.ZipFile(container) as archive:
+        head = json.loads(archive.read("container.json"))
+    cases: list[tuple[Path, str]] = [
+        (_rewritten(container, tmp_path / "later.ggz", container_json=json.dumps({**head, "version": 2}).encode()),
+         "version 2"),
+        (_rewritten(container, tmp_path / "other.ggz", container_json=b"{}"), "not the head"),
+        (_rewritten(container, tmp_path / "wrong.ggz", container_json=json.dumps({**head, "files": {}}).encode()),
+         "is damaged"),
+        (_rewritten(container, tmp_path / "less.ggz", map_bin=None), "holds no map.bin"),
+        (_rewritten(container, tmp_path / "more.ggz", **{"../../outside": b"x"}), "no map of ggslam"),
+        (_rewritten(container, tmp_path / "stream.ggz", map_bin=b"no stream"), "map.bin"),
+        (_rewritten(container, tmp_path / "record.ggz", run_json=b"[]"), "run.json"),
+    ]  # fmt: skip
+    bad.write_bytes(content[: len(content) // 2])
+    cases.append((bad, "no whole container"))
+    content[len(content) // 2] ^= 255
+    (tmp_path / "flipped.ggz").write_bytes(content)
+    cases.append((tmp_path / "flipped.ggz", "flipped.ggz"))
+    for path, reason in cases:
+        with pytest.raises(GgslamError, match=reason) as caught:
+            read_container(path, tmp_path / "out")
+        assert path.name in str(caught.value) and caught.value.exit_code == 2
+        assert not (tmp_path / "out").exists() and not (tmp_path.parent / "outside").exists()
+
+
+def test_what_cannot_be_sent(run: RunFolder, container: Path, tmp_path: Path) -> None:
+    for words, reason in (
+        (["encode", run.path / "map.ply", tmp_path / "a.ggz"], "map.ply"),
+        (["encode", run.path, tmp_path / "a.ggz", "--qp", 30], "--rate"),
+        (["decode", container, tmp_path / "b", "--slice", 0], "as a whole"),
+    ):
+        result = ggslam(*words)
+        assert isinstance(result.exception, GgslamError) and reason in str(result.exception)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(FormatError, match="missing"):
+        read_container(tmp_path / "none.ggz", tmp_path / "out")
+    with pytest.raises(RunFolderError, match="there is a run already"):
+        read_container(container, run.path)
