@@ -30,7 +30,7 @@ State = Literal["ok", "missing", "warning", "broken"]
 """missing: optional, something cannot be done without it; warning: works, but badly; broken: ggslam does not work."""
 
 CORE_PACKAGES = {
-    "torch": "torch", "numpy": "numpy", "scipy": "scipy", "opencv-python-headless": "cv2", "scikit-learn": "sklearn",
+    "torch": "torch", "numpy": "numpy", "scipy": "scipy", "opencv-python-headless": "cv2",
     "kornia": "kornia", "gtsam": "gtsam", "pydantic": "pydantic", "pyyaml": "yaml", "rich": "rich", "typer": "typer",
 }  # fmt: skip
 """Distribution and module of what is always needed."""
