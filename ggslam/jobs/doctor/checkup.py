@@ -60,6 +60,7 @@ EXTRAS = {
     "rerun": Extra(("rerun",), "ggslam run --log: a run streamed to rerun"),
     "phone": Extra(("liblzfse",), "recordings of Record3D (.r3d)"),
     "ros": Extra(("rosbags",), "ROS 1 and ROS 2 bags"),
+    "ray": Extra(("ray",), "batches on a Ray cluster"),
     "realsense": Extra(("pyrealsense2",), "RealSense cameras and their .bag files"),
     "docs": Extra(("material",), "building the pages of docs/"),
 }
