@@ -27,6 +27,7 @@ class Frame:
         mask_loader: reads the mask on demand; see `load_mask`.
         valid: bool [H, W], False where colour shows nothing (beyond the border of an undistorted image); the same array
             for all frames of a recording; None: all of it shows something.
+        depth_delay: seconds after `timestamp`, which is that of colour, at which depth was taken.
     """
 
     index: int
@@ -39,6 +40,7 @@ class Frame:
     T_world_camera: np.ndarray | None = None
     mask_loader: Callable[[], np.ndarray | None] | None = field(default=None, repr=False, compare=False)
     valid: np.ndarray | None = field(default=None, repr=False, compare=False)
+    depth_delay: float = 0.0
 
     def load_mask(self) -> np.ndarray | None:
         """The mask; reads it from disk on every call if it did not come with the frame.

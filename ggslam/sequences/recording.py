@@ -167,6 +167,7 @@ class Recording:
         pose_source: file or folder that the poses come from, for reports.
         camera_source: where the intrinsics come from, for reports; "" where only one place can tell them.
         time_source: where the timestamps come from, for reports.
+        depth_delays: float64 [n], seconds at which each frame's depth was taken after its colour; None: not known.
         instance_names: names of mask ids.
         problems: frames known to be damaged without reading their images: frame number -> reason.
         warnings: what a user should know about this recording.
@@ -189,6 +190,7 @@ class Recording:
     pose_source: str = "none"
     camera_source: str = ""
     time_source: str = f"nominal {NOMINAL_RATE:g} frames/s"
+    depth_delays: np.ndarray | None = None
     instance_names: dict[int, str] = field(default_factory=dict)
     problems: dict[int, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)

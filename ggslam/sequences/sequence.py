@@ -261,6 +261,7 @@ class Sequence:
             mask=self._mask(index) if masks is True else None,
             T_world_camera=pose.copy() if pose is not None and np.isfinite(pose).all() else None,
             valid=self.valid,
+            depth_delay=0.0 if self._recording.depth_delays is None else float(self._recording.depth_delays[source]),
             mask_loader=partial(self._mask, index) if masks == "lazy" and files.mask is not None else None,
         )
 

@@ -49,6 +49,7 @@ from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.slam.result import LearnedObjects, SlamTimes, TrackedFrame
 from ggslam.slam.run_objects import RunObjects
+from ggslam.slam.shutter_times import ShutterTimes
 from ggslam.slam.slam import Slam
 from ggslam.slam.step_log import StepLog
 from ggslam.system.object_tree import Keeper, Kept, Rule, Rules, describe, restore
@@ -220,7 +221,7 @@ RULES: Rules = {
         (Camera, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame, StepLog, LoopEvent,
          _Found, Link, Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes,
          CpuClassTable, ClassNumbers, IdentityClassifier, LearnedObjects, Observation, Associator, ConsistencyJudge,
-         PairEvidence, _Pair, Fragment, FragmentMemory),
+         PairEvidence, _Pair, Fragment, FragmentMemory, ShutterTimes),
         Rule(),
     ),
 }  # fmt: skip

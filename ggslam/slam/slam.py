@@ -35,6 +35,7 @@ from ggslam.slam.parts import device_name, make_parts
 from ggslam.slam.result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
 from ggslam.slam.run_objects import RunObjects
 from ggslam.slam.saved_places import saved_places_to_bytes
+from ggslam.slam.shutter_times import ShutterTimes
 from ggslam.slam.step_log import StepLog
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.process_memory import trim
@@ -95,7 +96,7 @@ class Slam:
         self._moves_followed = 0
         self._noise: DepthNoise | None = None
         self._objects = RunObjects(self.masks)
-        self._depth_edges = DepthEdges()
+        self._depth_edges, self._shutters = DepthEdges(), ShutterTimes()
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
         """Starts in a map made before; `surface` and `loops` hold its keyframes already. The camera counts as lost
@@ -233,13 +234,14 @@ class Slam:
     # --- its parts, also used by the real-time loop ------------------------------------------------------------------
 
     def receive(self, frame: Frame) -> Frame:
-        """The frame as the run uses it: without depth that hangs between two surfaces.
+        """The frame as the run uses it: without depth that hangs between two surfaces, and with depth as of the time of
+        colour.
 
         Raises:
             SequenceError: the frame is of another camera, or not what `Frame` says.
         """
         check_frame(frame, self.camera)
-        return self._depth_edges.clean(frame)
+        return self._shutters.bring(self._depth_edges.clean(frame))
 
     def track(self, frame: Frame) -> TrackingResult:
         """Locates one frame against the current target; a lost one is looked up among all keyframes.
@@ -259,6 +261,7 @@ class Slam:
             if found is not None:
                 result, keyframe = found
                 self.poses.anchor_to(keyframe, self.loops.poses[keyframe])
+        self._shutters.follow(None if result.status is TrackingStatus.LOST else result.T_world_camera)
         self._tell_noise(result.median_depth_m)
         self.times.tracking_by_frame.append(time.perf_counter() - start)
         self.times.tracking += self.times.tracking_by_frame[-1]
@@ -284,6 +287,7 @@ class Slam:
         self._moves_followed += len(moves)
         for T_new_old in moves:
             self.tracker.move(T_new_old)
+            self._shutters.move(T_new_old)
             self.policy.move(T_new_old)
             self.poses.move(T_new_old)
         if target is not None:

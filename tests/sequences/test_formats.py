@@ -272,3 +272,13 @@ def test_shared_recordings(shared_data: Path) -> None:
         frame = sequence.frame(count - 1)
         assert frame.color.shape == (240, 320, 3) and frame.T_world_camera is not None
         assert 0.3 < np.median(frame.depth[frame.depth > 0]) < 3
+
+
+def test_tum_tells_how_late_depth_is(make: Make) -> None:
+    folder = make("tum")
+    sequence = open_sequence(folder)
+    color, depth = (
+        float((folder / name).read_text().splitlines()[-1].split()[0]) for name in ("rgb.txt", "depth.txt")
+    )
+    assert sequence.frame(len(sequence) - 1).depth_delay == pytest.approx(depth - color, abs=1e-6)
+    assert open_sequence(make("replica")).frame(0).depth_delay == 0.0

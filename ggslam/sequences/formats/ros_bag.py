@@ -82,6 +82,7 @@ def _read(name: str, path: Path, bag: Bag, options: ReadOptions) -> Recording:
         name, path, files, color_times[[i for i, _ in pairs]],
         1.0 if in_metres(bag.message(topics.depth, 0)) else 1000.0, camera,
         time_source=f"headers of {topics.color}", warnings=warnings,
+        depth_delays=np.array([depth_times[j] - color_times[i] for i, j in pairs]),
     )  # fmt: skip
     if not rectified:
         recording.distortion, recording.fisheye = _distortion(f"{path}, {topics.color_info}", info)

@@ -52,7 +52,8 @@ class TumFormat:
             calibration, distortion, source = self._calibration(folder, warnings)
         recording = Recording(
             self.name, folder, files, times, DEPTH_SCALE, calibration=calibration, distortion=distortion,
-            time_source="rgb.txt", problems=missing_depth_problems(files), warnings=warnings, camera_source=source,
+            depth_delays=depth_times[[j for _, j in pairs]] - times, time_source="rgb.txt",
+            problems=missing_depth_problems(files), warnings=warnings, camera_source=source,
         )  # fmt: skip
         self._add_poses(recording)
         return recording
