@@ -30,7 +30,7 @@ State = Literal["ok", "missing", "warning", "broken"]
 """missing: optional, something cannot be done without it; warning: works, but badly; broken: ggslam does not work."""
 
 CORE_PACKAGES = {
-    "torch": "torch", "numpy": "numpy", "scipy": "scipy", "opencv-python-headless": "cv2", "scikit-learn": "sklearn",
+    "torch": "torch", "numpy": "numpy", "scipy": "scipy", "opencv-python-headless": "cv2",
     "kornia": "kornia", "gtsam": "gtsam", "pydantic": "pydantic", "pyyaml": "yaml", "rich": "rich", "typer": "typer",
 }  # fmt: skip
 """Distribution and module of what is always needed."""
@@ -60,6 +60,7 @@ EXTRAS = {
     "rerun": Extra(("rerun",), "ggslam run --log: a run streamed to rerun"),
     "phone": Extra(("liblzfse",), "recordings of Record3D (.r3d)"),
     "ros": Extra(("rosbags",), "ROS 1 and ROS 2 bags"),
+    "ray": Extra(("ray",), "batches on a Ray cluster"),
     "realsense": Extra(("pyrealsense2",), "RealSense cameras and their .bag files"),
     "docs": Extra(("material",), "building the pages of docs/"),
 }
