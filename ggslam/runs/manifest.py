@@ -12,6 +12,7 @@ from pathlib import Path
 from ggslam.errors import RunFolderError
 from ggslam.runs.checkpoints import FOLDER as CHECKPOINTS
 from ggslam.runs.records.mark import FileRecord, RunRecord
+from ggslam.system.foreign import is_plain_name
 
 Files = dict[str, FileRecord]
 
@@ -136,4 +137,4 @@ def refuse_mixed(folder: Path, mark: RunRecord) -> list[Problem]:
 
 
 def _is_own_name(name: str) -> bool:
-    return bool(name) and not name.startswith("/") and not {"", ".", ".."} & set(name.split("/")) and "\\" not in name
+    return all(map(is_plain_name, name.split("/")))

@@ -19,6 +19,8 @@ MAX_TEXT_BYTES = 256 << 20
 """Descriptions, tables and trajectories in text: a trajectory of a day at 30 frames/s has 200 MB."""
 MAX_IMAGE_BYTES = 256 << 20
 """One image file."""
+_LONGEST_NAME = 255
+"""Bytes of a file's name, on all usual file systems."""
 
 
 def open_foreign(path: str | Path, error: type[GgslamError] = FormatError) -> BinaryIO:
@@ -80,8 +82,10 @@ def read_foreign_text(path: str | Path, error: type[GgslamError] = FormatError, 
 
 
 def is_plain_name(name: object) -> bool:
-    """Whether this is a name of a file in a folder, and nothing that leads elsewhere."""
-    return isinstance(name, str) and name not in ("", ".", "..") and not set(name) & {"/", "\\", "\0"}
+    """Whether this is a name of a file in a folder, and nothing that leads elsewhere or is longer than names can be."""
+    if not isinstance(name, str) or name in ("", ".", "..") or set(name) & {"/", "\\", "\0"}:
+        return False
+    return len(name.encode(errors="surrogatepass")) <= _LONGEST_NAME
 
 
 def member(folder: str | Path, name: str, error: type[GgslamError] = FormatError) -> Path:
