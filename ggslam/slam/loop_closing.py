@@ -14,7 +14,7 @@ import numpy as np
 from ggslam.features.orb import FeatureView
 from ggslam.loops.activity import ActiveKeyframes
 from ggslam.loops.places import Place, PlaceIndex
-from ggslam.loops.pose_graph import PoseGraph
+from ggslam.loops.pose_graph import SURE_INFORMATION, PoseGraph
 from ggslam.loops.revisits import Revisits
 from ggslam.loops.uncertainty import information_in_frame
 from ggslam.loops.verification import Verification
@@ -28,9 +28,6 @@ from ggslam.tracking.gicp import AlignmentResult
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult
-
-_FIRM = 1e6 * np.eye(6)
-"""Information of a motion that is sure to a millimetre and a milliradian."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +177,7 @@ class LoopCloser:
         self.revisits.add(inverse(self.poses[before]) @ T if before >= 0 else np.eye(4))
         if before >= 0:
             T_before_world = inverse(self.poses[before])
-            information = _FIRM  # without an alignment, what drift allows for is all that is unsure
+            information = SURE_INFORMATION  # without an alignment, what drift allows for is all that is unsure
             if tracking.alignment is not None:
                 information = information_in_frame(tracking.alignment.information, T_before_world)
             self.graph.add_odometry(before, number, T_before_world @ T, information, found)
@@ -336,7 +333,7 @@ class LoopCloser:
             self.graph.add_node(T)
             self.revisits.add(inverse(self.poses[-1]) @ T if number else np.eye(4))
             if number:
-                self.graph.add_odometry(number - 1, number, inverse(self.poses[-1]) @ T, _FIRM)
+                self.graph.add_odometry(number - 1, number, inverse(self.poses[-1]) @ T, SURE_INFORMATION)
             self.poses.append(T.astype(float))
             self.activity.add(T, float(depth))
         if not len(self.poses) == len(self.places) == len(self._surface):
