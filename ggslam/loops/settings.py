@@ -78,6 +78,8 @@ class VerificationSettings:
     """Matches that agree with one pose."""
     min_cells: int = setting(5, 1, 16)
     """Of the 4x4 cells of the image, so many have inliers."""
+    min_cells_alike: int = setting(4, 1, 16)
+    """So many are enough where the surfaces have 1.5 times as much in common as `min_overlap` asks for."""
     min_kept: float = setting(0.6, 0, 1)
     """After refinement by geometry this share of the inliers still agrees (within twice the limits): a refinement that
     slides along a wall or into another minimum leaves the matches behind."""

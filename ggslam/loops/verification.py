@@ -7,7 +7,7 @@ A candidate is refused with the first reason that is found; the reason says what
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,6 +19,8 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
 
 _CELLS = 4
+_ALIKE = 1.5
+"""Of the overlap that is needed, so much is more than enough: features may then be gathered in fewer places."""
 
 
 class Status(Protocol):
@@ -113,12 +115,16 @@ def verify(
         align: refines T_old_new [4, 4] by geometry, from a start that is right to some centimetres and degrees.
     """
     registration = register(old.landmarks, new.landmarks, camera, settings.registration)
-    reason = _doubt_about_features(registration, camera, settings)
+    reason = _doubt_about_features(registration, camera, settings, settings.min_cells_alike)
     if reason:
         return _refusal(reason, registration)
     refined = align(registration.T_old_new)
     kept = registration.matches.agree(refined.T_world_camera, camera, settings.registration, slack=2.0)
-    return _judge(old, new, registration, refined, int((kept & registration.inliers).sum()), sigma, settings)
+    found = _judge(old, new, registration, refined, int((kept & registration.inliers).sum()), sigma, settings)
+    narrow = _doubt_about_features(registration, camera, settings, settings.min_cells)
+    if found.accepted and narrow and found.overlap < _ALIKE * settings.min_overlap:
+        return replace(found, accepted=False, reason=narrow)
+    return found
 
 
 def _judge(
@@ -184,16 +190,18 @@ def _voxel_keys(points: np.ndarray, voxel: float) -> np.ndarray:
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
 
-def _doubt_about_features(found: Registration, camera: Camera, settings: VerificationSettings) -> str:
+def _doubt_about_features(
+    found: Registration, camera: Camera, settings: VerificationSettings, min_cells: int
+) -> str:
     if found.count < settings.min_inliers:
         return f"{found.count} of {len(found.matches)} matches agree with one pose, {settings.min_inliers} needed"
     pixels = pixels_of(found.matches.new[found.inliers], camera)
     cells = np.floor(pixels / (camera.width, camera.height) * _CELLS).clip(0, _CELLS - 1).astype(int)
     filled = len(np.unique(cells[:, 0] * _CELLS + cells[:, 1]))
-    if filled < settings.min_cells:
+    if filled < min_cells:
         return (
             f"the {found.count} matches that agree lie in {filled} of {_CELLS**2} parts of the image, "
-            f"{settings.min_cells} needed"
+            f"{min_cells} needed"
         )
     return ""
 
