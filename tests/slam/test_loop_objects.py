@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ggslam.loops.activity import ActivitySettings
-from ggslam.loops.settings import GraphSettings
+from ggslam.loops.settings import GraphSettings, VerificationSettings
 from ggslam.objects.uniting import LabelledVoxels
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
@@ -52,7 +52,10 @@ def drifting(frames: list[Frame]) -> Slam:
     masks are not believed."""
     settings = ["mapping.iterations_per_frame=1", "masks.association.mode=always", "masks.source=recording"]
     activity = ActivitySettings(forget_after=0.05, near=0.15, batch=1, spread=0)
-    loops = LoopSettings(activity=activity, graph=GraphSettings(translation_drift=0.2, rotation_drift_deg=3))
+    loops = LoopSettings(
+        activity=activity, graph=GraphSettings(translation_drift=0.2, rotation_drift_deg=3),
+        verification=VerificationSettings(min_cells_alike=5),  # it closes late: by then there are double objects
+    )  # fmt: skip
     config = dataclasses.replace(load_config(None, settings), loops=loops)
     slam = Slam(frames[0].camera, config, has_masks=True)
     slam.tracker.noise = DepthNoise()
