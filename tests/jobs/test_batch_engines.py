@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from small_batch import write_small_batch
 from typer.testing import CliRunner, Result
 
 from ggslam.cli.main import app
@@ -23,17 +24,11 @@ from ggslam.jobs.batch.job_states import JobState, State
 from ggslam.jobs.batch.manifest import Manifest, read_manifest
 from ggslam.jobs.batch.ray_engine import Made, make_on_worker
 from ggslam.jobs.batch.slurm_script import slurm_script
-from ggslam.synthetic import write_synthetic_sequence
 
 
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("engines")
-    write_synthetic_sequence(folder / "first", frames=5, width=64, height=48, seed=0)
-    (folder / "batch.yaml").write_text(
-        "options: --iterations 1 --set mapping.first_frame_iterations=2\nrecordings: [missing, first]\nout: table\n"
-    )
-    return folder / "batch.yaml"
+    return write_small_batch(tmp_path_factory.mktemp("engines"), "[missing, first]", frames=5)
 
 
 def ggslam(*arguments: object) -> Result:
@@ -209,5 +204,6 @@ def test_a_batch_on_ray(manifest: Path, tmp_path: Path) -> None:
 @pytest.mark.long("a process that is begun and stopped")
 def test_a_process_that_is_stopped_leaves_nothing_running(manifest: Path, tmp_path: Path) -> None:
     worker = JobProcess.begin(JobState(read_manifest(manifest).jobs[0], tmp_path), (), 1)
-    worker.stop()
+    worker.ask_to_stop()
+    worker.wait_for_end()
     assert worker.process.poll() is not None

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import succeed
+from small_batch import write_small_batch
 
 from ggslam.errors import ConfigError
 from ggslam.jobs.batch.batch import run_batch
@@ -25,12 +26,7 @@ from ggslam.synthetic import write_synthetic_sequence
 
 @pytest.fixture(scope="module")
 def batch(tmp_path_factory: pytest.TempPathFactory) -> Manifest:
-    folder = tmp_path_factory.mktemp("batch")
-    write_synthetic_sequence(folder / "first", frames=6, width=64, height=48, seed=0)
-    (folder / "batch.yaml").write_text(
-        "options: --iterations 1 --set mapping.first_frame_iterations=2\nrecordings: [first, missing]\nout: table\n"
-    )
-    return read_manifest(folder / "batch.yaml")
+    return read_manifest(write_small_batch(tmp_path_factory.mktemp("batch"), "[first, missing]"))
 
 
 def told(states: list[JobState]) -> list[State]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -70,10 +69,14 @@ class JobProcess:
         code = self.process.returncode
         self.state.end(code if code >= 0 else 128 - code, time.monotonic() - self.start, self.state.last_line())
 
-    def stop(self) -> None:
-        """Ends a process that may still be at work: it saves what it has done."""
+    def ask_to_stop(self) -> None:
+        """Has a process that may still be at work save what it has done and end. To be called once: a second signal
+        ends it at once."""
         if self.process.poll() is None:
-            self.process.send_signal(signal.SIGTERM)
+            self.process.terminate()
+
+    def wait_for_end(self) -> None:
+        """Waits until a process that was asked to stop has saved, but not for ever."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(timeout=60)
         self.process.kill()
@@ -94,6 +97,6 @@ def make_job(state: JobState, processors: int, with_parent: bool = False) -> Non
     try:
         worker.process.wait()
     finally:
-        if worker.process.poll() is None:
-            worker.stop()
+        worker.ask_to_stop()
+        worker.wait_for_end()
     worker.end()

@@ -54,7 +54,7 @@ def run_locally(
             time.sleep(_WAIT_S)
     finally:
         for worker in busy:
-            worker.process.terminate()  # all at once: saving takes a while
+            worker.ask_to_stop()  # all together: saving takes a while
         for worker in busy:
-            worker.stop()
+            worker.wait_for_end()
     changed()
