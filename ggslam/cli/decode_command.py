@@ -40,8 +40,9 @@ def decode(
 ) -> None:
     """Decode an MPEG G-PCC stream, or one slice or box of it."""
     from ggslam.jobs.code.coding import decode_file
+    from ggslam.runs.map_container import is_container
 
-    if source.suffix.lower() == ".ggz":
+    if is_container(source):
         _unpack(source, out, slice_id is not None or box is not None, threads)
         return
     corners = None if box is None else _corners(box)

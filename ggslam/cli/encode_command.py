@@ -106,8 +106,9 @@ def encode(
     """Encode a point cloud or a Gaussian map as an MPEG G-PCC stream (ISO/IEC 23090-9), in parallel slices."""
     from ggslam.coding import CodecSettings
     from ggslam.jobs.code.coding import encode_file
+    from ggslam.runs.map_container import is_container
 
-    contained = out.suffix.lower() == ".ggz"
+    contained = is_container(out)
     _refuse_ignored(context, Preset.splat if contained else preset, sweep)
     settings = CodecSettings(
         qp=qp, chroma_offset=chroma_offset, geometry_scale=geometry_scale, voxel_size=voxel, geometry_bits=bits,

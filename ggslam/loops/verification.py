@@ -14,6 +14,7 @@ import numpy as np
 
 from ggslam.features.orb import Landmarks
 from ggslam.features.registration import Matches, Registration, pixels_of, register
+from ggslam.geometry.voxels import voxel_keys
 from ggslam.loops.settings import VerificationSettings
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
@@ -115,13 +116,14 @@ def verify(
         align: refines T_old_new [4, 4] by geometry, from a start that is right to some centimetres and degrees.
     """
     registration = register(old.landmarks, new.landmarks, camera, settings.registration)
-    reason = _doubt_about_features(registration, camera, settings, settings.min_cells_alike)
+    cells = _count_cells(registration, camera)
+    reason = _doubt_about_features(registration, cells, settings, settings.min_cells_alike)
     if reason:
         return _refusal(reason, registration)
     refined = align(registration.T_old_new)
     kept = registration.matches.agree(refined.T_world_camera, camera, settings.registration, slack=2.0)
     found = _judge(old, new, registration, refined, int((kept & registration.inliers).sum()), sigma, settings)
-    narrow = _doubt_about_features(registration, camera, settings, settings.min_cells)
+    narrow = _doubt_about_features(registration, cells, settings, settings.min_cells)
     if found.accepted and narrow and found.overlap < _ALIKE * settings.min_overlap:
         return replace(found, accepted=False, reason=narrow)
     return found
@@ -180,30 +182,26 @@ def voxel_overlap(old: np.ndarray, new: np.ndarray, voxel: float) -> float:
     """Share of the voxels with new points [n, 3] that hold old points [m, 3], too; edge `voxel` metres."""
     if not len(old) or not len(new):
         return 0.0
-    new_keys, old_keys = np.unique(_voxel_keys(new, voxel)), _voxel_keys(old, voxel)
+    new_keys, old_keys = np.unique(voxel_keys(new, voxel)), voxel_keys(old, voxel)
     return float(np.isin(new_keys, old_keys).mean())
 
 
-def _voxel_keys(points: np.ndarray, voxel: float) -> np.ndarray:
-    """int64 [n]; equal for points of one voxel (coordinates up to a million voxels)."""
-    cells = np.floor(points / voxel).astype(np.int64) + (1 << 20)
-    return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
-
-
-def _doubt_about_features(
-    found: Registration, camera: Camera, settings: VerificationSettings, min_cells: int
-) -> str:
+def _doubt_about_features(found: Registration, cells: int, settings: VerificationSettings, min_cells: int) -> str:
     if found.count < settings.min_inliers:
         return f"{found.count} of {len(found.matches)} matches agree with one pose, {settings.min_inliers} needed"
-    pixels = pixels_of(found.matches.new[found.inliers], camera)
-    cells = np.floor(pixels / (camera.width, camera.height) * _CELLS).clip(0, _CELLS - 1).astype(int)
-    filled = len(np.unique(cells[:, 0] * _CELLS + cells[:, 1]))
-    if filled < min_cells:
+    if cells < min_cells:
         return (
-            f"the {found.count} matches that agree lie in {filled} of {_CELLS**2} parts of the image, "
+            f"the {found.count} matches that agree lie in {cells} of {_CELLS**2} parts of the image, "
             f"{min_cells} needed"
         )
     return ""
+
+
+def _count_cells(found: Registration, camera: Camera) -> int:
+    """Parts of the image in which features agree."""
+    pixels = pixels_of(found.matches.new[found.inliers], camera)
+    cells = np.floor(pixels / (camera.width, camera.height) * _CELLS).clip(0, _CELLS - 1).astype(int)
+    return len(np.unique(cells[:, 0] * _CELLS + cells[:, 1]))
 
 
 def _doubt_about_geometry(

@@ -13,10 +13,10 @@ from itertools import product
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ggslam.geometry.voxels import neighbour_step, voxel_centres, voxel_keys
 from ggslam.merging.known_run import KnownRun
 from ggslam.scene.poses import transform_points
 
-_BITS, _OFFSET = 21, 1 << 20
 _NEAREST = 0.1
 """Metres; points nearer to the camera count as if they were so near."""
 
@@ -34,14 +34,14 @@ class Ownership:
         keys, weights, owners = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0, np.int64)]
         for number, (run, own) in enumerate(zip(runs, poses, strict=True)):
             for points, T in zip(run.points, own, strict=True):
-                keys.append(_keys(transform_points(points.astype(float), T), voxel))
+                keys.append(voxel_keys(transform_points(points.astype(float), T), voxel))
                 weights.append(1 / np.maximum(points[:, 2].astype(float), _NEAREST) ** 2)  # pixels a square metre
                 owners.append(np.full(len(points), number))
         found, where = np.unique(np.concatenate(keys), return_inverse=True)
         index = where.reshape(-1) * len(runs) + np.concatenate(owners)
         measured = np.bincount(index, np.concatenate(weights), len(found) * len(runs)).reshape(-1, len(runs))
         self._owners = _smooth(found, measured).argmax(1)
-        self._tree = cKDTree(_centres(found, voxel)) if len(found) else None
+        self._tree = cKDTree(voxel_centres(found, voxel)) if len(found) else None
 
     def of(self, points: np.ndarray) -> np.ndarray:
         """Number of the run that each place [n, 3] belongs to, int64 [n]: that of the nearest measured voxel."""
@@ -50,22 +50,11 @@ class Ownership:
         return self._owners[self._tree.query(points)[1]]
 
 
-def _keys(points: np.ndarray, voxel: float) -> np.ndarray:
-    cells = np.floor(points / voxel).astype(np.int64) + _OFFSET
-    return (cells[:, 0] << 2 * _BITS) | (cells[:, 1] << _BITS) | cells[:, 2]
-
-
-def _centres(keys: np.ndarray, voxel: float) -> np.ndarray:
-    mask = (1 << _BITS) - 1
-    cells = np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], 1) - _OFFSET
-    return (cells + 0.5) * voxel
-
-
 def _smooth(keys: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Sums [n, R] over each voxel (ascending keys [n]) and its 26 neighbours."""
     out = np.zeros_like(values)
     for x, y, z in product((-1, 0, 1), repeat=3):
-        wanted = keys + ((x << 2 * _BITS) + (y << _BITS) + z)
+        wanted = keys + neighbour_step(x, y, z)
         at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
         out += np.where((keys[at] == wanted)[:, None], values[at], 0) if len(keys) else 0
     return out

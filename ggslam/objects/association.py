@@ -119,14 +119,21 @@ class Associator:
         for i in number_ids(result.ids)[0].tolist():
             self.sightings[i] = self.sightings.get(i, 0) + 1
         for kept, dropped in result.merges:
-            self.sightings[kept] = max(self.sightings.get(kept, 0), self.sightings.pop(dropped, 0))
+            self._join_sightings(kept, dropped)
         return result if self.uses_own_ids else replace(result, forgotten=self._forget(result.created))
 
     def unite(self, kept: int, dropped: int) -> None:
         """Two objects are one, as others found out: the map is relabelled by them."""
         self._evidence.join(kept, dropped)
+        self._rename(kept, dropped)
+        self._join_sightings(kept, dropped)
+
+    def _rename(self, kept: int, dropped: int) -> None:
+        """What was called `dropped` is called `kept` from now on."""
         self._current[self._current == dropped] = kept
         self._fragments.rename(kept, dropped)
+
+    def _join_sightings(self, kept: int, dropped: int) -> None:
         self.sightings[kept] = max(self.sightings.get(kept, 0), self.sightings.pop(dropped, 0))
 
     def _forget(self, created: list[int]) -> list[int]:
@@ -185,8 +192,7 @@ class Associator:
         self._evidence.observe(overlap, find_touching_pairs(shown))
         merges = self._evidence.merges()
         for kept, dropped in merges:
-            self._current[self._current == dropped] = kept
-            self._fragments.rename(kept, dropped)
+            self._rename(kept, dropped)
         splits = [(part.parent, part.object_id) for part in parts.values() if part.object_id]
         return Association(self._current[image] if merges else image, merges, created, splits)
 

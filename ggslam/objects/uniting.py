@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.geometry.voxels import voxel_keys
 from ggslam.objects.settings import UnitingSettings
 from ggslam.scene.gaussian_map import GaussianMap
 
 FAINT = 0.1
 """Gaussians fainter than this say nothing."""
-_OFFSET, _BITS = 1 << 20, 21
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,7 @@ class LabelledVoxels:
     @staticmethod
     def of(means: np.ndarray, labels: np.ndarray, weights: np.ndarray, voxel: float) -> LabelledVoxels:
         """Of Gaussians: means [N, 3], object ids [N], weights [N]."""
-        cells = np.floor(means / voxel).astype(np.int64) + _OFFSET
-        keys = (cells[:, 0] << 2 * _BITS) | (cells[:, 1] << _BITS) | cells[:, 2]
-        present, where = np.unique(keys, return_inverse=True)
+        present, where = np.unique(voxel_keys(means, voxel), return_inverse=True)
         pairs, of_pair = np.unique(where.reshape(-1).astype(np.int64) << 16 | labels, return_inverse=True)
         weight = np.bincount(of_pair.reshape(-1), weights)
         order = np.lexsort((weight, pairs >> 16))  # the heaviest of a voxel comes last

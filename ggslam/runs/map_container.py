@@ -17,6 +17,7 @@ Votes, clouds, scores and pictures stay behind. Identity vectors become the code
 from __future__ import annotations
 
 import hashlib
+import io
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -34,6 +35,7 @@ from ggslam.coding.splats import BIRTH, gaussians_of, is_splat_cloud, splat_attr
 from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.gaussian_rows import GaussianRows
+from ggslam.merging.moving import with_channels
 from ggslam.objects.encoding import code_of
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import publish_run
@@ -45,7 +47,7 @@ from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points_of_map
 from ggslam.runs.writing import RUN_FILES, TRUTH_FILE
-from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
+from ggslam.scene.arrays import arrays_of, arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.saved_places import PLACES_FILE
@@ -225,24 +227,20 @@ def _write_run(path: Path, members: dict[str, bytes], staged: Path, threads: int
     if with_objects:
         gaussians = _with_codes(gaussians, IdentityClassifier.from_file(staged / _CLASSIFIER))
     write_gaussian_ply(staged / "map.ply", gaussians, ("object_id", "identity") if with_objects else ())
-    write_bytes(staged / PLACES_FILE, members[PLACES_FILE])
-    arrays = read_all_arrays(staged / PLACES_FILE, "the places of a run")
+    held = io.BytesIO(members[PLACES_FILE])
+    arrays = arrays_of(held, f"{path}: {PLACES_FILE}: damaged", lambda found: {n: found[n] for n in found.files})
     births = gaussians.birth_keyframe.numpy().astype(np.int32)
     write_bytes(staged / PLACES_FILE, arrays_to_bytes(**{**arrays, "birth": births}))
     save_points_of_map(staged, gaussians, with_objects)
-    write_bytes(staged / RunRecord.FILE, members[RunRecord.FILE])
+    write_bytes(staged / RunRecord.FILE, members[RunRecord.FILE])  # the mark of the new run takes its place
     mark = RunRecord.read(staged)
-    (staged / RunRecord.FILE).unlink()
     lossy = f"coded for sending ({path.name}) and decoded: places and colours are rounded"
     return mark.model_copy(update={"files": None, "missing": [], "edits": [*mark.edits, lossy]})
 
 
 def _with_codes(gaussians: GaussianMap, classifier: IdentityClassifier) -> GaussianMap:
     """The map with an identity vector for each Gaussian that the classifier reads as its object."""
-    out = GaussianMap(gaussians.sh_degree, classifier.weight.shape[1], with_moments=False)
-    g = gaussians
-    rows = out.insert(g.means, g.quaternions, g.log_scales, g.opacity_logits, g.rgb, object_id=g.object_id)
-    out.sh[rows], out.birth_keyframe[rows] = g.sh, g.birth_keyframe
+    out = with_channels(gaussians, gaussians.sh_degree, classifier.weight.shape[1])
     for number in classifier.class_ids.tolist():
         own = out.object_id == number
         if bool(own.any()):

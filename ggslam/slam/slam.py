@@ -244,12 +244,8 @@ class Slam:
         return self._shutters.bring(self._depth_edges.clean(frame))
 
     def track(self, frame: Frame) -> TrackingResult:
-        """Locates one frame against the current target; a lost one is looked up among all keyframes.
-
-        Raises:
-            SequenceError: the frame is of another camera, or not what `Frame` says.
-        """
-        check_frame(frame, self.camera)
+        """Locates one frame, as `receive` gave it, against the current target; a lost one is looked up among all
+        keyframes."""
         self.mapper.valid = frame.valid
         start = time.perf_counter()
         self._follow_moves()

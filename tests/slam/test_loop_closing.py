@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from drifting_camera import walk_with_drift
 
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.evaluation.trajectory import score_trajectory
@@ -55,19 +56,8 @@ def drifting(
     to a keyframe, which all frames are, and their true poses."""
     config = dataclasses.replace(load_config(None, CHEAP), loops=loops)
     slam = Slam(frames[0].camera, config, has_masks=False)
-    slam.tracker.noise = DepthNoise()
-    order = [*range(0, 24, 2), *range(22, -1, -2)]
-    truth = [inverse(frames[0].T_world_camera) @ frames[i].T_world_camera for i in order]
-    step = se3_exp(drift * np.array([0.15, 0.06, -0.09, 0.0, np.radians(4), 0.0]) / len(order))
-    assert slam.loops is not None
-    for k, i in enumerate(order[:keyframes]):
-        slam._follow_moves()
-        T = slam.loops.poses[-1] @ inverse(truth[k - 1]) @ truth[k] @ step if k else np.eye(4)
-        points = extract_points(frames[i].depth, slam.camera, config.tracking.points, DepthNoise(), slam.context)
-        tracking = TrackingResult(T, TrackingStatus.OK, 1.0, 0.0, "", points)
-        slam.insert(dataclasses.replace(frames[i], index=k), tracking, slam.moves_followed)
-        slam.mapper.run(2)
-    return slam, np.array(truth)
+    truth = walk_with_drift(slam, frames, drift * np.array([0.15, 0.06, -0.09, 0.0, np.radians(4), 0.0]), keyframes)
+    return slam, truth
 
 
 @pytest.fixture(scope="module")

@@ -8,20 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drifting_camera import walk_with_drift
 
 from ggslam.loops.activity import ActivitySettings
 from ggslam.loops.settings import GraphSettings, VerificationSettings
 from ggslam.objects.uniting import LabelledVoxels
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, se3_exp
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
 from ggslam.slam.loop_closing import LoopSettings
 from ggslam.slam.object_masks import MaskSettings, ObjectMasks
 from ggslam.slam.slam import Slam
-from ggslam.tracking.points import extract_points
-from ggslam.tracking.settings import DepthNoise
-from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 
 def cube(corner: float) -> np.ndarray:
@@ -58,18 +55,7 @@ def drifting(frames: list[Frame]) -> Slam:
     )  # fmt: skip
     config = dataclasses.replace(load_config(None, settings), loops=loops)
     slam = Slam(frames[0].camera, config, has_masks=True)
-    slam.tracker.noise = DepthNoise()
-    order = [*range(0, 24, 2), *range(22, -1, -2)]
-    truth = [inverse(frames[0].T_world_camera) @ frames[i].T_world_camera for i in order]
-    step = se3_exp(np.array([0.5, 0.2, -0.3, 0.0, np.radians(8), 0.0]) / len(order))
-    assert slam.loops is not None
-    for k, i in enumerate(order):
-        slam._follow_moves()
-        T = slam.loops.poses[-1] @ inverse(truth[k - 1]) @ truth[k] @ step if k else np.eye(4)
-        points = extract_points(frames[i].depth, slam.camera, config.tracking.points, DepthNoise(), slam.context)
-        tracking = TrackingResult(T, TrackingStatus.OK, 1.0, 0.0, "", points)
-        slam.insert(dataclasses.replace(frames[i], index=k), tracking, slam.moves_followed)
-        slam.mapper.run(2)
+    walk_with_drift(slam, frames, np.array([0.5, 0.2, -0.3, 0.0, np.radians(8), 0.0]))
     return slam
 
 

@@ -85,8 +85,11 @@ def by_truth(a: Side, b: Side) -> np.ndarray:
     return inverse(_true_world(b)) @ _true_world(a)
 
 
-def best_of_truth_and_none(a: Side, b: Side, max_distance: float, seed: int) -> tuple[Alignment, np.ndarray]:
-    """By the truth where a run has one and the clouds then lie upon one another clearly better, else not at all."""
+def best_of_truth_and_none(
+    a: Side, b: Side, cloud_b: Cloud, max_distance: float, seed: int
+) -> tuple[Alignment, np.ndarray]:
+    """By the truth where a run has one and the clouds then lie upon one another clearly better, else not at all.
+    `cloud_b` has the points of B."""
     with_poses = [side for side in (a, b) if side.trajectory is not None]
     if not with_poses or any(side.truth is None for side in with_poses):
         return "none", np.eye(4)
@@ -95,8 +98,7 @@ def best_of_truth_and_none(a: Side, b: Side, max_distance: float, seed: int) -> 
     except ConfigError:
         return "none", np.eye(4)
     few = Cloud(a.points[Cloud(a.points).sample(_PROBES, seed)])
-    target = Cloud(b.points)
-    plain, moved = (overlap(few, target, max_distance, start, seed).fitness for start in (np.eye(4), T))
+    plain, moved = (overlap(few, cloud_b, max_distance, start, seed).fitness for start in (np.eye(4), T))
     return ("truth", T) if moved > plain + _CLEARLY else ("none", np.eye(4))
 
 

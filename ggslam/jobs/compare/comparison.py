@@ -112,15 +112,14 @@ def compare(
     if not all(0 < d < np.inf for d in (max_distance, *thresholds)):
         raise ConfigError(f"expected positive distances in metres, found {max_distance} and {list(thresholds)}")
     one, other = read_side(a, seed), read_side(b, seed)
-    pairs = common_poses(one, other)
+    pairs, cloud_a, cloud_b = common_poses(one, other), Cloud(one.points), Cloud(other.points)
     T_b_a = np.eye(4)
     if align == "trajectory":
         T_b_a = by_trajectory(one, other, pairs)
     elif align == "truth":
         T_b_a = by_truth(one, other)
     elif align == "auto":
-        align, T_b_a = best_of_truth_and_none(one, other, max_distance, seed)
-    cloud_a, cloud_b = Cloud(one.points), Cloud(other.points)
+        align, T_b_a = best_of_truth_and_none(one, other, cloud_b, max_distance, seed)
     distances = [max(max_distance, d) for d in (0.25, 0.10)] + [max_distance]
     icp = None
     try:
