@@ -149,8 +149,9 @@ class CpuMapper(Mapper):
 
     def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:
         if pose_rate:
-            optimizer = self._pose_optimizers[keyframe.index]
-            keyframe.T_camera_world = optimizer.step(keyframe.T_camera_world, twist, pose_rate)
+            optimizer, T_before = self._pose_optimizers[keyframe.index], keyframe.T_camera_world
+            keyframe.T_camera_world = optimizer.step(T_before, twist, pose_rate)
+            self._move_rig(keyframe, T_before)
         if keyframe.index > 0 and self._is_exposed(keyframe):
             optimizer_of_exposure = self._exposure_optimizers[keyframe.index]
             keyframe.exposure = optimizer_of_exposure.step(keyframe.exposure, loss.exposure_gradient)
