@@ -32,10 +32,10 @@ class RigClock:
     interval: float = 0.0
 
     def knows(self, seconds: float) -> bool:
-        """Whether `moved` can tell the motion in so short a time."""
+        """Whether `motion_in` can tell the motion in so short a time."""
         return abs(seconds) <= TOGETHER_S or self.motion is not None
 
-    def moved(self, seconds: float) -> np.ndarray:
+    def motion_in(self, seconds: float) -> np.ndarray:
         """T_now_then [4, 4], to the rig's pose now from that so many seconds later; the identity if it is not known."""
         if self.motion is None or abs(seconds) <= 1e-6:
             return np.eye(4)

@@ -162,7 +162,7 @@ class RigSlam(Slam):
 
     def _T_first_of(self, frame: Frame, now: float) -> np.ndarray:
         """From a frame's camera to the first one's as it was at a time, seconds."""
-        return self._clock.moved(frame.timestamp - now) @ self.rig.T_first_camera[frame.camera_number]
+        return self._clock.motion_in(frame.timestamp - now) @ self.rig.T_first_camera[frame.camera_number]
 
     def _lead(self, frames: list[Frame]) -> Frame:
         """The first camera's frame; where that shows nothing, one without anything."""

@@ -98,7 +98,8 @@ def write_synthetic_rig(
             T_first_camera = inverse(T_rig_camera[0]) @ T_rig_camera[number]
             poses = _later(plan.poses, late * plan.frame_rate) @ T_first_camera
             (work / name).mkdir()
-            write_recording(work / name, plan, poses, plan.times + late, number, _shifted(progress, number, len(named)))
+            told = _progress_of(progress, number, len(named))
+            write_recording(work / name, plan, poses, plan.times + late, number, told)
         (work / "rig.yaml").write_text(_describe(names, T_rig_camera), encoding="utf-8")
     return target
 
@@ -112,7 +113,7 @@ def _later(poses: np.ndarray, share: float) -> np.ndarray:
     return np.stack([T @ se3_exp(share * se3_log(step)) for T, step in zip(poses, steps, strict=True)])
 
 
-def _shifted(
+def _progress_of(
     progress: Callable[[int, int], None] | None, number: int, cameras: int
 ) -> Callable[[int, int], None] | None:
     if progress is None:

@@ -140,6 +140,8 @@ def write_recording(
     """
     _write_images(folder, plan, poses, number, progress)
     _write_description(folder, plan, poses, times)
+    if (times != plan.times).any():  # else they follow from the frame rate
+        (folder / "timestamps.txt").write_text("".join(f"{time:.6f}\n" for time in times.tolist()), encoding="utf-8")
 
 
 @contextmanager

@@ -93,7 +93,7 @@ def join_points(parts: Sequence[FramePoints], T_first_camera: Sequence[np.ndarra
         parts: in the frame of each camera.
         T_first_camera: [4, 4] of each, to the frame of the result.
     """
-    moved = [_moved(part, T) for part, T in zip(parts, T_first_camera, strict=True)]
+    moved = [_in_frame(part, T) for part, T in zip(parts, T_first_camera, strict=True)]
     if len(moved) == 1:
         return moved[0]
     names = ("points", "normals", "covariances", "pixels", "weights")
@@ -101,7 +101,7 @@ def join_points(parts: Sequence[FramePoints], T_first_camera: Sequence[np.ndarra
     return FramePoints(*joined, depths=np.concatenate([part.z for part in moved]))
 
 
-def _moved(part: FramePoints, T: np.ndarray) -> FramePoints:
+def _in_frame(part: FramePoints, T: np.ndarray) -> FramePoints:
     """The points in another frame; themselves where that is their own."""
     if (np.eye(4) == T).all():
         return part
