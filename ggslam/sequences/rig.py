@@ -184,6 +184,22 @@ class RigSequence(Sequence):
         return bool(shift < TRUTH_NEAR_M and turn < TRUTH_NEAR_DEG)
 
 
+def one_camera(sequence: Sequence, what: str) -> Sequence:
+    """The same sequence, which is not of a rig.
+
+    Args:
+        sequence: a recording.
+        what: takes one camera's recording only, in words.
+
+    Raises:
+        SequenceError: it is of a rig.
+    """
+    if isinstance(sequence, RigSequence):
+        places = ", ".join(str(part.sequence.path) for part in sequence.parts)
+        raise SequenceError(f"{sequence.path}: is a rig, and {what} takes the recording of one camera: {places}")
+    return sequence
+
+
 def by_instant(frames: Iterable[Frame]) -> Iterator[list[Frame]]:
     """The frames of a rig's recording, in order, those of one instant together."""
     for _, together in groupby(frames, lambda frame: frame.instant):

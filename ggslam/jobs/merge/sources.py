@@ -108,7 +108,8 @@ class MergeSource:
         if self.recording.parts is not None:
             return list(self.recording.parts)
         values = {name: getattr(self.recording, name) for name in ("open", "format", "camera")}
-        return [PartRecord(run=self.place, frames=self.frame_count, **values)]
+        rig = {} if self.recording.rig is None else {"rig": self.recording.rig}
+        return [PartRecord(run=self.place, frames=self.frame_count, **values, **rig)]
 
     def run_objects(self) -> RunObjects | None:
         """Its objects, if it has any."""
