@@ -21,6 +21,8 @@ from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
 
+KEPT_POOLS = 64
+"""Keyframes whose pixels drawn ahead are kept, 64 KB for each with the settings' defaults."""
 MANY_CLASSES = 128
 """Beyond so many classes a step's softmax runs over those in its sample and this many others, drawn at random."""
 
@@ -34,6 +36,7 @@ class CpuIdentityLearner(IdentityLearner):
         seed: of sampling.
     """
 
+    kept_pools = KEPT_POOLS
     last_loss: float = float("nan")
     """Cross-entropy of the last step."""
 
