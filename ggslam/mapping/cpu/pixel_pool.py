@@ -42,8 +42,6 @@ def draw_pool(
 def _tile_by_tile(pixels: np.ndarray, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     """Pixels (flat indices [M]) of an image [H, W] in a random order of tiles: to composite those of a few tiles costs
     much less than as many from all over the image."""
-    import os
-    if os.environ.get("XX"): return rng.permutation(pixels)
     rows, columns = np.divmod(pixels, shape[1])
     across = -(-shape[1] // TILE)
     tile = rows // TILE * across + columns // TILE
