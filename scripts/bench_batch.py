@@ -24,8 +24,8 @@ import ray
 
 from ggslam.jobs.batch.batch import run_batch
 from ggslam.jobs.batch.job_states import JobState, State
-from ggslam.jobs.batch.local_engine import PROCESSORS
 from ggslam.jobs.batch.manifest import Manifest, read_manifest
+from ggslam.jobs.tasks.processors import PROCESSORS
 from ggslam.synthetic import write_synthetic_sequence
 
 COMPARED = ("map.ply", "trajectory.txt", "objects.json", "classifier.npz", "votes.npz", "points.ply", "frames.csv")
