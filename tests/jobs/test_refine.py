@@ -23,7 +23,7 @@ from ggslam.jobs.refine.cells_of_store import StoreCells
 from ggslam.jobs.refine.refine_run import refine_run
 from ggslam.jobs.refine.refine_store import refine_store
 from ggslam.jobs.refine.settings import RefineSettings
-from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, cell_arrays, gaussians_of_cell, map_of_arrays
+from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, cell_arrays, gaussians_of_cell
 from ggslam.jobs.submaps.stores import INDOORS, store_of_run
 from ggslam.jobs.tasks.engines import Engine
 from ggslam.rendering.cpu import CpuRasterizer

@@ -66,7 +66,7 @@ class CellBox:
         """Which points [..., 3] lie in it, bool [...]."""
         return np.asarray(((points >= np.array(self.low)) & (points < np.array(self.high))).all(-1))
 
-    def seen_in(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> CellView:
+    def view(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> CellView:
         """Where the measurements of a depth image [H, W] (metres, 0: none) lie as to the box."""
         height, width = depth.shape
         x, y = (np.arange(width) - camera.cx) / camera.fx, (np.arange(height) - camera.cy) / camera.fy

@@ -6,7 +6,6 @@ What comes out depends on what goes in and nothing else, so cells can be trained
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,11 +15,12 @@ from ggslam.errors import GgslamError
 from ggslam.jobs.refine.cell_mapper import CellBox, CellMapper, CellView
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.cell_gaussians import arrays_of_map, gaussians_from_bytes, gaussians_to_bytes, map_of_arrays
-from ggslam.jobs.submaps.visit_records import VisitRecord, exposure_of
+from ggslam.jobs.submaps.visit_records import exposure_of
 from ggslam.jobs.tasks.processors import own_threads
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.native.loader import NativeContext
 from ggslam.runs.recordings import open_recorded
+from ggslam.runs.records.visit import VisitRecord
 from ggslam.sequences import Sequence
 from ggslam.submaps.cell_keys import CellKey
 
@@ -82,7 +82,7 @@ def train_cell(task: CellTask) -> TrainedCell:
     if task.halo:
         halo = map_of_arrays(gaussians_from_bytes(task.halo, task.name)[0], with_moments=True)
         gaussians.append(halo.take(torch.arange(len(halo))))
-    record = VisitRecord.model_validate(json.loads(task.record))
+    record = VisitRecord.parse(task.record, task.name)
     sequence = _recording(task.record)
     keyframes, views = _views(task, record, sequence)
     if not keyframes or not task.settings.steps:
@@ -103,7 +103,7 @@ def _views(task: CellTask, record: VisitRecord, sequence: Sequence) -> tuple[lis
     for number in task.views:
         known = record.keyframes[number]
         frame = sequence.frame(known.frame, masks=False)
-        view = near.seen_in(frame.depth, frame.camera, known.T_world_camera)
+        view = near.view(frame.depth, frame.camera, known.T_world_camera)
         if view.shown.mean() < task.settings.share or not view.shown.any():
             continue
         keyframe = make_keyframe(len(keyframes), frame, known.T_world_camera)
@@ -116,7 +116,7 @@ def _views(task: CellTask, record: VisitRecord, sequence: Sequence) -> tuple[lis
 @lru_cache(maxsize=4)
 def _recording(record: str) -> Sequence:
     """The recording of a visit; a worker opens it once."""
-    known = VisitRecord.model_validate(json.loads(record))
+    known = VisitRecord.parse(record, "visit")
     try:
         return open_recorded(known.sequence, known.run)
     except GgslamError:

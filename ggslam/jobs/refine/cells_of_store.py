@@ -17,7 +17,8 @@ from ggslam.jobs.refine.cell_mapper import CellBox
 from ggslam.jobs.refine.cell_training import CellTask
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.cell_gaussians import ARRAYS, GAUSSIANS, cell_arrays, gaussians_to_bytes
-from ggslam.jobs.submaps.visit_records import VisitRecord, read_record
+from ggslam.jobs.submaps.visit_records import read_record
+from ggslam.runs.records.visit import VisitRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.submaps.cell_keys import CellKey
@@ -115,7 +116,7 @@ class _Views:
     """The keyframes of a visit, and what they may see."""
 
     def __init__(self, record: VisitRecord) -> None:
-        self.text = json.dumps(record.values())
+        self.text = json.dumps(record.model_copy(update={"poses": {}}).values())
         self._count = len(record.keyframes)
         reach = record.settings().mapping.insertion.max_depth_m
         cameras: dict[Camera, list[int]] = {}
