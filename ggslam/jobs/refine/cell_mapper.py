@@ -31,7 +31,7 @@ class CellView:
 
     Attributes:
         shown: in it, bool [H, W].
-        hidden: something before it, bool [H, W].
+        hidden: something before it, or the image shows nothing, bool [H, W].
     """
 
     shown: np.ndarray
@@ -105,7 +105,7 @@ class StillMapper(CpuMapper):
         super().__init__(gaussians, settings, context)
         gaussians.updates[:] = _GROWN_UP
         self.adopt(gaussians, keyframes)
-        self._valid = valid
+        self._counted = valid
 
     def train(
         self, steps: int, seed: Sequence[int], progress: Callable[[int, int], None] = lambda done, total: None
@@ -131,7 +131,7 @@ class StillMapper(CpuMapper):
         return (float(np.mean(found[:turns])), float(np.mean(found[-turns:]))) if found else (np.nan, np.nan)
 
     def _valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
-        return self._valid[keyframe.index]
+        return self._counted[keyframe.index]
 
     def _is_exposed(self, keyframe: Keyframe) -> bool:
         return bool((keyframe.exposure != identity_exposure()).any())
@@ -157,15 +157,13 @@ class CellMapper(StillMapper):
         context: threads.
         keyframes: numbered from 0.
         views: what the pixels of each show.
-        valid: where their images show something at all, bool [H, W]; None: everywhere.
     """
 
     def __init__(
         self, gaussians: GaussianMap, own: int, box: CellBox, settings: MapperSettings, context: NativeContext,
-        keyframes: list[Keyframe], views: Sequence[CellView], valid: np.ndarray | None = None,
+        keyframes: list[Keyframe], views: Sequence[CellView],
     ) -> None:  # fmt: skip
-        counts = [~view.hidden if valid is None else ~view.hidden & valid for view in views]
-        super().__init__(gaussians, settings, context, keyframes, counts)
+        super().__init__(gaussians, settings, context, keyframes, [~view.hidden for view in views])
         self._own, self._box, self._views = own, box, views
         self._others = {name: getattr(gaussians, name)[own:].clone() for name in _TRAINED}
         self._own_psnr = float("nan")

@@ -83,13 +83,12 @@ def train_cell(task: CellTask) -> TrainedCell:
         halo = map_of_arrays(gaussians_from_bytes(task.halo, task.name)[0], with_moments=True)
         gaussians.append(halo.take(torch.arange(len(halo))))
     record = VisitRecord.parse(task.record, task.name)
-    sequence = _recording(task.record)
-    keyframes, views = _views(task, record, sequence)
+    keyframes, views = _views(task, record, _recording(task.record))
     if not keyframes or not task.settings.steps:
         return TrainedCell(task.key, task.own, own, 0)
     settings = record.settings().mapping
     context = NativeContext(own_threads())
-    mapper = CellMapper(gaussians, own, task.box, settings, context, keyframes, views, sequence.valid)
+    mapper = CellMapper(gaussians, own, task.box, settings, context, keyframes, views)
     seed = [task.settings.seed, *(place + 2**32 for place in task.key)]
     before, after = mapper.train(task.settings.steps, seed)
     trained = {name: values[:own] for name, values in arrays_of_map(mapper.map).items()}
@@ -104,6 +103,8 @@ def _views(task: CellTask, record: VisitRecord, sequence: Sequence) -> tuple[lis
         known = record.keyframes[number]
         frame = sequence.frame(known.frame, masks=False)
         view = near.view(frame.depth, frame.camera, known.T_world_camera)
+        if frame.valid is not None:
+            view = CellView(view.shown & frame.valid, view.hidden | ~frame.valid)
         if view.shown.mean() < task.settings.share or not view.shown.any():
             continue
         keyframe = make_keyframe(len(keyframes), frame, known.T_world_camera)

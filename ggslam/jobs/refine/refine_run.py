@@ -8,6 +8,8 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from ggslam.errors import ConfigError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.jobs.progress import Observer, SilentObserver
@@ -98,11 +100,10 @@ def _refine(
 ) -> RunRefinement:  # fmt: skip
     sequence, record = open_recording_of(source, recording), source.keyframes()
     observer.begin("read keyframes", len(record.keyframes))
-    keyframes = _read_keyframes(source, sequence, observer)
+    keyframes, valid = _read_keyframes(source, sequence, observer)
     scene = source.segmented_map() if source.has_objects() else None
     gaussians = source.gaussians(with_moments=True)
-    settled, valid = source.config().mapping, [sequence.valid] * len(keyframes)
-    mapper = StillMapper(gaussians, settled, NativeContext(), keyframes, valid)
+    mapper = StillMapper(gaussians, source.config().mapping, NativeContext(), keyframes, valid)
     observer.begin("refine", settings.steps)
     before, after = mapper.train(settings.steps, [settings.seed], observer.advance)
     refined = None if scene is None else SegmentedMap(gaussians, scene.classifier, scene.table, scene.votes)
@@ -113,19 +114,22 @@ def _refine(
     return RunRefinement(target, len(keyframes), settings.steps, before, after, time.perf_counter() - start, notes)
 
 
-def _read_keyframes(source: RunFolder, sequence: Sequence, observer: Observer) -> list[Keyframe]:
-    """With their images, those of other recordings left out."""
-    keyframes, known = list[Keyframe](), source.keyframes().keyframes
+def _read_keyframes(
+    source: RunFolder, sequence: Sequence, observer: Observer
+) -> tuple[list[Keyframe], list[np.ndarray | None]]:
+    """With their images, and where these show something; those of other recordings are left out."""
+    keyframes, known, valid = list[Keyframe](), source.keyframes().keyframes, list[np.ndarray | None]()
     for done, record in enumerate(known, 1):
         if record.frame != ELSEWHERE:
             frame = sequence.frame(record.frame, masks=False)
             keyframe = make_keyframe(len(keyframes), frame, record.T_world_camera)
             keyframe.exposure = exposure_of(record).copy()
             keyframes.append(keyframe)
+            valid.append(frame.valid)
         observer.advance(done, len(known))
     if not keyframes:
         raise ConfigError(f"{source.path}: none of its keyframes is of its recording")
-    return keyframes
+    return keyframes, valid
 
 
 def _save(

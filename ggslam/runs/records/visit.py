@@ -38,12 +38,7 @@ class VisitRecord(Record):
 
     def camera_of(self, keyframe: KeyframeRecord) -> Camera:
         """The camera of a keyframe's images."""
-        first = 0
-        for part in self.sequence.parts or []:
-            first += part.frames
-            if keyframe.frame < first:
-                return part.camera
-        return self.sequence.camera
+        return self.sequence.camera_of(keyframe.frame)
 
     @staticmethod
     def parse(content: bytes | str, what: str) -> VisitRecord:
