@@ -78,7 +78,7 @@ class ObjectMasks:
             model = OnnxSegmenter(settings.model, settings.onnx)
             self._segment = lambda frame: model.segment(frame.color)
         self._associator = self._make_associator()
-        self._segmented: int | None = None  # number of the last frame that was
+        self._segmented: dict[int, int] = {}  # of each camera the last frame, or instant, that was
 
     def _make_associator(self) -> Associator:
         """A segmenter's ids mean nothing from one frame to the next; a recording's may."""
@@ -151,9 +151,10 @@ class ObjectMasks:
         """Whether too few frames have passed since the last one that was segmented."""
         if self._source not in ("geometry", "model"):
             return False
-        rests = self._segmented is not None and 0 <= frame.index - self._segmented < self.settings.every
+        number, now = frame.camera_number, frame.index if frame.instant is None else frame.instant
+        rests = number in self._segmented and 0 <= now - self._segmented[number] < self.settings.every
         if not rests:
-            self._segmented = frame.index
+            self._segmented[number] = now
         return rests
 
     def _segments(self, frame: Frame) -> np.ndarray | None:
