@@ -156,30 +156,36 @@ def open_recording_of(
         SequenceError: it is not there any more.
         RunFolderError: the run does not say which it was.
     """
-    record = folder.sequence()
+    return open_recorded(folder.sequence(), str(folder.path), path, masks, scale)
+
+
+def open_recorded(
+    record: SequenceRecord, run: str, path: Path | None = None, masks: Path | None = None, scale: float | None = None
+) -> Sequence:
+    """The same by the record alone; `run` names whose it is."""
     if record.parts is None:
-        return _open_as(folder, record, path, masks, scale)
+        return _open_as(run, record, path, masks, scale)
     if len({part.open.path for part in record.parts}) > 1 and (path is not None or masks is not None):
         what = "`sequence`" if path is not None else "`masks`"
-        raise RunFolderError(f"{folder.path}: was merged from runs of several recordings; {what} cannot be all of them")
-    return JoinedSequence([_open_part(folder, part, path, masks, scale) for part in record.parts])
+        raise RunFolderError(f"{run}: was merged from runs of several recordings; {what} cannot be all of them")
+    return JoinedSequence([_open_part(run, part, path, masks, scale) for part in record.parts])
 
 
 def _open_part(
-    folder: RunFolder, part: PartRecord, path: Path | None, masks: Path | None, scale: float | None
+    run: str, part: PartRecord, path: Path | None, masks: Path | None, scale: float | None
 ) -> JoinedPart:
-    sequence = _open_as(folder, part, path, masks, scale)
+    sequence = _open_as(run, part, path, masks, scale)
     T = np.eye(4) if part.T_joint_truth is None else part.T_joint_truth
     return JoinedPart(sequence, part.time_shift_s, T, None if masks is not None else part.mask_ids)
 
 
 def _open_as(
-    folder: RunFolder, record: SequenceRecord | PartRecord, path: Path | None, masks: Path | None, scale: float | None
+    run: str, record: SequenceRecord | PartRecord, path: Path | None, masks: Path | None, scale: float | None
 ) -> Sequence:
     """A recording as a record says, with another place of recording or masks, or at another scale."""
     request = request_in(record.open, path, masks)
     if is_live(request.path):
-        raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (`record`)")
+        raise RunFolderError(f"{run}: was run live ({request.path}), and its frames were not kept (`record`)")
     sequence = replace(request, scale=request.scale if scale is None else scale).open()
     if isinstance(sequence, RigSequence):
         found = {name: value for name, value in describe_rig(sequence).items() if name != "cameras" or scale is None}
@@ -191,6 +197,6 @@ def _open_as(
     if found != expected:
         if isinstance(sequence, RigSequence):  # the rest would be a screenful
             other = {name for name in found if found[name] != expected.get(name)}
-            raise RunFolderError(f"{sequence.path}: not the rig of {folder.path}: other {', '.join(sorted(other))}")
-        raise RunFolderError(f"{sequence.path}: not the recording of {folder.path}: expected {expected}, found {found}")
+            raise RunFolderError(f"{sequence.path}: not the rig of {run}: other {', '.join(sorted(other))}")
+        raise RunFolderError(f"{sequence.path}: not the recording of {run}: expected {expected}, found {found}")
     return sequence

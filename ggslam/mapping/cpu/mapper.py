@@ -13,6 +13,7 @@ from ggslam.mapping.cpu.exposure import ExposureAdam
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
+from ggslam.mapping.identity import MIN_WEIGHT, TERMS
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
@@ -134,7 +135,7 @@ class CpuMapper(Mapper):
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""
         height, width = alpha.shape
         grid = np.arange(height * width, dtype=np.int32).reshape(height, width)[::stride, ::stride]
-        terms = self._rasterizer.pixel_terms(grid.reshape(-1))
+        terms = self._rasterizer.pixel_terms(grid.reshape(-1), TERMS, MIN_WEIGHT)
         ids, share = terms.labels(self.vote_labels())
         ids, share = ids.reshape(grid.shape), share.reshape(grid.shape) * (alpha[::stride, ::stride] > 0.5)
         return MapLabels.from_grid(ids, share, depth, stride)
