@@ -30,8 +30,8 @@ JOBS = (
     {"run"},
     {"report"},
     {"changes"},
-    {"score", "edit", "localize", "compare", "code", "render", "doctor", "batch", "merge"},
-    {"submaps"},
+    {"score", "edit", "localize", "compare", "code", "render", "doctor", "batch", "merge", "refine"},
+    {"submaps", "tasks"},
     {"progress"},
 )
 """The order inside `jobs`, likewise."""

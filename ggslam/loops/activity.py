@@ -63,10 +63,14 @@ class ActiveKeyframes:
     def __len__(self) -> int:
         return len(self._depths)
 
-    def add(self, T_world_camera: np.ndarray, median_depth_m: float) -> None:
-        """A keyframe is made at `T_world_camera` [4, 4]. It is active, and the camera is there now."""
-        if len(self):
-            self._path += float(np.linalg.norm(T_world_camera[:3, 3] - self._cameras[-1]))
+    def add(self, T_world_camera: np.ndarray, median_depth_m: float, before: int | None = -1) -> None:
+        """A keyframe is made at `T_world_camera` [4, 4]. It is active, and the camera is there now.
+
+        Args:
+            before: number of the keyframe that the camera came from; None: it was there already (in a rig).
+        """
+        if len(self) and before is not None:
+            self._path += float(np.linalg.norm(T_world_camera[:3, 3] - self._cameras[before]))
         self.active.add(len(self))
         self._depths = np.append(self._depths, median_depth_m)
         self._cameras = np.vstack([self._cameras, T_world_camera[:3, 3]])

@@ -44,7 +44,7 @@ from ggslam.tracking.scale import scale_settings, scene_scale
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
-_TRIM_EVERY = 8
+TRIM_EVERY = 8
 """Keyframes: the C library keeps a fifth of a run's memory for itself that once held arrays; asking for it back takes
 milliseconds."""
 
@@ -140,7 +140,7 @@ class Slam:
                 self.loops.begin(frame)  # beside what the host waits for
             self.insert(frame, tracking, self.moves_followed)
             self.poses.add_keyframe(tracking.T_world_camera)
-            if len(self.mapper.keyframes) % _TRIM_EVERY == 0:
+            if len(self.mapper.keyframes) % TRIM_EVERY == 0:
                 trim()
         self.poses.add(frame, tracking)
         if self.mapper.keyframes and self.growing:
@@ -161,13 +161,19 @@ class Slam:
         """As trained so far; on the device that it is trained on."""
         return self.mapper.map
 
-    def note_step(self, is_keyframe: bool, seconds: float) -> StepReport:
-        """What the step did that has just ended and took `seconds`; `steps` remembers it."""
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Of the frames, by `Frame.camera_number`."""
+        return (self.camera,)
+
+    def note_step(self, is_keyframe: bool, seconds: float, number: int = -1) -> StepReport:
+        """What the step did that has just ended with frame `number` of `frames` and took `seconds`; `steps` remembers
+        it."""
         loops_s = 0.0 if self.loops is None else self.loops.seconds
-        frame = self.frames[-1]
+        frame = self.frames[number]
         report = self.steps.add(frame, is_keyframe, seconds, self.times, loops_s, self.mapper, self.gaussian_count)
         if frame.status != TrackingStatus.LOST.value:
-            report.T_world_camera = self.poses.newest()
+            report.T_world_camera = self.poses.as_tracked(frame)
         return report
 
     @property
@@ -224,7 +230,8 @@ class Slam:
         parts = [gaussians] if cells is None else (part for _, part in cells.parts())
         poses = np.stack([k.T_world_camera for k in self.mapper.keyframes])
         noise = self.tracker.noise or DepthNoise()
-        return saved_places_to_bytes(self.camera, self.surface, self.loops, noise, self.scale, poses, parts)
+        cameras = [k.camera for k in self.mapper.keyframes] if len(self.cameras) > 1 else None
+        return saved_places_to_bytes(self.camera, self.surface, self.loops, noise, self.scale, poses, parts, cameras)
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, for a run that has no result."""
@@ -246,7 +253,7 @@ class Slam:
     def track(self, frame: Frame) -> TrackingResult:
         """Locates one frame, as `receive` gave it, against the current target; a lost one is looked up among all
         keyframes."""
-        self.mapper.valid = frame.valid
+        self.mapper.note_valid(frame)
         start = time.perf_counter()
         self._follow_moves()
         if not len(self.surface):

@@ -13,6 +13,7 @@ from ggslam.mapping.cpu.exposure import ExposureAdam
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
+from ggslam.mapping.identity import MIN_WEIGHT, TERMS
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
@@ -134,7 +135,7 @@ class CpuMapper(Mapper):
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""
         height, width = alpha.shape
         grid = np.arange(height * width, dtype=np.int32).reshape(height, width)[::stride, ::stride]
-        terms = self._rasterizer.pixel_terms(grid.reshape(-1))
+        terms = self._rasterizer.pixel_terms(grid.reshape(-1), TERMS, MIN_WEIGHT)
         ids, share = terms.labels(self.vote_labels())
         ids, share = ids.reshape(grid.shape), share.reshape(grid.shape) * (alpha[::stride, ::stride] > 0.5)
         return MapLabels.from_grid(ids, share, depth, stride)
@@ -150,8 +151,9 @@ class CpuMapper(Mapper):
 
     def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:
         if pose_rate:
-            optimizer = self._pose_optimizers[keyframe.index]
-            keyframe.T_camera_world = optimizer.step(keyframe.T_camera_world, twist, pose_rate)
+            optimizer, T_before = self._pose_optimizers[keyframe.index], keyframe.T_camera_world
+            keyframe.T_camera_world = optimizer.step(T_before, twist, pose_rate)
+            self._move_rig(keyframe, T_before)
         if keyframe.index > 0 and self._is_exposed(keyframe):
             optimizer_of_exposure = self._exposure_optimizers[keyframe.index]
             keyframe.exposure = optimizer_of_exposure.step(keyframe.exposure, loss.exposure_gradient)
