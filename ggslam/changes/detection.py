@@ -16,6 +16,7 @@ from ggslam.changes.sightings import Sightings, Surface, Tolerance, Visit
 from ggslam.changes.things import UNNAMED, JudgedSurface, Thing, things_by_id, things_by_surface
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points, turning_angle
+from ggslam.volumes.upright import estimate_up
 
 Kind = Literal["moved", "removed", "added", "look", "unseen"]
 _SAME_PLACE = 0.03
@@ -80,6 +81,7 @@ class ChangeDetector:
     ) -> None:
         self.visits, self.settings, self._ids = (old, new), settings, ids
         self.sights = [Sightings(visit, settings, context) for visit in self.visits]
+        self._up = estimate_up(old.T_world_camera, old.measured, old.normals).up
         self.judged: list[JudgedSurface] = []
         self.things: list[list[Thing]] = [[], []]
 
@@ -126,11 +128,12 @@ class ChangeDetector:
         same, count = 0, 0
         old, new = self.judged
         tree = cKDTree(new.points) if len(new.points) else None
-        stayed = old.other.there(self.settings.min_views) & (old.ids > 0)
+        stayed = old.other.is_there(self.settings.min_views) & (old.ids > 0)
         for i in np.unique(old.ids[stayed]).tolist():
-            rows = np.flatnonzero(stayed & (old.ids == i))
-            if tree is None or len(rows) < self.settings.min_points:
-                continue
+            own = old.ids == i
+            rows = np.flatnonzero(stayed & own)
+            if tree is None or len(rows) < max(self.settings.min_points, self.settings.whole * own.sum()):
+                continue  # what stayed of a thing that went are the places where it touched others
             apart, nearest = tree.query(old.points[rows], distance_upper_bound=_SAME_PLACE)
             names = new.ids[nearest[np.isfinite(apart)]]
             if len(names):
@@ -175,9 +178,9 @@ class ChangeDetector:
         small, large = sorted((before.extent(), after.extent()))
         if large > self.settings.max_size_ratio * small:
             return None
-        return fit_shapes(before, after, self.sights[0], self.sights[1], self.settings)
+        return fit_shapes(before, after, self.sights[0], self.sights[1], self._up, self.settings)
 
-    def _moved(self, old: Thing, new: Thing, fit: Fit) -> Change | None:
+    def _motion_change(self, old: Thing, new: Thing, fit: Fit) -> Change | None:
         """The change that a fit tells; None: it did not move by more than the maps err."""
         s, shape = self.settings, self._shape(0, old)
         middle, error = shape.points.mean(0), 0.5 * float(self.judged[0].within[old.rows].mean())
@@ -205,7 +208,7 @@ class ChangeDetector:
             if fit is not None and min(old.changed, new.changed) >= (
                 s.min_changed if fit.share >= s.min_fit else s.whole
             ):
-                change = self._moved(old, new, fit)
+                change = self._motion_change(old, new, fit)
                 if change is not None:
                     found.changes.append(change)
 
@@ -224,7 +227,7 @@ class ChangeDetector:
     def _differ(self, old: Thing, new: Thing, look: float) -> bool:
         """Whether things at one place have different shapes or colours."""
         shapes = max(old.changed, new.changed) >= self.settings.min_changed
-        return shapes or max(_known(old.color_apart), _known(new.color_apart)) > look
+        return shapes or max(_or_zero(old.color_apart), _or_zero(new.color_apart)) > look
 
     def _counterpart(self, old: Thing) -> int:
         """Id of what the newer visit has where a thing of the older one stood; 0: nothing with one."""
@@ -247,7 +250,7 @@ class ChangeDetector:
         for a, b in taken:
             fit = fits[a, b]
             assert fit is not None
-            change = self._moved(gone[a], come[b], fit)
+            change = self._motion_change(gone[a], come[b], fit)
             if change is not None:
                 found.changes.append(change)
         for things, numbers in ((gone, {a for a, _ in taken}), (come, {b for _, b in taken})):
@@ -262,7 +265,7 @@ class ChangeDetector:
             if new is None or new.label >= UNNAMED or min(old.seen, new.seen) < s.min_seen:
                 continue
             parts = [self._parts(0, gone, old), self._parts(1, come, new)]
-            if any(parts) and max(_known(old.color_apart), _known(new.color_apart)) > s.swapped:
+            if any(parts) and max(_or_zero(old.color_apart), _or_zero(new.color_apart)) > s.swapped:
                 for things, own, whole in zip((gone, come), parts, (old, new), strict=True):
                     things[:] = [t for t in things if t not in own] + [whole]
 
@@ -278,16 +281,16 @@ class ChangeDetector:
         theirs = {t.label: t for t in self.things[1]}
         for old in self.things[0]:
             stays = id(old) not in known and old.seen >= s.min_seen and old.changed < s.min_changed
-            if stays and old.label < UNNAMED and _known(old.color_apart) > s.look:
+            if stays and old.label < UNNAMED and _or_zero(old.color_apart) > s.look:
                 new = theirs.get(self._counterpart(old))
-                if new is not None and _known(new.color_apart) > s.look:
+                if new is not None and _or_zero(new.color_apart) > s.look:
                     found.changes.append(Change("look", old, new, confidence=min(1.0, old.color_apart / (2 * s.look))))
 
 
-def _known(value: float) -> float:
+def _or_zero(value: float) -> float:
     return value if np.isfinite(value) else 0.0
 
 
 def _confidence(thing: Thing) -> float:
     """Of something that went or came."""
-    return min(1.0, 2 * thing.seen) * max(thing.changed, _known(thing.color_apart))
+    return min(1.0, 2 * thing.seen) * max(thing.changed, _or_zero(thing.color_apart))

@@ -18,7 +18,7 @@ from ggslam.scene.poses import fit_similarity, inverse, orthonormalize, se3_exp,
 
 COLOR_SCALE_M = 0.08
 """Metres that the distance from black to full in one channel counts as where partners are looked for."""
-_COARSE, _COARSE_STEPS, _GOOD = 120, 8, 12
+_COARSE, _COARSE_STEPS, _GOOD = 150, 10, 16
 _FINE, _FINE_STEPS, _BEST = 400, 15, 8
 """Points, steps of each stage, and motions that are kept after it."""
 _REFINED = 1500
@@ -83,7 +83,7 @@ class Fit:
 
 
 def fit_shapes(
-    old: Shape, new: Shape, sights_old: Sightings, sights_new: Sightings, settings: ChangeSettings
+    old: Shape, new: Shape, sights_old: Sightings, sights_new: Sightings, up: np.ndarray, settings: ChangeSettings
 ) -> Fit | None:
     """The motion that brings a thing upon what it may be in the other visit, judged by what either visit saw at the
     places where the other one's surface would then be; None: too few points.
@@ -91,11 +91,12 @@ def fit_shapes(
     Args:
         old, new: surfaces in the common world.
         sights_old, sights_new: what the visits saw.
+        up: [3], unit vector: most things turn about it.
     """
     if min(len(old.points), len(new.points)) < settings.min_points:
         return None
     target, sample = _Target(new), old.sample(_REFINED, np.random.default_rng(0))
-    motions = [target.refine(sample, T, settings.fit_m) for T in _motions(old, new)]
+    motions = [target.refine(sample, T, settings.fit_m) for T in _motions(old, new, up)]
     fits = [_judge(T, old, new, sights_old, sights_new, settings) for T in _unlike(motions, len(motions))]
     best = max(fits, key=Fit.quality)
     # Of motions as good as the best the one that turns least: round things tell no turn.
@@ -128,11 +129,13 @@ def _share_there(found: Evidence, near: np.ndarray) -> tuple[float, float]:
     return int((there & near).sum()) / max(1, judged), judged / max(1, len(there))
 
 
-def _motions(old: Shape, new: Shape) -> list[np.ndarray]:
+def _motions(old: Shape, new: Shape, up: np.ndarray) -> list[np.ndarray]:
     """The likeliest motions by points and colours together, from starts all around."""
     rng = np.random.default_rng(0)
-    motions = np.tile(np.eye(4), (len(_rotations()), 1, 1))
-    motions[:, :3, :3] = _rotations()
+    upright = np.array([_about(up, angle) for angle in range(0, 360, 15)])
+    rotations = np.concatenate([upright, _rotations()])
+    motions = np.tile(np.eye(4), (len(rotations), 1, 1))
+    motions[:, :3, :3] = rotations
     motions[:, :3, 3] = new.points.mean(0) - motions[:, :3, :3] @ old.points.mean(0)
     for count, kept, steps in ((_COARSE, _GOOD, _COARSE_STEPS), (_FINE, _BEST, _FINE_STEPS)):
         one, other = (shape.sample(count, rng) for shape in (old, new))

@@ -93,11 +93,11 @@ class Evidence:
         """Of some of the places."""
         return Evidence(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
-    def gone(self, min_views: int) -> np.ndarray:
+    def is_gone(self, min_views: int) -> np.ndarray:
         """bool [n]: seen through, by far more than saw something there: at grazing angles maps err."""
         return (self.through >= min_views) & (self.through > 2 * self.present)
 
-    def there(self, min_views: int) -> np.ndarray:
+    def is_there(self, min_views: int) -> np.ndarray:
         """bool [n]: seen, and not seen through."""
         return (self.present >= min_views) & (self.present >= self.through)
 
@@ -124,7 +124,7 @@ class Surface:
         return Surface(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0, np.uint16), np.zeros(0, np.int32))
 
     @staticmethod
-    def joined(parts: Sequence[Surface]) -> Surface:
+    def join(parts: Sequence[Surface]) -> Surface:
         """All parts."""
         names = Surface.__dataclass_fields__
         return Surface(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
@@ -215,7 +215,7 @@ class Sightings:
             points, counts = _back_project(picture, shown), np.ones(int(shown.sum()), np.int32)
             waiting.append(Surface(points, picture.color[shown] * BYTE, picture.labels[shown], counts))
             if len(waiting) == _THINNED_EVERY or number + 1 == len(self.pictures):
-                gathered, waiting = Surface.joined([gathered, *waiting]).thin(spacing), []
+                gathered, waiting = Surface.join([gathered, *waiting]).thin(spacing), []
         return gathered
 
 

@@ -62,7 +62,7 @@ class JudgedSurface:
 
     def thing(self, label: int, ids: tuple[int, ...], rows: np.ndarray, settings: ChangeSettings) -> Thing:
         """Some rows as a thing."""
-        gone, there = self.other.gone(settings.min_views)[rows], self.other.there(settings.min_views)[rows]
+        gone, there = self.other.is_gone(settings.min_views)[rows], self.other.is_there(settings.min_views)[rows]
         judged = int(gone.sum() + there.sum())
         apart = color_apart(self.colors[rows[there]], self.other.color[rows[there]])
         return Thing(label, ids, rows, judged / max(1, len(rows)), int(gone.sum()) / max(1, judged), apart)
@@ -103,7 +103,7 @@ def color_apart(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _gone_parts(judged: JudgedSurface, among: np.ndarray, settings: ChangeSettings) -> list[Thing]:
-    gone = judged.other.gone(settings.min_views)
+    gone = judged.other.is_gone(settings.min_views)
     whole = _ids_mostly_gone(judged, gone, settings)
     part_of_whole = np.isin(judged.ids, whole)
     rows = np.flatnonzero(among & (gone | part_of_whole) & (judged.other.through + judged.other.present > 0))
@@ -128,7 +128,7 @@ def _width(points: np.ndarray) -> float:
 
 def _ids_mostly_gone(judged: JudgedSurface, gone: np.ndarray, settings: ChangeSettings) -> np.ndarray:
     size = int(judged.ids.max(initial=0)) + 1
-    judgeable = gone | judged.other.there(settings.min_views)
+    judgeable = gone | judged.other.is_there(settings.min_views)
     lost = np.bincount(judged.ids[gone], minlength=size)
     known = np.bincount(judged.ids[judgeable], minlength=size)
     mostly = (lost >= settings.whole * np.maximum(known, 1)) & (lost > 0)
