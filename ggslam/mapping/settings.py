@@ -135,7 +135,7 @@ class ViewAlignmentSettings:
     iterations: int = setting(8, 1, 1000)
     """Steps at each of two scales at most."""
     tolerance: float = setting(2e-5, 0, 1, "m")
-    """The iteration stops at a step below this, in metres and radians."""
+    """The iteration stops at a step below this; a turn by one radian counts as 1 m."""
     farthest_sigmas: float = setting(5.0, 0, 1e3)
     """A pose that is farther from the tracked one than so many standard deviations of the depth noise at the frame's
     median depth is not believed; a turn by one radian counts as that depth."""

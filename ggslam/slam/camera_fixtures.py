@@ -21,11 +21,11 @@ EARLIER, VIEWS = 3, 16
 """Each view is compared with so many before; after so many views nothing is looked for any more."""
 APART, TURNED_DEG = 0.05, 4.0
 """Views are so far apart: metres for each metre of median depth, or degrees."""
-FEWEST_PAIRS, STILL_SHARE, AGAINST = 3, 0.3, 3
-"""So many pairs of views, and this share of them, find depth where it was, this many times as many as find it to be of
-the world."""
+FEWEST, STILL_SHARE, AGAINST = 6, 0.3, 3
+"""So many comparisons of views, and this share of them, find depth where it was, this many times as many as find it to
+be of the world."""
 SEEDS, SEED_SHARE = 2, 0.05
-"""So many pairs look through where something would be in the world, at this share of its pixels."""
+"""So many look through where something would be in the world, at this share of its pixels."""
 LEAST_SHARE = 0.005
 """Of the image: less is left alone."""
 NEARER, NEARER_THAN_SCENE = 1.5, 0.5
@@ -42,8 +42,8 @@ class CameraFixtures:
         nearest: metres; nearer depth is of it, too, wherever it is in the image.
         changes: how many times `mask` has changed.
         views: frames that were compared.
-        pairs: of them.
-        counts: int32 [3, h, w], pairs that say of a pixel that it is fixed, still, of the world (`PairEvidence`).
+        comparisons: of one of them with another.
+        counts: int32 [3, h, w], comparisons that say of a pixel that it is fixed, still, of the world (`PairEvidence`).
         latest: depth as compared, and pose, of the latest views.
     """
 
@@ -51,7 +51,7 @@ class CameraFixtures:
     nearest: float = 0.0
     changes: int = 0
     views: int = 0
-    pairs: int = 0
+    comparisons: int = 0
     counts: np.ndarray | None = None
     latest: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
     _depth: np.ndarray | None = None
@@ -92,11 +92,15 @@ class CameraFixtures:
         if self.counts is None:
             self.counts = np.zeros((3, *small.shape), np.int32)
         for other, T_world_other in self.latest:
-            found = compare_views(small, other, inverse(T_world_other) @ T_world_camera, smaller)
-            self.counts += np.stack([found.fixed, found.still, found.world])
-            self.pairs += 1
+            T_other_camera = inverse(T_world_other) @ T_world_camera
+            for found in (
+                compare_views(small, other, T_other_camera, smaller),
+                compare_views(other, small, inverse(T_other_camera), smaller),
+            ):
+                self.counts += np.stack([found.fixed, found.still, found.world])
+                self.comparisons += 1
         self.latest, self.views = [*self.latest[1 - EARLIER :], (small, T_world_camera.copy())], self.views + 1
-        if self.pairs >= FEWEST_PAIRS:
+        if self.comparisons >= FEWEST:
             self._judge(camera, factor, small)
         if self.views == VIEWS:
             self.latest = []
@@ -104,7 +108,7 @@ class CameraFixtures:
     def _judge(self, camera: Camera, factor: int, depth: np.ndarray) -> None:
         assert self.counts is not None
         fixed, still, world = self.counts
-        candidates = (still >= max(FEWEST_PAIRS, STILL_SHARE * self.pairs)) & (still >= AGAINST * world)
+        candidates = (still >= max(FEWEST, STILL_SHARE * self.comparisons)) & (still >= AGAINST * world)
         found = connected_with(candidates & (fixed >= SEEDS), candidates, SEED_SHARE)
         if found.mean() < LEAST_SHARE:
             return

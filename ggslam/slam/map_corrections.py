@@ -11,6 +11,7 @@ import numpy as np
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.pruning import drop_pixels
 from ggslam.objects.uniting import FAINT, LabelledVoxels
+from ggslam.scene.frame import Frame
 from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.loop_closing import Correction, LoopCloser
 from ggslam.slam.map_paging import MapPager
@@ -59,10 +60,10 @@ class MapCorrections:
         with self._publishing:
             self._surface.add(tracking.points, tracking.T_world_camera)
 
-    def leave_out(self, fixtures: CameraFixtures) -> None:
-        """What has turned out to be fixed to the camera goes from map, keyframes and surface. What is on disk where
-        memory is limited stays."""
-        if fixtures.mask is None or fixtures.changes == self._left_out:
+    def leave_out(self, fixtures: CameraFixtures, newest: Frame) -> None:
+        """What has turned out to be fixed to the camera goes from map, keyframes and surface, which have the newest
+        frame. What is on disk where memory is limited stays."""
+        if fixtures.mask is None or (fixtures.changes == self._left_out and not newest.depth[fixtures.mask].any()):
             return
         self._left_out = fixtures.changes
         if self._pager is None:

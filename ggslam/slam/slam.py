@@ -333,13 +333,13 @@ class Slam:
             moves_followed: the corrections that this knows of.
         """
         tracking = self._corrections.follow(tracking, moves_followed)
-        self._corrections.leave_out(self._fixtures)
         if self.pager is not None:
             self.pager.prepare(tracking.T_world_camera, frame.depth)
         before = self.map.count
         keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
         added = self.map.count - before
         self._corrections.add_points(tracking)
+        self._corrections.leave_out(self._fixtures, frame)
         if self.loops is not None:
             correction = self.loops.add(frame, tracking)
             if correction is not None:
