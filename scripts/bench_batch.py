@@ -3,6 +3,7 @@
 
     python scripts/bench_batch.py
     python scripts/bench_batch.py --rooms 3 --frames 8
+    python scripts/bench_batch.py --folder /tmp/batch --parts alone      # then local, then ray: the same in short calls
 
 Rooms are generated, each is run with every seed. On Ray, the process of one worker is killed in the middle of its run.
 Every run is then compared with the one made alone, byte for byte: map, trajectory, keyframes' images, objects.
@@ -19,32 +20,37 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import ray
 
 from ggslam.jobs.batch.batch import run_batch
 from ggslam.jobs.batch.job_states import JobState, State
-from ggslam.jobs.batch.local_engine import PROCESSORS
 from ggslam.jobs.batch.manifest import Manifest, read_manifest
+from ggslam.jobs.tasks.processors import PROCESSORS
 from ggslam.synthetic import write_synthetic_sequence
 
 COMPARED = ("map.ply", "trajectory.txt", "objects.json", "classifier.npz", "votes.npz", "points.ply", "frames.csv")
+PARTS = ("alone", "local", "ray")
 
 
 def write_rooms(folder: Path, rooms: int, frames: int, width: int, seeds: int) -> Path:
     """The recordings and the manifest."""
     names = [f"room{k:02d}" for k in range(rooms)]
     for k, name in enumerate(names):
-        write_synthetic_sequence(folder / name, frames=frames, width=width, height=width * 3 // 4, seed=k)
+        if not (folder / name).is_dir():
+            write_synthetic_sequence(folder / name, frames=frames, width=width, height=width * 3 // 4, seed=k)
     (folder / "batch.yaml").write_text(f"recordings: {names}\nseeds: {list(range(seeds))}\n".replace("'", ""))
     return folder / "batch.yaml"
 
 
 def run_alone(manifest: Manifest, out: Path) -> float:
-    """Each run by itself, one after the other; seconds."""
+    """Each run by itself, one after the other, those that are there left out; seconds."""
     start = time.perf_counter()
     environment = os.environ | {"OMP_NUM_THREADS": str(PROCESSORS), "OMP_WAIT_POLICY": "PASSIVE"}
     for job in manifest.jobs:
+        if (out / job.name / "metrics.json").is_file():
+            continue
         subprocess.run(
             [sys.executable, "-m", "ggslam", "run", *job.words, "--out", str(out / job.name)], env=environment,
             check=True, capture_output=True,
@@ -87,36 +93,53 @@ def differences(states: Sequence[JobState], alone: Path) -> list[str]:
     ]  # fmt: skip
 
 
+def run_part(engine: str, path: Path, folder: Path) -> None:
+    """One engine's batch, and its line of the table."""
+    killer, start = Killer(after_s=3), time.perf_counter()
+    more: dict[str, Any] = {}
+    if engine == "ray":
+        # Two workers of Ray, whatever the machine has: the cluster is begun here and joined by its address.
+        ray.init(num_cpus=2 * PROCESSORS, include_dashboard=False, log_to_driver=False)
+        more = {"engine": "ray", "address": ray.get_runtime_context().gcs_address}
+    outcome = run_batch(read_manifest(path, folder / engine), changed=killer.look if more else ignore, **more)
+    seconds = time.perf_counter() - start
+    done = sum(state.state in (State.DONE, State.SKIPPED) for state in outcome.states)
+    said = differences(outcome.states, folder / "alone")
+    killed = f", worker of {killer.killed} killed" if killer.killed else ""
+    print(f"| {engine}{killed} | {seconds:.0f} | {done} of {len(outcome.states)} | {len(said)} |", flush=True)
+    print("\n".join(said[:10]), end="\n" if said else "")
+    rows = (folder / engine / "table.md").read_text().splitlines()
+    counts = [sum(row.startswith(f"| {word}") for row in rows) for word in ("room", "mean")]
+    print(f"table of {engine}: {counts[0]} recordings, {counts[1]} mean", flush=True)
+
+
+def run_parts(given: argparse.Namespace, folder: Path) -> None:
+    """The parts that were asked for."""
+    path = write_rooms(folder, given.rooms, given.frames, given.width, given.seeds)
+    print(f"{given.rooms} rooms x {given.seeds} seeds, {given.frames} frames; {os.cpu_count()} processors")
+    print("| engine | s | done | differing files |\n|---|---|---|---|", flush=True)
+    for part in given.parts:
+        if part == "alone":
+            print(f"| one by one | {run_alone(read_manifest(path), folder / 'alone'):.0f} | | |", flush=True)
+        else:
+            run_part(part, path, folder)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--rooms", type=int, default=12)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--width", type=int, default=96)
+    parser.add_argument("--folder", type=Path, help="for runs; kept, to be used again")
+    parser.add_argument("--parts", nargs="+", default=[*PARTS], choices=PARTS)
     given = parser.parse_args()
+    if given.folder is not None:
+        given.folder.mkdir(parents=True, exist_ok=True)
+        run_parts(given, given.folder)
+        return
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        path = write_rooms(folder, given.rooms, given.frames, given.width, given.seeds)
-        alone = run_alone(read_manifest(path), folder / "alone")
-        print(f"{given.rooms} rooms x {given.seeds} seeds, {given.frames} frames; {os.cpu_count()} processors")
-        print("| engine | s | done | differing files |\n|---|---|---|---|")
-        print(f"| one by one | {alone:.0f} | | |", flush=True)
-        # Two workers of Ray, whatever the machine has: the cluster is begun here and joined by its address.
-        ray.init(num_cpus=2 * PROCESSORS, include_dashboard=False, log_to_driver=False)
-        address = ray.get_runtime_context().gcs_address
-        for engine in ("local", "ray"):
-            killer, start = Killer(after_s=3), time.perf_counter()
-            on_ray = {"engine": "ray", "address": address} if engine == "ray" else {}
-            look = killer.look if on_ray else ignore
-            outcome = run_batch(read_manifest(path, folder / engine), changed=look, **on_ray)
-            seconds = time.perf_counter() - start
-            done = sum(state.state is State.DONE for state in outcome.states)
-            said = differences(outcome.states, folder / "alone")
-            killed = f", worker of {killer.killed} killed" if killer.killed else ""
-            print(f"| {engine}{killed} | {seconds:.0f} | {done} of {len(outcome.states)} | {len(said)} |", flush=True)
-            print("\n".join(said[:10]), end="\n" if said else "")
-        rows = (folder / "ray" / "table.md").read_text().splitlines()
-        print(f"table: {sum(row.startswith('| room') for row in rows)} recordings and a mean")
+        run_parts(given, Path(name))
 
 
 def ignore(states: Sequence[JobState]) -> None:

@@ -6,20 +6,25 @@
 
 A camera walks through one generated room (`room`) or a house (`loop`: a ring of rooms, which needs larger images: at
 80x60 it is lost at doors) again and again. One round is drawn before the run; each time it is walked every image gets
-noise of its own. A row for every so many frames is printed as soon as they are done. Nothing else should run on the
-machine.
+noise of its own. A row for every so many frames is printed as soon as they are done.
+
+Machines change their speed within minutes. So a process beside this one walks the first frames of the round with a map
+of its own, several times for each row, while this one waits: `against short` is this run's frames/s over that one's.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import multiprocessing
 import os
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +40,7 @@ from ggslam.synthetic.trajectory import SEEN_AGAIN
 from ggslam.synthetic.writer import FOCAL_LENGTH
 from ggslam.system.process_memory import resident_bytes, trim
 
-GAUSSIAN_PARTS = ("insertion_ms", "forward_ms", "loss_ms", "backward_ms", "identity_ms")
+TRAINING_PARTS = ("forward_ms", "loss_ms", "backward_ms", "identity_ms")
 
 
 class Rounds:
@@ -81,14 +86,59 @@ class Rounds:
             )  # fmt: skip
 
 
+SHORT, SHORT_EVERY = 60, 250
+"""Frames of a short run, and of the long one between two of them."""
+
+
+def walk_shortly(rounds: Rounds, overrides: list[str], processor_time: bool, orders: Connection) -> None:
+    """Whenever told to, walks the first frames with a new map, and says how many a second."""
+    clock = time.process_time if processor_time else time.perf_counter
+    while orders.recv():
+        slam, seconds = Slam(rounds.camera, load_config(None, overrides), has_masks=False), 0.0
+        for frame in rounds.frames(SHORT):
+            begin = clock()
+            slam.step(frame)
+            seconds += clock() - begin
+        orders.send(SHORT / seconds)
+
+
+class ShortRuns:
+    """Short runs in another process, by turns with a long one; arguments as of `Soak`."""
+
+    def __init__(self, rounds: Rounds, overrides: list[str], processor_time: bool) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._orders, theirs = context.Pipe()
+        arguments = (rounds, overrides, processor_time, theirs)
+        self._process = context.Process(target=walk_shortly, args=arguments, daemon=True)
+        self._process.start()
+        self._rates = [self._measure()]
+        self._rates.clear()  # the first one warms up
+
+    def measure(self) -> None:
+        """Makes one now, and waits for it."""
+        self._rates.append(self._measure())
+
+    def frames_per_s(self) -> float:
+        """Of those since the last call."""
+        mean = float(np.mean(self._rates))
+        self._rates.clear()
+        return mean
+
+    def _measure(self) -> float:
+        self._orders.send(True)
+        return float(self._orders.recv())
+
+
 @dataclass(frozen=True)
 class Row:
     """How a run stands after some frames; milliseconds are means of the frames since the row before."""
 
     frames: int
     frames_per_s: float
+    against_short: float
     tracking_ms: float
-    mapping_ms: float
+    insertion_ms: float
+    training_ms: float
     loops_ms: float
     places_ms: float
     resident_mb: float
@@ -132,11 +182,18 @@ class Soak:
         rounds: its recording.
         overrides: settings, as `--set` takes them.
         every: frames of a row.
+        processor_time: count that, not wall time.
+        short: runs to compare it with; None: `against_short` is NaN.
     """
 
-    def __init__(self, rounds: Rounds, overrides: list[str], every: int) -> None:
+    def __init__(
+        self, rounds: Rounds, overrides: list[str], every: int, processor_time: bool = False,
+        short: ShortRuns | None = None,
+    ) -> None:  # fmt: skip
         self.slam = Slam(rounds.camera, load_config(None, overrides), has_masks=False)
         self.rounds, self.every, self.rows = rounds, every, list[Row]()
+        self._clock = time.process_time if processor_time else time.perf_counter
+        self._short = short
         self._watch_places()
 
     def _watch_places(self) -> None:
@@ -159,9 +216,11 @@ class Soak:
         """Walks `count` frames; returns a row for every `every` of them."""
         start, before = time.perf_counter(), 0.0
         for frame in self.rounds.frames(count):
-            begin = time.perf_counter()
+            begin = self._clock()
             self.slam.step(frame)
-            before += time.perf_counter() - begin
+            before += self._clock() - begin
+            if self._short is not None and (frame.index + 1) % min(SHORT_EVERY, self.every) == 0:
+                self._short.measure()
             if (frame.index + 1) % self.every == 0:
                 self.rows.append(self._row(frame, before))
                 before, self._places_s = 0.0, 0.0
@@ -176,9 +235,10 @@ class Soak:
         table = dict(zip(COLUMNS, slam.steps.table()[-every:].mean(0), strict=True))
         truth = np.linalg.inv(self.rounds.poses[0]) @ frame.T_world_camera  # type: ignore[operator]
         trim()
-        loops = slam.loops
+        loops, rate = slam.loops, every / seconds
         return Row(
-            frame.index + 1, every / seconds, table["tracking_ms"], sum(table[name] for name in GAUSSIAN_PARTS),
+            frame.index + 1, rate, rate / self._short.frames_per_s() if self._short is not None else math.nan,
+            table["tracking_ms"], table["insertion_ms"], sum(table[name] for name in TRAINING_PARTS),
             table["loops_ms"], 1e3 * self._places_s / every, resident_bytes() / 1e6, map_bytes(slam) / 1e6,
             slam.gaussian_count, len(slam.mapper.keyframes), len(slam.surface.active),
             0 if loops is None else sum(event.kind == "closed" for event in loops.events),
@@ -200,14 +260,16 @@ def open_files() -> int:
 
 
 def verdicts(rows: list[Row]) -> list[str]:
-    """What the rows say of a long run's bars; the first row warms up."""
-    if len(rows) < 3:
+    """What the rows say of a long run's bars; the first quarter fills what is kept active."""
+    if len(rows) < 4:
         return []
+    quarter = len(rows) // 4
     first, last = rows[1], rows[-1]
+    early, late = (np.mean([r.against_short for r in part]) for part in (rows[quarter : 2 * quarter], rows[-quarter:]))
     beside = [row.resident_mb - row.map_mb for row in (first, last)]
     return [
-        f"frames/s: {first.frames_per_s:.1f} at first, {last.frames_per_s:.1f} at last "
-        f"({last.frames_per_s / first.frames_per_s - 1:+.0%})",
+        f"frames/s against short runs: {early:.3f} in the second quarter, {late:.3f} in the last "
+        f"({late / early - 1:+.1%})",
         f"loops: {first.loops_ms:.2f} ms a frame at first, {last.loops_ms:.2f} ms at last",
         f"memory: {first.resident_mb:.0f} to {last.resident_mb:.0f} MB, of which the map {first.map_mb:.0f} to "
         f"{last.map_mb:.0f} MB; beside it {beside[0]:.0f} to {beside[1]:.0f} MB",
@@ -238,10 +300,10 @@ def main() -> None:
     given = parse_arguments()
     length = given.round or {"room": 240, "loop": 420}[given.scene]
     rounds = Rounds(given.scene, length, given.width, given.width * 3 // 4, keep=given.keep)
-    if given.processor_time:
-        time.perf_counter = time.process_time
     objects = [] if given.objects else ["identity.enabled=false"]
-    soak = Soak(rounds, [f"mapping.iterations_per_frame={given.iterations}", *objects, *given.set], given.every)
+    overrides = [f"mapping.iterations_per_frame={given.iterations}", *objects, *given.set]
+    short = ShortRuns(rounds, overrides, given.processor_time)
+    soak = Soak(rounds, overrides, given.every, given.processor_time, short)
     size = f"{given.width}x{given.width * 3 // 4}"
     print(f"{given.frames} frames of {size}, {length} a round; load {os.getloadavg()[0]:.1f}")
     print(Row.header(), flush=True)

@@ -35,7 +35,7 @@ fault, 130 interrupted. Where output is no terminal, long commands print a line 
 _GROUPS = {
     "Make a map": ("run", "inspect", "synth", "doctor"),
     "Look and score": ("view", "render", "report", "eval", "compare"),
-    "Use a map": ("edit", "export", "volumes", "encode", "decode", "localize", "submaps"),
+    "Use a map": ("edit", "export", "volumes", "encode", "decode", "localize", "submaps", "refine"),
 }
 
 

@@ -91,6 +91,16 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A generated recording by two cameras back to back, 24 frames of 128x96 each, the second 10 ms later."""
+    from ggslam.synthetic import write_synthetic_rig
+
+    return generated_recording(
+        tmp_path_factory, "rig", write_synthetic_rig, frames=24, width=128, height=96, delay=0.01
+    )
+
+
+@pytest.fixture(scope="session")
 def room_run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """A run of the first ten frames of the room, with objects, not scored. Who changes it works on a copy."""
     from ggslam.jobs.run.pipeline import RunRequest, execute

@@ -102,14 +102,16 @@ def _synthetic_sources() -> list[Path]:
     return sorted([*package.glob("synthetic/*.py"), *package.glob("scene/*.py")])
 
 
-def generated_recording(factory: pytest.TempPathFactory, name: str, **options: Any) -> Path:
-    """A recording as `write_synthetic_sequence` draws it with these options, not to be changed. Drawing takes longest
-    of all that tests need; it is kept until what draws changes, and every run of the tests has a copy."""
+def generated_recording(
+    factory: pytest.TempPathFactory, name: str, write: Callable[..., Path] | None = None, **options: Any
+) -> Path:
+    """A recording as `write_synthetic_sequence` (or `write`) draws it with these options, not to be changed. Drawing
+    takes longest of all that tests need; it is kept until what draws changes, and every run of the tests has a copy."""
     from ggslam.synthetic import write_synthetic_sequence
 
     words = "-".join([name, *(f"{key}={value}" for key, value in sorted(options.items()))])
     cached = build_once(
         cached_folder(words, *_synthetic_sources()),
-        lambda folder: write_synthetic_sequence(folder, **options),
+        lambda folder: (write or write_synthetic_sequence)(folder, **options),
     )
     return build_once(session_folder(factory) / "recordings" / name, lambda to: shutil.copytree(cached, to))

@@ -29,8 +29,8 @@ JOBS = (
     {"volumes"},
     {"run"},
     {"report"},
-    {"score", "edit", "localize", "compare", "code", "render", "doctor", "batch", "merge"},
-    {"submaps"},
+    {"score", "edit", "localize", "compare", "code", "render", "doctor", "batch", "merge", "refine"},
+    {"submaps", "tasks"},
     {"progress"},
 )
 """The order inside `jobs`, likewise."""

@@ -15,6 +15,7 @@ from ggslam.cli.console import console, table
 if TYPE_CHECKING:
     from ggslam.scene.camera import Camera
     from ggslam.sequences.inspection import SequenceReport
+    from ggslam.sequences.rig_inspection import RigReport
 
 EPILOG = """
 [bold]Examples[/]
@@ -65,26 +66,71 @@ def inspect(
         _print_stream(sequence)
         return
     from ggslam.sequences.inspection import inspect_sequence
+    from ggslam.sequences.rig import RigSequence
+    from ggslam.sequences.rig_inspection import inspect_rig
 
     recording = open_sequence(
         sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, masks=masks,
         depth_scale=depth_scale, depth_camera=depth_camera, min_confidence=min_confidence, topics=topics or (),
         pose_convention=pose_convention, camera=camera, intrinsics=intrinsics,
     )  # fmt: skip
+    if isinstance(recording, RigSequence):
+        _print_rig(inspect_rig(recording, samples=samples, clocks=True))
+        return
     report = inspect_sequence(recording, samples=samples, clocks=True)
-    for name, value in _lines(report):
-        console.print(f"[bold]{name:<13}[/] {escape(value)}", highlight=False)
+    _print_lines(_lines(report))
     for reason in report.damaged:
         console.print(f"[red]damaged:[/] {escape(reason)}", highlight=False)
-    for warning in report.warnings:
+    _print_warnings(report.warnings)
+
+
+def _print_lines(lines: list[tuple[str, str]]) -> None:
+    for name, value in lines:
+        console.print(f"[bold]{name:<13}[/] {escape(value)}", highlight=False)
+
+
+def _print_warnings(warnings: list[str]) -> None:
+    for warning in warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}", highlight=False)
+
+
+def _print_rig(report: RigReport) -> None:
+    """The rig, then each camera with its recording."""
+    from math import degrees
+
+    import numpy as np
+
+    from ggslam.scene.poses import turning_angle
+
+    names = ", ".join(camera.name for camera in report.cameras)
+    tolerance = f"images at most {1e3 * report.tolerance:g} ms apart were taken together"
+    _print_lines([
+        ("rig", f"{report.name}: {names}"),
+        ("instants", f"{report.instants}, {report.whole} of them with frames of all cameras; {tolerance}"),
+    ])  # fmt: skip
+    for camera in report.cameras:
+        console.print()
+        place, turned = camera.T_first_camera[:3, 3], degrees(turning_angle(camera.T_first_camera, np.eye(4)))
+        words = f"{camera.frames} frames, {camera.together} of them with another camera's"
+        if camera is not report.cameras[0]:
+            words += f", {1e3 * camera.gap_s[0]:+.1f} ms after it (median; most {1e3 * camera.gap_s[1]:.1f} ms)"
+        at = f"at {place[0]:.3f}, {place[1]:.3f}, {place[2]:.3f} m, turned by {turned:.1f} degrees"
+        off = f"; true poses have it {100 * camera.off[0]:.1f} cm, {camera.off[1]:.2f} deg off" if camera.off else ""
+        lines = [("camera of rig", camera.name), ("in the rig", f"{at} from {report.cameras[0].name}{off}")]
+        _print_lines([*lines, ("images of it", words), *_lines(camera.recording)])
+        for reason in camera.recording.damaged:
+            console.print(f"[red]damaged:[/] {escape(reason)}", highlight=False)
+    _print_warnings(report.warnings)
 
 
 def _print_formats() -> None:
     from ggslam.sequences import FORMATS
+    from ggslam.sequences.rig import LAYOUT as RIG_LAYOUT
+    from ggslam.sequences.rig import NAME as RIG
 
     for known in FORMATS:
         console.print(f"[bold]{known.name:<13}[/] {escape(known.layout)}", highlight=False, soft_wrap=True)
+    console.print(f"[bold]{RIG:<13}[/] {escape(RIG_LAYOUT)}", highlight=False, soft_wrap=True)
 
 
 def _print_stream(path: Path) -> None:

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING
 from ggslam.cli.console import console, table
 
 if TYPE_CHECKING:
-    from ggslam.runs.records.metrics import MetricsRecord, SegmentationRecord, TrajectoryScoresRecord
+    from ggslam.runs.records.metrics import (
+        CameraScoresRecord,
+        MetricsRecord,
+        SegmentationRecord,
+        TrajectoryScoresRecord,
+    )
     from ggslam.runs.records.record import Record
 
 _IMAGE_COLUMNS = [
@@ -44,12 +49,25 @@ def print_scores(metrics: MetricsRecord) -> None:
             text = f"{name.replace('_', ' ')}: PSNR {scores.psnr_exposed:.2f} of frames brought to the map's exposure"
             console.print(text, highlight=False)
     console.print(table("images; all but 'unmasked' over pixels with measured depth", columns, rows))
+    if metrics.cameras:
+        _print_cameras(metrics.cameras)
     if metrics.segmentation is not None:
         _print_segmentation(metrics.segmentation)
     console.print(_trajectory_line(metrics.trajectory), highlight=False)
     console.print(_speed_line(metrics), highlight=False)
     for note in metrics.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
+
+
+def _print_cameras(cameras: dict[str, CameraScoresRecord]) -> None:
+    """Held-out images and trajectory of each camera of a rig; of all images where none was held out."""
+    rows = []
+    for name, of_camera in cameras.items():
+        images = of_camera.images.held_out or of_camera.images.all
+        ate = None if of_camera.trajectory is None else of_camera.trajectory.ate_rmse_m
+        rows.append([name, _text(ate, 100, ".2f"), *(_cells(images, _IMAGE_COLUMNS) if images is not None else [])])
+    columns = ["camera", "ATE cm", *(title for title, *_ in _IMAGE_COLUMNS)]
+    console.print(table("cameras of the rig, held-out images", columns, rows))
 
 
 def _print_segmentation(s: SegmentationRecord) -> None:

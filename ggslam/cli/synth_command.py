@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,8 @@ EPILOG = """
   ggslam synth demo/loop --scene loop
 
   ggslam synth demo/corridor --scene corridor --frames 300
+
+  ggslam synth demo/rig --rig front,back
 """
 
 
@@ -50,16 +53,30 @@ def synth(
         typer.Option(help="Fixed error of the depth camera, steps of disparity; default 0, for the loop 0.3."),
     ] = None,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Add depth noise like a Kinect's.")] = True,
+    rig: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CAMERAS",
+            help="Record with several cameras fixed to one another: some of front,left,back,right, or degrees to the "
+            "right, like 0,45,-30.",
+        ),
+    ] = None,
+    rig_delay: Annotated[
+        float, typer.Option(help="Seconds by which each camera of a rig is later than the one before it.", min=0)
+    ] = 0.0,
 ) -> None:
     """Generate a recording: textured, furnished rooms with exact poses and instance masks."""
-    from ggslam.synthetic import SCENES, write_synthetic_sequence
+    from ggslam.synthetic import SCENES, write_synthetic_rig, write_synthetic_sequence
 
     frames = SCENES[scene.value].frames if frames is None else frames
+    write, cameras = write_synthetic_sequence, ""
+    if rig is not None:
+        write, cameras = partial(write_synthetic_rig, cameras=rig.split(","), delay=rig_delay), f" by each of {rig}"
     with progress_bar() as bar:
         task = bar.add_task("render", total=frames, info="")
-        write_synthetic_sequence(
+        write(
             folder, frames=frames, width=width, height=height, seed=seed, noise=noise, scene=scene.value,
             depth_distortion=depth_distortion,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
-    console.print(f"wrote {folder}: {frames} frames of {width}x{height}", highlight=False, markup=False)
+    console.print(f"wrote {folder}: {frames} frames of {width}x{height}{cameras}", highlight=False, markup=False)

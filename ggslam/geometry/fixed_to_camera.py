@@ -72,7 +72,7 @@ def compare_views(depth: np.ndarray, other: np.ndarray, T_other_camera: np.ndarr
     return PairEvidence(still & inside & (seen > (1 + BEHIND) * z), still, inside & (np.abs(seen - z) < SAME * z))
 
 
-def connected_with(seeds: np.ndarray, candidates: np.ndarray, least_share: float) -> np.ndarray:
+def parts_with_seeds(seeds: np.ndarray, candidates: np.ndarray, least_share: float) -> np.ndarray:
     """The connected parts of `candidates`, bool [h, w], of which at least a share are `seeds`, which are candidates."""
     count, labels = cv2.connectedComponents(candidates.astype(np.uint8), connectivity=8)
     inside, of_them = (np.bincount(labels[image], minlength=count) for image in (candidates, seeds & candidates))

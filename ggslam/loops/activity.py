@@ -63,17 +63,23 @@ class ActiveKeyframes:
     def __len__(self) -> int:
         return len(self._depths)
 
-    def add(self, T_world_camera: np.ndarray, median_depth_m: float) -> None:
-        """A keyframe is made at `T_world_camera` [4, 4]. It is active, and the camera is there now."""
-        if len(self):
-            self._path += float(np.linalg.norm(T_world_camera[:3, 3] - self._cameras[-1]))
+    def add(self, T_world_camera: np.ndarray, median_depth_m: float, before: int | None = -1) -> None:
+        """A keyframe is made at `T_world_camera` [4, 4]. It is active, and the camera is there now.
+
+        Args:
+            before: number of the keyframe that the camera came from; None: it was there already (in a rig).
+        """
+        if len(self) and before is not None:
+            self._path += float(np.linalg.norm(T_world_camera[:3, 3] - self._cameras[before]))
         self.active.add(len(self))
         self._depths = np.append(self._depths, median_depth_m)
         self._cameras = np.vstack([self._cameras, T_world_camera[:3, 3]])
         self._middles = np.vstack([self._middles, T_world_camera[:3, 3] + median_depth_m * T_world_camera[:3, 2]])
         self._seen = np.append(self._seen, self._path)
-        known = np.array(sorted(self.active | self.spare))
-        self._seen[known[self._near(-1)[known]]] = self._path
+        known = np.zeros(len(self), bool)
+        for numbers in (self.active, self.spare):
+            known[np.fromiter(numbers, int, len(numbers))] = True
+        self._seen[known & self._near(-1)] = self._path
 
     def move(self, T_world_camera: np.ndarray) -> None:
         """Keyframes were given new poses [K, 4, 4]."""
@@ -88,7 +94,8 @@ class ActiveKeyframes:
         if len(stale) >= max(s.batch, len(self.active) // _SHARE):
             self.active -= stale
         if self.spare:
-            self.spare = {k for k in self.spare if self._path - self._seen[k] <= limit}
+            spare = np.fromiter(self.spare, int, len(self.spare))
+            self.spare = set(spare[self._path - self._seen[spare] <= limit].tolist())
         around = set(np.flatnonzero(self._near(-1)).tolist())
         near = around - self.active
         if len(self.active) < s.most or len(around) - len(near) < s.most // 4:
@@ -103,15 +110,20 @@ class ActiveKeyframes:
 
     def _reachable(self, near: set[int]) -> set[int]:
         """Those of some numbers that lie right to the active ones, by way of others of them, too."""
-        reachable = set[int]()
-        while found := {k for k in near - reachable if self._has_neighbour(k, reachable)}:
-            reachable |= found
-        return reachable
+        numbers = np.array(sorted(near), int)
+        if not len(numbers):
+            return set()
+        chain = np.cumsum(np.diff(numbers, prepend=numbers[0]) > self.settings.spread)
+        tied = np.bincount(chain, self._beside_known()[numbers]) > 0
+        return set(numbers[tied[chain]].tolist())
 
-    def _has_neighbour(self, number: int, others: set[int]) -> bool:
-        """Whether one of its neighbours in time is active, spare or among the others."""
-        reach = range(number - self.settings.spread, number + self.settings.spread + 1)
-        return any(k in self.active or k in self.spare or k in others for k in reach)
+    def _beside_known(self) -> np.ndarray:
+        """Which keyframes are active or spare or have neighbours in time that are, bool [K]."""
+        reach, known = self.settings.spread, np.zeros(len(self) + 2 * self.settings.spread + 1, int)
+        for numbers in (self.active, self.spare):
+            known[np.fromiter(numbers, int, len(numbers)) + reach + 1] = 1
+        gathered = np.cumsum(known)
+        return gathered[2 * reach + 1 :] > gathered[: len(self)]
 
     def _put_aside_spare(self, near: set[int]) -> None:
         """Where more than enough are active, those go that were seen longest ago, and among equals the newer ones,
@@ -119,7 +131,8 @@ class ActiveKeyframes:
         same reason lie right as well."""
         most = self.settings.most
         if len(self.active) >= most:
-            self.spare |= {k for k in near if self._has_neighbour(k, set())}
+            beside = self._beside_known()
+            self.spare |= {k for k in near if beside[k]}
         if len(self.active) > most + most // _SHARE:
             newest = len(self) - most // 4
             order = sorted(self.active, key=lambda k: (k >= newest, self._seen[k], -k))

@@ -91,9 +91,9 @@ class PlaceIndex:
         """A place of this index or another one with the words that it is looked up by here."""
         return replace(place, words=self._words(place.landmarks.descriptors))
 
-    def describe(self, view: FeatureView) -> Place:
-        """What a view is known by; for `add`, `query`, or both."""
-        landmarks = view.landmarks(self.camera, self.settings.features)
+    def describe(self, view: FeatureView, camera: Camera | None = None) -> Place:
+        """What a view is known by; for `add`, `query`, or both. `camera` took it, if not the one of all views."""
+        landmarks = view.landmarks(camera or self.camera, self.settings.features)
         return Place(landmarks, self._words(landmarks.descriptors), self._fern_codes(view))
 
     def add(self, number: int, place: Place) -> None:

@@ -26,6 +26,8 @@ from ggslam.scene.poses import inverse, se3_log, so3_log
 
 _SHORTEST = 0.01
 """Metres: standing still counts as a path of this length, so that no motion is held to be exact."""
+_RIGID_M, _RIGID_DEG = 1e-4, 1e-3
+"""Standard deviations of where the cameras of a rig are to one another."""
 SURE_INFORMATION = 1e6 * np.eye(6)
 """Of a motion that is sure to a millimetre and a milliradian: then drift is all that is unsure of it."""
 
@@ -92,18 +94,23 @@ class PoseGraph:
             self._tree = OdometryTree.root()
         return len(self.poses) - 1
 
-    def add_odometry(self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray, found: bool = False) -> None:
+    def add_odometry(
+        self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray, found: bool = False, rigid: bool = False
+    ) -> None:
         """The motion from an earlier node i to the newest node j. It is never doubted.
 
         Args:
             found: the camera was lost on the way, and found at node i.
+            rigid: both are cameras of one rig at one instant; nothing drifts between them.
 
         Raises:
             ValueError: j is not the newest node, has odometry already, or i is not before it.
         """
         if j != len(self.poses) - 1 or len(self._tree) != j or not 0 <= i < j:
             raise ValueError(f"odometry {i} to {j}: expected from an older node to the newest, which has none yet")
-        s, covariance = self.settings, odometry_covariance(T_i_j, information, self.settings)
+        s, covariance = self.settings, _isotropic(_RIGID_M, _RIGID_DEG)
+        if not rigid:
+            covariance = odometry_covariance(T_i_j, information, s)
         if found:
             covariance += covariance_in_frame(_isotropic(s.found_translation, s.found_rotation_deg), T_i_j)
         self._tree.add(i, np.array(T_i_j, float), covariance)

@@ -47,21 +47,22 @@ class Revisits:
 
     def __init__(self, settings: RevisitSettings | None = None) -> None:
         self.settings = settings or RevisitSettings()
-        self._way: list[float] = []
+        self._way = np.zeros(0)
         """How far the camera had gone at each keyframe, metres."""
-        self._ties: list[tuple[int, int]] = []
-        """Keyframes that were compared, the older first."""
+        self._tied_at = np.zeros(0)
+        """The same at the newest keyframe that each was compared with as the older one; -inf: with none."""
         self._rests_until = 0
 
     def add(self, T_before_new: np.ndarray) -> None:
         """The next keyframe, after a motion [4, 4] since the one before it."""
         turn = float(np.linalg.norm(so3_log(T_before_new[:3, :3])))
-        before = self._way[-1] if self._way else 0.0
-        self._way.append(before + float(np.linalg.norm(T_before_new[:3, 3])) + turn)
+        before = self._way[-1] if len(self._way) else 0.0
+        self._way = np.append(self._way, before + float(np.linalg.norm(T_before_new[:3, 3])) + turn)
+        self._tied_at = np.append(self._tied_at, -np.inf)
 
     def tie(self, old: int, new: int) -> None:
         """Two keyframes were compared, and lie right to each other now."""
-        self._ties.append((old, new))
+        self._tied_at[old] = max(self._tied_at[old], self._way[new])
 
     def pause(self) -> None:
         """The newest keyframe was compared in vain."""
@@ -73,10 +74,10 @@ class Revisits:
         old = newest + 1 - self.settings.gap
         if not self.settings.enabled or newest < self._rests_until or old < 1:
             return np.zeros(0, int)
-        way = np.array(self._way)
-        apart = way[newest] - way[:old]
-        if self._ties:
-            ends = np.array(self._ties)
-            over = np.abs(way[:old, None] - way[ends[:, 0]]) + (way[newest] - way[ends[:, 1]])
-            apart = np.minimum(apart, over.min(1))
+        way, tied = self._way, self._tied_at
+        # The shortest way by one tie: from the keyframe along the recording to the tie's old end, before it or behind
+        # it, and from the tie's new end to the newest keyframe.
+        before = np.maximum.accumulate(tied + way)[:old] - way[:old]
+        behind = np.maximum.accumulate((tied - way)[::-1])[::-1][:old] + way[:old]
+        apart = way[newest] - np.maximum(way[:old], np.maximum(before, behind))
         return np.flatnonzero(apart >= self.settings.least_way * median_depth_m)

@@ -45,6 +45,9 @@ class Keyframe:
     iterations: int = 0
     archive: ArrayArchive | None = None
     """Has the images once they were put away; they are read from there."""
+    camera_number: int = 0
+    instant: int | None = None
+    """Of a rig, see `Frame`."""
 
     def put_away(self, archive: ArrayArchive) -> None:
         """Hands the images to an archive, which keeps them in memory or not. They must not be changed any more."""
@@ -80,7 +83,7 @@ def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyfr
     units[frame.depth * DEPTH_UNITS_PER_METRE > 65535] = 0
     return Keyframe(
         index, frame.index, frame.timestamp, frame.camera, np.ascontiguousarray(frame.color), units,
-        inverse(T_world_camera), frame.mask,
+        inverse(T_world_camera), frame.mask, camera_number=frame.camera_number, instant=frame.instant,
     )  # fmt: skip
 
 

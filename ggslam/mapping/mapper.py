@@ -29,7 +29,7 @@ from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import inverse
+from ggslam.scene.poses import inverse, orthonormalize
 
 FINAL_DECAY = 0.2
 """The last identity steps fall to this share of their length."""
@@ -113,8 +113,7 @@ class Mapper(ABC):
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
         self.residency: Residency | None = None
         """Keeps a part of the map on disk; None: all of it is in memory."""
-        self.valid: np.ndarray | None = None
-        """Where images of this recording show something, bool [H, W]; None: everywhere. Nothing else is trained on."""
+        self._valid: dict[int, np.ndarray | None] = {}
         self.extra_loss: ExtraLoss | None = None
         """A loss of the user's own, added to the mapper's; on the CPU only."""
         self._rasterizer: TrainingRasterizer
@@ -156,7 +155,7 @@ class Mapper(ABC):
             labeller: tells the keyframe's object mask, if objects are learned.
         """
         start = time.perf_counter()
-        self.valid = frame.valid
+        self.note_valid(frame)
         keyframe = self._new_keyframe(frame, T_world_camera)
         self._insert(keyframe, T_world_camera, labeller)
         self.keyframes.append(keyframe)
@@ -224,10 +223,14 @@ class Mapper(ABC):
         for _ in range(iterations):
             self.iterate(self._draw(numbers))
 
+    def note_valid(self, frame: Frame) -> None:
+        """Remembers where images of a frame's camera show something: nothing else is trained on."""
+        self._valid[frame.camera_number] = frame.valid
+
     def _valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
-        """What `valid` says of a keyframe: nothing of those of other recordings."""
-        of_this = keyframe.frame_index != ELSEWHERE and self.valid is not None
-        return self.valid if of_this and self.valid.shape == keyframe.color.shape[:2] else None  # type: ignore[union-attr]
+        """Where a keyframe shows something, bool [H, W]; None: everywhere, or it is of another recording."""
+        valid = self._valid.get(keyframe.camera_number) if keyframe.frame_index != ELSEWHERE else None
+        return valid if valid is not None and valid.shape == keyframe.color.shape[:2] else None
 
     def _trainable(self) -> Sequence[int]:
         return range(len(self.keyframes)) if self.residency is None else self.residency.trainable()
@@ -271,11 +274,30 @@ class Mapper(ABC):
             optimizer=self._standard_adam if rate_factor == 1 else self._adam(rate_factor),
             detach_features=identity is None or identity.settings.detach,
         )  # fmt: skip
-        pose_rate = rate_factor * self._pose_rate if keyframe.index > 0 else 0.0  # the first keyframe is the world
+        pose_rate = 0.0 if self._is_world(keyframe) else rate_factor * self._pose_rate
         self._finish_step(keyframe, step.twist, loss, pose_rate)
         times.backward += watch.lap()
         times.iterations += 1
         keyframe.iterations += 1
+
+    def _is_world(self, keyframe: Keyframe) -> bool:
+        """Whether its pose stays: the first keyframe is the world, with those that its rig took at the same instant."""
+        first = self.keyframes[0].instant
+        if keyframe.index == 0 or first is None or keyframe.instant != first:
+            return keyframe.index == 0
+        return all(earlier.instant == first for earlier in self.keyframes[: keyframe.index])
+
+    def _move_rig(self, keyframe: Keyframe, T_before: np.ndarray) -> None:
+        """Lets keyframes that a rig took at the same instant follow one whose T_camera_world was `T_before` [4, 4]."""
+        if keyframe.instant is None:
+            return
+        T_before_now = inverse(T_before) @ keyframe.T_camera_world
+        for step in (-1, 1):
+            k = keyframe.index + step
+            while 0 <= k < len(self.keyframes) and self.keyframes[k].instant == keyframe.instant:
+                moved = self.keyframes[k].T_camera_world @ T_before_now
+                self.keyframes[k].T_camera_world = orthonormalize(moved)  # they move one another, and so would rounding
+                k += step
 
     @property
     def _pose_rate(self) -> float:

@@ -53,7 +53,7 @@ def align_view(
     T, exposure = np.eye(4), np.array([1.0, 0.0])
     for blur in BLURS:
         ours, theirs = (cv2.GaussianBlur(image, (0, 0), blur) for image in (grey, rendered))
-        pixels = _textured(theirs, depth, alpha, settings)
+        pixels = _choose_textured(theirs, depth, alpha, settings)
         if len(pixels) < FEWEST_POINTS:
             return None
         points = camera.rays().reshape(-1, 3)[pixels].astype(np.float64) * depth.reshape(-1)[pixels, None]
@@ -74,7 +74,7 @@ def _gradients(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return tuple(cv2.Sobel(image, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))  # type: ignore[return-value]
 
 
-def _textured(
+def _choose_textured(
     rendered: np.ndarray, depth: np.ndarray, alpha: np.ndarray, settings: ViewAlignmentSettings
 ) -> np.ndarray:
     """Flat indices of pixels that the map covers and that have contrast, evenly thinned to the number set."""

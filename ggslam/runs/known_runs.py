@@ -17,13 +17,10 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.starting import arrays_with_prefix, camera_of, scale_of
 from ggslam.scene.arrays import read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.slam.saved_places import PLACES_FILE
+from ggslam.slam.saved_places import KEYFRAME_CAMERAS, PLACES_FILE
 from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface
-
-KEYFRAME_CAMERAS = "keyframe_cameras"
-"""In places.npz of a merged run: the camera of each keyframe, as the row `camera`."""
 
 
 def read_known_run(folder: RunFolder, context: NativeContext) -> KnownRun:

@@ -16,6 +16,7 @@ from ggslam.runs.records.sequence import OpenRecord, PartRecord, SequenceRecord
 from ggslam.sequences import Sequence, open_sequence
 from ggslam.sequences.joined import JoinedPart, JoinedSequence
 from ggslam.sequences.live import LiveSequence, is_live, open_live
+from ggslam.sequences.rig import RigSequence
 from ggslam.system.json_files import json_ready
 
 
@@ -87,21 +88,37 @@ def describe(
     for name in ("path", "masks", "depth_camera", "camera"):
         if values[name] is not None and not is_live(values[name]):
             values[name] = Path(values[name]).absolute()
+    rig = {"rig": describe_rig(sequence)} if isinstance(sequence, RigSequence) else {}
     return SequenceRecord.of({
         "open": values, "format": sequence.format, "camera": asdict(sequence.camera), "frames": len(sequence),
         "warnings": sequence.warnings, "skipped": [asdict(skipped) for skipped in sequence.skipped_frames],
         "mask_problems": sequence.mask_problems, "map": None if earlier is None else earlier.path.absolute(),
-        "map_fingerprint": None if earlier is None else fingerprint(earlier),
+        "map_fingerprint": None if earlier is None else fingerprint(earlier), **rig,
     })  # fmt: skip
+
+
+def describe_rig(sequence: RigSequence) -> dict[str, Any]:
+    """What sequence.json holds of a rig."""
+    ranges = []
+    for number in range(len(sequence.rig)):
+        at = sequence.places[sequence.frames_of(number), 0]
+        breaks = np.flatnonzero(np.diff(at) != 1) + 1
+        ranges.append([(int(run[0]), int(run[-1]) + 1) for run in np.split(at, breaks) if len(run)])
+    rig = sequence.rig
+    return {
+        "names": list(rig.names), "cameras": [asdict(camera) for camera in rig.cameras],
+        "T_first_camera": rig.T_first_camera, "tolerance": sequence.tolerance, "instants": ranges,
+    }  # fmt: skip
 
 
 def identity_of(sequence: Sequence) -> dict[str, Any]:
     """Tells a recording from another one, wherever it lies: plain values for a record."""
     times = hashlib.sha256(np.ascontiguousarray(sequence.timestamps).tobytes()).hexdigest()
-    file = sequence.path.stat().st_size if sequence.path.is_file() else None
+    rig = {"rig": describe_rig(sequence)} if isinstance(sequence, RigSequence) else {}
+    file = sequence.path.stat().st_size if sequence.path.is_file() and not rig else None
     return json_ready({
         "format": sequence.format, "frames": len(sequence), "camera": asdict(sequence.camera), "times": times,
-        "file_size": file, "masks": sequence.has_masks,
+        "file_size": file, "masks": sequence.has_masks, **rig,
     })  # fmt: skip
 
 
@@ -139,33 +156,47 @@ def open_recording_of(
         SequenceError: it is not there any more.
         RunFolderError: the run does not say which it was.
     """
-    record = folder.sequence()
+    return open_recorded(folder.sequence(), str(folder.path), path, masks, scale)
+
+
+def open_recorded(
+    record: SequenceRecord, run: str, path: Path | None = None, masks: Path | None = None, scale: float | None = None
+) -> Sequence:
+    """The same by the record alone; `run` names whose it is."""
     if record.parts is None:
-        return _open_as(folder, record, path, masks, scale)
+        return _open_as(run, record, path, masks, scale)
     if len({part.open.path for part in record.parts}) > 1 and (path is not None or masks is not None):
         what = "`sequence`" if path is not None else "`masks`"
-        raise RunFolderError(f"{folder.path}: was merged from runs of several recordings; {what} cannot be all of them")
-    return JoinedSequence([_open_part(folder, part, path, masks, scale) for part in record.parts])
+        raise RunFolderError(f"{run}: was merged from runs of several recordings; {what} cannot be all of them")
+    return JoinedSequence([_open_part(run, part, path, masks, scale) for part in record.parts])
 
 
 def _open_part(
-    folder: RunFolder, part: PartRecord, path: Path | None, masks: Path | None, scale: float | None
+    run: str, part: PartRecord, path: Path | None, masks: Path | None, scale: float | None
 ) -> JoinedPart:
-    sequence = _open_as(folder, part, path, masks, scale)
+    sequence = _open_as(run, part, path, masks, scale)
     T = np.eye(4) if part.T_joint_truth is None else part.T_joint_truth
     return JoinedPart(sequence, part.time_shift_s, T, None if masks is not None else part.mask_ids)
 
 
 def _open_as(
-    folder: RunFolder, record: SequenceRecord | PartRecord, path: Path | None, masks: Path | None, scale: float | None
+    run: str, record: SequenceRecord | PartRecord, path: Path | None, masks: Path | None, scale: float | None
 ) -> Sequence:
     """A recording as a record says, with another place of recording or masks, or at another scale."""
     request = request_in(record.open, path, masks)
     if is_live(request.path):
-        raise RunFolderError(f"{folder.path}: was run live ({request.path}), and its frames were not kept (`record`)")
+        raise RunFolderError(f"{run}: was run live ({request.path}), and its frames were not kept (`record`)")
     sequence = replace(request, scale=request.scale if scale is None else scale).open()
-    found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scale(record.open.scale))}
-    expected = {"frames": record.frames, "camera": asdict(record.camera)}
-    if json_ready(found) != expected:
-        raise RunFolderError(f"{sequence.path}: not the recording of {folder.path}: expected {expected}, found {found}")
+    if isinstance(sequence, RigSequence):
+        found = {name: value for name, value in describe_rig(sequence).items() if name != "cameras" or scale is None}
+        expected = {} if record.rig is None else {name: record.rig.values().get(name) for name in found}
+    else:
+        found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scale(record.open.scale))}
+        expected = {"frames": record.frames, "camera": asdict(record.camera)}
+    found = json_ready(found)
+    if found != expected:
+        if isinstance(sequence, RigSequence):  # the rest would be a screenful
+            other = {name for name in found if found[name] != expected.get(name)}
+            raise RunFolderError(f"{sequence.path}: not the rig of {run}: other {', '.join(sorted(other))}")
+        raise RunFolderError(f"{sequence.path}: not the recording of {run}: expected {expected}, found {found}")
     return sequence

@@ -22,7 +22,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 from ggslam.slam.loop_closing import LoopCloser
 from ggslam.slam.result import LearnedObjects
-from ggslam.slam.saved_places import PLACES_FILE
+from ggslam.slam.saved_places import KEYFRAME_CAMERAS, PLACES_FILE
 from ggslam.slam.slam import Slam
 from ggslam.tracking.settings import DepthNoise
 
@@ -94,7 +94,10 @@ def _load(
     if len(loops.poses) != len(poses) or not np.isfinite(np.array(loops.poses)).all():
         raise ValueError(f"expected numbers for the poses of {len(poses)} keyframes")
     slam.tracker.noise = DepthNoise(constant, square)
-    return gaussians, [_bare_keyframe(k, T, slam.camera) for k, T in enumerate(poses)]
+    cameras = [slam.camera] * len(poses)
+    if KEYFRAME_CAMERAS in arrays:
+        cameras = [camera_of(row) for row in arrays[KEYFRAME_CAMERAS]]
+    return gaussians, [_bare_keyframe(k, T, cameras[k]) for k, T in enumerate(poses)]
 
 
 def scale_of(arrays: dict[str, Any]) -> float:
@@ -155,7 +158,7 @@ def _with_images(
     for keyframe, record in zip(keyframes[first:], records, strict=True):
         frame = sequence.frame(record.frame, masks=with_masks)
         made = make_keyframe(keyframe.index, frame, keyframe.T_world_camera)
-        out.append(replace(made, frame_index=ELSEWHERE, iterations=record.iterations))
+        out.append(replace(made, frame_index=ELSEWHERE, iterations=record.iterations, instant=None))
     return out
 
 

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from ggslam import __version__
 from ggslam.errors import GgslamError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
@@ -26,7 +28,7 @@ from ggslam.slam.config import Config, save_config
 from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
-from ggslam.system.atomic import write_bytes, write_text
+from ggslam.system.atomic import make_folder, write_bytes, write_text
 
 OBJECT_FILES = ("objects.json", "classifier.npz", "votes.npz")
 """Files of a run with objects, in the order in which they are removed; they are written in the opposite one."""
@@ -34,10 +36,12 @@ TRUTH_FILE = "ground_truth.txt"
 """True poses of the frames that have both, with the times of trajectory.txt; written by the report."""
 REPORT_FILE = "report.html"
 POINTS = ("points.ply", "points_grid.ply")
+TRAJECTORIES = "trajectories"
+"""Folder with a trajectory of each camera of a rig; trajectory.txt is that of the rig."""
 RUN_FILES = (
     *OBJECT_FILES, "map.ply", MAP_INDEX, "trajectory.txt", KeyframesRecord.FILE, LoopsRecord.FILE, SequenceRecord.FILE,
     TimingRecord.FILE, "config.yaml", "metrics.json", "frames.csv", *POINTS, PLACES_FILE, STEPS_FILE, TRUTH_FILE,
-    REPORT_FILE, "renders", "volumes", "plots",
+    REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES,
 )  # fmt: skip
 """Files and folders that a run may have besides run.json."""
 
@@ -96,7 +100,7 @@ class RunToWrite:
         save_config(self.config, folder / "config.yaml")
         for record in (self.sequence, KeyframesRecord.of_result(result)):
             record.write(folder)
-        write_tum(folder / "trajectory.txt", result.timestamps(), result.trajectory())
+        write_trajectories(folder, self.sequence, result)
         if result.cells is not None:
             save_map_in_parts(folder, result, self.names)
         elif result.objects is None:
@@ -111,6 +115,23 @@ class RunToWrite:
             missing=list(missing), verdicts=[VerdictRecord(**vars(verdict)) for verdict in self.verdicts],
             environment={**environment(self.config.threads), "device": self.result.device},
         )  # fmt: skip
+
+
+def write_trajectories(folder: Path, sequence: SequenceRecord, result: SlamResult) -> None:
+    """Writes trajectory.txt: the poses of all frames; of a rig those of its first camera, one for each instant, and
+    those of the frames of each camera into a folder of their own."""
+    times, poses = result.timestamps(), result.trajectory()
+    if sequence.rig is None:
+        write_tum(folder / "trajectory.txt", times, poses)
+        return
+    places = sequence.rig.places[[frame.frame_index for frame in result.frames]].reshape(-1, 2)
+    _, first = np.unique(places[:, 0], return_index=True)
+    of_rig = [sequence.rig.pose_of_first(poses[k], places[k, 1]) for k in first]
+    write_tum(folder / "trajectory.txt", times[first], np.array(of_rig).reshape(-1, 4, 4))
+    make_folder(folder / TRAJECTORIES)
+    for number, name in enumerate(sequence.rig.names):
+        own = places[:, 1] == number
+        write_tum(folder / TRAJECTORIES / f"{name}.txt", times[own], poses[own])
 
 
 def write_objects(folder: Path, segmented: SegmentedMap) -> None:

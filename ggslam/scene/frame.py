@@ -28,6 +28,8 @@ class Frame:
         valid: bool [H, W], False where colour shows nothing (beyond the border of an undistorted image); the same array
             for all frames of a recording; None: all of it shows something.
         depth_delay: seconds after `timestamp`, which is that of colour, at which depth was taken.
+        camera_number: of the camera in its rig; 0 without one.
+        instant: number of the instant at which the cameras of a rig took their images together; None without a rig.
     """
 
     index: int
@@ -41,6 +43,8 @@ class Frame:
     mask_loader: Callable[[], np.ndarray | None] | None = field(default=None, repr=False, compare=False)
     valid: np.ndarray | None = field(default=None, repr=False, compare=False)
     depth_delay: float = 0.0
+    camera_number: int = 0
+    instant: int | None = None
 
     def load_mask(self) -> np.ndarray | None:
         """The mask; reads it from disk on every call if it did not come with the frame.

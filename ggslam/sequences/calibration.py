@@ -101,16 +101,31 @@ def depth_camera_entry(path: Path, settings: Any) -> DepthCamera:
     """
     if not isinstance(settings, dict):
         raise SequenceError(f"{path}: expected entries width, height, fx, fy, cx, cy, T_color_depth of a depth camera")
-    if "T_color_depth" not in settings:
-        raise SequenceError(f"{path}: entry 'T_color_depth' is missing")
+    T = transform_entry(str(path), settings, "T_color_depth")
+    distortion, fisheye = distortion_entry(path, settings)
+    return DepthCamera(camera_entry(path, settings), T, distortion, fisheye)
+
+
+def transform_entry(place: str, settings: dict[str, Any], key: str) -> np.ndarray:
+    """A rigid transform, float64 [4, 4], of 16 numbers row by row, or of four rows.
+
+    Args:
+        place: of the entries, for messages.
+        settings: them.
+        key: name of the entry.
+
+    Raises:
+        SequenceError: it is missing, or no rigid transform.
+    """
+    if key not in settings:
+        raise SequenceError(f"{place}: entry '{key}' is missing")
     try:
-        T = np.array(settings["T_color_depth"], float).reshape(-1)
+        T = np.array(settings[key], float).reshape(-1)
     except (TypeError, ValueError):
         T = np.zeros(0)
     if T.size != 16 or not np.isfinite(T).all() or not is_valid_pose(T.reshape(4, 4)):
-        raise SequenceError(f"{path}: expected 'T_color_depth' to be the 16 numbers of a rigid transform, row by row")
-    distortion, fisheye = distortion_entry(path, settings)
-    return DepthCamera(camera_entry(path, settings), T.reshape(4, 4), distortion, fisheye)
+        raise SequenceError(f"{place}: expected '{key}' to be the 16 numbers of a rigid transform, row by row")
+    return T.reshape(4, 4)
 
 
 def use_depth_camera(recording: Recording, path: Path) -> None:

@@ -32,6 +32,10 @@ from ggslam.sequences.masks import find_masks
 from ggslam.sequences.own_camera import read_own_camera, use_own_camera
 from ggslam.sequences.pose_conventions import convert_poses
 from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat
+from ggslam.sequences.rig import LAYOUT as RIG_LAYOUT
+from ggslam.sequences.rig import NAME as RIG
+from ggslam.sequences.rig import open_rig
+from ggslam.sequences.rig_file import find_rig_file
 from ggslam.sequences.sequence import OnBadFrame, Sequence
 from ggslam.system.foreign import refuse_links
 
@@ -80,8 +84,8 @@ def open_sequence(
     """Opens an RGB-D recording.
 
     Args:
-        path: folder or file of the recording.
-        format: name of a format in `FORMATS`; None: recognised from the folder or file.
+        path: folder or file of the recording; rig.yaml, or its folder, for the recordings of a rig (see `rig`).
+        format: name of a format in `FORMATS`, or "rig"; None: recognised from the folder or file.
         start, stop, stride: frames start, start + stride, ... below stop (None: to the end). A stop past the end means
             the end.
         scale: size of the delivered images, in (0, 1]; None: 1, but of colour much finer than depth (phones) what
@@ -104,6 +108,15 @@ def open_sequence(
         SequenceError: the recording cannot be read; the message names the file, what was expected and what was found.
     """
     topics = tuple(topics)
+    rig = find_rig_file(Path(path).expanduser()) if format in (None, RIG) else None
+    if rig is not None:
+        of_cameras = {
+            "masks": masks, "depth_scale": depth_scale, "depth_camera": depth_camera, "min_confidence": min_confidence,
+            "topics": topics or None, "pose_convention": pose_convention, "camera": camera, "intrinsics": intrinsics,
+        }  # fmt: skip
+        return _open_rig(Path(path).expanduser(), rig, start, stop, stride, scale, on_bad_frame, of_cameras)
+    if format == RIG:
+        raise SequenceError(f"{path}: expected {RIG_LAYOUT}")
     read = partial(
         _read_recording, Path(path).expanduser(), format, None if masks is None else Path(masks).expanduser(),
         depth_scale, _options(depth_camera, min_confidence, topics, camera, intrinsics), pose_convention,
@@ -118,6 +131,21 @@ def open_sequence(
         "min_confidence": min_confidence, "topics": topics, "pose_convention": pose_convention,
         "camera": None if camera is None else Path(camera).expanduser(), "intrinsics": intrinsics,
     }  # fmt: skip
+    return sequence
+
+
+def _open_rig(
+    path: Path, file: Path, start: int, stop: int | None, stride: int, scale: float | None, on_bad_frame: OnBadFrame,
+    of_cameras: dict[str, object],
+) -> Sequence:  # fmt: skip
+    """A rig; `of_cameras` are arguments that hold for one camera alone."""
+    given = [name for name, value in of_cameras.items() if value is not None]
+    if given:
+        raise SequenceError(f"{file}: `{given[0]}` is of one camera; say it in the rig's file, as `{given[0]}` there")
+    sequence = open_rig(
+        file, open_sequence, start=start, stop=stop, stride=stride, scale=scale, on_bad_frame=on_bad_frame
+    )
+    sequence.options = {"path": path, "format": RIG, "scale": sequence.scale, "on_bad_frame": on_bad_frame}
     return sequence
 
 
@@ -203,6 +231,8 @@ def _options(
 def recognise_format(path: str | Path) -> str | None:
     """Name of the format of a folder or file, None when it is none of the known ones."""
     place = Path(path)
+    if find_rig_file(place) is not None:
+        return RIG
     return next((f.name for f in FORMATS if place.exists() and f.matches(place)), None)
 
 
@@ -210,11 +240,11 @@ def _find_format(folder: Path, name: str | None) -> RecordingFormat:
     if name is not None:
         named = next((f for f in FORMATS if f.name == name), None)
         if named is None:
-            raise SequenceError(f"unknown format '{name}'; known: {', '.join(f.name for f in FORMATS)}")
+            raise SequenceError(f"unknown format '{name}'; known: {', '.join([*(f.name for f in FORMATS), RIG])}")
         return named
     recognised = next((f for f in FORMATS if f.matches(folder)), None)
     if recognised is None:
-        looked_for = "\n".join(f"  {f.name}: {f.layout}" for f in FORMATS)
+        looked_for = "\n".join([*(f"  {f.name}: {f.layout}" for f in FORMATS), f"  {RIG}: {RIG_LAYOUT}"])
         if folder.is_file():
             raise SequenceError(f"{folder}: expected a recording, found a file that is none. Looked for:\n{looked_for}")
         raise SequenceError(f"{folder}: not a known recording; it holds {_contents(folder)}. Looked for:\n{looked_for}")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from ggslam.geometry.fixed_to_camera import compare_views, connected_with, shrink_depth
+from ggslam.geometry.fixed_to_camera import compare_views, parts_with_seeds, shrink_depth
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
@@ -109,7 +109,7 @@ class CameraFixtures:
         assert self.counts is not None
         fixed, still, world = self.counts
         candidates = (still >= max(FEWEST, STILL_SHARE * self.comparisons)) & (still >= AGAINST * world)
-        found = connected_with(candidates & (fixed >= SEEDS), candidates, SEED_SHARE)
+        found = parts_with_seeds(candidates & (fixed >= SEEDS), candidates, SEED_SHARE)
         if found.mean() < LEAST_SHARE:
             return
         grown = cv2.dilate(found.astype(np.uint8), np.ones((3, 3), np.uint8))

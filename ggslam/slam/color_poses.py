@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ggslam.mapping.cpu.mapper import CpuMapper
+from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.view_alignment import align_view, grey_of
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize, separation
@@ -32,18 +33,22 @@ class ColorPoses:
     Attributes:
         images: of frames that were located: their number among all frames, and grey values uint8 [H, W].
         held_bytes: what they take.
+        active: whether frames may be aligned: the map is trained on the CPU, and by the thread that tracks.
     """
 
-    mapper: CpuMapper
+    mapper: Mapper
     poses: FramePoses
     state: TrackerState
     images: list[tuple[int, np.ndarray]] = field(default_factory=list)
     held_bytes: int = 0
+    active: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.active = isinstance(self.mapper, CpuMapper) and self.mapper.settings.view_alignment.enabled
 
     def align(self, frame: Frame, found: TrackingResult) -> TrackingResult:
         """What the tracker found, with the pose by colour where that is due and does not contradict it."""
-        located = found.status not in (TrackingStatus.LOST, TrackingStatus.FIRST)
-        if not located or not self.mapper.settings.view_alignment.enabled or not self.mapper.keyframes:
+        if found.status in (TrackingStatus.LOST, TrackingStatus.FIRST) or not self.active or not self.mapper.keyframes:
             return found
         number = len(self.poses.frames)
         if not self._is_due and number >= UNDECIDED:
@@ -62,7 +67,7 @@ class ColorPoses:
 
     def align_again(self) -> None:
         """Aligns the frames that are no keyframes to the map as it is now."""
-        if not self._is_due:
+        if not self.active or not self._is_due:
             return
         frames, keyframes = self.poses.frames, self.mapper.keyframes
         own = {keyframe.frame_index for keyframe in keyframes}
@@ -84,6 +89,7 @@ class ColorPoses:
         """T_world_camera [4, 4] by colour, from one near by; None if there is none that can be believed."""
         camera, settings = self.state.camera, self.mapper.settings.view_alignment
         T_camera_world = inverse(T_world_camera)
+        assert isinstance(self.mapper, CpuMapper)
         view = self.mapper.render_view(camera, T_camera_world)
         depth, alpha = view.expected_depth.numpy(), view.alpha.numpy()
         rendered = grey_of(np.ascontiguousarray(view.image.numpy().clip(0, 1).transpose(1, 2, 0)))

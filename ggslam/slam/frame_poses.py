@@ -51,9 +51,9 @@ class FramePoses:
             )
         )  # fmt: skip
 
-    def newest(self) -> np.ndarray:
-        """T_world_camera [4, 4] of the newest frame as tracked."""
-        return self._T_world_anchor @ self.frames[-1].T_keyframe_camera
+    def as_tracked(self, frame: TrackedFrame) -> np.ndarray:
+        """T_world_camera [4, 4] of a frame that was just added as tracked."""
+        return self._T_world_anchor @ frame.T_keyframe_camera
 
     def pose_of(self, frame: TrackedFrame, keyframes: Sequence[Keyframe]) -> np.ndarray:
         """T_world_camera [4, 4] of a frame that was not lost, as far as is known by now.

@@ -108,12 +108,15 @@ class LoopCloser:
         """T_world_camera of the keyframes as tracked and corrected (the mapper refines its own on top)."""
         self.revisits = Revisits(settings.revisits)
         self.comparison = PlaceComparison(
-            camera, settings.verification, settings.neighbourhood, surface, tracker, context
+            settings.verification, settings.neighbourhood, surface, tracker, context
         )
         self._camera, self._surface, self._tracker = camera, surface, tracker
         self._verified: list[_Found] = []
         self._found_at: tuple[int, int] | None = None
-        """Frame at which a lost camera was found, and the keyframe it was found at; until its first keyframe is in."""
+        """When a lost camera was found (see `_moment`), and the keyframe it was found at; until its first keyframe is
+        in."""
+        self._taken: list[tuple[int | None, int]] = []
+        """Instant and camera number of each keyframe of a rig; instants are None without one."""
         self._lock = threading.RLock()
         self._helper: ThreadPoolExecutor | None = None
         self._begun: tuple[int, Future[Place]] | None = None
@@ -133,7 +136,7 @@ class LoopCloser:
         begun, self._begun = self._begun, None
         if begun is not None and begun[0] == frame.index:
             return begun[1].result()
-        return self.places.describe(FeatureView(frame.color, frame.depth, T_world_camera))
+        return self.places.describe(FeatureView(frame.color, frame.depth, T_world_camera), frame.camera)
 
     def add(self, frame: Frame, tracking: TrackingResult) -> Correction | None:
         """A keyframe was made of a frame, and its points are in the surface. Puts aside and takes back keyframes.
@@ -146,10 +149,12 @@ class LoopCloser:
             T = tracking.T_world_camera
             place = self._describe(frame, T)
             # In real time, keyframes from before the camera was lost may still come after it was found.
-            belated = self._found_at is not None and frame.index < self._found_at[0]
-            self._connect(tracking, belated)
-            self.activity.add(T, tracking.median_depth_m)
+            belated = self._found_at is not None and _moment(frame) < self._found_at[0]
+            before, rigid = self._came_from(frame)
+            self._connect(tracking, belated, before, rigid)
+            self.activity.add(T, tracking.median_depth_m, None if rigid else before)
             self.poses.append(T.copy())
+            self._taken.append((frame.instant, frame.camera_number))
             self.places.add(len(self.poses) - 1, place)
             if belated:
                 self.activity.active.discard(len(self.poses) - 1)
@@ -167,20 +172,34 @@ class LoopCloser:
             self._surface.arrange(correction.active, correction.T_world_camera)
             self._verified.clear()
 
-    def _connect(self, tracking: TrackingResult, belated: bool) -> None:
+    def _came_from(self, frame: Frame) -> tuple[int, bool]:
+        """The keyframe before that of a new frame, -1 without one, and whether it is of the same instant. In a rig that
+        is one of this instant, else the same camera's of the instant before, else any of that."""
+        newest = len(self.poses) - 1
+        if newest < 0 or frame.instant is None:
+            return newest, False
+        first, at = newest, self._taken[newest][0]
+        while at is not None and first > 0 and self._taken[first - 1][0] == at:
+            first -= 1
+        if at == frame.instant:
+            return first, True
+        same = [k for k in range(first, newest + 1) if self._taken[k][1] == frame.camera_number]
+        return (same[0] if same else first), False
+
+    def _connect(self, tracking: TrackingResult, belated: bool, before: int, rigid: bool) -> None:
         """The new keyframe's node, tied to the one before it, or to where a lost camera was found again."""
         T, number = tracking.T_world_camera, len(self.poses)
         self.graph.add_node(T)
-        before, found = number - 1, self._found_at is not None and not belated
+        found = self._found_at is not None and not belated
         if self._found_at is not None and found:
             before, self._found_at = self._found_at[1], None
-        self.revisits.add(inverse(self.poses[before]) @ T if before >= 0 else np.eye(4))
+        self.revisits.add(inverse(self.poses[before]) @ T if before >= 0 and not rigid else np.eye(4))
         if before >= 0:
             T_before_world = inverse(self.poses[before])
             information = SURE_INFORMATION  # without an alignment, what drift allows for is all that is unsure
             if tracking.alignment is not None:
                 information = information_in_frame(tracking.alignment.information, T_before_world)
-            self.graph.add_odometry(before, number, T_before_world @ T, information, found)
+            self.graph.add_odometry(before, number, T_before_world @ T, information, found, rigid)
 
     def _look_back(self, frame: Frame, place: Place, tracking: TrackingResult) -> Correction | None:
         number, s = len(self.poses) - 1, self.settings
@@ -192,7 +211,7 @@ class LoopCloser:
             return self._revisit(frame, place, tracking, near, T)
         if len(known) < len(self.poses):  # there is something to come back to
             for match in self.places.query(place, s.candidates, known.__contains__):
-                found, _ = self._compare(tracking.points, place, match.number)
+                found, _ = self._compare(frame.camera, tracking.points, place, match.number)
                 if found.accepted:
                     return self._believe(frame, match.number, found)
                 if found.inliers >= s.verification.min_inliers:  # others were never likely
@@ -217,7 +236,8 @@ class LoopCloser:
         """Compares the newest keyframe, expected at a pose [4, 4], with the likeliest of the old ones chosen."""
         number = len(self.poses) - 1
         for match in self.places.query(place, 1, lambda k: k not in chosen):
-            old, found = match.number, self._compare_expected(tracking.points, place, match.number, T_expected)
+            old = match.number
+            found = self._compare_expected(frame.camera, tracking.points, place, old, T_expected)
             if not found.accepted:
                 self.revisits.pause()
                 continue
@@ -235,18 +255,22 @@ class LoopCloser:
             return self._verified[-1]
         return None
 
-    def _compare_expected(self, source: PointSource, place: Place, old: int, T: np.ndarray) -> Verification:
+    def _compare_expected(
+        self, camera: Camera, source: PointSource, place: Place, old: int, T: np.ndarray
+    ) -> Verification:
         """Compares the newest keyframe with an old one, expected at `T` [4, 4]."""
         T_old_new, needed = inverse(self.poses[old]) @ T, self.settings.revisits.min_witnesses
         matches = self.comparison.matches(place, self.places[old])
-        if self.comparison.count_agreeing(matches, T_old_new, slack=4) >= needed:
-            return self.comparison.confirm(source, place, self.places, self.poses, old, matches, T_old_new, needed)
-        return self._compare(source, place, old)[0]
+        if self.comparison.count_agreeing(matches, T_old_new, camera, slack=4) >= needed:
+            return self.comparison.confirm(
+                source, place, self.places, self.poses, old, camera, matches, T_old_new, needed
+            )
+        return self._compare(camera, source, place, old)[0]
 
     def _compare(
-        self, source: PointSource, place: Place, old: int
+        self, camera: Camera, source: PointSource, place: Place, old: int
     ) -> tuple[Verification, AlignmentResult | None]:
-        return self.comparison.find(source, place, self.places, self.poses, old)
+        return self.comparison.find(source, place, self.places, self.poses, old, camera)
 
     def _is_confirmed(self) -> bool:
         """Whether the last loops found agree on the correction."""
@@ -298,13 +322,13 @@ class LoopCloser:
 
     def _found_among(self, frame: Frame, lost: TrackingResult) -> tuple[TrackingResult, int] | None:
         view = FeatureView(frame.color, frame.depth, lost.T_world_camera)
-        place = self.places.describe(view)
+        place = self.places.describe(view, frame.camera)
         for match in self.places.query(place, self.settings.candidates):
-            found, alignment = self._compare(lost.points, place, match.number)
+            found, alignment = self._compare(frame.camera, lost.points, place, match.number)
             if not found.accepted or alignment is None:
                 continue
             old = match.number
-            self._found_at = frame.index, old
+            self._found_at = _moment(frame), old
             self.activity.restart(old)
             self._surface.arrange(self.activity.active)
             reason = f"keyframe {old}: {found.inliers} features, {found.overlap:.0%} of the voxels"
@@ -335,7 +359,13 @@ class LoopCloser:
             if number:
                 self.graph.add_odometry(number - 1, number, inverse(self.poses[-1]) @ T, SURE_INFORMATION)
             self.poses.append(T.astype(float))
+            self._taken.append((None, 0))
             self.activity.add(T, float(depth))
         if not len(self.poses) == len(self.places) == len(self._surface):
             raise ValueError("places, poses and surfaces are not of the same keyframes")
         self.activity.active = set()
+
+
+def _moment(frame: Frame) -> int:
+    """When a frame was taken: its number, or that of its instant."""
+    return frame.index if frame.instant is None else frame.instant

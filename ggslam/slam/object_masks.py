@@ -42,6 +42,9 @@ class MaskSettings:
     min_views: int = setting(3, 1, 10**6)
     """Objects that a segmenter or association found on fewer keyframes are noise. Runs of less than ten keyframes for
     each of these views ask for less."""
+    min_repeat: float = setting(0.35, 0, 1)
+    """Objects that a segmenter or association found on a smaller share of the segmented keyframes that show their place
+    are noise, too."""
     min_gaussians: int = setting(20, 0, 10**9)
     """Objects with fewer Gaussians that a segmenter or association found are noise, too."""
     cleaning: CleaningSettings = field(default_factory=CleaningSettings)
@@ -75,7 +78,7 @@ class ObjectMasks:
             model = OnnxSegmenter(settings.model, settings.onnx)
             self._segment = lambda frame: model.segment(frame.color)
         self._associator = self._make_associator()
-        self._segmented: int | None = None  # number of the last frame that was
+        self._segmented: dict[int, int] = {}  # of each camera the last frame, or instant, that was
 
     def _make_associator(self) -> Associator:
         """A segmenter's ids mean nothing from one frame to the next; a recording's may."""
@@ -148,9 +151,10 @@ class ObjectMasks:
         """Whether too few frames have passed since the last one that was segmented."""
         if self._source not in ("geometry", "model"):
             return False
-        rests = self._segmented is not None and 0 <= frame.index - self._segmented < self.settings.every
+        number, now = frame.camera_number, frame.index if frame.instant is None else frame.instant
+        rests = number in self._segmented and 0 <= now - self._segmented[number] < self.settings.every
         if not rests:
-            self._segmented = frame.index
+            self._segmented[number] = now
         return rests
 
     def _segments(self, frame: Frame) -> np.ndarray | None:
@@ -167,18 +171,24 @@ class ObjectMasks:
         return self._segment(frame)
 
     def noise(
-        self, object_ids: np.ndarray, seen: dict[int, Observation], keyframes: int, sizes: np.ndarray
-    ) -> list[int]:
+        self, object_ids: np.ndarray, seen: dict[int, Observation], keyframes: int, sizes: np.ndarray,
+        chances: Mapping[int, int],
+    ) -> list[int]:  # fmt: skip
         """Of `object_ids`, those that are too small or were seen too rarely, in so many keyframes, to be believed.
 
         Args:
             sizes: number of Gaussians by id, [65536].
+            chances: number of keyframes by id in which an object could have been seen; where it is not known, the
+                object is not doubted for it.
         """
         if self.supervision == "masks":
             return []
         views = {i: seen[i].views if i in seen else 0 for i in object_ids.tolist()}
-        enough = min(self.settings.min_views, 1 + keyframes // 10)
-        return [i for i, count in views.items() if count < enough or sizes[i] < self.settings.min_gaussians]
+        enough, share = min(self.settings.min_views, 1 + keyframes // 10), self.settings.min_repeat
+        return [
+            i for i, count in views.items()
+            if count < max(enough, share * chances.get(i, 0)) or sizes[i] < self.settings.min_gaussians
+        ]  # fmt: skip
 
 
 def _choose(settings: MaskSettings, has_masks: bool | None) -> Source | None:

@@ -27,7 +27,6 @@ class PlaceComparison:
     """Compares frames with the places of keyframes.
 
     Args:
-        camera: of all frames.
         settings: what a comparison has to show.
         neighbourhood: keyframes before and after an old one whose points make its surface.
         surface: the keyframes' points.
@@ -36,16 +35,17 @@ class PlaceComparison:
     """
 
     def __init__(
-        self, camera: Camera, settings: VerificationSettings, neighbourhood: int, surface: MeasuredSurface,
-        tracker: Tracker, context: NativeContext,
+        self, settings: VerificationSettings, neighbourhood: int, surface: MeasuredSurface, tracker: Tracker,
+        context: NativeContext,
     ) -> None:  # fmt: skip
         self.settings = settings
-        self._camera, self._neighbourhood, self._surface = camera, neighbourhood, surface
+        self._neighbourhood, self._surface = neighbourhood, surface
         self._tracker, self._context = tracker, context
 
     def find(
-        self, source: PointSource, place: Place, places: PlaceIndex, poses: Sequence[np.ndarray], old: int
-    ) -> tuple[Verification, AlignmentResult | None]:
+        self, source: PointSource, place: Place, places: PlaceIndex, poses: Sequence[np.ndarray], old: int,
+        camera: Camera,
+    ) -> tuple[Verification, AlignmentResult | None]:  # fmt: skip
         """Whether a frame sees what keyframe `old` saw, from wherever, and the last alignment to the surface there.
 
         Args:
@@ -54,10 +54,11 @@ class PlaceComparison:
             places: of the keyframes.
             poses: T_world_camera of the keyframes.
             old: number of the keyframe.
+            camera: that took the frame.
         """
         there = _There(self, source.read(), poses, old)
         found = verify(
-            there.local_map(places), LocalMap(place.landmarks, there.points.points), self._camera, self.noise.sigma,
+            there.local_map(places), LocalMap(place.landmarks, there.points.points), camera, self.noise.sigma,
             there.align_at, self.settings,
         )  # fmt: skip
         return found, there.last
@@ -66,18 +67,18 @@ class PlaceComparison:
         """Features that two places share."""
         return match(old.landmarks, place.landmarks, self.settings.registration)
 
-    def count_agreeing(self, matches: Matches, T_old_new: np.ndarray, slack: float = 1.0) -> int:
-        """How many of the matches a motion [4, 4] explains; `slack` widens the limits."""
-        return int(matches.agree(T_old_new, self._camera, self.settings.registration, slack).sum())
+    def count_agreeing(self, matches: Matches, T_old_new: np.ndarray, camera: Camera, slack: float = 1.0) -> int:
+        """How many of the matches a motion [4, 4] explains; `camera` took the new frame, `slack` widens the limits."""
+        return int(matches.agree(T_old_new, camera, self.settings.registration, slack).sum())
 
     def confirm(
         self, source: PointSource, place: Place, places: PlaceIndex, poses: Sequence[np.ndarray], old: int,
-        matches: Matches, T_old_new: np.ndarray, min_witnesses: int,
+        camera: Camera, matches: Matches, T_old_new: np.ndarray, min_witnesses: int,
     ) -> Verification:  # fmt: skip
         """As `find`, where the motion is expected to be about `T_old_new` [4, 4], and `matches` are known."""
         there = _There(self, source.read(), poses, old)
         return verify_expected(
-            there.local_map(places), LocalMap(place.landmarks, there.points.points), matches, T_old_new, self._camera,
+            there.local_map(places), LocalMap(place.landmarks, there.points.points), matches, T_old_new, camera,
             self.noise.sigma, there.align_at, self.settings, min_witnesses,
         )  # fmt: skip
 

@@ -22,11 +22,13 @@ if TYPE_CHECKING:
     from ggslam.tracking.surface import MeasuredSurface
 
 PLACES_FILE = "places.npz"
+KEYFRAME_CAMERAS = "keyframe_cameras"
+"""In places.npz of a run of several cameras: the camera of each keyframe, as the row `camera`."""
 
 
 def saved_places_to_bytes(
     camera: Camera, surface: MeasuredSurface, loops: LoopCloser, noise: DepthNoise, scale: float,
-    keyframe_poses: np.ndarray, parts: Iterable[GaussianMap],
+    keyframe_poses: np.ndarray, parts: Iterable[GaussianMap], keyframe_cameras: Iterable[Camera] | None = None,
 ) -> bytes:  # fmt: skip
     """Content of `places.npz`.
 
@@ -38,6 +40,7 @@ def saved_places_to_bytes(
         scale: size of the scene against a room's.
         keyframe_poses: T_world_camera, float64 [n, 4, 4].
         parts: its map in the order of map.ply.
+        keyframe_cameras: of its keyframes, if they are not all of `camera`.
     """
     arrays = {f"surface_{name}": values for name, values in surface.to_arrays().items()}
     arrays |= {f"loops_{name}": values for name, values in loops.to_arrays().items()}
@@ -48,6 +51,8 @@ def saved_places_to_bytes(
         "keyframe_poses": keyframe_poses,
         "birth": np.concatenate([np.zeros(0, np.int32), *(part.birth_keyframe.numpy() for part in parts)]),
     }  # fmt: skip
+    if keyframe_cameras is not None:
+        arrays[KEYFRAME_CAMERAS] = np.stack([camera_row(of_keyframe) for of_keyframe in keyframe_cameras])
     return arrays_to_bytes(**arrays)
 
 

@@ -50,6 +50,8 @@ from ggslam.slam.loop_closing import LoopCloser, LoopEvent, _Found
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.slam.result import LearnedObjects, SlamTimes, TrackedFrame
+from ggslam.slam.rig_clock import RigClock
+from ggslam.slam.rig_slam import RigSlam
 from ggslam.slam.run_objects import RunObjects
 from ggslam.slam.shutter_times import ShutterTimes
 from ggslam.slam.slam import Slam
@@ -103,9 +105,12 @@ def reason_against_saving(config: Config) -> str | None:
 
 def check_state(slam: Slam) -> None:
     """Raises FormatError if parts of a state do not fit together, which compiled code would not survive."""
-    camera, mapper, surface = slam.camera, slam.mapper, slam.surface
-    shape = (camera.height, camera.width)
+    mapper, surface = slam.mapper, slam.surface
     for number, keyframe in enumerate(mapper.keyframes):
+        if not 0 <= keyframe.camera_number < len(slam.cameras):
+            raise FormatError(f"keyframe {number}: not of this recording")
+        camera = slam.cameras[keyframe.camera_number]
+        shape = (camera.height, camera.width)
         images = (keyframe.color, keyframe.depth)
         empty = all(image.size == 0 for image in images)
         good = empty or (keyframe.color.shape == (*shape, 3) and keyframe.depth.shape == shape)
@@ -182,6 +187,7 @@ def _names(*names: str) -> frozenset[str]:
 RULES: Rules = {
     **dict.fromkeys(_settings_classes(Config) - {Config}, Rule(checked=True)),
     Slam: _but("camera", "config", "context", "pager", "_notes", "_on_device"),
+    RigSlam: _but("camera", "rig", "config", "context", "pager", "_notes", "_on_device", "_engine"),
     SlamTimes: _but("_started", growing=_names("tracking_by_frame"), after=_go_on),
     ColorPoses: _but("mapper", "poses", "state", growing=_names("images")),
     FramePoses: Rule(growing=_names("frames")),
@@ -224,7 +230,7 @@ RULES: Rules = {
         (Camera, CameraFixtures, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame,
          StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam,
          ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier, LearnedObjects, Observation,
-         Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory, ShutterTimes),
+         Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory, ShutterTimes, RigClock),
         Rule(),
     ),
 }  # fmt: skip

@@ -20,7 +20,6 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError
-from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.camera import Camera
@@ -47,7 +46,7 @@ from ggslam.tracking.scale import scale_settings, scene_scale
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
-_TRIM_EVERY = 8
+TRIM_EVERY = 8
 """Keyframes: the C library keeps a fifth of a run's memory for itself that once held arrays; asking for it back takes
 milliseconds."""
 
@@ -99,10 +98,7 @@ class Slam:
         self._moves_followed = 0
         self._noise: DepthNoise | None = None
         self._objects = RunObjects(self.masks)
-        self.color_poses: ColorPoses | None = None
-        """None: frames stay where the tracker finds them."""
-        if isinstance(self.mapper, CpuMapper):
-            self.color_poses = ColorPoses(self.mapper, self.poses, self.tracker.state)
+        self.color_poses = ColorPoses(self.mapper, self.poses, self.tracker.state)
         self._depth_edges, self._shutters, self._fixtures = DepthEdges(), ShutterTimes(), CameraFixtures()
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
@@ -147,7 +143,7 @@ class Slam:
                 self.loops.begin(frame)  # beside what the host waits for
             self.insert(frame, tracking, self.moves_followed)
             self.poses.add_keyframe(tracking.T_world_camera)
-            if len(self.mapper.keyframes) % _TRIM_EVERY == 0:
+            if len(self.mapper.keyframes) % TRIM_EVERY == 0:
                 trim()
         self.poses.add(frame, tracking)
         if self.mapper.keyframes and self.growing:
@@ -168,13 +164,19 @@ class Slam:
         """As trained so far; on the device that it is trained on."""
         return self.mapper.map
 
-    def note_step(self, is_keyframe: bool, seconds: float) -> StepReport:
-        """What the step did that has just ended and took `seconds`; `steps` remembers it."""
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Of the frames, by `Frame.camera_number`."""
+        return (self.camera,)
+
+    def note_step(self, is_keyframe: bool, seconds: float, number: int = -1) -> StepReport:
+        """What the step did that has just ended with frame `number` of `frames` and took `seconds`; `steps` remembers
+        it."""
         loops_s = 0.0 if self.loops is None else self.loops.seconds
-        frame = self.frames[-1]
+        frame = self.frames[number]
         report = self.steps.add(frame, is_keyframe, seconds, self.times, loops_s, self.mapper, self.gaussian_count)
         if frame.status != TrackingStatus.LOST.value:
-            report.T_world_camera = self.poses.newest()
+            report.T_world_camera = self.poses.as_tracked(frame)
         return report
 
     @property
@@ -204,8 +206,7 @@ class Slam:
         try:
             if steps:
                 self.mapper.refine(steps, note, begin)
-            if self.color_poses is not None:
-                self.color_poses.align_again()
+            self.color_poses.align_again()
         finally:  # an interrupted refinement counts for what it did
             self.refine_iterations = begin + self.mapper.times.iterations - before
             self.times.refinement = time.perf_counter() - start
@@ -233,7 +234,8 @@ class Slam:
         parts = [gaussians] if cells is None else (part for _, part in cells.parts())
         poses = np.stack([k.T_world_camera for k in self.mapper.keyframes])
         noise = self.tracker.noise or DepthNoise()
-        return saved_places_to_bytes(self.camera, self.surface, self.loops, noise, self.scale, poses, parts)
+        cameras = [k.camera for k in self.mapper.keyframes] if len(self.cameras) > 1 else None
+        return saved_places_to_bytes(self.camera, self.surface, self.loops, noise, self.scale, poses, parts, cameras)
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, for a run that has no result."""
@@ -255,7 +257,7 @@ class Slam:
     def track(self, frame: Frame) -> TrackingResult:
         """Locates one frame, as `receive` gave it, against the current target; a lost one is looked up among all
         keyframes."""
-        self.mapper.valid = frame.valid
+        self.mapper.note_valid(frame)
         start = time.perf_counter()
         self._follow_moves()
         if not len(self.surface):
@@ -266,8 +268,7 @@ class Slam:
             if found is not None:
                 result, keyframe = found
                 self.poses.anchor_to(keyframe, self.loops.poses[keyframe])
-        if self.color_poses is not None:
-            result = self.color_poses.align(frame, result)
+        result = self.color_poses.align(frame, result)
         located = None if result.status is TrackingStatus.LOST else result.T_world_camera
         self._shutters.follow(located)
         self._fixtures.follow(self.camera, located)

@@ -5,6 +5,7 @@
         index.sqlite                  what there is (index.py): settings, visits, cells, parts with size and CRC-32
         lock                          held by the one writer
         cells/3_0_-2/17/points.pcd    cell (3, 0, -2), a part written with version 17 (cell_files.py)
+        visits/                       what is remembered of visits (visit_files.py)
 
 Units: metres in world coordinates, seconds on the clock of the recordings, sizes in bytes.
 
@@ -34,7 +35,8 @@ from ggslam.submaps.index import CellIndex
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.atomic import make_folder, write_failure
 
-_INDEX, _LOCK, _CELLS = "index.sqlite", "lock", "cells"
+INDEX, CELLS = "index.sqlite", "cells"
+_LOCK = "lock"
 
 
 class GridStore:
@@ -51,7 +53,7 @@ class GridStore:
         """The visit that writes belong to; see `begin_visit`."""
         self._index = index
         self._lock = lock
-        self._files = CellFiles(path / _CELLS)
+        self._files = CellFiles(path / CELLS)
         self._last_version = index.last_version()
         self._visit_number: int | None = None
         self._writing = threading.RLock()
@@ -80,9 +82,9 @@ class GridStore:
         temporary = path / f".index-{os.getpid()}-{secrets.token_hex(4)}"
         try:
             CellIndex.create(temporary, settings or SubmapSettings())
-            temporary.replace(path / _INDEX)
+            temporary.replace(path / INDEX)
         except OSError as error:
-            raise write_failure(path / _INDEX, error) from error
+            raise write_failure(path / INDEX, error) from error
         finally:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
@@ -104,8 +106,8 @@ class GridStore:
             RunFolderError: another process writes to it, or the folder cannot be opened.
         """
         path = Path(path)
-        if not (path / _INDEX).is_file():
-            raise FormatError(f"{path}: no grid store: there is no file {_INDEX}")
+        if not (path / INDEX).is_file():
+            raise FormatError(f"{path}: no grid store: there is no file {INDEX}")
         for entry in path.iterdir():
             if entry.is_symlink():
                 raise FormatError(f"{entry}: is a link; a store holds none")
@@ -114,10 +116,10 @@ class GridStore:
             if write:
                 lock = WriterLock(path / _LOCK)
                 undone.callback(lock.abandon)
-                if not (path / _CELLS).is_dir():
-                    make_folder(path / _CELLS)
+                if not (path / CELLS).is_dir():
+                    make_folder(path / CELLS)
                     wait_for_disk(path)
-            index, own = CellIndex.open(path / _INDEX, write)
+            index, own = CellIndex.open(path / INDEX, write)
             undone.callback(index.close)
             if settings is not None:
                 check_same_grid(path, own, settings)
@@ -297,6 +299,10 @@ class GridStore:
     def visits(self) -> list[str]:
         """Names of the visits, oldest first."""
         return self._index.visits()
+
+    def copy_index(self, path: Path) -> None:
+        """Writes the index as it is now to a new file."""
+        self._index.copy(path)
 
     def _check_writable(self) -> None:
         if self._lock is None:

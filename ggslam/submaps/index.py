@@ -91,6 +91,15 @@ class CellIndex:
         with self._lock, suppress(sqlite3.Error):
             self._connection.close()
 
+    def copy(self, path: Path) -> None:
+        """Writes all of it to a new file, as it is at one moment."""
+        with self._lock, _explain_errors(path):
+            copy = sqlite3.connect(path)
+            try:
+                self._connection.backup(copy)
+            finally:
+                copy.close()
+
     def keys(self) -> list[CellKey]:
         """Every cell, sorted."""
         return self._rows("SELECT x, y, z FROM cells ORDER BY x, y, z")

@@ -6,6 +6,7 @@ scanner."""
 from ggslam.synthetic.corridor import furnished_corridor
 from ggslam.synthetic.house import ring_of_rooms
 from ggslam.synthetic.raycast import RayCaster, RayImages
+from ggslam.synthetic.rig import write_synthetic_rig
 from ggslam.synthetic.room import furnished_room
 from ggslam.synthetic.scene import Scene, SceneBuilder, Shape
 from ggslam.synthetic.scenes import SCENES
@@ -37,5 +38,6 @@ __all__ = [
     "ring_of_rooms",
     "walk",
     "world_cloud",
+    "write_synthetic_rig",
     "write_synthetic_sequence",
 ]

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -69,28 +71,95 @@ def write_synthetic_sequence(
         SequenceError: impossible arguments, or the folder cannot be written.
     """
     target = Path(folder)
+    plan = plan_recording(width, height, frames, seed, noise, trajectory, frame_rate, scene, depth_distortion)
+    check_target(target, "camera.yaml", overwrite)
+    with new_folder(target) as work:
+        write_recording(work, plan, plan.poses, plan.times, progress=progress)
+    return target
+
+
+@dataclass(frozen=True)
+class RecordingPlan:
+    """A recording about to be made; see `write_synthetic_sequence`.
+
+    Attributes:
+        scene, camera, seed, noise, trajectory, frame_rate: of it.
+        distortion: of its depth camera, steps of disparity.
+        poses: T_world_camera, float64 [n, 4, 4].
+    """
+
+    scene: Scene
+    camera: Camera
+    seed: int
+    noise: bool
+    trajectory: str
+    frame_rate: float
+    distortion: float
+    poses: np.ndarray
+
+    @property
+    def times(self) -> np.ndarray:
+        """Seconds, float64 [n]."""
+        return np.arange(len(self.poses)) / self.frame_rate
+
+
+def plan_recording(
+    width: int, height: int, frames: int | None, seed: int, noise: bool, trajectory: str | None,
+    frame_rate: float | None, scene: Scene | str, depth_distortion: float | None,
+) -> RecordingPlan:  # fmt: skip
+    """What is to be recorded, of arguments as of `write_synthetic_sequence`.
+
+    Raises:
+        SequenceError: they are impossible.
+    """
     kind = _kind_of(scene)
     frames = kind.frames if frames is None else frames
     frame_rate = kind.frame_rate if frame_rate is None else frame_rate
     trajectory = kind.trajectory if trajectory is None else trajectory
     distortion = kind.depth_distortion if depth_distortion is None else depth_distortion
     _check_numbers(width, height, frame_rate, distortion)
-    _check_target(target, overwrite)
     scene = scene if isinstance(scene, Scene) else kind.build(seed, frames)
-    poses = camera_path(scene, frames, trajectory, seed)
     focal = FOCAL_LENGTH * width
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    poses = camera_path(scene, frames, trajectory, seed)
+    return RecordingPlan(scene, camera, seed, noise, trajectory, frame_rate, distortion, poses)
+
+
+def write_recording(
+    folder: Path, plan: RecordingPlan, poses: np.ndarray, times: np.ndarray, number: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:  # fmt: skip
+    """Ray-casts a recording into a folder that is there.
+
+    Args:
+        folder: to write to.
+        plan: what is recorded.
+        poses: T_world_camera, float64 [n, 4, 4], and `times`, seconds, of its frames.
+        number: of the camera, if several record the same: the sensor of each has its own noise.
+        progress: called with (frames done, frames).
+    """
+    _write_images(folder, plan, poses, number, progress)
+    _write_description(folder, plan, poses, times)
+    if (times != plan.times).any():  # else they follow from the frame rate
+        (folder / "timestamps.txt").write_text("".join(f"{time:.6f}\n" for time in times.tolist()), encoding="utf-8")
+
+
+@contextmanager
+def new_folder(target: Path) -> Iterator[Path]:
+    """A folder to write to, which becomes `target` when all is well.
+
+    Raises:
+        SequenceError: it cannot be written.
+    """
     work = _folder_beside(target)
     try:
-        _write_images(work, scene, camera, poses, seed, noise, distortion, progress)
-        _write_description(work, scene, camera, poses, seed, noise, trajectory, frame_rate, distortion)
+        yield work
         work.chmod(0o755)  # mkdtemp makes it private
         _put_in_place(work, target)
     except OSError as error:
         raise SequenceError(f"{target}: cannot be written: {error}") from None
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    return target
 
 
 def _check_numbers(width: int, height: int, frame_rate: float, distortion: float) -> None:
@@ -133,14 +202,16 @@ def _put_in_place(work: Path, target: Path) -> None:
     shutil.rmtree(former, ignore_errors=True)
 
 
-def _check_target(target: Path, overwrite: bool) -> None:
+def check_target(target: Path, file: str, overwrite: bool) -> None:
+    """Raises SequenceError unless a recording can be made at `target`: nothing is there, or with `overwrite` one of
+    this generator, which `file` in it says."""
     if not target.exists():
         return
     if not target.is_dir():
         raise SequenceError(f"{target}: expected a folder to make, found a file")
     if not any(target.iterdir()):
         return
-    description = target / "camera.yaml"
+    description = target / file
     generated = description.is_file() and "generator:" in description.read_text(encoding="utf-8", errors="replace")
     if not (overwrite and generated):
         what = "holds a generated recording already" if generated else "is not empty"
@@ -148,19 +219,18 @@ def _check_target(target: Path, overwrite: bool) -> None:
 
 
 def _write_images(
-    folder: Path, scene: Scene, camera: Camera, poses: np.ndarray, seed: int, noise: bool,
-    distortion: float, progress: Callable[[int, int], None] | None,
-) -> None:  # fmt: skip
+    folder: Path, plan: RecordingPlan, poses: np.ndarray, number: int, progress: Callable[[int, int], None] | None
+) -> None:
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir()
-    caster = RayCaster(scene, seed)
-    offset = disparity_distortion(camera, distortion, seed) if distortion else 0.0
+    caster = RayCaster(plan.scene, plan.seed)
+    offset = disparity_distortion(plan.camera, plan.distortion, plan.seed + number) if plan.distortion else 0.0
     for i, pose in enumerate(poses):
-        images = caster.render(camera, pose)
+        images = caster.render(plan.camera, pose)
         color, depth = images.color, images.depth
-        if noise:
-            rng = np.random.default_rng([seed, 4, i])
-            color, depth = noisy_color(color, rng), noisy_depth(depth, camera, rng, offset)
+        if plan.noise:
+            rng = np.random.default_rng([plan.seed, 4, i, *([number] if number else [])])
+            color, depth = noisy_color(color, rng), noisy_depth(depth, plan.camera, rng, offset)
         raw = np.rint(np.minimum(depth * DEPTH_SCALE, 65535)).astype(np.uint16)
         _write_png(folder / "rgb" / f"{i:06d}.png", cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
         _write_png(folder / "depth" / f"{i:06d}.png", raw)
@@ -176,15 +246,13 @@ def _write_png(path: Path, image: np.ndarray) -> None:
     path.write_bytes(content.tobytes())
 
 
-def _write_description(
-    folder: Path, scene: Scene, camera: Camera, poses: np.ndarray, seed: int, noise: bool, trajectory: str, rate: float,
-    distortion: float,
-) -> None:  # fmt: skip
+def _write_description(folder: Path, plan: RecordingPlan, poses: np.ndarray, times: np.ndarray) -> None:
+    camera = plan.camera
     description = {
         "generator": f"ggslam synth {__version__}",
-        "seed": seed,
-        "noise": noise,
-        "trajectory": trajectory,
+        "seed": plan.seed,
+        "noise": plan.noise,
+        "trajectory": plan.trajectory,
         "width": camera.width,
         "height": camera.height,
         "fx": camera.fx,
@@ -192,14 +260,14 @@ def _write_description(
         "cx": camera.cx,
         "cy": camera.cy,
         "depth_scale": DEPTH_SCALE,
-        "frame_rate": rate,
-        **({"depth_distortion": distortion} if distortion and noise else {}),
-        "instances": dict(scene.instance_names),
+        "frame_rate": plan.frame_rate,
+        **({"depth_distortion": plan.distortion} if plan.distortion and plan.noise else {}),
+        "instances": dict(plan.scene.instance_names),
     }
     (folder / "camera.yaml").write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
     lines = ["# timestamp tx ty tz qx qy qz qw (camera to world)"]
-    for i, T in enumerate(poses):
+    for time, T in zip(times.tolist(), poses, strict=True):
         w, x, y, z = matrix_to_quaternion(T[:3, :3])
         numbers = (*T[:3, 3], x, y, z, w)
-        lines.append(f"{i / rate:.6f} " + " ".join(f"{value:.9f}" for value in numbers))
+        lines.append(f"{time:.6f} " + " ".join(f"{value:.9f}" for value in numbers))
     (folder / "poses.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -85,3 +85,27 @@ def _parse(text: str) -> Any:
 
 
 _parse_again = lru_cache(maxsize=16)(_parse)
+
+
+def repeated_key(text: str) -> tuple[str, int] | None:
+    """A name that a map of a text in YAML holds twice, of which only the last would count, and its line; None if there
+    is none.
+
+    Raises:
+        PlainYamlError: it is no YAML.
+    """
+    try:
+        pending = [yaml.compose(text, _Loader)]
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise PlainYamlError(" ".join(str(error).split())) from None
+    while pending:
+        node = pending.pop()
+        if isinstance(node, yaml.MappingNode):
+            names = [key.value for key, _ in node.value]
+            for number, (key, value) in enumerate(node.value):
+                if isinstance(key, yaml.ScalarNode) and key.value in names[:number]:
+                    return str(key.value), key.start_mark.line + 1
+                pending.append(value)
+        elif isinstance(node, yaml.SequenceNode):
+            pending += node.value
+    return None

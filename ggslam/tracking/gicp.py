@@ -272,7 +272,8 @@ def native_align_settings(
 def native_points(points: FramePoints) -> structures.AlignPoints:
     """The core's form of a frame's points, which must stay alive."""
     arrays = (points.points, points.normals, points.covariances, points.weights)
-    return structures.AlignPoints(*(address(a) for a in arrays), len(points))
+    depths = None if points.depths is None else address(points.depths)
+    return structures.AlignPoints(*(address(a) for a in arrays), depths, len(points))
 
 
 def align(

@@ -63,6 +63,10 @@ class GicpTracker(Tracker):
         """Where points are extracted and aligned."""
         return self._given_engine or CpuTrackingEngine(self.camera, self.context)
 
+    @engine.setter
+    def engine(self, engine: TrackingEngine) -> None:
+        self._given_engine = engine
+
     def track(self, frame: Frame) -> TrackingResult:
         """See `Tracker.track`."""
         target, motion = self.target, self.state.motion

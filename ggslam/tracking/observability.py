@@ -42,7 +42,7 @@ class PointSpread:
         """Of these points."""
         if not len(source):
             return cls(0.0, np.zeros(3), 0.0)
-        z = source.points[:, 2]
+        z = source.z
         inverse_variance = 1.0 / (noise.constant + noise.square * z * z) ** 2
         total = float(inverse_variance.sum())
         centroid = inverse_variance @ source.points / total

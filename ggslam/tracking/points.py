@@ -44,6 +44,8 @@ class FramePoints:
         covariances: float32 [n, 6], xx xy xz yy yz zz, regularised: median eigenvalue 1 (equation 1 of GS-ICP).
         pixels: int32 [n, 2], column and row.
         weights: float32 [n], (sigma(1 m) / sigma(z))^2.
+        depths: float32 [n], metres along the axis of the camera that saw each; None: z of the points, all of which one
+            camera saw.
     """
 
     points: np.ndarray
@@ -51,6 +53,7 @@ class FramePoints:
     covariances: np.ndarray
     pixels: np.ndarray
     weights: np.ndarray
+    depths: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -58,7 +61,12 @@ class FramePoints:
     @property
     def median_depth(self) -> float:
         """Median depth in metres; 0 without points."""
-        return float(np.median(self.points[:, 2])) if len(self.points) else 0.0
+        return float(np.median(self.z)) if len(self.points) else 0.0
+
+    @property
+    def z(self) -> np.ndarray:
+        """Depth of each along the axis of the camera that saw it, float32 [n], metres; noise follows from it."""
+        return self.points[:, 2] if self.depths is None else self.depths
 
     def median_depth_if_known(self) -> float | None:
         """See `PointSource`."""

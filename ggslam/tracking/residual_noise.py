@@ -57,7 +57,7 @@ class ResidualNoise:
         if matched.sum() < 100:
             return noise
         sigma = float(np.sqrt(np.median(squared_distances[matched]))) / _MEDIAN_OF_NORMAL
-        self.residuals = [*self.residuals[1 - LATEST :], (float(np.median(points.points[matched, 2])), sigma)]
+        self.residuals = [*self.residuals[1 - LATEST :], (float(np.median(points.z[matched])), sigma)]
         if len(self.residuals) < FEWEST:
             return noise
         ratios = [sigma / max(noise.sigma(z), SURFACE_SIGMA) for z, sigma in self.residuals]

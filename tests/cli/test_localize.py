@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from ggslam.cli.main import app
 from ggslam.errors import GgslamError
 from ggslam.formats.trajectory import read_tum, write_tum
-from ggslam.jobs.submaps.stores import GAUSSIANS
+from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS
 from ggslam.runs.folder import RunFolder
 from ggslam.submaps.grid import GridStore
 from ggslam.synthetic.world_cloud import cloud_tiles

@@ -15,6 +15,7 @@ import pytest
 from small_batch import write_small_batch
 from typer.testing import CliRunner, Result
 
+from ggslam import __version__
 from ggslam.cli.main import app
 from ggslam.errors import ConfigError, GgslamError, MissingDependency
 from ggslam.jobs.batch import ray_engine
@@ -22,8 +23,10 @@ from ggslam.jobs.batch.batch import run_batch, run_one
 from ggslam.jobs.batch.job_process import JobProcess
 from ggslam.jobs.batch.job_states import JobState, State
 from ggslam.jobs.batch.manifest import Manifest, read_manifest
-from ggslam.jobs.batch.ray_engine import Made, make_on_worker
+from ggslam.jobs.batch.ray_engine import RayJob, make_on_worker
 from ggslam.jobs.batch.slurm_script import slurm_script
+from ggslam.jobs.tasks.outcomes import Failure
+from ggslam.jobs.tasks.ray_cluster import do_on_worker
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +154,7 @@ def test_a_worker_without_the_folder_sends_its_files(
         state.end(1, 2.5, "a line")
 
     monkeypatch.setattr(ray_engine, "make_job", make)
-    made = make_on_worker(job, "/no/such/folder", "token", ray_engine.__version__, _Actor)
+    made = make_on_worker(RayJob(job, "/no/such/folder", "token", _Actor))
     assert made.files is not None and (made.exit_code, made.seconds, made.line) == (1, 2.5, "a line")
     assert not folders[0].exists()  # what the worker made is not left there
     state = JobState(job, tmp_path)
@@ -162,13 +165,14 @@ def test_a_worker_without_the_folder_sends_its_files(
 
     (tmp_path / "seen").mkdir()
     (tmp_path / "seen/.shared-by").write_text("token")
-    assert make_on_worker(job, str(tmp_path / "seen"), "token", ray_engine.__version__, _Actor).files is None
+    assert make_on_worker(RayJob(job, str(tmp_path / "seen"), "token", _Actor)).files is None
     assert folders[-1] == tmp_path / "seen"
 
 
 def test_another_version_on_the_worker_is_said(manifest: Path, tmp_path: Path) -> None:
-    made = make_on_worker(read_manifest(manifest).jobs[0], str(tmp_path), "token", "0.0.0", _Actor)
-    assert made == Made(1, 0.0, f"ggslam {ray_engine.__version__} on the worker, 0.0.0 where the batch was begun")
+    job = RayJob(read_manifest(manifest).jobs[0], str(tmp_path), "token", _Actor)
+    made = do_on_worker(make_on_worker, job, "0.0.0")
+    assert made == Failure(f"ggslam {__version__} on the worker, 0.0.0 where the work was begun")
 
 
 def test_ray_that_is_missing_is_named(manifest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,8 +19,8 @@ from small_batch import write_small_batch
 from ggslam.errors import ConfigError
 from ggslam.jobs.batch.batch import run_batch
 from ggslam.jobs.batch.job_states import JobState, State, states_of
-from ggslam.jobs.batch.local_engine import shares
 from ggslam.jobs.batch.manifest import BatchJob, Manifest, read_manifest
+from ggslam.jobs.tasks.processors import shares
 from ggslam.synthetic import write_synthetic_sequence
 
 

@@ -17,7 +17,7 @@ from command_line import ggslam, refuse, succeed
 from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.jobs.export.export_run import export_run
 from ggslam.jobs.export.formats import ExportFormat, choose_format
-from ggslam.jobs.submaps.stores import GAUSSIANS
+from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.verification import accept_files
 

@@ -99,7 +99,7 @@ def test_objects_that_are_not_ready_are_refused() -> None:
     place = numbers.ctypes.data
     slice_, target = library.ggslam_gpcc_slice_create(), library.ggslam_gicp_target_create()
     raht, octree = RahtSettings(components=3, bit_depth=8, index=-1), OctreeSettings(depth=4)
-    points = AlignPoints(place, place, place, place, 3)
+    points = AlignPoints(place, place, place, place, None, 3)
     pose = np.eye(4)
     align = (context.handle, target, ctypes.byref(points), ctypes.byref(AlignSettings()))
     try:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ggslam.geometry.fixed_to_camera import compare_views, connected_with, is_in_image_part, shrink_depth
+from ggslam.geometry.fixed_to_camera import compare_views, is_in_image_part, parts_with_seeds, shrink_depth
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, transform_points
@@ -93,9 +93,9 @@ def test_parts_without_seeds_go() -> None:
     candidates, seeds = np.zeros((20, 20), bool), np.zeros((20, 20), bool)
     candidates[2:6, 2:6] = candidates[10:14, 10:14] = True
     seeds[3, 3] = True
-    found = connected_with(seeds, candidates, 0.05)
+    found = parts_with_seeds(seeds, candidates, 0.05)
     assert found[2:6, 2:6].all() and found.sum() == 16
-    assert not connected_with(seeds, candidates, 0.5).any()
+    assert not parts_with_seeds(seeds, candidates, 0.5).any()
 
 
 def test_frames_lose_it_and_others_stay_as_they_are() -> None:

@@ -123,7 +123,7 @@ def test_it_pays_where_depth_drifts(tmp_path: Path) -> None:
     assert slam.tracker.state.residuals.hidden > 8
     assert error < 0.7 * without
     exact, _ = tracked(room, drift=False)
-    assert exact.color_poses is not None and not exact.color_poses._is_due
+    assert not exact.color_poses._is_due
     assert len(exact.color_poses.images) <= color_poses.UNDECIDED
 
 
@@ -136,7 +136,7 @@ def test_a_pose_that_contradicts_the_tracker_is_not_believed(room: Path, monkeyp
         moved = se3_exp(np.array([shift, 0, 0, 0, 0, 0]))
         monkeypatch.setattr(color_poses, "align_view", lambda *_, moved=moved: moved)
         frame = slam.receive(sequence.frame(1))
-        before, align = [], slam.color_poses.align  # type: ignore[union-attr]
+        before, align = [], slam.color_poses.align
         monkeypatch.setattr(slam.color_poses, "align", lambda f, r, a=align, b=before: (b.append(r), a(f, r))[1])
         found = slam.track(frame)
         assert np.allclose(found.T_world_camera, before[-1].T_world_camera @ inverse(moved if believed else np.eye(4)))

@@ -91,6 +91,7 @@ struct AlignPoints {
   const float* normals;
   const float* covariances;
   const float* weights;
+  const float* depths;  // [n] along the axis of the camera that saw each, of which their noise follows; null: points' z
   int32_t count;
 };
 

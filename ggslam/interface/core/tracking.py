@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/tracking.hpp"
-HEADER_SHA256 = "5808877624845db446b625e6e46bda69f88857bb1ab4827dd4007d25b40bc32e"
+HEADER_SHA256 = "c64a52dc3b49e0a2105185bd3f4e069626c4fe64ef8c871ac9ca225630f0ca5c"
 
 
 class DepthPointsSettings(Structure):
@@ -85,7 +85,7 @@ class AlignPoints(Structure):
 
     _fields_ = [
         ("points", c_void_p), ("normals", c_void_p), ("covariances", c_void_p), ("weights", c_void_p),
-        ("count", c_int32),
+        ("depths", c_void_p), ("count", c_int32),
     ]
 
 

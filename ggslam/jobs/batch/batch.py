@@ -14,10 +14,11 @@ from ggslam import __version__
 from ggslam.errors import ConfigError
 from ggslam.jobs.batch.job_process import make_job
 from ggslam.jobs.batch.job_states import JobState, State, states_of
-from ggslam.jobs.batch.local_engine import run_locally, shares
+from ggslam.jobs.batch.local_engine import run_locally
 from ggslam.jobs.batch.manifest import Manifest
 from ggslam.jobs.batch.ray_engine import run_on_ray
 from ggslam.jobs.batch.scores_table import ScoresTable
+from ggslam.jobs.tasks.processors import shares
 from ggslam.runs.environment import processor
 from ggslam.system.atomic import make_folder, write_text
 from ggslam.system.folder_lock import folder_lock

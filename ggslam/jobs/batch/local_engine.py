@@ -3,31 +3,14 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 
-from ggslam.errors import ConfigError
 from ggslam.jobs.batch.job_process import JobProcess
 from ggslam.jobs.batch.job_states import JobState, State
+from ggslam.jobs.tasks.processors import shares
 
-PROCESSORS = 2
-"""Of a run, unless the number of workers is asked for: more hardly make it faster."""
 _WAIT_S = 0.1
-
-
-def shares(workers: int | None) -> list[tuple[int, ...]]:
-    """Numbers of the processors of each worker; without a number of workers, two for each.
-
-    Raises:
-        ConfigError: no worker.
-    """
-    there = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    count = max(1, len(there) // PROCESSORS) if workers is None else workers
-    if count < 1:
-        raise ConfigError(f"`workers`: expected at least 1, found {workers}")
-    each = max(1, len(there) // count)
-    return [tuple(there[(k * each + i) % len(there)] for i in range(each)) for k in range(count)]
 
 
 def run_locally(

@@ -8,27 +8,23 @@ machine, and ggslam has to be installed there in this version.
 
 from __future__ import annotations
 
-import os
 import secrets
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from ggslam import __version__
-from ggslam.errors import GgslamError, MissingDependency
+from ggslam.errors import GgslamError
 from ggslam.jobs.batch.job_process import make_job
 from ggslam.jobs.batch.job_states import JobState, State
-from ggslam.jobs.batch.local_engine import PROCESSORS
 from ggslam.jobs.batch.manifest import BatchJob
+from ggslam.jobs.tasks.outcomes import Failure
+from ggslam.jobs.tasks.processors import own_threads
+from ggslam.jobs.tasks.ray_cluster import RayCluster
 from ggslam.system.atomic import make_folder, write_text
 
-_TRIES = 3
-"""Times that a task is made again whose worker died."""
-_WAIT_S = 0.2
 _TOKEN = ".shared-by"
 """File in the batch's folder by which a worker sees that it is the driver's."""
 
@@ -63,6 +59,23 @@ class Begun:
         return self._names
 
 
+@dataclass(frozen=True)
+class RayJob:
+    """What a worker is given.
+
+    Attributes:
+        job: the run to make.
+        out: the batch's folder where the driver is.
+        token: what its file `.shared-by` holds.
+        begun: the actor `Begun`, told that the run has begun.
+    """
+
+    job: BatchJob
+    out: str
+    token: str
+    begun: Any
+
+
 def run_on_ray(
     states: Sequence[JobState], address: str | None = None, changed: Callable[[], None] = lambda: None
 ) -> None:
@@ -71,62 +84,48 @@ def run_on_ray(
 
     Args:
         states: of all runs.
-        address: of the cluster, as `ray.init` takes it ("auto": the one this machine belongs to); None: one on this
-            machine, for as long as this takes.
+        address: of the cluster, see `RayCluster`.
 
     Raises:
         MissingDependency: Ray is not installed.
         GgslamError: there is no cluster at the address.
     """
-    ray = _connect(address)
-    waiting = [state for state in states if state.state is State.WAITING]
-    token, pending = secrets.token_hex(8), dict[Any, JobState]()
-    try:
-        begun = ray.remote(num_cpus=0)(Begun).remote()
-        make = ray.remote(num_cpus=PROCESSORS, max_retries=_TRIES)(make_on_worker)
-        if waiting:
-            write_text(waiting[0].out / _TOKEN, token)
-        for state in waiting:
-            pending[make.remote(state.job, str(state.out.absolute()), token, __version__, begun)] = state
-        while pending:
-            done, _ = ray.wait(list(pending), timeout=_WAIT_S)
-            for reference in done:
-                _take(ray, reference, pending.pop(reference))
-            names = ray.get(begun.names.remote())
-            for state in pending.values():
-                if state.job.name in names:
-                    state.see_begun()
+    waiting = {state.job.name: state for state in states if state.state is State.WAITING}
+    token = secrets.token_hex(8)
+    with RayCluster(address) as cluster:
+        begun = cluster.ray.remote(num_cpus=0)(Begun).remote()
+
+        def look() -> None:
+            for name in cluster.ray.get(begun.names.remote()):
+                if waiting[name].state is State.WAITING:
+                    waiting[name].see_begun()
             changed()
-    finally:
-        for reference in pending:
-            ray.cancel(reference, force=True)
-        for state in waiting[:1]:
-            (state.out / _TOKEN).unlink(missing_ok=True)
-        ray.shutdown()
+
+        def take(task: RayJob, made: Made | Failure) -> None:
+            _take(waiting[task.job.name], made)
+
+        tasks = [RayJob(state.job, str(state.out.absolute()), token, begun) for state in waiting.values()]
+        try:
+            for state in list(waiting.values())[:1]:
+                write_text(state.out / _TOKEN, token)
+            cluster.do(make_on_worker, tasks, take, look)
+        finally:
+            for state in list(waiting.values())[:1]:
+                (state.out / _TOKEN).unlink(missing_ok=True)
 
 
-def make_on_worker(job: BatchJob, out: str, token: str, version: str, begun: Any) -> Made:
-    """What a worker does: makes a run in the batch's folder if it sees that, else in one of its own.
-
-    Args:
-        job: the run.
-        out: the batch's folder where the driver is.
-        token: what its file `.shared-by` holds.
-        version: of the driver's ggslam.
-        begun: the actor `Begun`, told that the run has begun.
-    """
-    if version != __version__:
-        return Made(1, 0.0, f"ggslam {__version__} on the worker, {version} where the batch was begun")
-    begun.note.remote(job.name)
-    if _is_shared(Path(out), token):
-        return _make_in_folder(JobState(job, Path(out)), None)
+def make_on_worker(task: RayJob) -> Made:
+    """What a worker does: makes a run in the batch's folder if it sees that, else in one of its own."""
+    task.begun.note.remote(task.job.name)
+    if _is_shared(Path(task.out), task.token):
+        return _make_in_folder(JobState(task.job, Path(task.out)), None)
     with tempfile.TemporaryDirectory(prefix="ggslam-batch-") as folder:
-        return _make_in_folder(JobState(job, Path(folder)), Path(folder))
+        return _make_in_folder(JobState(task.job, Path(folder)), Path(folder))
 
 
 def _make_in_folder(state: JobState, root: Path | None) -> Made:
     try:
-        make_job(state, _own_processors(), with_parent=True)
+        make_job(state, own_threads(), with_parent=True)
     except GgslamError as error:
         return Made(1, 0.0, str(error))
     record = state.memory()
@@ -138,11 +137,6 @@ def _make_in_folder(state: JobState, root: Path | None) -> Made:
     return Made(record.exit_code, record.seconds, record.line, files)
 
 
-def _own_processors() -> int:
-    """What Ray gave this task."""
-    return int(os.environ.get("OMP_NUM_THREADS", PROCESSORS))
-
-
 def _is_shared(out: Path, token: str) -> bool:
     try:
         return (out / _TOKEN).read_text() == token
@@ -150,12 +144,10 @@ def _is_shared(out: Path, token: str) -> bool:
         return False
 
 
-def _take(ray: ModuleType, reference: Any, state: JobState) -> None:
+def _take(state: JobState, made: Made | Failure) -> None:
     """Notes what came back of a run."""
-    try:
-        made: Made = ray.get(reference)
-    except ray.exceptions.RayError as error:
-        made = Made(1, 0.0, f"the worker died {_TRIES + 1} times: {_first_line(error)}")
+    if isinstance(made, Failure):
+        made = Made(made.exit_code, 0.0, made.line)
     if made.files is not None:
         _put(state, made.files)
     state.begin()
@@ -174,19 +166,3 @@ def _put(state: JobState, files: dict[str, bytes]) -> None:
     if beside.is_dir():
         shutil.rmtree(state.run, ignore_errors=True)
         beside.replace(state.run)
-
-
-def _connect(address: str | None) -> ModuleType:
-    try:
-        import ray
-    except ImportError:
-        raise MissingDependency("batches on Ray need it: pip install 'ggslam[ray]'") from None
-    try:
-        ray.init(address=address, include_dashboard=False if address is None else None, log_to_driver=False)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise GgslamError(f"no Ray cluster at {address}: {_first_line(error)}") from None
-    return ray
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -7,8 +7,8 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 
-from ggslam.jobs.batch.local_engine import PROCESSORS
 from ggslam.jobs.batch.manifest import Manifest, option
+from ggslam.jobs.tasks.processors import PROCESSORS
 
 _MEMORY_GB = 4
 _HOURS = 4

@@ -14,7 +14,7 @@ from ggslam.formats.point_sampling import MapPart
 from ggslam.formats.streamed_sog import INDEX, StreamedSize, write_streamed_sog
 from ggslam.jobs.export.chosen import ChosenGaussians, Prepare
 from ggslam.jobs.progress import Observer, SilentObserver
-from ggslam.jobs.submaps.stores import GAUSSIANS, gaussians_of_cell
+from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, gaussians_of_cell
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.submaps.grid import GridStore

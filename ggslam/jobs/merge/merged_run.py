@@ -21,7 +21,6 @@ from ggslam.merging.objects import UnitedObjects
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.runs.environment import environment
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.known_runs import KEYFRAME_CAMERAS
 from ggslam.runs.publishing import publish_run
 from ggslam.runs.recordings import fingerprint
 from ggslam.runs.records.keyframes import KeyframesRecord
@@ -34,7 +33,7 @@ from ggslam.runs.writing import RUN_FILES, TRUTH_FILE, write_objects
 from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.slam.config import save_config
-from ggslam.slam.saved_places import PLACES_FILE, camera_row
+from ggslam.slam.saved_places import KEYFRAME_CAMERAS, PLACES_FILE, camera_row
 from ggslam.system.atomic import write_bytes
 from ggslam.system.process_memory import peak_memory_mb
 

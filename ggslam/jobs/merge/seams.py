@@ -90,7 +90,8 @@ def keyframes_of(
             if seam[number][k] and source.sequence is not None and record.frame != ELSEWHERE:
                 frame = source.sequence.frame(record.frame, masks=with_masks)
                 mask = frame.mask if table is None or frame.mask is None else table[frame.mask]
-                keyframe = make_keyframe(index, replace(frame, index=source.first_frame + record.frame, mask=mask), T)
+                frame = replace(frame, index=source.first_frame + record.frame, mask=mask, instant=None)
+                keyframe = make_keyframe(index, frame, T)
                 trained.append(index)
             keyframes.append(keyframe)
     return keyframes, trained

@@ -6,6 +6,8 @@ from __future__ import annotations
 from ggslam.errors import GgslamError
 from ggslam.sequences import Sequence, inspect_sequence
 from ggslam.sequences.live import LiveSequence
+from ggslam.sequences.rig import RigSequence
+from ggslam.sequences.rig_inspection import inspect_rig
 from ggslam.sequences.verdicts import Verdict, judge_intrinsics, judge_times
 from ggslam.slam.result import SlamResult
 from ggslam.slam.verdicts import judge_path, judge_run
@@ -27,6 +29,8 @@ def _judge_recording(sequence: Sequence | LiveSequence, result: SlamResult) -> l
     if isinstance(sequence, LiveSequence):
         return [*judge_intrinsics(sequence.camera), *judge_times(result.timestamps())]
     try:
+        if isinstance(sequence, RigSequence):
+            return inspect_rig(sequence, FRAMES, masks=False).verdicts
         return inspect_sequence(sequence, FRAMES, masks=False).verdicts
     except GgslamError:  # a recording that went away meanwhile; the run ends as it would have
         return []

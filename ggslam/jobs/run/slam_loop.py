@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,9 +19,11 @@ from ggslam.runs.starting import start_in_map
 from ggslam.scene.frame import Frame
 from ggslam.sequences import Sequence
 from ggslam.sequences.live import LiveSequence
+from ggslam.sequences.rig import RigSequence, by_instant
 from ggslam.slam.config import Config
 from ggslam.slam.realtime import RealtimeSlam
 from ggslam.slam.result import SlamResult, StepReport, tracked_poses
+from ggslam.slam.rig_slam import RigSlam
 from ggslam.slam.slam import Slam
 from ggslam.system.interrupts import StopRequest
 from ggslam.system.staging import new_staging
@@ -70,7 +73,7 @@ class SlamLoop:
             self.observer.note("compiling the CUDA kernels, once: about a minute")
         folder = self.folder
         paging = new_staging(folder.path) if self.config.memory_limit_mb and folder is not None else None
-        slam = Slam(self.sequence.camera, self.config, self.sequence.has_masks, paging)
+        slam = make_slam(self.sequence, self.config, paging)
         begin = None if self.resume is None else self.resume(slam)
         if begin is None and self.earlier is not None:
             start_in_map(slam, self.earlier, self.growing)
@@ -95,15 +98,27 @@ class SlamLoop:
             paced = RealtimeSlam(slam, self.config.realtime_fps, live=isinstance(sequence, LiveSequence))
             paced.run(frames, lambda *step: self._report(slam, *step))
             return
+        if isinstance(slam, RigSlam):
+            self._instants(slam, frames)
+            return
         for frame in frames:
             self._between_steps = False
             self._report(slam, frame, slam.step(frame))
 
-    def _report(self, slam: Slam, frame: Frame, step: StepReport) -> None:
-        """After every frame."""
+    def _instants(self, slam: RigSlam, frames: Iterable[Frame]) -> None:
+        for together in by_instant(frames):
+            self._between_steps = False
+            steps = slam.step_together(together)
+            for frame, step in zip(together, steps, strict=True):
+                self._report(slam, frame, step, whole=frame is together[-1])
+
+    def _report(self, slam: Slam, frame: Frame, step: StepReport, whole: bool = True) -> None:
+        """After every frame; `whole`: no other one was part of the same step and is still to come."""
         self.observer.frame(step)
         if self.follower is not None:
             self.follower(slam, frame, step)
+        if not whole:
+            return
         if self.config.realtime_fps == 0:
             self._between_steps = True
             if self.checkpointing is not None:
@@ -136,6 +151,13 @@ class SlamLoop:
                 self.folder.save_trajectory(stamps, _last_poses(slam), repr(failure))
                 self.observer.note(f"the map is lost; the trajectory of {len(stamps)} frames is in {self.folder.path}")
             raise
+
+
+def make_slam(sequence: Sequence | LiveSequence, config: Config, paging: Path | None = None) -> Slam:
+    """A fresh `Slam` for a recording; arguments and errors as of `Slam`."""
+    if isinstance(sequence, RigSequence):
+        return RigSlam(sequence.rig, config, sequence.has_masks)
+    return Slam(sequence.camera, config, sequence.has_masks, paging)
 
 
 def _for_people(stopped: BaseException) -> BaseException:

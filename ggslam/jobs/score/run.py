@@ -20,6 +20,7 @@ from ggslam.evaluation.lpips import Lpips
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.score.objects import ObjectScorer
+from ggslam.jobs.score.rig import RigScores, shows_anything
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.exposure import identity_exposure, measure_exposure
 from ggslam.rendering.types import RenderBuffers
@@ -32,6 +33,7 @@ from ggslam.runs.records.timing import TimingRecord
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
+from ggslam.sequences.rig import RigSequence
 from ggslam.slam.camera_fixtures import CameraFixtures, find_fixtures
 from ggslam.system.atomic import make_folder, write_text
 
@@ -71,15 +73,20 @@ def _score(
     poses = record.poses()
     sets = _sets(folder, record, every)
     scorer = _object_scorer(folder, sequence, sets)
-    fixtures = find_fixtures((sequence.frame(i) for i in _spread(poses, LOOKED_AT)), poses)
+    rig = RigScores(sequence, sets) if isinstance(sequence, RigSequence) else None
+    asked = sets if rig is None else {**sets, **rig.sets()}
+    looked_at = _spread(poses, LOOKED_AT if rig is None else 0)
+    fixtures = find_fixtures((sequence.frame(i) for i in looked_at), poses)
+    images = _images(folder, record, sequence, asked, scorer, metric, observer, fixtures)
     metrics = MetricsRecord.of({
-        "trajectory": _trajectory(sequence, poses),
-        "images": _images(folder, record, sequence, sets, scorer, metric, observer, fixtures),
+        "trajectory": _trajectory(sequence, poses) if rig is None else rig.trajectory(poses),
+        "images": {name: images[name] for name in sets},
         "segmentation": None if scorer is None else scorer.to_dict(),
         "tracking": dict(Counter(f.status for f in record.frames)),
         **_performance(folder.timing()),
         "scored_every": every,
         "notes": [],
+        **({} if rig is None else {"cameras": rig.of_cameras(poses, images)}),
     })  # fmt: skip
     if metrics.images.held_out is None or not metrics.images.held_out.frames:
         notes.append("no frame was held out; every score is over frames that the map was or could be trained on")
@@ -171,6 +178,8 @@ def _images(
         rows.append({"frame": frame.index, "kind": kind, **(scores or ImageScores()).to_dict()})
 
     frames = _up_to(max(poses, default=-1), sequence, masks=scorer is not None and sequence.has_masks)
+    if isinstance(sequence, RigSequence):
+        frames = (frame for frame in frames if shows_anything(frame))
     means = score_images(show, map(fixtures.clean, frames), sets, lpips, note)
     observer.advance(len(sequence), len(sequence))
     _write_rows(folder, rows)

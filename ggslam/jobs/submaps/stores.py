@@ -3,30 +3,29 @@
 
 from __future__ import annotations
 
-import io
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.raw_points import read_raw_points
+from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, arrays_of_map, gaussians_to_bytes
+from ggslam.jobs.submaps.visit_records import remember_run
 from ggslam.localization.places import PLACES, StoredView, stored_places_to_bytes
 from ggslam.localization.surface import NORMAL
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import fingerprint
-from ggslam.scene.arrays import arrays_of, arrays_to_bytes, read_all_arrays, read_array
+from ggslam.scene.arrays import read_all_arrays, read_array
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
 from ggslam.slam.saved_places import PLACES_FILE
-from ggslam.submaps.cell_keys import CellKey, partition
+from ggslam.submaps.cell_keys import partition
 from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
@@ -34,9 +33,6 @@ from ggslam.submaps.settings import SubmapSettings
 
 INDOORS = SubmapSettings(voxel=0.02)
 """For maps of depth cameras."""
-GAUSSIANS = "gaussians.npz"
-"""The part of a cell with the Gaussians whose means lie in it: the arrays of `GaussianMap`."""
-_GAUSSIAN_ARRAYS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features", "object_id")
 _CELLS_AT_ONCE = 64
 _CLOUDS = (".ply", ".pcd", ".npy", ".bin")
 
@@ -79,6 +75,7 @@ def store_of_run(run: Path, store: GridStore, visit: str | None = None, at: floa
     folder = RunFolder.open(run)
     time = float(folder.trajectory().timestamps[-1]) if at is None else at
     store.begin_visit(visit or visit_of(folder))
+    remember_run(store, folder)
     arrays: dict[str, Any] = {}
     if (folder.path / PLACES_FILE).is_file():
         arrays = read_all_arrays(folder.path / PLACES_FILE, "the places of a run")
@@ -113,26 +110,6 @@ def store_of_cloud(path: Path, store: GridStore, visit: str | None = None, at: f
     points, attributes = _cloud(path)
     due = _Due(store, at or 0.0).of(points)
     store_cloud(store, points[due], {name: values[due] for name, values in attributes.items()}, at or 0.0)
-
-
-def gaussians_of_cell(store: GridStore, key: CellKey) -> GaussianMap:
-    """The Gaussians whose means lie in a cell that has some, without optimizer state.
-
-    Raises:
-        FormatError: their file is missing or damaged.
-    """
-    what = f"{store.path}: cell {key}: no Gaussians written by ggslam"
-    file = io.BytesIO(store.get(key, GAUSSIANS))
-    rows = arrays_of(file, what, lambda held: {name: torch.from_numpy(held[name]) for name in _GAUSSIAN_ARRAYS})
-    try:
-        means, sh, features = rows["means"], rows["sh"], rows["features"]
-        out = GaussianMap(math.isqrt(sh.shape[1]) - 1, features.shape[1], with_moments=False)
-        out.insert(means, rows["quaternions"], rows["log_scales"], rows["opacity_logits"], torch.zeros(len(means), 3),
-                   features=features, object_id=rows["object_id"])  # fmt: skip
-        out.sh[:] = sh
-    except (KeyError, ValueError, IndexError, RuntimeError, TypeError) as error:
-        raise FormatError(f"{what}: {error}") from None
-    return out
 
 
 class _Due(dict[tuple[int, int, int], bool]):
@@ -210,7 +187,7 @@ def _place_parts(store: GridStore, views: list[StoredView], camera: Camera) -> I
 
 
 def _gaussian_parts(store: GridStore, gaussians: GaussianMap) -> Iterator[CellWrite]:
-    arrays = {name: getattr(gaussians, name).detach().numpy() for name in _GAUSSIAN_ARRAYS}
+    arrays = arrays_of_map(gaussians)
     for key, indices in partition(arrays["means"], store.grid):
-        data = arrays_to_bytes(**{name: values[indices] for name, values in arrays.items()})
+        data = gaussians_to_bytes({name: values[indices] for name, values in arrays.items()}, store.visit)
         yield CellWrite(key, {GAUSSIANS: data}, counts={GAUSSIANS: len(indices)})

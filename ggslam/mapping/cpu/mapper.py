@@ -13,6 +13,7 @@ from ggslam.mapping.cpu.exposure import ExposureAdam
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
+from ggslam.mapping.identity import MIN_WEIGHT, TERMS
 from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
@@ -54,6 +55,8 @@ class CpuMapper(Mapper):
         self._loss = CpuImageLoss(context)
         self._pose_optimizers: list[PoseAdam] = []
         self._exposure_optimizers: list[ExposureAdam] = []
+        self._exposure_changed = False
+        """Whether a keyframe has an anchor: as soon as one has, those that follow are compared with the map's."""
 
     @property
     def losses(self) -> LossSums:
@@ -117,12 +120,11 @@ class CpuMapper(Mapper):
         if found is None:
             return keyframe.color
         self._exposure_optimizers[keyframe.index].measured = found
-        changed = any(optimizer.is_anchored for optimizer in self._exposure_optimizers)
-        if not changed and abs(np.log(change_of(found))) > self.settings.exposure.change:
+        if not self._exposure_changed and abs(np.log(change_of(found))) > self.settings.exposure.change:
             for earlier in self.keyframes:
                 self._anchor(earlier)
-            changed = True
-        return self._anchor(keyframe) if changed else keyframe.color
+            self._exposure_changed = True
+        return self._anchor(keyframe) if self._exposure_changed else keyframe.color
 
     def _anchor(self, keyframe: Keyframe) -> np.ndarray:
         """Gives a keyframe the exposure that was measured, if it differs from the map's; returns as `_compensate`."""
@@ -141,7 +143,7 @@ class CpuMapper(Mapper):
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""
         height, width = alpha.shape
         grid = np.arange(height * width, dtype=np.int32).reshape(height, width)[::stride, ::stride]
-        terms = self._rasterizer.pixel_terms(grid.reshape(-1))
+        terms = self._rasterizer.pixel_terms(grid.reshape(-1), TERMS, MIN_WEIGHT)
         ids, share = terms.labels(self.vote_labels())
         ids, share = ids.reshape(grid.shape), share.reshape(grid.shape) * (alpha[::stride, ::stride] > 0.5)
         return MapLabels.from_grid(ids, share, depth, stride)
@@ -157,8 +159,9 @@ class CpuMapper(Mapper):
 
     def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:
         if pose_rate:
-            optimizer = self._pose_optimizers[keyframe.index]
-            keyframe.T_camera_world = optimizer.step(keyframe.T_camera_world, twist, pose_rate)
+            optimizer, T_before = self._pose_optimizers[keyframe.index], keyframe.T_camera_world
+            keyframe.T_camera_world = optimizer.step(T_before, twist, pose_rate)
+            self._move_rig(keyframe, T_before)
         if keyframe.index > 0 and self._is_exposed(keyframe):
             optimizer_of_exposure = self._exposure_optimizers[keyframe.index]
             keyframe.exposure = optimizer_of_exposure.step(keyframe.exposure, loss.exposure_gradient)

@@ -132,6 +132,13 @@ class MemoryRecord(Record):
     peak_rss_mb: NumberOrNone = None
 
 
+class CameraScoresRecord(Record):
+    """Of the frames of one camera of a rig."""
+
+    trajectory: TrajectoryScoresRecord | None = None
+    images: ImagesRecord = ImagesRecord()
+
+
 class MetricsRecord(RecordFile):
     """All scores of a run.
 
@@ -143,6 +150,8 @@ class MetricsRecord(RecordFile):
         speed, map, memory: of the run.
         scored_every: the images of every n-th frame were scored.
         notes: what could not be scored, and why.
+        cameras: of a rig, by the names of its cameras: the same of the frames of each. `trajectory` is of the rig then:
+            of the first frame of each instant.
     """
 
     FILE: ClassVar[str] = "metrics.json"
@@ -155,3 +164,4 @@ class MetricsRecord(RecordFile):
     memory: MemoryRecord = MemoryRecord()
     scored_every: int = 1
     notes: list[str] = []
+    cameras: dict[str, CameraScoresRecord] | None = None

@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import cached_property
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
 import pydantic
 
 from ggslam.runs.records.record import Array, Number, NumberOrNone, Record, RecordFile
 from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse
 
 
 def _camera(value: Any) -> Camera:
@@ -51,12 +54,44 @@ class SkippedRecord(Record):
     reason: str
 
 
+class RigRecord(Record):
+    """The cameras of a rig, and which of them took the frames of its recordings; see `sequences.rig.RigSequence`.
+
+    Attributes:
+        names: of the cameras.
+        cameras: of their images as the run saw them.
+        T_first_camera: [n, 4, 4], from each camera's frame to the first one's.
+        tolerance: seconds between images that count as taken together.
+        instants: of each camera the instants at which it has a frame, as ranges [first, one past the last].
+    """
+
+    names: list[str]
+    cameras: list[Annotated[Camera, pydantic.PlainValidator(_camera), pydantic.PlainSerializer(asdict)]]
+    T_first_camera: Array
+    tolerance: Number = 0.0
+    instants: list[list[tuple[int, int]]]
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Instant and camera number of each frame, int64 [n, 2]."""
+        rows = [
+            np.stack([np.arange(first, end), np.full(end - first, number)], 1)
+            for number, ranges in enumerate(self.instants) for first, end in ranges
+        ]  # fmt: skip
+        places = np.concatenate([np.zeros((0, 2), int), *rows])
+        return places[np.lexsort((places[:, 1], places[:, 0]))]
+
+    def pose_of_first(self, T_world_camera: np.ndarray, number: int) -> np.ndarray:
+        """T_world_first [4, 4] by the pose of camera `number`."""
+        return T_world_camera @ inverse(self.T_first_camera[number])
+
+
 class PartRecord(Record):
     """One of the recordings of a run that was merged from several.
 
     Attributes:
         run: folder of the run of it.
-        open, format, camera, frames: as of `SequenceRecord`.
+        open, format, camera, frames, rig: as of `SequenceRecord`.
         time_shift_s: seconds added to its times, so that those of the whole rise.
         T_joint_truth: [4, 4], brings its true poses into the world of the first recording's.
         mask_ids: what its mask ids are called in the merged run; None: as they are.
@@ -70,6 +105,7 @@ class PartRecord(Record):
     time_shift_s: Number = 0.0
     T_joint_truth: Array | None = None
     mask_ids: dict[int, int] | None = None
+    rig: RigRecord | None = None
 
 
 class SequenceRecord(RecordFile):
@@ -84,6 +120,7 @@ class SequenceRecord(RecordFile):
         map: folder of the run whose map this one began with.
         map_fingerprint: of that run, see `recordings.fingerprint`.
         parts: of a merged run its recordings; `open`, `format` and `camera` are the first one's then, `frames` are all.
+        rig: of a run of a rig its cameras; `camera` is the first one then.
     """
 
     FILE: ClassVar[str] = "sequence.json"
@@ -97,14 +134,32 @@ class SequenceRecord(RecordFile):
     map: str | None = None
     map_fingerprint: str | None = None
     parts: list[PartRecord] | None = None
+    rig: RigRecord | None = None
 
     def own_number(self, frame: int) -> int:
-        """Number of a frame in its own recording; of a run with one recording the number itself."""
+        """Number of a frame in its own recording, of a rig's that of its instant; of a run with one recording the
+        number itself."""
+        part, own = self._part_of(frame)
+        return own if part.rig is None else int(part.rig.places[own, 0])
+
+    def camera_of(self, frame: int) -> Camera:
+        """The camera that took a frame, as the run saw its images."""
+        part, own = self._part_of(frame)
+        return part.camera if part.rig is None else part.rig.cameras[part.rig.places[own, 1]]
+
+    def cameras(self) -> list[Camera]:
+        """All that took frames, each once."""
+        parts: list[SequenceRecord | PartRecord] = [*self.parts] if self.parts else [self]
+        found = [camera for part in parts for camera in ([part.camera] if part.rig is None else part.rig.cameras)]
+        return list(dict.fromkeys(found))
+
+    def _part_of(self, frame: int) -> tuple[SequenceRecord | PartRecord, int]:
+        """The recording of a frame, and its number there."""
         for part in self.parts or []:
             if frame < part.frames:
-                break
+                return part, frame
             frame -= part.frames
-        return frame
+        return self, frame
 
     def notes(self) -> list[str]:
         """What a user should know of frames and masks besides the warnings, a line each."""

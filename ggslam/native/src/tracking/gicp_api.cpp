@@ -296,6 +296,7 @@ void check_points(const ggslam::AlignPoints* pointer, const ggslam::AlignSetting
   const AlignPoints& points = object_of<AlignPoints>(pointer);
   const void* const arrays[] = {points.points, points.normals, points.covariances, points.weights, match, squared_distance};
   for (const void* array : arrays) check_array("points", array, points.count);
+  if (points.depths) check_array("depths of points", points.depths, points.count);
   object_of<AlignSettings>(settings);
 }
 

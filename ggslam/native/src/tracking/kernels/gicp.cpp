@@ -86,6 +86,10 @@ void add_normal_equations(const float m[6], const float q[3], const float d[3], 
   b[5] += x * md[1] - y * md[0];
 }
 
+float depth_of(const AlignPoints& points, std::size_t i) {
+  return points.depths ? points.depths[i] : points.points[3 * i + 2];
+}
+
 // Whether the point has moved so far since its match was found that another voxel may be nearer by more than a trifle;
 // notes the place if so. The last iterations move points by micrometres and need no search.
 bool must_search(const LinearizeArgs& args, std::size_t i, const float p[3]) {
@@ -111,7 +115,7 @@ void linearize_block(const LinearizeArgs& args, std::size_t begin, std::size_t e
     pose.rotate(args.points.points + 3 * i, q);
     pose.rotate(args.points.normals + 3 * i, n);
     for (int a = 0; a < 3; ++a) p[a] = q[a] + pose.t[a];
-    const float depth = args.points.points[3 * i + 2];
+    const float depth = depth_of(args.points, i);
     const float sigma = s.noise_constant + s.noise_square * depth * depth;
     const float width = args.kernel_factor * (s.kernel_constant + s.kernel_sigmas * sigma), g = width * width;
     const float weight = args.points.weights[i];
@@ -151,7 +155,7 @@ void plane_information_block(const LinearizeArgs& args, std::size_t begin, std::
   int inliers = 0;
   for (std::size_t i = begin; i < end; i += args.point_step) {
     if (args.match[i] < 0) continue;
-    const float depth = args.points.points[3 * i + 2];
+    const float depth = depth_of(args.points, i);
     const float sigma = s.noise_constant + s.noise_square * depth * depth;
     const float limit = s.overlap_constant + s.overlap_sigmas * sigma;
     if (args.squared_distance[i] < limit * limit) {

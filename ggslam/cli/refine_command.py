@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam refine`: a finished map trained further."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ggslam.cli import options
+from ggslam.cli.console import console, progress_bar
+from ggslam.cli.observer import ProgressObserver
+from ggslam.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ggslam.jobs.refine.refine_store import StoreRefinement
+
+EPILOG = """
+A store is refined cell by cell, each with the Gaussians around it standing still; what comes out does not depend on the
+number of workers. If it is cut off, the same command goes on.
+
+[bold]Examples[/]
+
+  ggslam refine runs/kitchen --steps 1000 --out runs/kitchen_refined
+
+  ggslam refine house.grid --workers 4
+
+  ggslam refine house.grid --out house_refined.grid --engine ray --address auto
+"""
+
+
+class EngineName(str, Enum):
+    """What trains the cells."""
+
+    local = "local"
+    ray = "ray"
+
+
+Source = Annotated[
+    Path, typer.Argument(metavar="RUN_OR_STORE", help="Folder that `ggslam run` or `ggslam submaps` wrote.")
+]
+Out = Annotated[Path | None, typer.Option(help="Folder for the refined run or store; default: in place.")]
+Steps = Annotated[int, typer.Option(help="Optimisation steps, of a store for each cell.", min=0)]
+Seed = Annotated[int, typer.Option(help="Of the order of the keyframes.", min=0)]
+Engine = Annotated[
+    EngineName, typer.Option(help="Of a store: local: processes on this machine; ray: tasks of a Ray cluster.")
+]
+Workers = Annotated[int | None, typer.Option(help="Of a store: cells at a time; default: one for two processors.")]
+Address = Annotated[
+    str | None,
+    typer.Option(help="Of the Ray cluster, auto: the one this machine belongs to; default: one on this machine."),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already at --out.")]
+
+
+def refine(
+    source: Source,
+    out: Out = None,
+    steps: Steps = 300,
+    seed: Seed = 0,
+    sequence: options.MovedSequence = None,
+    engine: Engine = EngineName.local,
+    workers: Workers = None,
+    address: Address = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Train a finished map further on its keyframes: a run's, or a grid store's cell by cell."""
+    from ggslam.jobs.refine.refine_run import refine_run
+    from ggslam.jobs.refine.refine_store import refine_store
+    from ggslam.jobs.refine.settings import RefineSettings
+    from ggslam.jobs.submaps.stores import is_store
+    from ggslam.jobs.tasks.engines import Engine as TaskEngine
+
+    settings = RefineSettings(steps=steps, seed=seed)
+    if address is not None and engine is not EngineName.ray:
+        raise ConfigError("--address is for --engine ray")
+    with progress_bar() as bar:
+        if is_store(source):
+            if sequence is not None or overwrite:
+                raise ConfigError("--sequence and --overwrite are for runs, and this is a grid store")
+            where = TaskEngine(engine.value, workers, address)
+            outcome = refine_store(source, out, settings=settings, engine=where, observer=ProgressObserver(bar))
+        else:
+            if engine is not EngineName.local or workers is not None:
+                raise ConfigError("--engine and --workers are for grid stores, and this is none")
+            done = refine_run(
+                source, out, settings=settings, recording=sequence, overwrite=overwrite, observer=ProgressObserver(bar)
+            )
+    if is_store(source):
+        _show_store(outcome)
+        return
+    _print([
+        f"{done.steps} steps on {done.keyframes} keyframes: {done.before:.2f} dB before, {done.after:.2f} dB after",
+        *(f"note: {note}" for note in done.notes), f"wrote {done.folder.path} in {done.seconds:.1f} s",
+    ])  # fmt: skip
+
+
+def _show_store(outcome: StoreRefinement) -> None:
+    lines = [f"{outcome.trained} of {outcome.cells} cells trained, {outcome.steps} steps"]
+    if outcome.trained:
+        lines[0] += f": {outcome.before:.2f} dB before, {outcome.after:.2f} dB after"
+    if outcome.resumed:
+        lines.append(f"{outcome.resumed} cells were done by an earlier call")
+    if outcome.unseen:
+        lines.append(f"{outcome.unseen} cells are as they were: no keyframe shows enough of them")
+    lines += [f"note: {note}" for note in outcome.notes]
+    _print([*lines, f"wrote {outcome.path} in {outcome.seconds:.1f} s"])
+    if outcome.failures:
+        _print([f"as it was: {line}" for line in outcome.failures.values()])
+        raise typer.Exit(1)
+
+
+def _print(lines: list[str]) -> None:
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run whose map is trained further on its keyframes: what `ggslam refine RUN` does."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import ConfigError
+from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.jobs.progress import Observer, SilentObserver
+from ggslam.jobs.refine.cell_mapper import StillMapper
+from ggslam.jobs.refine.settings import RefineSettings
+from ggslam.jobs.submaps.visit_records import exposure_of
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
+from ggslam.native.loader import NativeContext
+from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.publishing import publish_run
+from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.saving_parts import save_points_of_map
+from ggslam.runs.writing import RUN_FILES, TRUTH_FILE, write_objects
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.sequences import Sequence
+from ggslam.slam.saved_places import PLACES_FILE
+from ggslam.slam.step_log import STEPS_FILE
+from ggslam.system.folder_lock import folder_lock
+from ggslam.system.interrupts import delay_interrupts
+
+_STAY = ("trajectory.txt", "config.yaml", "sequence.json", "loops.json", STEPS_FILE, TRUTH_FILE, PLACES_FILE)
+"""Files that are true of the refined run as well; keyframes.json and timing.json with a change."""
+
+
+@dataclass
+class RunRefinement:
+    """What came of refining a run.
+
+    Attributes:
+        folder: the refined run.
+        keyframes: that it was trained on.
+        steps: optimisation steps.
+        before, after: PSNR of keyframes the first and the last time they were trained on, mean in dB.
+        seconds: that it took.
+        notes: what the user should know.
+    """
+
+    folder: RunFolder
+    keyframes: int
+    steps: int
+    before: float
+    after: float
+    seconds: float
+    notes: list[str] = field(default_factory=list)
+
+
+def refine_run(
+    run: str | Path, out: str | Path | None = None, *, settings: RefineSettings | None = None,
+    recording: Path | None = None, overwrite: bool = False, observer: Observer | None = None,
+) -> RunRefinement:  # fmt: skip
+    """Trains the map of a finished run further on its keyframes; poses, exposures and objects stay.
+
+    Args:
+        run: its folder.
+        out: folder of the refined run; None: in place, at once when all of it is written.
+        settings: how; of a run only steps and seed count.
+        recording: where the recording is now, if it was moved.
+        overwrite: replace a run that is already at `out`.
+        observer: receives progress updates.
+
+    Raises:
+        ConfigError: the run was edited, or it has no keyframes of its recording.
+        SequenceError: the recording is not there any more.
+        RunFolderError: files of the run are missing or damaged, or it cannot be written.
+    """
+    start, settings, source = time.perf_counter(), settings or RefineSettings(), RunFolder.open(Path(run))
+    if source.mark().edits and not (source.path / PLACES_FILE).is_file():
+        raise ConfigError(f"{source.path}: was edited, and its recording does not show that: refine first, then edit")
+    target = source if out is None or Path(out).resolve() == source.path.resolve() else None
+    if target is None:
+        assert out is not None
+        if source.path.resolve() in Path(out).resolve().parents:
+            raise ConfigError(f"`out` {out}: lies in the run; choose another folder")
+        target = RunFolder.create(Path(out), overwrite)
+    try:
+        with folder_lock(target.path):
+            return _refine(source, target, settings, recording, observer or SilentObserver(), start)
+    except BaseException:
+        target.discard()
+        raise
+
+
+def _refine(
+    source: RunFolder, target: RunFolder, settings: RefineSettings, recording: Path | None, observer: Observer,
+    start: float,
+) -> RunRefinement:  # fmt: skip
+    sequence, record = open_recording_of(source, recording), source.keyframes()
+    observer.begin("read keyframes", len(record.keyframes))
+    keyframes, valid = _read_keyframes(source, sequence, observer)
+    scene = source.segmented_map() if source.has_objects() else None
+    gaussians = source.gaussians(with_moments=True)
+    mapper = StillMapper(gaussians, source.config().mapping, NativeContext(), keyframes, valid)
+    observer.begin("refine", settings.steps)
+    before, after = mapper.train(settings.steps, [settings.seed], observer.advance)
+    refined = None if scene is None else SegmentedMap(gaussians, scene.classifier, scene.table, scene.votes)
+    seconds = time.perf_counter() - start
+    with delay_interrupts():
+        _save(source, target, gaussians, refined, {k.frame_index: k.iterations for k in keyframes}, seconds)
+    notes = ["scores were not made anew: `ggslam eval` makes them"] if source.metrics() is not None else []
+    return RunRefinement(target, len(keyframes), settings.steps, before, after, time.perf_counter() - start, notes)
+
+
+def _read_keyframes(
+    source: RunFolder, sequence: Sequence, observer: Observer
+) -> tuple[list[Keyframe], list[np.ndarray | None]]:
+    """With their images, and where these show something; those of other recordings are left out."""
+    keyframes, known, valid = list[Keyframe](), source.keyframes().keyframes, list[np.ndarray | None]()
+    for done, record in enumerate(known, 1):
+        if record.frame != ELSEWHERE:
+            frame = sequence.frame(record.frame, masks=False)
+            keyframe = make_keyframe(len(keyframes), frame, record.T_world_camera)
+            keyframe.exposure = exposure_of(record).copy()
+            keyframes.append(keyframe)
+            valid.append(frame.valid)
+        observer.advance(done, len(known))
+    if not keyframes:
+        raise ConfigError(f"{source.path}: none of its keyframes is of its recording")
+    return keyframes, valid
+
+
+def _save(
+    source: RunFolder, target: RunFolder, gaussians: GaussianMap, scene: SegmentedMap | None, steps: dict[int, int],
+    seconds: float,
+) -> None:  # fmt: skip
+    """Writes the refined run; `steps`: made on each frame."""
+
+    def write(staged: Path) -> RunRecord:
+        for name in _STAY:
+            if (source.path / name).is_file():
+                shutil.copyfile(source.path / name, staged / name)
+        record = source.keyframes()
+        changed = [
+            k.model_copy(update={"iterations": k.iterations + steps.get(k.frame, 0)}) for k in record.keyframes
+        ]
+        record.model_copy(update={"keyframes": changed}).write(staged)
+        timing = source.timing()
+        timing.model_copy(update={
+            "refine_iterations": timing.refine_iterations + sum(steps.values()),
+            "refinement_s": timing.refinement_s + seconds,
+        }).write(staged)  # fmt: skip
+        if scene is None:
+            write_gaussian_ply(staged / "map.ply", gaussians)
+        else:
+            write_objects(staged, scene)
+        save_points_of_map(staged, gaussians, scene is not None)
+        return source.mark()
+
+    publish_run(target.path, write, RUN_FILES, f"{target.path}: the refined run cannot be written")

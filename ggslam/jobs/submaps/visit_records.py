@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a store remembers of a run that filled it: its recording, settings and keyframes, so that cells can be trained,
+and their surfaces fused, from the images again."""
+
+from __future__ import annotations
+
+import json
+import logging
+
+import numpy as np
+
+from ggslam.errors import GgslamError
+from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.rendering.exposure import identity_exposure
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.records.keyframes import KeyframeRecord
+from ggslam.runs.records.visit import VisitRecord
+from ggslam.slam.config import config_to_dict
+from ggslam.submaps.grid import GridStore
+from ggslam.submaps.visit_files import read_visit, visit_file, write_visit
+from ggslam.system.foreign import printable
+
+_log = logging.getLogger(__name__)
+
+
+def exposure_of(keyframe: KeyframeRecord) -> np.ndarray:
+    """Gain and offset of each colour channel, [3, 2]."""
+    return identity_exposure() if keyframe.exposure is None else keyframe.exposure
+
+
+def remember_run(store: GridStore, folder: RunFolder) -> None:
+    """Writes the record of the visit that was begun. A run whose own records are damaged can be stored, but not be
+    trained any further.
+
+    Raises:
+        RunFolderError: the record cannot be written.
+    """
+    try:
+        record = _record_of(folder)
+    except GgslamError as error:
+        _log.warning("warning: %s; what is stored of the run cannot be refined", printable(str(error)))
+        return
+    write_visit(store, json.dumps(record.values()).encode())
+
+
+def _record_of(folder: RunFolder) -> VisitRecord:
+    record = folder.keyframes()
+    known = [keyframe for keyframe in record.keyframes if keyframe.frame != ELSEWHERE]
+    return VisitRecord(
+        run=str(folder.path.absolute()), sequence=folder.sequence(), config=config_to_dict(folder.config()),
+        keyframes=known, poses=record.poses(),
+    )  # fmt: skip
+
+
+def read_record(store: GridStore, visit: str) -> VisitRecord | None:
+    """The record of a visit; None: it has none, because it was no run or the store is older.
+
+    Raises:
+        FormatError: it is damaged.
+    """
+    data = read_visit(store, visit)
+    return None if data is None else VisitRecord.parse(data, str(visit_file(store.path, visit)))

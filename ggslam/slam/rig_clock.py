@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras of a rig whose shutters do not open together: how the rig moves from one's image to another's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.scene.poses import inverse, se3_exp, se3_log
+
+LONGEST_S = 0.5
+"""Seconds between two instants beyond which the motion between them says nothing of that within one."""
+TOGETHER_S = 0.002
+"""Images so few seconds apart were taken together: nothing that is carried by hand moves by a millimetre meanwhile."""
+
+
+@dataclass
+class RigClock:
+    """Knows the rig's motion from the last instant to the one before: it is taken to go on.
+
+    Attributes:
+        T_world_first: [4, 4], where the rig was at the last instant; None: not known.
+        time: of that, seconds.
+        motion: [4, 4], from its pose at the instant before to that at the last one; None: not known.
+        interval: the time that took, seconds.
+    """
+
+    T_world_first: np.ndarray | None = None
+    time: float = 0.0
+    motion: np.ndarray | None = None
+    interval: float = 0.0
+
+    def knows(self, seconds: float) -> bool:
+        """Whether `motion_in` can tell the motion in so short a time."""
+        return abs(seconds) <= TOGETHER_S or self.motion is not None
+
+    def motion_in(self, seconds: float) -> np.ndarray:
+        """T_now_then [4, 4], to the rig's pose now from that so many seconds later; the identity if it is not known."""
+        if self.motion is None or abs(seconds) <= 1e-6:
+            return np.eye(4)
+        return se3_exp(seconds / self.interval * se3_log(self.motion))
+
+    def follow(self, T_world_first: np.ndarray | None, time: float) -> None:
+        """The rig was located at a pose [4, 4], or not (None), at the next instant."""
+        interval, self.motion = time - self.time, None
+        if T_world_first is not None and self.T_world_first is not None and 0 < interval <= LONGEST_S:
+            self.motion, self.interval = inverse(self.T_world_first) @ T_world_first, interval
+        self.T_world_first, self.time = T_world_first, time
+
+    def move(self, T_new_old: np.ndarray) -> None:
+        """The world about the rig was moved by a correction [4, 4]."""
+        if self.T_world_first is not None:
+            self.T_world_first = T_new_old @ self.T_world_first
