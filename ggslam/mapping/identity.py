@@ -32,9 +32,9 @@ from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 
-POOL_STEPS = 8
+POOL_STEPS = 4
 """Steps' worth of pixels that are drawn from a keyframe at once."""
-TERMS, MIN_WEIGHT = 32, 5e-3
+TERMS, MIN_WEIGHT = 32, 2e-2
 """Contributions to a pixel that training looks at: at most so many, none lighter."""
 SPLIT_STRIDE = 2
 """A split looks at every so manyth pixel and row."""

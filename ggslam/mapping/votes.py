@@ -8,6 +8,9 @@ import torch
 
 from ggslam.scene.gaussian_map import GaussianMap
 
+_ROWS_AT_ONCE = 65536
+"""Rows that are looked at together on the CPU, so that not all votes are in memory twice."""
+
 
 def vote_labels(gaussians: GaussianMap) -> torch.Tensor:
     """Object with the most votes of each Gaussian, int32 [N], 0 where there are none."""
@@ -28,16 +31,18 @@ def merge_votes(gaussians: GaussianMap, alias: torch.Tensor) -> None:
     """Replaces ids in the votes by `alias` (int32 [65536] on the map's device); slots that then name one object become
     one."""
     ids, weights = gaussians.vote_ids, gaussians.vote_weights
-    merged = alias[ids.long()]
     if ids.device.type != "cpu":  # to ask which rows change would wait for the device
+        merged = alias[ids.long()]
         _merge_rows(merged, weights)
         ids.copy_(merged)
         return
-    rows = (merged != ids).any(1).nonzero()[:, 0]
-    if len(rows):
-        ids_there, weights_there = merged[rows], weights[rows]
-        _merge_rows(ids_there, weights_there)
-        ids[rows], weights[rows] = ids_there, weights_there
+    for ids_here, weights_here in zip(ids.split(_ROWS_AT_ONCE), weights.split(_ROWS_AT_ONCE), strict=True):
+        merged = alias[ids_here.long()]
+        rows = (merged != ids_here).any(1).nonzero()[:, 0]
+        if len(rows):
+            ids_there, weights_there = merged[rows], weights_here[rows]
+            _merge_rows(ids_there, weights_there)
+            ids_here[rows], weights_here[rows] = ids_there, weights_there
 
 
 def _merge_rows(ids: torch.Tensor, weights: torch.Tensor) -> None:

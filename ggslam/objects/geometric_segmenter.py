@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from ggslam.objects.depth_surfaces import DepthSurface, surface_of
+from ggslam.objects.plane_colors import colors_to_compare, find_flat_things
 from ggslam.objects.planes import find_planes
 from ggslam.objects.regions import Borders, Groups, find_borders, gap_tolerance
 from ggslam.objects.segments import connected_pieces
@@ -24,6 +25,10 @@ _CONVEX_BENT = 0.25
 _FLAKE = 6
 _FLAKE_CLOSED = 0.6
 _GROWTH = 4
+_FLAT_BORDER = 12
+_FLAT_SHARE = 0.9
+_ALIKE = 0.75
+_HOLLOW = 0.3
 _SQUARE = np.ones((3, 3), np.uint8)
 
 
@@ -54,7 +59,9 @@ class GeometricSegmenter:
             unit = -planes / np.linalg.norm(planes, axis=1, keepdims=True)
             normals[on_plane] = unit[plane_of[on_plane] - 1]
         regions = self._regions(surface, plane_of)
-        regions = self._join_regions(regions, len(planes), surface, normals)
+        regions = self._join_regions(regions, planes, surface, normals, color)
+        things = find_flat_things(color, np.where(regions <= len(planes), regions, 0), self._settings)
+        regions = np.where(things > 0, int(regions.max()) + things, regions)
         return _by_size(regions, surface.valid, self._settings.min_area)
 
     def _regions(self, surface: DepthSurface, plane_of: np.ndarray) -> np.ndarray:
@@ -95,14 +102,32 @@ class GeometricSegmenter:
         connected[middle][rows[concave], columns[concave]] = False
         return connected
 
-    def _join_regions(self, regions: np.ndarray, planes: int, surface: DepthSurface, normals: np.ndarray) -> np.ndarray:
-        """Regions with convex and smooth neighbours joined."""
-        borders = find_borders(regions, surface, normals, surface.step + 1, self._settings)
+    def _join_regions(
+        self, regions: np.ndarray, planes: np.ndarray, surface: DepthSurface, normals: np.ndarray, color: np.ndarray
+    ) -> np.ndarray:
+        """Regions with convex and smooth neighbours joined; what is flat on a plane and looks like it is the plane."""
+        settings = self._settings
+        borders = find_borders(regions, surface, normals, colors_to_compare(color), surface.step + 1, settings)
         groups = Groups(int(regions.max()) + 1)
-        for k in np.flatnonzero(_is_convex(borders)):
+        alike = ~_is_convex(borders) & (borders.contrast < _ALIKE * settings.color_contrast)
+        parts = _is_hollow(borders, len(planes)) | self._is_flat(borders, alike, regions, planes, surface)
+        for k in np.flatnonzero(_is_convex(borders) | (alike & parts)):
             groups.join(*borders.pairs[k].tolist())
         regions = groups.roots().astype(np.int32)[regions]
-        return _without_flakes(regions, planes, borders, groups, self._settings.min_area)
+        return _without_flakes(regions, len(planes), borders, groups, self._settings.min_area)
+
+    def _is_flat(
+        self, borders: Borders, asked: np.ndarray, regions: np.ndarray, planes: np.ndarray, surface: DepthSurface
+    ) -> np.ndarray:
+        """bool [n]: those of the borders `asked` that part a plane and something that lies flat on it."""
+        first, second = borders.pairs.T
+        asked = asked & (first <= len(planes)) & (second > len(planes)) & (borders.length >= _FLAT_BORDER)
+        flat = np.zeros(len(asked), bool)
+        for k in np.flatnonzero(asked & (borders.closed >= 0.5 * borders.length)):
+            plane, points = planes[first[k] - 1], surface.points[regions == second[k]]
+            away = np.abs(points @ plane - 1) / np.linalg.norm(plane)
+            flat[k] = np.count_nonzero(away < self._settings.flat_m) >= _FLAT_SHARE * len(away)
+        return flat
 
 
 def _without_flakes(regions: np.ndarray, planes: int, borders: Borders, groups: Groups, min_area: float) -> np.ndarray:
@@ -135,6 +160,13 @@ def _is_convex(borders: Borders) -> np.ndarray:
     closed = borders.closed >= _CONVEX_CLOSED * borders.length
     judged = (borders.judged >= 3) & (borders.judged >= 0.3 * borders.length)
     return closed & judged & (borders.concave <= _CONVEX_BENT * borders.judged)
+
+
+def _is_hollow(borders: Borders, planes: int) -> np.ndarray:
+    """bool [n]: borders between two things, none of them a plane, that make up much of the outline of one: perhaps the
+    inside and the outside of a bowl."""
+    rim = np.bincount(borders.pairs.ravel(), np.repeat(borders.length, 2), int(borders.pairs.max(initial=0)) + 1)
+    return (borders.pairs[:, 0] > planes) & (borders.length >= _HOLLOW * rim[borders.pairs].min(1))
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

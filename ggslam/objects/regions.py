@@ -26,6 +26,7 @@ class Borders:
         judged: closed links where both regions reach far enough to compare normals.
         concave: judged links that are a concave edge.
         bent: judged links that are any edge (convex or concave).
+        contrast: median difference of colour across the links, float64 [n].
     """
 
     pairs: np.ndarray
@@ -34,6 +35,7 @@ class Borders:
     judged: np.ndarray
     concave: np.ndarray
     bent: np.ndarray
+    contrast: np.ndarray
 
 
 def gap_tolerance(surface: DepthSurface, settings: GeometricSettings) -> np.ndarray:
@@ -42,13 +44,15 @@ def gap_tolerance(surface: DepthSurface, settings: GeometricSettings) -> np.ndar
 
 
 def find_borders(
-    regions: np.ndarray, surface: DepthSurface, normals: np.ndarray, reach: int, settings: GeometricSettings
-) -> Borders:
+    regions: np.ndarray, surface: DepthSurface, normals: np.ndarray, colors: np.ndarray, reach: int,
+    settings: GeometricSettings,
+) -> Borders:  # fmt: skip
     """Examines every border between regions (int32 [H, W], 0 = none).
 
     Args:
+        colors: float32 [H, W, 3], in a space where distances are differences to the eye.
         normals: float32 [H, W, 3], those of planes where planes are known.
-        reach: pixels away from the border at which normals are compared, where edges do not blur them.
+        reach: pixels away from the border at which normals and colours are compared, where edges do not blur them.
     """
     tolerance = gap_tolerance(surface, settings)
     limit = np.cos(np.radians(settings.concave_degrees))
@@ -57,6 +61,7 @@ def find_borders(
         a, b = _link_ends(regions, axis)
         p, q = _shift(a, regions.shape, axis, -reach), _shift(b, regions.shape, axis, reach)
         flat, points, normal = regions.ravel(), surface.points.reshape(-1, 3), normals.reshape(-1, 3)
+        color = colors.reshape(-1, 3)
         judged = (flat[p] == flat[a]) & (flat[q] == flat[b])
         p, q = np.where(judged, p, a), np.where(judged, q, b)
         step = points[b] - points[a]
@@ -68,13 +73,16 @@ def find_borders(
         opening = ((normal[q] - normal[p]) * (points[q] - points[p])).sum(1)
         judged &= closed
         bent = judged & (cosine < limit)
-        columns = [np.ones(len(a)), closed, judged, bent & (opening < 0), bent]
+        contrast = np.linalg.norm(color[p] - color[q], axis=1)
+        columns = [np.ones(len(a)), closed, judged, bent & (opening < 0), bent, contrast]
         low, high = np.minimum(flat[a], flat[b]).astype(np.int64), np.maximum(flat[a], flat[b])
         found.append((low << 32 | high, np.stack(columns, 1)))
     codes, place = np.unique(np.concatenate([codes for codes, _ in found]), return_inverse=True)
     values = np.concatenate([values for _, values in found])
-    sums = [np.bincount(place, values[:, k], len(codes)).astype(np.int64) for k in range(values.shape[1])]
-    return Borders(np.stack([codes >> 32, codes & 0xFFFFFFFF], 1), *sums)
+    sums = [np.bincount(place, values[:, k], len(codes)).astype(np.int64) for k in range(values.shape[1] - 1)]
+    order = np.lexsort((values[:, -1], place))
+    middle = np.cumsum(sums[0]) - (sums[0] + 1) // 2
+    return Borders(np.stack([codes >> 32, codes & 0xFFFFFFFF], 1), *sums, values[order[middle], -1])
 
 
 def _link_ends(regions: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:

@@ -78,6 +78,11 @@ class GeometricSettings:
     """Planes with fewer blocks are left to the search for smooth surfaces."""
     plane_degrees: float = setting(8.0, 0.1, 90, "deg")
     """Neighbouring blocks whose normals differ by less than this may share a plane."""
+    flat_m: float = setting(0.03, 0, 10, "m")
+    """Pieces no higher above or lower below a plane than this are a part of it unless their colour differs."""
+    color_contrast: float = setting(20.0, 0, 255)
+    """Difference of colour (CIELAB, each channel scaled to 0 to 255) from which what lies flat on a plane is something
+    else than the plane. 0: colour is not looked at."""
     min_area: float = setting(4e-4, 0, 0.5)
     """Segments below this share of the image are joined to a neighbour on the same surface, or left unlabelled."""
     max_depth_m: float = setting(8.0, 0.05, 1e4, "m")

@@ -12,10 +12,11 @@ import ctypes
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from ggslam.errors import RenderError
+from ggslam.errors import CoreInputError, RenderError
 from ggslam.interface.arrays import address
 from ggslam.interface.core import rendering as structures
 from ggslam.native.loader import NativeContext, load_library
@@ -121,6 +122,37 @@ class CpuPixelTerms:
         Raises:
             RenderError: wrong shape, no moments, out of memory.
         """
+        gradient, adam = self._feature_adam(gaussians, gradient, optimizer)
+        _check(load_library().ggslam_terms_step(self.context.handle, *self._arguments(gradient, adam)))
+
+    def learn(
+        self, gaussians: GaussianMap, gradient: np.ndarray, optimizer: FeatureAdamSettings, labels: np.ndarray,
+        pixel_weights: np.ndarray,
+    ) -> None:  # fmt: skip
+        """`step` and `vote` at once, which is quicker than one after the other.
+
+        Raises:
+            RenderError: wrong shape, no moments, out of memory.
+        """
+        gradient, adam = self._feature_adam(gaussians, gradient, optimizer)
+        labels, pixel_weights = _checked_labels(labels, len(self)), np.ascontiguousarray(pixel_weights, np.float32)
+        ids, weights = gaussians.vote_ids, gaussians.vote_weights
+        votes = structures.TermVotes(
+            labels.ctypes.data, pixel_weights.ctypes.data, address(ids), address(weights), ids.shape[1]
+        )
+        _check(
+            load_library().ggslam_terms_learn(
+                self.context.handle, *self._arguments(gradient, adam), ctypes.byref(votes)
+            )
+        )
+
+    def _arguments(self, gradient: np.ndarray, adam: structures.FeatureAdam) -> tuple[Any, ...]:
+        return ctypes.byref(self.native()), gradient.ctypes.data, ctypes.byref(adam)
+
+    def _feature_adam(
+        self, gaussians: GaussianMap, gradient: np.ndarray, optimizer: FeatureAdamSettings
+    ) -> tuple[np.ndarray, structures.FeatureAdam]:
+        """The gradient as the compiled core wants it, and the optimizer; its schedule lives in a cache."""
         channels = _checked_channels(gaussians)
         if gradient.shape != (len(self), channels) or gradient.dtype != np.float32:
             raise RenderError(
@@ -128,18 +160,14 @@ class CpuPixelTerms:
             )
         if not gaussians.moments:
             raise RenderError("step: the map was made without moments")
-        gradient, schedule = np.ascontiguousarray(gradient), optimizer.schedule()
+        schedule = optimizer.schedule()
         first, second = gaussians.moments["features"]
         adam = structures.FeatureAdam(
             len(gaussians), address(gaussians.features), address(first), address(second),
             address(gaussians.feature_updates), schedule.ctypes.data, len(schedule), channels,
             optimizer.beta1, optimizer.beta2, optimizer.epsilon,
         )  # fmt: skip
-        _check(
-            load_library().ggslam_terms_step(
-                self.context.handle, ctypes.byref(self.native()), gradient.ctypes.data, ctypes.byref(adam)
-            )
-        )
+        return np.ascontiguousarray(gradient), adam
 
     def vote(self, gaussians: GaussianMap, labels: np.ndarray, pixel_weights: np.ndarray | None = None) -> None:
         """Adds the pixels' weights to the votes of their Gaussians.
@@ -168,14 +196,16 @@ class CpuPixelTerms:
             gaussian_labels: label of each Gaussian of the map, uint16 [N].
         """
         gaussian_labels = np.ascontiguousarray(gaussian_labels, np.uint16)
-        used = np.arange(self.gaussians.shape[1]) < self.counts[:, None]
-        if self.gaussians.max(initial=-1, where=used) >= len(gaussian_labels):
-            raise RenderError(f"gaussian_labels: a label for every Gaussian of the map, found {len(gaussian_labels)}")
         ids, shares = np.empty(len(self), np.uint16), np.empty(len(self), np.float32)
-        load_library().ggslam_terms_label(
-            self.context.handle, ctypes.byref(self.native()), gaussian_labels.ctypes.data, ids.ctypes.data,
-            shares.ctypes.data,
-        )  # fmt: skip
+        try:
+            load_library().ggslam_terms_label(
+                self.context.handle, ctypes.byref(self.native()), gaussian_labels.ctypes.data, len(gaussian_labels),
+                ids.ctypes.data, shares.ctypes.data,
+            )  # fmt: skip
+        except CoreInputError as error:
+            raise RenderError(
+                f"gaussian_labels: a label for every Gaussian of the map, found {len(gaussian_labels)}"
+            ) from error
         return ids, shares
 
 

@@ -42,6 +42,9 @@ class MaskSettings:
     min_views: int = setting(3, 1, 10**6)
     """Objects that a segmenter or association found on fewer keyframes are noise. Runs of less than ten keyframes for
     each of these views ask for less."""
+    min_repeat: float = setting(0.35, 0, 1)
+    """Objects that a segmenter or association found on a smaller share of the segmented keyframes that show their place
+    are noise, too."""
     min_gaussians: int = setting(20, 0, 10**9)
     """Objects with fewer Gaussians that a segmenter or association found are noise, too."""
     cleaning: CleaningSettings = field(default_factory=CleaningSettings)
@@ -168,18 +171,24 @@ class ObjectMasks:
         return self._segment(frame)
 
     def noise(
-        self, object_ids: np.ndarray, seen: dict[int, Observation], keyframes: int, sizes: np.ndarray
-    ) -> list[int]:
+        self, object_ids: np.ndarray, seen: dict[int, Observation], keyframes: int, sizes: np.ndarray,
+        chances: Mapping[int, int],
+    ) -> list[int]:  # fmt: skip
         """Of `object_ids`, those that are too small or were seen too rarely, in so many keyframes, to be believed.
 
         Args:
             sizes: number of Gaussians by id, [65536].
+            chances: number of keyframes by id in which an object could have been seen; where it is not known, the
+                object is not doubted for it.
         """
         if self.supervision == "masks":
             return []
         views = {i: seen[i].views if i in seen else 0 for i in object_ids.tolist()}
-        enough = min(self.settings.min_views, 1 + keyframes // 10)
-        return [i for i, count in views.items() if count < enough or sizes[i] < self.settings.min_gaussians]
+        enough, share = min(self.settings.min_views, 1 + keyframes // 10), self.settings.min_repeat
+        return [
+            i for i, count in views.items()
+            if count < max(enough, share * chances.get(i, 0)) or sizes[i] < self.settings.min_gaussians
+        ]  # fmt: skip
 
 
 def _choose(settings: MaskSettings, has_masks: bool | None) -> Source | None:

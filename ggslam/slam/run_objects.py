@@ -7,6 +7,7 @@ import numpy as np
 
 from ggslam.mapping.mapper import Mapper
 from ggslam.slam.map_paging import MapPager
+from ggslam.slam.object_chances import count_chances, typical_points
 from ggslam.slam.object_masks import ObjectMasks, observations
 from ggslam.slam.result import LearnedObjects
 
@@ -38,10 +39,16 @@ class RunObjects:
         self._settled = True  # if it fails below, the map can still be had by another call
         earlier = None if self.learned is None else self.learned.observations
         seen = observations(mapper.keyframes, identity.current, earlier)
-        sizes = np.bincount(mapper.vote_labels(), minlength=65536)
+        labels = mapper.vote_labels()
+        sizes = np.bincount(labels, minlength=65536)
         if pager is not None:
             sizes += pager.vote_sizes()
-        noise = self._masks.noise(identity.classifier.class_ids, seen, len(mapper.keyframes), sizes)
+        chances: dict[int, int] = {}
+        if self._masks.supervision != "masks":
+            points = typical_points(mapper.map.means.cpu().numpy(), labels)
+            since = {i: observation.first_frame for i, observation in seen.items()}
+            chances = count_chances(points, since, mapper.keyframes)
+        noise = self._masks.noise(identity.classifier.class_ids, seen, len(mapper.keyframes), sizes, chances)
         identity.forget(mapper.map, noise)
         mapper.finish_identity()
         kept = {i: observation for i, observation in seen.items() if i not in noise}

@@ -17,6 +17,7 @@ from ggslam.mapping.cpu.class_table import FIRST_CLASSES
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.pixel_pool import draw_pool
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
+from ggslam.mapping.identity import POOL_STEPS
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.native.loader import NativeContext
@@ -331,7 +332,7 @@ def test_consecutive_parts_of_a_pool_are_used(cuda_library: CudaLibrary, monkeyp
     monkeypatch.setattr(CudaIdentityLearner, "kept_pools", 2)
     both = Both(cuda_library)
     others = [MaskedKeyframe(number, both.keyframe.mask, both.device) for number in (1, 2)]
-    parts = [both.cuda._draw(both.keyframe)[0] for _ in range(8)]
+    parts = [both.cuda._draw(both.keyframe)[0] for _ in range(POOL_STEPS)]
     assert torch.equal(torch.cat(parts), both.cuda._pools[0].pixels)
     first = both.cuda._pools[0]
     both.cuda._draw(both.keyframe)

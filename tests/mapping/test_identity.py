@@ -307,6 +307,16 @@ def test_the_sample_is_balanced_and_its_votes_are_not() -> None:
     assert votes[2] / votes.sum() == pytest.approx(100 / 9000, rel=0.1)
 
 
+def test_a_sample_by_tiles_is_the_same_in_another_order() -> None:
+    ids = np.random.default_rng(0).integers(0, 4, (60, 70)).astype(np.uint16)
+    settings = IdentitySettings()
+    mixed, by_tile = (draw_pool(ids, 800, settings, np.random.default_rng(5), flag) for flag in (False, True))
+    assert np.array_equal(np.sort(mixed.pixels), np.sort(by_tile.pixels))
+    assert len(np.unique(np.stack([by_tile.pixels[:200] // 70, by_tile.pixels[:200] % 70]) // 16, axis=1).T) <= 7
+    empty = draw_pool(np.zeros_like(ids), 10, settings, np.random.default_rng(0), True)
+    assert not len(empty.pixels)
+
+
 def test_members_are_what_the_classifier_takes_for_an_object_rather_than_for_its_rival() -> None:
     rng = np.random.default_rng(0)
     table = CpuClassTable(rng)

@@ -146,3 +146,49 @@ def test_objects_on_a_table(shared_data: Path) -> None:
 def test_impossible_settings_are_refused() -> None:
     with pytest.raises(ConfigError, match="GeometricSettings.concave_degrees"):
         GeometricSettings(concave_degrees=0)
+
+
+def painted(camera: Camera, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Colours of a grey plane with something on it, and where that is, bool [H, W]."""
+    color = np.full((camera.height, camera.width, 3), 128, np.uint8)
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    thing = (abs(rows - 100) < 30) & (abs(columns - 140) < 40)
+    if kind == "picture":  # of two colours in a frame
+        color[thing] = (90, 50, 20)
+        color[(abs(rows - 100) < 24) & (abs(columns - 140) < 34)] = (40, 90, 200)
+        color[(rows > 100) & (rows < 124) & (abs(columns - 140) < 34)] = (40, 160, 60)
+    elif kind == "shadow":
+        color[thing] = 90
+    elif kind == "tiles":
+        color[(rows // 30 + columns // 30) % 2 == 0] = (200, 60, 60)
+    elif kind == "ragged":
+        color[(abs(rows - 100) < 2) | (abs(columns - 140) < 2)] = (200, 60, 60)
+    return color, thing
+
+
+@pytest.mark.parametrize(("kind", "expected"), [("picture", 2), ("shadow", 1), ("tiles", 1), ("ragged", 1)])
+@pytest.mark.parametrize("size", [1, 2])
+def test_colour_tells_what_lies_flat_on_a_plane(kind: str, expected: int, size: int) -> None:
+    camera = CAMERA.scale(size)
+    color, thing = painted(CAMERA, kind)
+    color, thing = (image.repeat(size, 0).repeat(size, 1) for image in (color, thing))
+    depth = np.full(thing.shape, 1.5, np.float32)
+    segments = GeometricSegmenter().segment(color, depth, camera)
+    assert segments.max() == expected
+    if expected == 2:
+        assert ((segments == 2) & thing).sum() / ((segments == 2) | thing).sum() > 0.9
+    assert GeometricSegmenter(GeometricSettings(color_contrast=0)).segment(color, depth, camera).max() == 1
+
+
+def test_a_flat_rim_of_the_same_colour_is_a_part_of_its_plane() -> None:
+    rows, columns = np.mgrid[:240, :320]
+    outside = np.hypot(rows - 120, columns - 160)
+    ring = (outside > 80) & (outside < 95)
+    depth = (1.5 - 0.028 * np.maximum(1 - abs(outside - 87.5) / 7.5, 0)).astype(np.float32)
+    color = grey(CAMERA)
+    for settings, expected in ((GeometricSettings(), True), (GeometricSettings(color_contrast=0), False)):
+        segments = GeometricSegmenter(settings).segment(color, depth, CAMERA)
+        assert (segments[120, 160] == segments[120, 160 + 87]) == expected
+    color[ring] = (128, 20, 20)
+    segments = GeometricSegmenter().segment(color, depth, CAMERA)
+    assert segments[120, 160] != segments[120, 160 + 87]

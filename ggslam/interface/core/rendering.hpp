@@ -78,6 +78,15 @@ struct FeatureAdam {
   float beta1, beta2, epsilon;
 };
 
+// Votes of Gaussians, and the labels that pixels give them.
+struct TermVotes {
+  const std::uint16_t* labels;  // [P]; 0 votes for nothing
+  const float* pixel_weights;   // [P], or null: 1 each
+  std::int32_t* ids;            // [N, slots]
+  float* weights;               // [N, slots]
+  std::int32_t slots;
+};
+
 // A mesh and a camera. Positions [vertices, 3] in the camera's axes, colours [vertices, 3] as they are to be seen; triangles
 // [triangles, 3], counter-clockwise seen from their front.
 struct MeshPictureInput {
@@ -131,9 +140,13 @@ GGSLAM_EXPORT int ggslam_terms_vote(void* context, const ggslam::PixelTerms* ter
                                     const float* pixel_weights, std::int64_t gaussians, int slots, std::int32_t* ids,
                                     float* weights);
 
+// Both on one set of terms: Adam on the features, and the votes. Returns 0 or 1 (out of memory).
+GGSLAM_EXPORT int ggslam_terms_learn(void* context, const ggslam::PixelTerms* terms, const float* gradient,
+                                     const ggslam::FeatureAdam* adam, const ggslam::TermVotes* votes);
+
 // The label with the largest rendering weight at each pixel, and its share of the pixel's weight. `labels` [gaussians].
 GGSLAM_EXPORT int ggslam_terms_label(void* context, const ggslam::PixelTerms* terms, const std::uint16_t* labels,
-                                     std::uint16_t* ids, float* shares);
+                                     std::int64_t gaussians, std::uint16_t* ids, float* shares);
 
 // Draws on what stands in `picture` [height, width, 3]; `inverse_z` [height, width] must be 0 at first.
 GGSLAM_EXPORT int ggslam_draw_mesh(void* context, const ggslam::MeshPictureInput* in, float* inverse_z,

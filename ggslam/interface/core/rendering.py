@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_float, c_int, c_int32, c_int64, c_void_
 from typing import Any
 
 HEADER = "core/rendering.hpp"
-HEADER_SHA256 = "e0e807edc197855cbfdddb7afff7a29cf0775b046cc70f899d9665fbf1cbf070"
+HEADER_SHA256 = "53230ddfaa07e6d4a3638b308f7454efef108cf89398029613d54b3b2d17840a"
 
 
 class GaussianArrays(Structure):
@@ -93,6 +93,14 @@ class FeatureAdam(Structure):
     ]
 
 
+class TermVotes(Structure):
+    """Votes of Gaussians, and the labels that pixels give them."""
+
+    _fields_ = [
+        ("labels", c_void_p), ("pixel_weights", c_void_p), ("ids", c_void_p), ("weights", c_void_p), ("slots", c_int32),
+    ]
+
+
 class MeshPictureInput(Structure):
     """A mesh and a camera. Positions [vertices, 3] in the camera's axes, colours [vertices, 3] as they are to be
     seen; triangles [triangles, 3], counter-clockwise seen from their front."""
@@ -106,7 +114,7 @@ class MeshPictureInput(Structure):
 
 STRUCTURES: tuple[type[Structure], ...] = (
     GaussianArrays, CameraView, RenderTargets, ImageGradients, GaussianGradients, AdamArrays, AdamArguments, PixelTerms,
-    FeatureAdam, MeshPictureInput,
+    FeatureAdam, TermVotes, MeshPictureInput,
 )
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_rasterizer_create": (c_void_p, [c_void_p]),
@@ -124,7 +132,8 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_terms_vote": (c_int, [
         c_void_p, POINTER(PixelTerms), c_void_p, c_void_p, c_int64, c_int, c_void_p, c_void_p,
     ]),
-    "ggslam_terms_label": (c_int, [c_void_p, POINTER(PixelTerms), c_void_p, c_void_p, c_void_p]),
+    "ggslam_terms_learn": (c_int, [c_void_p, POINTER(PixelTerms), c_void_p, POINTER(FeatureAdam), POINTER(TermVotes)]),
+    "ggslam_terms_label": (c_int, [c_void_p, POINTER(PixelTerms), c_void_p, c_int64, c_void_p, c_void_p]),
     "ggslam_draw_mesh": (c_int, [c_void_p, POINTER(MeshPictureInput), c_void_p, c_void_p]),
 }
 """Result and arguments of each."""

@@ -16,6 +16,7 @@ using ggslam::ImageGradients;
 using ggslam::MeshPictureInput;
 using ggslam::PixelTerms;
 using ggslam::RenderTargets;
+using ggslam::TermVotes;
 
 namespace {
 constexpr std::size_t kLayout[] = {
@@ -48,6 +49,8 @@ constexpr std::size_t kLayout[] = {
     offsetof(FeatureAdam, first_moments), offsetof(FeatureAdam, second_moments), offsetof(FeatureAdam, updates),
     offsetof(FeatureAdam, schedule), offsetof(FeatureAdam, schedule_rows), offsetof(FeatureAdam, channels),
     offsetof(FeatureAdam, beta1), offsetof(FeatureAdam, beta2), offsetof(FeatureAdam, epsilon),
+    sizeof(TermVotes), offsetof(TermVotes, labels), offsetof(TermVotes, pixel_weights), offsetof(TermVotes, ids),
+    offsetof(TermVotes, weights), offsetof(TermVotes, slots),
     sizeof(MeshPictureInput), offsetof(MeshPictureInput, positions), offsetof(MeshPictureInput, colors),
     offsetof(MeshPictureInput, triangles), offsetof(MeshPictureInput, vertices), offsetof(MeshPictureInput, count),
     offsetof(MeshPictureInput, fx), offsetof(MeshPictureInput, fy), offsetof(MeshPictureInput, cx),

@@ -21,6 +21,8 @@ from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
 
+KEPT_POOLS = 64
+"""Keyframes whose pixels drawn ahead are kept, 64 KB for each with the settings' defaults."""
 MANY_CLASSES = 128
 """Beyond so many classes a step's softmax runs over those in its sample and this many others, drawn at random."""
 
@@ -34,6 +36,7 @@ class CpuIdentityLearner(IdentityLearner):
         seed: of sampling.
     """
 
+    kept_pools = KEPT_POOLS
     last_loss: float = float("nan")
     """Cross-entropy of the last step."""
 
@@ -104,13 +107,16 @@ class CpuIdentityLearner(IdentityLearner):
         labels = self.current(keyframe.mask.reshape(-1)[pixels])
         terms = rasterizer.pixel_terms(pixels, TERMS, MIN_WEIGHT)
         labels = self._as_mapped(gaussians, terms, labels)
-        terms.vote(gaussians, labels, vote_weights)
-        if self.settings.schedule == "sampled":
-            self._train(gaussians, terms, self.table.classes(labels), rate_factor)
+        classes = self.table.classes(labels)
+        if self.settings.schedule == "sampled" and (classes >= 0).any():
+            self._train(gaussians, terms, labels, vote_weights, classes, rate_factor)
+        else:
+            terms.vote(gaussians, labels, vote_weights)
 
     def _new_pool(self, keyframe: MaskedKeyframe, wanted: int) -> PixelPool[np.ndarray]:
         assert keyframe.mask is not None
-        return draw_pool(self.current(keyframe.mask), wanted, self.settings, self._rng)
+        by_tile = self.table.count <= MANY_CLASSES  # else the softmax would miss the classes of other tiles
+        return draw_pool(self.current(keyframe.mask), wanted, self.settings, self._rng, by_tile)
 
     def _dense(
         self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: MaskedKeyframe, view: RenderBuffers
@@ -132,10 +138,13 @@ class CpuIdentityLearner(IdentityLearner):
             terms.step(gaussians, pull, FeatureAdamSettings(rate=s.rate))
         return torch.from_numpy(out.reshape(view.features.shape))
 
-    def _train(self, gaussians: GaussianMap, terms: CpuPixelTerms, classes: np.ndarray, rate_factor: float) -> None:
-        s, known = self.settings, classes >= 0  # an object may have been taken back since its pixels were drawn
-        if not known.any():
-            return
+    def _train(
+        self, gaussians: GaussianMap, terms: CpuPixelTerms, labels: np.ndarray, vote_weights: np.ndarray,
+        classes: np.ndarray, rate_factor: float,
+    ) -> None:  # fmt: skip
+        """Votes and a step at pixels with these labels and their classes, int32 [P], some of which are none (-1): an
+        object may have been taken back since its pixels were drawn."""
+        s, known = self.settings, classes >= 0
         chosen = self._choose_competitors(classes[known])
         features = terms.features(gaussians)
         gradient = np.zeros_like(features)
@@ -145,7 +154,8 @@ class CpuIdentityLearner(IdentityLearner):
             pulled, pull = self._pull_together(gaussians)
             terms = terms.append(CpuPixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
             gradient = np.concatenate([gradient, pull])
-        terms.step(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate))
+            labels, vote_weights = (np.pad(array, (0, len(pulled))) for array in (labels, vote_weights))
+        terms.learn(gaussians, gradient, FeatureAdamSettings(rate=rate_factor * s.rate), labels, vote_weights)
         self.table.step(chosen, s.weight * rows, rate_factor * s.classifier_rate)
 
     def _choose_competitors(self, classes: np.ndarray) -> np.ndarray:

@@ -13,6 +13,9 @@ from scipy.spatial import cKDTree
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import NOTHING_LOGIT
 
+MOST_POINTS = 65536
+"""Of a larger map neighbours are looked for among every second, third, ... Gaussian, as few as are at most so many."""
+
 
 class NeighbourIndex:
     """k nearest neighbours among the Gaussians' means. Rows are those of the map as it is now.
@@ -25,6 +28,7 @@ class NeighbourIndex:
         self._growth = growth
         self._tree: cKDTree | None = None
         self._order = -1
+        self._size, self._stride = 0, 1  # of the map when the tree was built; every so manyth Gaussian is in it
         self.built = 0
         """Number of times the tree was built."""
 
@@ -35,14 +39,19 @@ class NeighbourIndex:
         return cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False)
 
     def neighbours(self, gaussians: GaussianMap, rows: np.ndarray, k: int) -> np.ndarray:
-        """int64 [M, k], the k nearest other Gaussians of each of `rows` [M]; k is less in a tiny map."""
-        if self._tree is None or self._order != gaussians.order or len(gaussians) > self._tree.n * (1 + self._growth):
-            self._tree = self.tree_of(gaussians.means.numpy().copy())
-            self._order = gaussians.order
+        """int64 [M, k], the k nearest other Gaussians of each of `rows` [M]; k is less in a tiny map. In a map of more
+        than `MOST_POINTS` those of a part of it."""
+        size, means = len(gaussians), gaussians.means.numpy()
+        if self._tree is None or self._order != gaussians.order or size > self._size * (1 + self._growth):
+            self._stride = -(-size // MOST_POINTS)
+            self._tree = self.tree_of(means[:: self._stride].copy())
+            self._order, self._size = gaussians.order, size
             self.built += 1
         k = min(k, self._tree.n - 1)
-        _, found = self._tree.query(gaussians.means.numpy()[rows], k + 1)
-        return found[:, 1:]
+        _, found = self._tree.query(means[rows], k + 1)
+        found *= self._stride
+        itself = rows % self._stride == 0  # is among those that are looked at, and the nearest
+        return np.where(itself[:, None], found[:, 1:], found[:, :-1])
 
 
 def kl_gradient(logits: np.ndarray, neighbour_logits: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

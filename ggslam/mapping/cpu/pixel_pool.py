@@ -8,9 +8,12 @@ import numpy as np
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
 
+TILE = 16
+"""Pixels across a tile, as the rasterizer has them."""
+
 
 def draw_pool(
-    ids: np.ndarray, wanted: int, settings: IdentitySettings, rng: np.random.Generator
+    ids: np.ndarray, wanted: int, settings: IdentitySettings, rng: np.random.Generator, by_tile: bool = False
 ) -> PixelPool[np.ndarray]:
     """Draws labelled pixels: a share `settings.boundary` of them at the boundaries of objects, where nearly all errors
     are, the others anywhere; in both parts an object of n pixels comes with a share that goes with n^(1 - balance).
@@ -18,31 +21,46 @@ def draw_pool(
     Args:
         ids: object of each pixel, uint16 [H, W]; 0 is never drawn.
         wanted: how many; a pixel may come twice.
+        by_tile: those that come together are of a few tiles of the image, and quicker to composite.
     """
     flat = ids.reshape(-1)
-    edge = at_boundary(ids).reshape(-1)
-    parts, density = [], np.zeros(len(flat))
-    for share, strata in ((1 - settings.boundary, flat), (settings.boundary, np.where(edge, flat, 0))):
-        counts = np.bincount(strata)
-        counts[0] = 0
-        present = np.flatnonzero(counts)
-        number = round(share * wanted)
-        if not len(present) or not number:
-            continue
-        odds = counts[present].astype(np.float64) ** (1 - settings.balance)
-        odds /= odds.sum()
-        by_object = np.argsort(strata, kind="stable").astype(np.int32)  # a radix sort for 16 bits
-        starts = np.concatenate([[0], np.cumsum(np.bincount(strata))])[present]
-        drawn = rng.choice(len(present), number, p=odds)
-        parts.append(by_object[starts[drawn] + (rng.random(number) * counts[present][drawn]).astype(np.int64)])
-        per_pixel = np.zeros(len(counts))
-        per_pixel[present] = number * odds / counts[present]
-        density += per_pixel[strata]
-    if not parts:
+    edge = np.flatnonzero(at_boundary(ids))
+    anywhere, at_edges = _odds(flat, settings.balance), _odds(flat[edge], settings.balance)
+    if anywhere is None:
         return PixelPool(np.zeros(0, np.int32), np.zeros(0, np.float32))
-    pixels = rng.permutation(np.concatenate(parts))
+    share = 0.0 if at_edges is None else settings.boundary
+    density = ((1 - share) * anywhere)[flat]
+    if at_edges is not None:
+        density[edge] += (share * at_edges)[flat[edge]]
+    # Every so manyth of the sum, from a random one on.
+    sums = density.cumsum()
+    places = np.minimum((np.arange(wanted) + rng.random()) * (sums[-1] / wanted), np.nextafter(sums[-1], 0))
+    pixels = np.searchsorted(sums, places, side="right").astype(np.int32)
+    pixels = _tile_by_tile(pixels, ids.shape, rng) if by_tile else rng.permutation(pixels)
     weights = 1 / density[pixels]
     return PixelPool(pixels, (weights / weights.mean()).astype(np.float32))
+
+
+def _tile_by_tile(pixels: np.ndarray, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Pixels (flat indices [M]) of an image [H, W] in a random order of tiles."""
+    rows, columns = np.divmod(pixels, shape[1])
+    across = -(-shape[1] // TILE)
+    tile = rows // TILE * across + columns // TILE
+    place = rng.permutation(int(tile.max(initial=0)) + 1)
+    return pixels[np.argsort(place[tile], kind="stable")]
+
+
+def _odds(ids: np.ndarray, balance: float) -> np.ndarray | None:
+    """Odds of one pixel by its id, summing to 1 over all pixels, float64 [largest id + 1], 0 for id 0; None if no pixel
+    is labelled."""
+    counts = np.bincount(ids, minlength=1).astype(np.float64)
+    counts[0] = 0
+    present = counts > 0
+    if not present.any():
+        return None
+    odds = np.zeros(len(counts))
+    odds[present] = counts[present] ** -balance
+    return odds / (odds @ counts)
 
 
 def at_boundary(ids: np.ndarray) -> np.ndarray:

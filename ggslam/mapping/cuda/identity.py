@@ -44,7 +44,7 @@ Neighbours = Callable[[torch.Tensor, torch.Tensor, int, CudaLibrary], torch.Tens
 LOGITS_AT_ONCE = 2**24
 """The dense schedule takes as many pixels at a time as make so many logits; the 3-D loss no more than a tenth of it."""
 KEPT_POOLS = 256
-"""Keyframes whose pixels drawn ahead are kept, 128 KB for each with the settings' defaults. Those drawn first go."""
+"""Keyframes whose pixels drawn ahead are kept, 64 KB for each with the settings' defaults. Those drawn first go."""
 SPLIT_PIXELS, SPLIT_TERMS, SPLIT_MIN_WEIGHT = 32768, 48, 1e-3
 """A split looks at so many pixels at a time, with so many contributions to each, none lighter."""
 

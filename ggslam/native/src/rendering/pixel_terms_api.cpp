@@ -51,6 +51,14 @@ void check_counts(const PixelTerms& terms) {
   for (std::int64_t p = 0; p < terms.pixels; ++p) check_range("counts", terms.counts[p], 0, terms.capacity);
 }
 
+void check_gaussians(const PixelTerms& terms, std::int64_t gaussians) {
+  check_counts(terms);
+  for (std::int64_t p = 0; p < terms.pixels; ++p)
+    for (int i = 0; i < terms.counts[p]; ++i)
+      if (const std::int32_t g = terms.gaussians[p * terms.capacity + i]; g < 0 || g >= gaussians)
+        refuse("terms: expected Gaussians below %lld, found %d", static_cast<long long>(gaussians), g);
+}
+
 // The transposed terms. Counting sort, so that the order within a Gaussian is that of the pixels.
 class Transposed {
  public:
@@ -109,6 +117,37 @@ void add_vote(std::int32_t* ids, float* weights, int slots, std::int32_t label, 
   }
   ids[lightest] = label;
   weights[lightest] += weight;
+}
+
+// Adds the votes of some touched Gaussians.
+void add_votes(const TermsByGaussian& terms, const TermVotes& votes, std::size_t begin, std::size_t end) {
+  for (std::size_t i = begin; i < end; ++i) {
+    const std::size_t at = static_cast<std::size_t>(terms.touched[i]) * votes.slots;
+    for (std::int64_t k = terms.starts[i]; k < terms.starts[i + 1]; ++k) {
+      const std::int32_t row = terms.rows[k];
+      const float factor = votes.pixel_weights != nullptr ? votes.pixel_weights[row] : 1.0f;
+      if (votes.labels[row] != 0)
+        add_vote(votes.ids + at, votes.weights + at, votes.slots, votes.labels[row], factor * terms.weights[k]);
+    }
+  }
+}
+
+const TermVotes& check_votes(const TermVotes* pointer, const PixelTerms& terms, std::int64_t gaussians) {
+  const TermVotes& votes = object_of<TermVotes>(pointer);
+  check_range("slots", votes.slots, 1, 1 << 16);
+  check_array("labels", votes.labels, terms.pixels);
+  check_array("ids", votes.ids, gaussians), check_array("weights", votes.weights, gaussians);
+  return votes;
+}
+
+const FeatureAdam& check_adam(const FeatureAdam* pointer, const PixelTerms& terms, const float* gradient) {
+  const FeatureAdam& adam = object_of<FeatureAdam>(pointer);
+  check_range("channels", adam.channels, 0, kMaxTermChannels);
+  check_range("schedule_rows", adam.schedule_rows, 1, std::numeric_limits<std::int32_t>::max());
+  const void* const arrays[] = {adam.features, adam.first_moments, adam.second_moments, adam.updates, adam.schedule};
+  for (const void* array : arrays) check_array("features and moments", array, adam.gaussians);
+  check_array("gradient", gradient, terms.pixels);
+  return adam;
 }
 
 constexpr int kDistinct = 16;
@@ -173,11 +212,7 @@ GGSLAM_EXPORT int ggslam_terms_step(void* context, const PixelTerms* terms, cons
                                     const FeatureAdam* adam) try {
   Context& c = object_of<Context>(context);
   const Transposed transposed(check_terms(terms), object_of<FeatureAdam>(adam).gaussians);
-  check_range("channels", adam->channels, 0, kMostChannels);
-  check_range("schedule_rows", adam->schedule_rows, 1, std::numeric_limits<std::int32_t>::max());
-  const void* const arrays[] = {adam->features, adam->first_moments, adam->second_moments, adam->updates, adam->schedule};
-  for (const void* array : arrays) check_array("features and moments", array, adam->gaussians);
-  check_array("gradient", gradient, terms->pixels);
+  check_adam(adam, *terms, gradient);
   const TermsByGaussian view = transposed.view();
   const auto step = GGSLAM_DISPATCH(c.isa, step_term_rows);
   c.pool.parallel_for(transposed.size(), 512, [&](std::size_t begin, std::size_t end, int) {
@@ -190,27 +225,35 @@ GGSLAM_EXPORT int ggslam_terms_vote(void* context, const PixelTerms* terms, cons
                                     const float* pixel_weights, std::int64_t gaussians, int slots, std::int32_t* ids, float* weights) try {
   Context& c = object_of<Context>(context);
   const Transposed transposed(check_terms(terms), gaussians);
-  check_range("slots", slots, 1, kMostChannels);
-  check_array("labels", labels, terms->pixels), check_array("ids", ids, gaussians), check_array("weights", weights, gaussians);
+  const TermVotes votes{labels, pixel_weights, ids, weights, slots};
+  check_votes(&votes, *terms, gaussians);
   const TermsByGaussian view = transposed.view();
   c.pool.parallel_for(transposed.size(), 512, [&](std::size_t begin, std::size_t end, int) {
-    for (std::size_t i = begin; i < end; ++i) {
-      const std::size_t at = static_cast<std::size_t>(view.touched[i]) * slots;
-      for (std::int64_t k = view.starts[i]; k < view.starts[i + 1]; ++k) {
-        const std::int32_t row = view.rows[k];
-        const float factor = pixel_weights != nullptr ? pixel_weights[row] : 1.0f;
-        if (labels[row] != 0) add_vote(ids + at, weights + at, slots, labels[row], factor * view.weights[k]);
-      }
-    }
+    add_votes(view, votes, begin, end);
+  });
+  return 0;
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_terms_learn(void* context, const PixelTerms* terms, const float* gradient,
+                                     const FeatureAdam* adam, const TermVotes* votes) try {
+  Context& c = object_of<Context>(context);
+  const Transposed transposed(check_terms(terms), object_of<FeatureAdam>(adam).gaussians);
+  check_adam(adam, *terms, gradient);
+  check_votes(votes, *terms, adam->gaussians);
+  const TermsByGaussian view = transposed.view();
+  const auto step = GGSLAM_DISPATCH(c.isa, step_term_rows);
+  c.pool.parallel_for(transposed.size(), 512, [&](std::size_t begin, std::size_t end, int) {
+    step(view, gradient, *adam, static_cast<std::int64_t>(begin), static_cast<std::int64_t>(end));
+    add_votes(view, *votes, begin, end);
   });
   return 0;
 } GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_terms_label(void* context, const PixelTerms* terms, const std::uint16_t* labels,
-                                     std::uint16_t* ids, float* shares) try {
+                                     std::int64_t gaussians, std::uint16_t* ids, float* shares) try {
   Context& c = object_of<Context>(context);
-  check_counts(check_terms(terms));
-  check_array("labels", labels, 1), check_array("ids", ids, terms->pixels), check_array("shares", shares, terms->pixels);
+  check_gaussians(check_terms(terms), gaussians);
+  check_array("labels", labels, gaussians), check_array("ids", ids, terms->pixels), check_array("shares", shares, terms->pixels);
   c.pool.parallel_for(terms->pixels, 1024, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t p = begin; p < end; ++p) label_pixel(*terms, static_cast<std::int64_t>(p), labels, ids[p], shares[p]);
   });

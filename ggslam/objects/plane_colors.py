@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What colour says where depth says nothing: things that lie flat on a plane, such as papers on a table, pictures on a
+wall or a stove in a counter.
+
+A plane falls apart at edges of colour. A piece is a thing if the plane has its colour nowhere else (tiles, boards and
+drawers repeat), if it differs in more than brightness (shadows do not), and if it is compact.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from ggslam.objects.segments import connected_pieces
+from ggslam.objects.settings import GeometricSettings
+
+_WIDTH = 160
+"""Pixels across of the image in which colours are compared."""
+_LEAST_PLANE = 0.04
+"""Share of the image that a plane covers at least."""
+_LEAST_PIECE, _MOST_PIECE = 2.5e-3, 0.4
+"""Size of a thing: share of the image at least, share of its plane at most."""
+_LINK = 0.6
+"""Neighbouring pixels belong together up to this share of the contrast that tells a thing."""
+_REPEATED, _REPEATED_ON_PLANE = 0.5, 0.01
+"""A piece's colour may be on so much of its plane besides: shares of the piece and of the plane."""
+_SHADE = (0.45, 1.6)
+"""Ratios of brightness between which a piece of the same hue may be in shadow or in the sun."""
+_SOLID = 0.6
+"""Share of its convex hull that a thing fills."""
+
+
+def colors_to_compare(color: np.ndarray) -> np.ndarray:
+    """CIELAB, each channel scaled to 0 to 255, float32 [H, W, 3], a little blurred, of an image uint8 [H, W, 3]."""
+    return cv2.cvtColor(cv2.blur(color, (3, 3)), cv2.COLOR_RGB2LAB).astype(np.float32)
+
+
+def find_flat_things(color: np.ndarray, plane_of: np.ndarray, settings: GeometricSettings) -> np.ndarray:
+    """Things that differ from the plane around them by colour alone.
+
+    Args:
+        color: uint8 [H, W, 3].
+        plane_of: number of each pixel's plane, int32 [H, W], 0 = none.
+        settings: contrast.
+
+    Returns:
+        int32 [H, W], number of each pixel's thing from 1 on, 0 = none.
+    """
+    found = np.zeros(plane_of.shape, np.int32)
+    if not settings.color_contrast:
+        return found
+    size = _WIDTH, max(1, round(plane_of.shape[0] * _WIDTH / plane_of.shape[1]))
+    small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+    plane = cv2.resize(plane_of.astype(np.float32), size, interpolation=cv2.INTER_NEAREST).astype(np.int32)
+    areas = np.bincount(plane.ravel())
+    large = areas >= _LEAST_PLANE * plane.size
+    large[0] = False
+    if not large.any():
+        return found
+    plane[~large[plane]] = 0
+    lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
+    things = np.zeros(plane.shape, np.int32)
+    pieces = connected_pieces(plane, _links(plane, lab, _LINK * settings.color_contrast))
+    for number in np.flatnonzero(large):
+        strange = _strange_pieces(pieces, plane == number, lab, settings.color_contrast)
+        _add_compact(things, strange, plane == number)
+    enlarged = cv2.resize(things.astype(np.float32), plane_of.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    found = enlarged.astype(np.int32)
+    on_plane = cv2.resize(plane.astype(np.float32), plane_of.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    found[on_plane != plane_of] = 0
+    return found
+
+
+def _links(plane: np.ndarray, lab: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Whether a pixel belongs with its right and its lower neighbour, bool [h, w-1] and [h-1, w]."""
+    links = []
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        step = lab[a] - lab[b]
+        links.append((plane[a] == plane[b]) & (np.einsum("ijk,ijk->ij", step, step) < limit**2))
+    return links[0], links[1]
+
+
+def _strange_pieces(pieces: np.ndarray, inside: np.ndarray, lab: np.ndarray, contrast: float) -> np.ndarray:
+    """Pixels of the pieces of a plane (bool [h, w]) whose colour is their own, bool [h, w]."""
+    out = np.zeros(inside.shape, bool)
+    numbers, colors = pieces[inside], lab[inside]
+    area = np.bincount(numbers)
+    candidates = np.flatnonzero((area >= _LEAST_PIECE * inside.size) & (area <= _MOST_PIECE * len(numbers)))
+    for piece in candidates:
+        own = numbers == piece
+        mean, rest = colors[own].mean(0), colors[~own]
+        away = rest - mean
+        alike = np.count_nonzero(np.einsum("ij,ij->i", away, away) < contrast**2)
+        if alike > _REPEATED * area[piece] + _REPEATED_ON_PLANE * len(numbers):
+            continue
+        usual = np.median(rest, 0)
+        hue = float(np.linalg.norm(mean[1:] - usual[1:]))
+        shade = mean[0] / max(usual[0], 1.0)
+        if hue >= 0.5 * contrast or not _SHADE[0] < shade < _SHADE[1]:
+            out |= pieces == piece
+    return out
+
+
+def _add_compact(things: np.ndarray, strange: np.ndarray, inside: np.ndarray) -> None:
+    """Numbers what hangs together of `strange` and is compact; with what it encloses."""
+    if not strange.any():
+        return
+    grown = cv2.dilate(strange.astype(np.uint8), np.ones((3, 3), np.uint8)) & inside
+    outlines, _ = cv2.findContours(grown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    for outline in outlines:
+        filled = cv2.drawContours(np.zeros(grown.shape, np.uint8), [outline], -1, 1, cv2.FILLED)
+        hull = cv2.drawContours(np.zeros(grown.shape, np.uint8), [cv2.convexHull(outline)], -1, 1, cv2.FILLED)
+        area = np.count_nonzero(filled)
+        if _LEAST_PIECE * filled.size <= area and area >= _SOLID * np.count_nonzero(hull):
+            things[(filled > 0) & inside] = things.max() + 1

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How often an object could have been found: what a segmenter found now and then, though its place was in view nearly
+always, is noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+
+_NEAR_M, _NEAR_RELATIVE = 0.05, 0.05
+"""A keyframe shows a point if it measured the point's depth but for so much; the larger of the two."""
+
+
+def typical_points(means: np.ndarray, labels: np.ndarray) -> dict[int, np.ndarray]:
+    """For each object the centre of the Gaussian in the middle of its own, float32 [3].
+
+    Args:
+        means: of all Gaussians, [N, 3].
+        labels: their objects, [N]; 0 is none.
+    """
+    rows = np.flatnonzero(labels)
+    rows = rows[np.argsort(labels[rows], kind="stable")]
+    ids, starts = np.unique(labels[rows], return_index=True)
+    found = {}
+    for object_id, own in zip(ids.tolist(), np.split(rows, starts[1:]), strict=True):
+        points = means[own]
+        away = points - np.median(points, 0)
+        found[object_id] = points[np.einsum("ij,ij->i", away, away).argmin()]
+    return found
+
+
+def count_chances(
+    points: Mapping[int, np.ndarray], since: Mapping[int, int], keyframes: Sequence[Keyframe]
+) -> dict[int, int]:
+    """For each object the number of segmented keyframes of this recording that show its typical point.
+
+    Args:
+        points: typical points by id, world frame.
+        since: first frame by id in which each object was found; what it is a part of may have been found before.
+        keyframes: with masks or without.
+    """
+    seen = np.zeros(len(points), int)
+    world = np.array(list(points.values()), float).reshape(-1, 3)
+    begin = np.array([since.get(i, 0) for i in points], int)
+    for keyframe in keyframes:
+        if keyframe.mask is None or keyframe.frame_index == ELSEWHERE or not len(world):
+            continue
+        camera, T = keyframe.camera, keyframe.T_camera_world
+        p = world @ T[:3, :3].T + T[:3, 3]
+        z = np.maximum(p[:, 2], 1e-6)
+        u, v = np.rint(camera.fx * p[:, 0] / z + camera.cx), np.rint(camera.fy * p[:, 1] / z + camera.cy)
+        shown = (p[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        inside = np.flatnonzero(shown & (keyframe.frame_index >= begin))
+        depth = keyframe.depth_m()[v[inside].astype(int), u[inside].astype(int)]
+        near = np.abs(depth - z[inside]) < np.maximum(_NEAR_M, _NEAR_RELATIVE * z[inside])
+        seen[inside[near]] += 1
+    return dict(zip(points, seen.tolist(), strict=True))
