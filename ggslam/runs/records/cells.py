@@ -7,6 +7,7 @@ import pydantic
 
 from ggslam.runs.records.mark import FileRecord
 from ggslam.runs.records.record import Record
+from ggslam.submaps.settings import GridAxes
 
 CELLS_FORMAT, CELLS_VERSION = "ggslam cells", 1
 
@@ -33,7 +34,7 @@ class CellsRecord(Record):
     ggslam: str = "unknown"
     rate: str = ""
     spacing: float
-    axes: str
+    axes: GridAxes
     cells: dict[str, CellMember]
 
     @staticmethod
