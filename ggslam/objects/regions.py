@@ -82,7 +82,9 @@ def find_borders(
     sums = [np.bincount(place, values[:, k], len(codes)).astype(np.int64) for k in range(values.shape[1] - 1)]
     order = np.lexsort((values[:, -1], place))
     middle = np.cumsum(sums[0]) - (sums[0] + 1) // 2
-    return Borders(np.stack([codes >> 32, codes & 0xFFFFFFFF], 1), *sums, values[order[middle], -1])
+    length, closed, judged, concave, bent = sums
+    pairs, contrast = np.stack([codes >> 32, codes & 0xFFFFFFFF], 1), values[order[middle], -1]
+    return Borders(pairs, length, closed, judged, concave, bent, contrast)
 
 
 def _link_ends(regions: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
