@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 from ggslam import __version__
 from ggslam.cli import (
     batch_command,
+    changes_command,
     compare_command,
     decode_command,
     doctor_command,
@@ -83,6 +84,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "render": (render_command.render, render_command.EPILOG), "export": (export_command.export, export_command.EPILOG),
     "batch": (batch_command.batch, batch_command.EPILOG),
     "report": (report_command.report, report_command.EPILOG),
+    "changes": (changes_command.changes, changes_command.EPILOG),
     "compare": (compare_command.compare, compare_command.EPILOG),
     "doctor": (doctor_command.doctor, doctor_command.EPILOG), "edit": (edit_command.edit, edit_command.EPILOG),
     "encode": (encode_command.encode, encode_command.EPILOG), "decode": (decode_command.decode, decode_command.EPILOG),

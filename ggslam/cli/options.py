@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -72,5 +73,27 @@ PoseConvention = Annotated[
         metavar="NAME",
         help="How the recording's poses are written, if not camera to world with OpenCV axes: world-to-camera, opengl, "
         "world-to-camera-opengl, wxyz, world-to-camera-wxyz.",
+    ),
+]
+
+
+class EngineName(str, Enum):
+    """Where cells of a store are worked on."""
+
+    local = "local"
+    ray = "ray"
+
+
+CellEngine = Annotated[
+    EngineName,
+    typer.Option("--engine", help="Of a store: local: processes on this machine; ray: tasks of a Ray cluster."),
+]
+CellWorkers = Annotated[
+    int | None, typer.Option("--workers", help="Of a store: cells at a time; default: one for every two processors.")
+]
+CellAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--address", help="Of the Ray cluster, auto: the one this machine belongs to; default: one on this machine."
     ),
 ]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,27 +30,12 @@ number of workers. If it is cut off, the same command goes on.
 """
 
 
-class EngineName(str, Enum):
-    """What trains the cells."""
-
-    local = "local"
-    ray = "ray"
-
-
 Source = Annotated[
     Path, typer.Argument(metavar="RUN_OR_STORE", help="Folder that `ggslam run` or `ggslam submaps` wrote.")
 ]
 Out = Annotated[Path | None, typer.Option(help="Folder for the refined run or store; default: in place.")]
 Steps = Annotated[int, typer.Option(help="Optimisation steps, of a store for each cell.", min=0)]
 Seed = Annotated[int, typer.Option(help="Of the order of the keyframes.", min=0)]
-Engine = Annotated[
-    EngineName, typer.Option(help="Of a store: local: processes on this machine; ray: tasks of a Ray cluster.")
-]
-Workers = Annotated[int | None, typer.Option(help="Of a store: cells at a time; default: one for two processors.")]
-Address = Annotated[
-    str | None,
-    typer.Option(help="Of the Ray cluster, auto: the one this machine belongs to; default: one on this machine."),
-]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already at --out.")]
 
 
@@ -61,9 +45,9 @@ def refine(
     steps: Steps = 300,
     seed: Seed = 0,
     sequence: options.MovedSequence = None,
-    engine: Engine = EngineName.local,
-    workers: Workers = None,
-    address: Address = None,
+    engine: options.CellEngine = options.EngineName.local,
+    workers: options.CellWorkers = None,
+    address: options.CellAddress = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Train a finished map further on its keyframes: a run's, or a grid store's cell by cell."""
@@ -71,19 +55,19 @@ def refine(
     from ggslam.jobs.refine.refine_store import refine_store
     from ggslam.jobs.refine.settings import RefineSettings
     from ggslam.jobs.submaps.stores import is_store
-    from ggslam.jobs.tasks.engines import Engine as TaskEngine
+    from ggslam.jobs.tasks.engines import Engine
 
     settings = RefineSettings(steps=steps, seed=seed)
-    if address is not None and engine is not EngineName.ray:
+    if address is not None and engine is not options.EngineName.ray:
         raise ConfigError("--address is for --engine ray")
     with progress_bar() as bar:
         if is_store(source):
             if sequence is not None or overwrite:
                 raise ConfigError("--sequence and --overwrite are for runs, and this is a grid store")
-            where = TaskEngine(engine.value, workers, address)
+            where = Engine(engine.value, workers, address)
             outcome = refine_store(source, out, settings=settings, engine=where, observer=ProgressObserver(bar))
         else:
-            if engine is not EngineName.local or workers is not None:
+            if engine is not options.EngineName.local or workers is not None:
                 raise ConfigError("--engine and --workers are for grid stores, and this is none")
             done = refine_run(
                 source, out, settings=settings, recording=sequence, overwrite=overwrite, observer=ProgressObserver(bar)

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from ggslam.cli.console import console, progress_bar
+from ggslam.errors import SequenceError
 
 EPILOG = """
 [bold]Examples[/]
@@ -22,6 +23,9 @@ EPILOG = """
   ggslam synth demo/corridor --scene corridor --frames 300
 
   ggslam synth demo/rig --rig front,back
+
+  ggslam synth demo/monday --changes 5
+  ggslam synth demo/tuesday --changes 5 --visit 2
 """
 
 
@@ -64,12 +68,21 @@ def synth(
     rig_delay: Annotated[
         float, typer.Option(help="Seconds by which each camera of a rig is later than the one before it.", min=0)
     ] = 0.0,
+    changes: Annotated[
+        int | None,
+        typer.Option(help="Things of the room that differ between two visits; the second one's are in changes.json."),
+    ] = None,
+    visit: Annotated[int, typer.Option(help="Which of the two visits to record.", min=1, max=2)] = 1,
 ) -> None:
     """Generate a recording: textured, furnished rooms with exact poses and instance masks."""
     from ggslam.synthetic import SCENES, write_synthetic_rig, write_synthetic_sequence
 
     frames = SCENES[scene.value].frames if frames is None else frames
-    write, cameras = write_synthetic_sequence, ""
+    if changes is None and visit > 1:
+        raise SequenceError("--visit: only with --changes there are two visits")
+    if changes is not None and rig is not None:
+        raise SequenceError("--changes: not with --rig")
+    write, cameras = partial(write_synthetic_sequence, changes=changes, visit=visit), ""
     if rig is not None:
         write, cameras = partial(write_synthetic_rig, cameras=rig.split(","), delay=rig_delay), f" by each of {rig}"
     with progress_bar() as bar:

@@ -27,15 +27,21 @@ EPILOG = """
   ggslam volumes data/livingroom --esdf --slice 0.5        (poses of the recording itself)
 
   ggslam volumes data/redkitchen --scale 0.5 --live --esdf      (tracked and fused frame by frame)
+
+  ggslam volumes house.grid --esdf --workers 4      (a grid store, cell by cell)
 """
 
 SourcePath = Annotated[
-    Path, typer.Argument(metavar="RUN_OR_SEQUENCE", help="Folder that `ggslam run` wrote, or folder of a recording.")
+    Path,
+    typer.Argument(
+        metavar="SOURCE", help="Folder that `ggslam run` wrote, folder of a recording, or a grid store made of runs."
+    ),
 ]
 
 
 Out = Annotated[
-    Path | None, typer.Option(help="Folder for the results; default RUN/volumes, or volumes/NAME of a recording.")
+    Path | None,
+    typer.Option(help="Folder for the results; default RUN/volumes, STORE/volumes, or volumes/NAME of a recording."),
 ]
 Voxel = Annotated[float | None, typer.Option(help="Edge of the TSDF's voxels, metres (default 0.02).")]
 Esdf = Annotated[bool, typer.Option("--esdf", help="Also make a distance field, with a slice and a ROS map.")]
@@ -116,8 +122,12 @@ def volumes(
     skip_bad_frames: options.SkipBadFrames = False,
     device: Device = None,
     overwrite: Overwrite = False,
+    engine: options.CellEngine = options.EngineName.local,
+    workers: options.CellWorkers = None,
+    address: options.CellAddress = None,
 ) -> None:
     """Make maps that planners read, each with a picture: TSDF with mesh, distance field, occupancy."""
+    from ggslam.jobs.submaps.stores import is_store
     from ggslam.jobs.volumes.fuse import VolumesRequest
     from ggslam.runs.recordings import SequenceRequest
     from ggslam.volumes.safety import Braking, Latencies
@@ -134,7 +144,50 @@ def volumes(
         onto=onto, slice_height=slice_height, band=_band(band), latency=driving, device=device, config=config,
         overrides=settings or [], overwrite=overwrite,
     )  # fmt: skip
-    _make_and_show(request, _numbers("--speeds", speeds), braking)
+    where = (engine, workers, address)
+    if is_store(source):
+        return _make_of_store(request, *where)
+    if where != (options.EngineName.local, None, None):
+        raise ConfigError("--engine, --workers and --address are for grid stores, and this is none")
+    return _make_and_show(request, _numbers("--speeds", speeds), braking)
+
+
+def _make_of_store(
+    request: VolumesRequest, engine: options.EngineName, workers: int | None, address: str | None
+) -> None:
+    """Makes the volumes of a store and prints what came of it."""
+    from dataclasses import replace
+
+    from ggslam.jobs.tasks.engines import Engine
+    from ggslam.jobs.volumes.fuse import VolumesRequest
+    from ggslam.jobs.volumes.store_volumes import make_store_volumes
+    from ggslam.slam.config import load_config
+
+    plain = VolumesRequest(
+        request.source, request.sequence, out=request.out, voxel=request.voxel, esdf=request.esdf,
+        objects=request.objects, config=request.config, overrides=request.overrides,
+    )  # fmt: skip
+    if request != plain or request.sequence != type(request.sequence)(request.source):
+        raise ConfigError("of a grid store --out, --voxel, --esdf, --config, --set and the workers can be chosen")
+    if address is not None and engine is not options.EngineName.ray:
+        raise ConfigError("--address is for --engine ray")
+    settings = load_config(request.config, request.overrides).volumes
+    if request.voxel is not None:
+        settings = replace(settings, tsdf=replace(settings.tsdf, voxel=request.voxel))
+    where = Engine(engine.value, workers, address)
+    with progress_bar() as bar:
+        outcome = make_store_volumes(
+            request.source, request.out, settings=settings, esdf=request.esdf, engine=where,
+            observer=ProgressObserver(bar),
+        )  # fmt: skip
+    took = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.seconds.items())
+    for line in (
+        f"{outcome.cells} cells, {outcome.blocks} blocks of 8^3 voxels, {outcome.triangles} triangles ({took})",
+        f"wrote {outcome.out}", *(f"not made: {line}" for line in outcome.failures.values()),
+    ):  # fmt: skip
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if outcome.failures:
+        raise typer.Exit(1)
 
 
 def _make_and_show(request: VolumesRequest, speeds: list[float], braking: Braking) -> None:

@@ -8,7 +8,7 @@ translation), axes x right, y down, z forward. The centre of the top-left pixel 
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +18,18 @@ from ggslam.scene.poses import inverse, matrix_to_quaternion
 from ggslam.system.atomic import write_bytes
 
 _PINHOLE = 1
-_CAMERA_ID = 1
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track_length", "<u8")])
 
 
 def write_colmap_model(
-    folder: str | Path, camera: Camera, names: Sequence[str], T_world_camera: Sequence[np.ndarray],
+    folder: str | Path, cameras: Sequence[Camera], names: Sequence[str], T_world_camera: Sequence[np.ndarray],
     points: np.ndarray, colors: np.ndarray,
 ) -> None:  # fmt: skip
-    """Writes a model of images that share a pinhole camera; each file whole or not at all.
+    """Writes a model of images of pinhole cameras; each file whole or not at all.
 
     Args:
         folder: exists; customarily `sparse/0`.
-        camera: of all images.
+        cameras: of each image; equal ones become one, numbered from 1 in the order in which they come.
         names: of the image files, relative to the folder of images; images are numbered from 1 in this order.
         T_world_camera: a float64 [4, 4] for each.
         points: [N, 3] metres; they have no tracks: no image is said to have seen them.
@@ -40,22 +39,26 @@ def write_colmap_model(
         RunFolderError: a file cannot be written.
     """
     folder = Path(folder)
-    write_bytes(folder / "cameras.bin", _cameras(camera))
-    write_bytes(folder / "images.bin", _images(names, T_world_camera))
+    numbers = {camera: number for number, camera in enumerate(dict.fromkeys(cameras), start=1)}
+    write_bytes(folder / "cameras.bin", _cameras(numbers))
+    write_bytes(folder / "images.bin", _images(names, T_world_camera, [numbers[camera] for camera in cameras]))
     write_bytes(folder / "points3D.bin", _points(points, colors))
 
 
-def _cameras(camera: Camera) -> bytes:
-    numbers = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)
-    return struct.pack("<QIiQQ4d", 1, _CAMERA_ID, _PINHOLE, camera.width, camera.height, *numbers)
+def _cameras(numbers: Mapping[Camera, int]) -> bytes:
+    parts = [struct.pack("<Q", len(numbers))]
+    for camera, number in numbers.items():
+        values = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)
+        parts.append(struct.pack("<IiQQ4d", number, _PINHOLE, camera.width, camera.height, *values))
+    return b"".join(parts)
 
 
-def _images(names: Sequence[str], T_world_camera: Sequence[np.ndarray]) -> bytes:
+def _images(names: Sequence[str], T_world_camera: Sequence[np.ndarray], cameras: Sequence[int]) -> bytes:
     parts = [struct.pack("<Q", len(names))]
-    for number, (name, T) in enumerate(zip(names, T_world_camera, strict=True), start=1):
+    for number, (name, T, camera) in enumerate(zip(names, T_world_camera, cameras, strict=True), start=1):
         T_camera_world = inverse(np.asarray(T, float))
         pose = (*matrix_to_quaternion(T_camera_world[:3, :3]), *T_camera_world[:3, 3])
-        parts.append(struct.pack("<I7dI", number, *pose, _CAMERA_ID) + name.encode() + b"\0" + struct.pack("<Q", 0))
+        parts.append(struct.pack("<I7dI", number, *pose, camera) + name.encode() + b"\0" + struct.pack("<Q", 0))
     return b"".join(parts)
 
 

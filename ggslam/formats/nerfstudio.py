@@ -27,33 +27,30 @@ MOST_DEPTH = 65.535
 @dataclass(frozen=True)
 class TransformsFrame:
     """One image: its file and its depth's, relative to the folder of transforms.json, T_world_camera float64 [4, 4]
-    with the axes of this project, and whether it was kept away from training."""
+    with the axes of this project, whether it was kept away from training, and its camera."""
 
     image: str
     depth: str
     T_world_camera: np.ndarray
     held_out: bool
+    camera: Camera
 
 
-def write_transforms(
-    path: str | Path, camera: Camera, frames: Sequence[TransformsFrame], points: str | None = None
-) -> None:
-    """Writes the file, whole or not at all.
+def write_transforms(path: str | Path, frames: Sequence[TransformsFrame], points: str | None = None) -> None:
+    """Writes the file, whole or not at all. Images of several cameras each tell their own.
 
     Args:
         path: of transforms.json.
-        camera: of all images.
-        frames: the images; those held out are named as validation and test images.
+        frames: the images, one or more; those held out are named as validation and test images.
         points: PLY file of coloured points that training may begin with, relative to the folder.
 
     Raises:
         RunFolderError: it cannot be written.
     """
     held_out = [frame.image for frame in frames if frame.held_out]
-    values: dict[str, Any] = {
-        "camera_model": "OPENCV", "w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy,
-        "cx": camera.cx + 0.5, "cy": camera.cy + 0.5, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
-    }  # fmt: skip
+    several = len({frame.camera for frame in frames}) > 1
+    shared = {} if several else _intrinsics(frames[0].camera)
+    values: dict[str, Any] = {"camera_model": "OPENCV", **shared, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
     if points is not None:
         values["ply_file_path"] = points
     if held_out:
@@ -61,10 +58,16 @@ def write_transforms(
         values |= {"train_filenames": trained, "val_filenames": held_out, "test_filenames": held_out}
     values["frames"] = [
         {"file_path": frame.image, "depth_file_path": frame.depth,
+         **(_intrinsics(frame.camera) if several else {}),
          "transform_matrix": (np.asarray(frame.T_world_camera, float) @ _OPENGL_FROM_OPENCV).tolist()}
         for frame in frames
     ]  # fmt: skip
     write_text(path, json.dumps(values, indent=1) + "\n")
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    return {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx + 0.5,
+            "cy": camera.cy + 0.5}  # fmt: skip
 
 
 def millimetres(depth: np.ndarray) -> np.ndarray:

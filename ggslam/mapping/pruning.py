@@ -4,11 +4,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 
+from ggslam.geometry.fixed_to_camera import is_in_image_part
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.settings import PruningSettings
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import transform_points
 
 
 def prune(gaussians: GaussianMap, settings: PruningSettings) -> int:
@@ -22,3 +27,19 @@ def prune(gaussians: GaussianMap, settings: PruningSettings) -> int:
     good = (gaussians.opacity_logits > logit) & (largest < math.log(settings.max_scale_m))
     good &= torch.isfinite(gaussians.means).all(1)
     return gaussians.keep(good)
+
+
+def drop_pixels(gaussians: GaussianMap, keyframes: Sequence[Keyframe], part: np.ndarray, nearest: float) -> None:
+    """Takes out what keyframes have mapped, and measured, in a part of their images, bool [H, W], or nearer than some
+    metres. Keyframes of other recordings, and those with images of another size, are left alone."""
+    birth, means = gaussians.birth_keyframe.cpu().numpy(), gaussians.means.detach().cpu().numpy()
+    stays = np.ones(len(gaussians), bool)
+    for keyframe in keyframes:
+        camera = keyframe.camera
+        if keyframe.frame_index == ELSEWHERE or (camera.height, camera.width) != part.shape:
+            continue
+        rows = np.flatnonzero(birth == keyframe.index)
+        seen = transform_points(means[rows], keyframe.T_camera_world)
+        stays[rows] = ~is_in_image_part(seen, part, camera) & (seen[:, 2] >= nearest)
+        keyframe.depth = np.where(part | (keyframe.depth_m() < nearest), np.uint16(0), keyframe.depth)
+    gaussians.keep(torch.from_numpy(stays))

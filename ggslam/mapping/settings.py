@@ -119,6 +119,29 @@ class ExposureSettings:
 
 
 @settings_class(frozen=True)
+class ViewAlignmentSettings:
+    """Alignment of frames to the map by colour alone, where depth errs more than its images show (on the CPU, in
+    synchronous runs)."""
+
+    enabled: bool = setting(True, basic=True)
+    """Whether frames are aligned to the map so."""
+    hidden_noise: float = setting(8.0, 1, 1e6)
+    """Frames are aligned so where the residuals of tracking are this many times what the first image shows of noise:
+    errors that neighbouring pixels share, and so many points do not help against them."""
+    points: int = setting(8000, 500, 10**6)
+    """Textured pixels at most."""
+    min_gradient: float = setting(0.01, 1e-4, 1)
+    """A pixel is textured if grey, in [0, 1], changes by this per pixel."""
+    iterations: int = setting(8, 1, 1000)
+    """Steps at each of two scales at most."""
+    tolerance: float = setting(2e-5, 0, 1, "m")
+    """The iteration stops at a step below this; a turn by one radian counts as 1 m."""
+    farthest_sigmas: float = setting(5.0, 0, 1e3)
+    """A pose that is farther from the tracked one than so many standard deviations of the depth noise at the frame's
+    median depth is not believed; a turn by one radian counts as that depth."""
+
+
+@settings_class(frozen=True)
 class LossSettings:
     """Weights and kinds of the terms of the loss.
 
@@ -161,3 +184,4 @@ class MapperSettings:
     pruning: PruningSettings = field(default_factory=PruningSettings)
     pose_refinement: PoseRefinementSettings = field(default_factory=PoseRefinementSettings)
     exposure: ExposureSettings = field(default_factory=ExposureSettings)
+    view_alignment: ViewAlignmentSettings = field(default_factory=ViewAlignmentSettings)

@@ -34,6 +34,7 @@ class ZoomWidening:
         camera: of the training views.
         T_world_camera: their poses, each [4, 4].
         zoom: at least 1.
+        cameras: of each view, if not all are `camera`'s.
 
     Raises:
         ConfigError: no views, or an impossible zoom.
@@ -42,6 +43,7 @@ class ZoomWidening:
     camera: Camera
     T_world_camera: Sequence[np.ndarray]
     zoom: float
+    cameras: Sequence[Camera] | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.zoom <= 1000:
@@ -63,16 +65,18 @@ class ZoomWidening:
 
     def closest_depths(self, points: np.ndarray) -> np.ndarray:
         """Smallest depth, float64 [N], in metres, at which a view has each of the points [N, 3] in its image; of
-        points in no image, their distance from the nearest camera."""
+        points in no image, their distance from the nearest camera. Depth in views of another camera is as if `camera`
+        had pixels as large there."""
         chosen = np.unique(np.linspace(0, len(self.T_world_camera) - 1, MOST_VIEWS).round().astype(int))
         depth, distance = np.full(len(points), np.inf), np.full(len(points), np.inf)
-        c = self.camera
-        for T in (self.T_world_camera[i] for i in chosen):
+        focal = np.sqrt(self.camera.fx * self.camera.fy)
+        for T, c in ((self.T_world_camera[i], self.cameras[i] if self.cameras else self.camera) for i in chosen):
+            larger = 1.0 if c == self.camera else focal / np.sqrt(c.fx * c.fy)
             R, t = inverse(T)[:3, :3], inverse(T)[:3, 3]
             seen = points @ R.T + t
             z = np.maximum(seen[:, 2], _NEAR_M)
             u, v = c.fx * seen[:, 0] / z + c.cx, c.fy * seen[:, 1] / z + c.cy
             inside = (seen[:, 2] > _NEAR_M) & (u > -0.5) & (v > -0.5) & (u < c.width - 0.5) & (v < c.height - 0.5)
-            depth[inside] = np.minimum(depth[inside], z[inside])
-            distance = np.minimum(distance, np.linalg.norm(seen, axis=1))
+            depth[inside] = np.minimum(depth[inside], larger * z[inside])
+            distance = np.minimum(distance, larger * np.linalg.norm(seen, axis=1))
         return np.where(np.isfinite(depth), depth, np.maximum(distance, _NEAR_M))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -136,7 +136,7 @@ def open_sequence(
 
 def _open_rig(
     path: Path, file: Path, start: int, stop: int | None, stride: int, scale: float | None, on_bad_frame: OnBadFrame,
-    of_cameras: dict[str, object],
+    of_cameras: Mapping[str, object],
 ) -> Sequence:  # fmt: skip
     """A rig; `of_cameras` are arguments that hold for one camera alone."""
     given = [name for name, value in of_cameras.items() if value is not None]

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -62,11 +62,13 @@ class RigSequence(Sequence):
     def __init__(
         self, path: Path, rig: Rig, parts: list[RigPart], instants: np.ndarray, tolerance: float
     ) -> None:
-        vars(self).update(vars(parts[0].sequence))
+        own = {"_recording", "_masks", "_geometry", "mask_problems"}
+        vars(self).update({name: value for name, value in vars(parts[0].sequence).items() if name not in own})
         self.rig, self.parts, self.instants, self.tolerance = rig, parts, instants, tolerance
         self.path, self.format = path, NAME
         self.name = path.parent.resolve().name if path.stem == NAME else path.stem
-        self._reopen, self.options, self._skipped, self.mask_problems = None, None, {}, {}
+        self._reopen, self.options, self._skipped = None, None, {}
+        self._earlier_problems: dict[int, str] = {}
         self.selected = range(len(instants))
         """Numbers of the instants in all of the recordings."""
         self.warnings = [f"{part.name}: {warning}" for part in parts for warning in part.sequence.warnings]
@@ -102,6 +104,21 @@ class RigSequence(Sequence):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
+
+    @property
+    def mask_problems(self) -> dict[int, str]:  # type: ignore[override]
+        """See `Sequence`."""
+        found = dict(self._earlier_problems)
+        for number, part in enumerate(self.parts):
+            frames = {int(self.instants[self.places[i, 0], number]): i for i in self.frames_of(number).tolist()}
+            of_part = part.sequence.mask_problems.items()
+            found.update({frames[own]: reason for own, reason in of_part if own in frames})
+        return found
+
+    def go_on_after(self, skipped: Iterable[SkippedFrame], mask_problems: Mapping[int, str]) -> None:
+        """See `Sequence`."""
+        super().go_on_after(skipped, {})
+        self._earlier_problems.update(mask_problems)
 
     def place_of(self, index: int) -> tuple[int, int]:
         """Instant and camera number of a frame.
@@ -182,6 +199,22 @@ class RigSequence(Sequence):
         apart = [separation(T, self.rig.T_first_camera[b]) for T in T_first_b]
         shift, turn = np.median(np.array(apart), axis=0)
         return bool(shift < TRUTH_NEAR_M and turn < TRUTH_NEAR_DEG)
+
+
+def one_camera(sequence: Sequence, what: str) -> Sequence:
+    """The same sequence, which is not of a rig.
+
+    Args:
+        sequence: a recording.
+        what: takes one camera's recording only, in words.
+
+    Raises:
+        SequenceError: it is of a rig.
+    """
+    if isinstance(sequence, RigSequence):
+        places = ", ".join(str(part.sequence.path) for part in sequence.parts)
+        raise SequenceError(f"{sequence.path}: is a rig, and {what} takes the recording of one camera: {places}")
+    return sequence
 
 
 def by_instant(frames: Iterable[Frame]) -> Iterator[list[Frame]]:

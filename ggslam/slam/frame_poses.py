@@ -32,6 +32,11 @@ class FramePoses:
         """From now on poses are remembered relative to a keyframe with the pose [4, 4]."""
         self._anchor, self._T_world_anchor = keyframe, T_world_camera.copy()
 
+    @property
+    def anchor(self) -> tuple[int, np.ndarray]:
+        """The keyframe that poses are remembered relative to now, and its pose [4, 4] as tracked."""
+        return max(0, self._anchor), self._T_world_anchor
+
     def move(self, T_new_old: np.ndarray) -> None:
         """The world about the camera was moved by a correction [4, 4]."""
         self._T_world_anchor = T_new_old @ self._T_world_anchor

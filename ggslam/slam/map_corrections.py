@@ -9,7 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.mapping.mapper import Mapper
+from ggslam.mapping.pruning import drop_pixels
 from ggslam.objects.uniting import FAINT, LabelledVoxels
+from ggslam.scene.frame import Frame
+from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.loop_closing import Correction, LoopCloser
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_masks import ObjectMasks
@@ -33,6 +36,7 @@ class MapCorrections:
     ) -> None:
         self._surface, self._mapper, self._pager, self._masks = surface, mapper, pager, masks
         self._moves: list[np.ndarray] = []
+        self._left_out = 0  # changes of what is fixed to the camera that the map knows of
         self._publishing = threading.Lock()
 
     def __len__(self) -> int:
@@ -55,6 +59,17 @@ class MapCorrections:
         """The points of a new keyframe join the surface."""
         with self._publishing:
             self._surface.add(tracking.points, tracking.T_world_camera)
+
+    def leave_out(self, fixtures: CameraFixtures, newest: Frame) -> None:
+        """What has turned out to be fixed to the camera goes from map, keyframes and surface, which have the newest
+        frame. What is on disk where memory is limited stays."""
+        if fixtures.mask is None or (fixtures.changes == self._left_out and not newest.depth[fixtures.mask].any()):
+            return
+        self._left_out = fixtures.changes
+        if self._pager is None:
+            drop_pixels(self._mapper.map, self._mapper.keyframes, fixtures.mask, fixtures.nearest)
+            with self._publishing:
+                self._surface.drop_pixels(fixtures.mask, fixtures.nearest, self._mapper.keyframes[-1].camera)
 
     def apply(self, correction: Correction, loops: LoopCloser) -> None:
         """Moves the map after its keyframes, unites objects that both ends have mapped, takes out what is double now,

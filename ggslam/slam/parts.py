@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from ggslam.cuda.library import CudaLibrary, library_for_device
-from ggslam.errors import ConfigError, MissingDependency
+from ggslam.errors import ConfigError, InputError, MissingDependency
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
@@ -162,3 +162,15 @@ def make_pager(camera: Camera, config: Config, folder: Path | None) -> MapPager 
     if folder is None:
         weakref.finalize(pager, shutil.rmtree, pager.folder, ignore_errors=True)
     return pager
+
+
+def check_arguments(camera: object, config: object, extra_loss: object) -> None:
+    """Raises InputError unless they are a camera, settings and a function."""
+    if not isinstance(camera, Camera):
+        hint = "; its attribute camera is one" if isinstance(getattr(camera, "camera", None), Camera) else ""
+        raise InputError(f"Slam: camera: expected a Camera, found {type(camera).__name__}{hint}")
+    if config is not None and not isinstance(config, Config):
+        hint = "; Config(**values) makes one of a dict" if isinstance(config, dict) else ""
+        raise InputError(f"Slam: config: expected a Config, found {type(config).__name__}{hint}")
+    if extra_loss is not None and not callable(extra_loss):
+        raise InputError(f"Slam: extra_loss: expected a function, found {extra_loss!r}")

@@ -41,6 +41,8 @@ from ggslam.objects.table import Observation
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.slam.camera_fixtures import CameraFixtures
+from ggslam.slam.color_poses import ColorPoses
 from ggslam.slam.config import Config
 from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.frame_poses import FramePoses
@@ -192,6 +194,7 @@ RULES: Rules = {
     Slam: _but("camera", "config", "context", "pager", "_notes", "_on_device"),
     RigSlam: _but("camera", "rig", "config", "context", "pager", "_notes", "_on_device", "_engine"),
     SlamTimes: _but("_started", growing=_names("tracking_by_frame"), after=_go_on),
+    ColorPoses: _but("mapper", "poses", "state", growing=_names("images")),
     FramePoses: Rule(growing=_names("frames")),
     MapCorrections: _but("_surface", "_mapper", "_pager", "_masks", "_publishing"),
     RunObjects: _but("_masks"),
@@ -229,10 +232,10 @@ RULES: Rules = {
     NeighbourIndex: Rule(save=_save_index, take=_take_index),
     # plain values
     **dict.fromkeys(
-        (Camera, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame, StepLog, LoopEvent,
-         _Found, Link, Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes,
-         CpuClassTable, ClassNumbers, IdentityClassifier, LearnedObjects, Observation, Associator, ConsistencyJudge,
-         PairEvidence, _Pair, Fragment, FragmentMemory, ShutterTimes, RigClock),
+        (Camera, CameraFixtures, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame,
+         StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam,
+         ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier, LearnedObjects, Observation,
+         Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory, ShutterTimes, RigClock),
         Rule(),
     ),
 }  # fmt: skip

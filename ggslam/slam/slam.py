@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.errors import ConfigError, InputError
+from ggslam.errors import ConfigError
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.camera import Camera
@@ -27,11 +27,13 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.frame_checks import check_frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
+from ggslam.slam.camera_fixtures import CameraFixtures
+from ggslam.slam.color_poses import ColorPoses
 from ggslam.slam.config import REFINE_SHARE, Config
 from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.map_corrections import MapCorrections
-from ggslam.slam.parts import device_name, make_parts
+from ggslam.slam.parts import check_arguments, device_name, make_parts
 from ggslam.slam.result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
 from ggslam.slam.run_objects import RunObjects
 from ggslam.slam.saved_places import saved_places_to_bytes
@@ -72,7 +74,7 @@ class Slam:
         self, camera: Camera, config: Config | None = None, has_masks: bool | None = None, paging: Path | None = None,
         library: CudaLibrary | None = None, extra_loss: ExtraLoss | None = None,
     ) -> None:  # fmt: skip
-        _check_arguments(camera, config, extra_loss)
+        check_arguments(camera, config, extra_loss)
         self.camera = camera
         self.config = config or Config()
         parts = make_parts(camera, self.config, has_masks, paging, library, compact=extra_loss is None)
@@ -96,7 +98,8 @@ class Slam:
         self._moves_followed = 0
         self._noise: DepthNoise | None = None
         self._objects = RunObjects(self.masks)
-        self._depth_edges, self._shutters = DepthEdges(), ShutterTimes()
+        self.color_poses = ColorPoses(self.mapper, self.poses, self.tracker.state)
+        self._depth_edges, self._shutters, self._fixtures = DepthEdges(), ShutterTimes(), CameraFixtures()
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
         """Starts in a map made before; `surface` and `loops` hold its keyframes already. The camera counts as lost
@@ -203,6 +206,7 @@ class Slam:
         try:
             if steps:
                 self.mapper.refine(steps, note, begin)
+            self.color_poses.align_again()
         finally:  # an interrupted refinement counts for what it did
             self.refine_iterations = begin + self.mapper.times.iterations - before
             self.times.refinement = time.perf_counter() - start
@@ -218,7 +222,7 @@ class Slam:
             gaussians, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
             self.refine_iterations, objects, self.loops.events if self.loops else [],
             self._places(gaussians, cells), cells, None if self.pager is None else self.pager.report(),
-            [*self._notes, *([] if self.pager is None else self.pager.budget.notes)],
+            [*self._notes, *self._fixtures.notes(), *([] if self.pager is None else self.pager.budget.notes)],
             None if self.pager is None else self.pager.close, self.steps.to_csv(), device_name(self.map.device),
             self.config,
         )  # fmt: skip
@@ -241,14 +245,14 @@ class Slam:
     # --- its parts, also used by the real-time loop ------------------------------------------------------------------
 
     def receive(self, frame: Frame) -> Frame:
-        """The frame as the run uses it: without depth that hangs between two surfaces, and with depth as of the time of
-        colour.
+        """The frame as the run uses it: without depth that hangs between two surfaces, with depth as of the time of
+        colour, and without what is fixed to the camera.
 
         Raises:
             SequenceError: the frame is of another camera, or not what `Frame` says.
         """
         check_frame(frame, self.camera)
-        return self._shutters.bring(self._depth_edges.clean(frame))
+        return self._fixtures.clean(self._shutters.bring(self._depth_edges.clean(frame)))
 
     def track(self, frame: Frame) -> TrackingResult:
         """Locates one frame, as `receive` gave it, against the current target; a lost one is looked up among all
@@ -264,7 +268,10 @@ class Slam:
             if found is not None:
                 result, keyframe = found
                 self.poses.anchor_to(keyframe, self.loops.poses[keyframe])
-        self._shutters.follow(None if result.status is TrackingStatus.LOST else result.T_world_camera)
+        result = self.color_poses.align(frame, result)
+        located = None if result.status is TrackingStatus.LOST else result.T_world_camera
+        self._shutters.follow(located)
+        self._fixtures.follow(self.camera, located)
         self._tell_noise(result.median_depth_m)
         self.times.tracking_by_frame.append(time.perf_counter() - start)
         self.times.tracking += self.times.tracking_by_frame[-1]
@@ -333,21 +340,10 @@ class Slam:
         keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
         added = self.map.count - before
         self._corrections.add_points(tracking)
+        self._corrections.leave_out(self._fixtures, frame)
         if self.loops is not None:
             correction = self.loops.add(frame, tracking)
             if correction is not None:
                 self._corrections.apply(correction, self.loops)
         if self.pager is not None:
             self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
-
-
-def _check_arguments(camera: object, config: object, extra_loss: object) -> None:
-    """Raises InputError unless they are a camera, settings and a function."""
-    if not isinstance(camera, Camera):
-        hint = "; its attribute camera is one" if isinstance(getattr(camera, "camera", None), Camera) else ""
-        raise InputError(f"Slam: camera: expected a Camera, found {type(camera).__name__}{hint}")
-    if config is not None and not isinstance(config, Config):
-        hint = "; Config(**values) makes one of a dict" if isinstance(config, dict) else ""
-        raise InputError(f"Slam: config: expected a Config, found {type(config).__name__}{hint}")
-    if extra_loss is not None and not callable(extra_loss):
-        raise InputError(f"Slam: extra_loss: expected a function, found {extra_loss!r}")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from ggslam import __version__
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
+from ggslam.synthetic.changes import MadeChange, room_at_two_visits
 from ggslam.synthetic.raycast import RayCaster
 from ggslam.synthetic.scene import Scene
 from ggslam.synthetic.scenes import SCENES, SceneKind
@@ -26,6 +28,7 @@ from ggslam.synthetic.trajectory import camera_path
 
 DEPTH_SCALE = 5000.0
 LARGEST_DISTORTION = 10.0
+CHANGES_FILE = "changes.json"
 FOCAL_LENGTH = 0.75
 """As a share of the image width: 67 degrees of view."""
 
@@ -42,6 +45,8 @@ def write_synthetic_sequence(
     frame_rate: float | None = None,
     scene: Scene | str = "room",
     depth_distortion: float | None = None,
+    changes: int | None = None,
+    visit: int = 1,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
@@ -61,6 +66,9 @@ def write_synthetic_sequence(
             corridor; or a scene of one's own, for which None means as for the room.
         depth_distortion: what the depth camera always measures wrongly, in steps of disparity, see
             `disparity_distortion`; nothing without noise. None: 0.3 in the house, else 0.
+        changes: things of the room that differ between its two visits (see `room_at_two_visits`); the second one's
+            folder has them in changes.json. The camera goes all around ("round") if no trajectory is given.
+        visit: which of the two, 1 or 2; the second goes the other way round.
         overwrite: replaces a recording of this generator that is already there.
         progress: called with (frames done, frames).
 
@@ -70,12 +78,30 @@ def write_synthetic_sequence(
     Raises:
         SequenceError: impossible arguments, or the folder cannot be written.
     """
-    target = Path(folder)
+    target, made = Path(folder), list[MadeChange]()
+    if changes is not None:
+        scene, made = _scene_of_visit(scene, seed, changes, visit)
+        trajectory = trajectory or "round"
     plan = plan_recording(width, height, frames, seed, noise, trajectory, frame_rate, scene, depth_distortion)
+    poses = plan.poses
+    if visit > 1:  # another hand, and the way back
+        poses = np.ascontiguousarray(camera_path(plan.scene, len(poses), plan.trajectory, seed + 1)[::-1])
     check_target(target, "camera.yaml", overwrite)
     with new_folder(target) as work:
-        write_recording(work, plan, plan.poses, plan.times, progress=progress)
+        write_recording(work, plan, poses, plan.times, number=visit - 1, progress=progress)
+        if visit > 1:
+            text = json.dumps({"changes": [change.to_dict() for change in made]}, indent=1)
+            (work / CHANGES_FILE).write_text(text + "\n", encoding="utf-8")
     return target
+
+
+def _scene_of_visit(scene: Scene | str, seed: int, changes: int, visit: int) -> tuple[Scene, list[MadeChange]]:
+    if scene != "room":
+        raise SequenceError("changes: only the room has two visits")
+    if visit not in (1, 2):
+        raise SequenceError(f"visit: expected 1 or 2, found {visit}")
+    first, second, made = room_at_two_visits(seed, changes)
+    return (first, second)[visit - 1], made
 
 
 @dataclass(frozen=True)

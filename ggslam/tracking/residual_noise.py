@@ -33,10 +33,12 @@ class ResidualNoise:
         residuals: of the latest frames looked at: median depth, and robust standard deviation of the distances of the
             points to the surface, metres.
         frames: seen so far.
+        hidden: how many times as large the noise is taken to be as at first.
     """
 
     residuals: list[tuple[float, float]] = field(default_factory=list)
     frames: int = 0
+    hidden: float = 1.0
 
     def due(self) -> bool:
         """Whether the next frame is looked at; counts it."""
@@ -64,7 +66,9 @@ class ResidualNoise:
             return noise
         depth, found = (float(np.median(values)) for values in zip(*self.residuals, strict=True))
         self.residuals = []
-        return larger_noise(noise, depth, found)
+        larger = larger_noise(noise, depth, found)
+        self.hidden *= larger.sigma(depth) / noise.sigma(depth)
+        return larger
 
 
 def larger_noise(noise: DepthNoise, depth: float, sigma: float) -> DepthNoise:

@@ -96,9 +96,11 @@ def join_points(parts: Sequence[FramePoints], T_first_camera: Sequence[np.ndarra
     moved = [_in_frame(part, T) for part, T in zip(parts, T_first_camera, strict=True)]
     if len(moved) == 1:
         return moved[0]
-    names = ("points", "normals", "covariances", "pixels", "weights")
-    joined = [np.concatenate([getattr(part, name) for part in moved]) for name in names]
-    return FramePoints(*joined, depths=np.concatenate([part.z for part in moved]))
+    return FramePoints(
+        np.concatenate([part.points for part in moved]), np.concatenate([part.normals for part in moved]),
+        np.concatenate([part.covariances for part in moved]), np.concatenate([part.pixels for part in moved]),
+        np.concatenate([part.weights for part in moved]), np.concatenate([part.z for part in moved]),
+    )  # fmt: skip
 
 
 def _in_frame(part: FramePoints, T: np.ndarray) -> FramePoints:

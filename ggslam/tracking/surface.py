@@ -15,7 +15,9 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from ggslam.formats.array_archive import ArrayArchive, Arrays
+from ggslam.geometry.fixed_to_camera import is_in_image_part
 from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.points import PointSource
@@ -128,6 +130,17 @@ class MeasuredSurface:
         self._joined = [numbers]
         self.target = self._gather([self._parts[number] for number in numbers], None, before)
         return self.target
+
+    def drop_pixels(self, part: np.ndarray, nearest: float, camera: Camera) -> None:
+        """Takes out the points that keyframes have in a part of their images, bool [H, W], or nearer than some metres;
+        those in an archive stay."""
+        if self._archive is not None:
+            return
+        for number, old in enumerate(self._parts):
+            stays = ~is_in_image_part(old.points, part, camera) & (old.points[:, 2] >= nearest)
+            self._parts[number] = _Part(number, old.points[stays], old.normals[stays], old.T_world_camera, None)
+        if self.target is not None:
+            self.gather_again()
 
     def gather_again(self) -> None:
         """Makes the target from the keyframes in the order in which it came to be, so that it is the same bit for

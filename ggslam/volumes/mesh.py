@@ -88,10 +88,30 @@ def extract_mesh(tsdf: TsdfMap, min_weight: float = MIN_WEIGHT, min_triangles: i
     finally:
         core.ggslam_mesher_destroy(mesher)
     mesh = Mesh(*arrays)
-    return _without_small_pieces(mesh, min_triangles) if min_triangles > 1 else mesh
+    return without_small_pieces(mesh, min_triangles) if min_triangles > 1 else mesh
 
 
-def _without_small_pieces(mesh: Mesh, min_triangles: int) -> Mesh:
+def join_meshes(parts: list[Mesh]) -> Mesh:
+    """Meshes as one: vertices that are the same bit for bit become one, with what the first has of them."""
+    if not parts:
+        none = np.zeros((0, 3), np.float32)
+        return Mesh(none, none, none.astype(np.uint8), np.zeros(0, np.uint16), none.astype(np.int32))
+    vertices = np.concatenate([part.vertices for part in parts])
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    triangles = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
+    bits = np.ascontiguousarray(vertices + 0.0).view([("", np.float32)] * 3).ravel()  # + 0: -0 and 0 are the same
+    _, first, number = np.unique(bits, return_index=True, return_inverse=True)
+    order = np.argsort(first, kind="stable")
+    rows, place = first[order], np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    normals, colors, labels = (
+        np.concatenate([getattr(part, name) for part in parts])[rows] for name in ("normals", "colors", "labels")
+    )
+    return Mesh(vertices[rows], normals, colors, labels, place[number.reshape(-1)][np.concatenate(triangles)])
+
+
+def without_small_pieces(mesh: Mesh, min_triangles: int) -> Mesh:
+    """A mesh without its connected pieces of fewer triangles."""
     first, second, third = mesh.triangles.T
     rows, columns = np.concatenate([first, second]), np.concatenate([second, third])
     links = coo_array((np.ones(len(rows), bool), (rows, columns)), (len(mesh.vertices),) * 2)

@@ -149,6 +149,7 @@ class TsdfMap:
         T_world_camera: np.ndarray,
         color: np.ndarray | None = None,
         labels: np.ndarray | None = None,
+        within: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> IntegrationStats:
         """Fuses a view.
 
@@ -165,6 +166,7 @@ class TsdfMap:
             T_world_camera: [4, 4] pose.
             color: uint8 [H, W, 3].
             labels: uint16 [H, W], 0: none.
+            within: least and greatest coordinates [3] of blocks; others stay as they are. None: all.
 
         Raises:
             InputError: an image of another size or kind than the camera's, a pose that is not finite and rigid, or
@@ -175,10 +177,14 @@ class TsdfMap:
         numbers = FusionSettings(
             s.min_depth, s.max_depth, s.free_share, s.edge_voxels * s.voxel, s.clearing, s.max_free_weight
         )
+        if within is not None:
+            low, high = (np.asarray(ends).astype(int).tolist() for ends in within)
+            numbers.bounded, numbers.low[:], numbers.high[:] = 1, low, [end + 1 for end in high]
         self._library.ggslam_tsdf_integrate(
             self.handle, self.context.handle, ctypes.byref(view.structure()), ctypes.byref(numbers), ctypes.byref(stats)
         )
-        if not stats.blocks and (unit := wrong_unit(view.depth)):  # looked at only where nothing came of it
+        # Looked at only where nothing came of the view.
+        if not stats.blocks and within is None and (unit := wrong_unit(view.depth)):
             raise InputError(unit)
         return IntegrationStats(*(getattr(stats, field.name) for field in fields(IntegrationStats)))
 

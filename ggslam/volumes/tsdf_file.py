@@ -29,13 +29,18 @@ def save_tsdf(path: str | Path, tsdf: TsdfMap) -> None:
     Raises:
         RunFolderError: the file cannot be written.
     """
+    write_bytes(path, tsdf_to_bytes(tsdf))
+
+
+def tsdf_to_bytes(tsdf: TsdfMap) -> bytes:
+    """Content of the file."""
     blocks = tsdf.blocks()
     # Order in the map depends on its history; in the file it does not.
     order = np.lexsort(blocks.coordinates.T)
     coordinates, dense = blocks.coordinates[order], blocks.dense[order]
     voxels = tsdf.read(coordinates[dense])
     names = [field.name for field in dataclasses.fields(TsdfSettings)]
-    data = arrays_to_bytes(
+    return arrays_to_bytes(
         version=np.array(_VERSION),
         setting_names=np.array(names),
         setting_values=np.array([getattr(tsdf.settings, name) for name in names], float),
@@ -44,7 +49,6 @@ def save_tsdf(path: str | Path, tsdf: TsdfMap) -> None:
         free_weight=blocks.free_weight[order][~dense],
         **{name: getattr(voxels, name) for name in _VOXEL_ARRAYS},
     )
-    write_bytes(path, data)
 
 
 def load_tsdf(path: str | Path, frozen: bool = True, context: NativeContext | None = None) -> TsdfMap:
@@ -58,7 +62,13 @@ def load_tsdf(path: str | Path, frozen: bool = True, context: NativeContext | No
     Raises:
         FormatError: the file is missing or damaged.
     """
-    arrays = read_all_arrays(path, _CONTENT)
+    tsdf = tsdf_of_arrays(read_all_arrays(path, _CONTENT), path, context)
+    tsdf.freeze(frozen)
+    return tsdf
+
+
+def tsdf_of_arrays(arrays: dict[str, np.ndarray], path: str | Path, context: NativeContext | None = None) -> TsdfMap:
+    """The map of a file's arrays; `path` is for messages. Raises FormatError if they are none."""
     settings = _settings(path, arrays)
     dense = _check(path, arrays, "dense", np.int32, (-1, 3))
     free = _check(path, arrays, "free", np.int32, (-1, 3))
@@ -73,8 +83,21 @@ def load_tsdf(path: str | Path, frozen: bool = True, context: NativeContext | No
     tsdf = TsdfMap(settings, context)
     tsdf.write(dense, **voxels)
     tsdf.write_free(free, free_weight)
-    tsdf.freeze(frozen)
     return tsdf
+
+
+def blocks_within(arrays: dict[str, np.ndarray], low: np.ndarray, high: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays of a file without the blocks that lie outside of coordinates low to high [3]."""
+    inside = {name: ((arrays[name] >= low) & (arrays[name] <= high)).all(1) for name in ("dense", "free")}
+    chosen = {name: arrays[name][inside["dense"]] for name in ("dense", *_VOXEL_ARRAYS)}
+    chosen |= {name: arrays[name][inside["free"]] for name in ("free", "free_weight")}
+    return {**arrays, **chosen}
+
+
+def join_blocks(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The arrays of several files, which have no block in common, as of one."""
+    names = ("dense", *_VOXEL_ARRAYS, "free", "free_weight")
+    return {**parts[0], **{name: np.concatenate([part[name] for part in parts]) for name in names}}
 
 
 def _settings(path: str | Path, arrays: dict[str, np.ndarray]) -> TsdfSettings:

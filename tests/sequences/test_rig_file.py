@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +95,30 @@ def test_true_poses_of_another_world_give_way(two: Path) -> None:
     assert (report.instants, report.whole) == (5, 5)
     assert report.cameras[1].off is not None and report.cameras[1].off[1] == pytest.approx(90, abs=0.1)
     assert any("true poses have it 10.0 cm and 90.0 degrees" in warning for warning in report.warnings)
+
+
+def test_other_processes_read_it_too(two: Path) -> None:
+    rig = open_rig(write_rig(two, entry("a", "folder", np.eye(4)), entry("b", "folder")))
+    again = pickle.loads(pickle.dumps(rig))
+    assert len(again) == len(rig) == 10
+    for k in (0, 7):
+        np.testing.assert_array_equal(again[k].depth, rig[k].depth)
+        assert (again[k].instant, again[k].camera_number) == (rig[k].instant, rig[k].camera_number)
+
+
+def test_damaged_images_and_masks_are_told_by_the_rigs_numbers(two: Path) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(two / "folder", two / name)
+    (two / "b" / "depth" / "2.png").write_bytes(b"nothing")
+    (two / "b" / "masks" / "3.png").write_bytes(b"nothing")
+    path = write_rig(two, entry("a", "a", np.eye(4)), entry("b", "b"))
+    rig = open_rig(path, on_bad_frame="skip")
+    assert len(list(rig)) == 9
+    assert [(skipped.index, skipped.source_index) for skipped in rig.skipped_frames] == [(5, 2)]
+    assert "b: " in rig.skipped_frames[0].reason
+    assert list(rig.mask_problems) == [7]
+    with pytest.raises(SequenceError, match="2.png"):
+        list(open_rig(path))
 
 
 def test_a_camera_has_its_own_scale_and_intrinsics(two: Path) -> None:

@@ -20,7 +20,7 @@ from ctypes import (
 from typing import Any
 
 HEADER = "core/volumes.hpp"
-HEADER_SHA256 = "a935f68511659094b2ed9fd538875cf97014c9e21e9b25b5b64193d0f03dfb1c"
+HEADER_SHA256 = "735ad5d952c896406b6cd0854d1702f2e9cc667d8573a8a89a149a17047acc0d"
 
 
 class VoxelArrays(Structure):
@@ -36,7 +36,8 @@ class FusionSettings(Structure):
 
     _fields_ = [
         ("min_depth", c_float), ("max_depth", c_float), ("free_share", c_float), ("edge", c_float),
-        ("clearing", c_float), ("max_free_weight", c_float),
+        ("clearing", c_float), ("max_free_weight", c_float), ("bounded", c_int32), ("low", c_int32 * 3),
+        ("high", c_int32 * 3),
     ]
 
 

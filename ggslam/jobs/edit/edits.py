@@ -131,7 +131,7 @@ def edit_run(
     outcome = EditOutcome(written, [change.text for change in changes], inpainted=inpainting, notes=notes)
     try:
         outcome.filling = _mend(source, scene, recording, settings or InpaintSettings() if inpainting else None, notes)
-        pictures = before_and_after(original, scene.gaussians, changes, source.camera, source.keyframes)
+        pictures = before_and_after(original, scene.gaussians, changes, source.camera_of, source.keyframes)
         named_only = all(edit.kind == "rename" for edit in edits)
         with delay_interrupts():
             outcome.pictures = save_edited(
@@ -162,13 +162,13 @@ class _Source:
     """What an edit needs of a run besides its map.
 
     Attributes:
-        camera: it saw with.
+        camera_of: tells which camera a frame was seen with.
         keyframes: where they are, and how frames were tracked.
         views: of the keyframes.
         displacement: by earlier edits; follows this one.
     """
 
-    camera: Camera
+    camera_of: Callable[[int], Camera]
     keyframes: KeyframesRecord
     views: list[CameraView]
     displacement: Displacement
@@ -180,17 +180,18 @@ class _Source:
         Raises:
             RunFolderError: a file is missing or damaged, naming it.
         """
-        displacement, camera = folder.mark().displacement(), folder.sequence().camera
+        displacement, recording = folder.mark().displacement(), folder.sequence()
         folder.timing()
         record = folder.keyframes()
         if not record.keyframes or not record.poses():
             raise RunFolderError(f"{folder.path / record.FILE}: it lists no keyframes or no tracked frames")
         # Keyframes of the map that the run began with have no images here.
         views = [
-            CameraView(camera, inverse(k.T_world_camera), None if k.frame == ELSEWHERE else k.frame)
+            CameraView(recording.camera, inverse(k.T_world_camera), None) if k.frame == ELSEWHERE
+            else CameraView(recording.camera_of(k.frame), inverse(k.T_world_camera), k.frame)
             for k in record.keyframes
         ]  # fmt: skip
-        return _Source(camera, record, views, displacement)
+        return _Source(recording.camera_of, record, views, displacement)
 
 
 def _apply_all(scene: SegmentedMap, edits: Sequence[Edit], displacement: Displacement) -> list[Change]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -24,15 +24,16 @@ _LOOKED_AT = 60
 
 
 def before_and_after(
-    original: GaussianMap, edited: GaussianMap, changes: Sequence[Change], camera: Camera, record: KeyframesRecord
-) -> dict[str, np.ndarray]:
+    original: GaussianMap, edited: GaussianMap, changes: Sequence[Change], camera_of: Callable[[int], Camera],
+    record: KeyframesRecord,
+) -> dict[str, np.ndarray]:  # fmt: skip
     """Before, after and difference (colour, and depth below) from the frames that show the edits best.
 
     Args:
         original: the map before.
         edited: the map after.
         changes: what was done; changes that cannot be seen make no pictures.
-        camera: of the run.
+        camera_of: tells the camera of a frame.
         record: of the run.
 
     Returns:
@@ -44,14 +45,14 @@ def before_and_after(
     poses = record.poses()
     numbers = np.array(sorted(poses))
     looked_at = numbers[np.unique(np.linspace(0, len(numbers) - 1, _LOOKED_AT).round().astype(int))]
-    views = [CameraView(camera, inverse(poses[frame]), frame) for frame in looked_at.tolist()]
+    views = [CameraView(camera_of(frame), inverse(poses[frame]), frame) for frame in looked_at.tolist()]
     before, after = (join_gaussians([getattr(c, name) for c in visible]) for name in ("before", "after"))
     areas = _areas(original, before, views) + _areas(edited, after, views)
     pictures, rasterizer = {}, CpuRasterizer()
     for number in _best(areas, PICTURES):
         images = []
         for gaussians in (original, edited):
-            out = rasterizer.forward(gaussians, camera, views[number].T_camera_world, features=False)
+            out = rasterizer.forward(gaussians, views[number].camera, views[number].T_camera_world, features=False)
             depth = np.where(out.alpha.numpy() > 0.5, out.expected_depth.numpy(), 0)
             images.append((color_to_uint8(out.image.numpy()), depth))
         (color, depth), (new_color, new_depth) = images

@@ -124,7 +124,9 @@ def _export_store(
 def _widen_for(folder: RunFolder, zoom: float) -> ZoomWidening:
     record = folder.keyframes()
     poses, numbers = record.poses(), record.keyframe_numbers()
-    return ZoomWidening(folder.sequence().camera, [poses[i] for i in sorted(poses) if i in numbers], zoom)
+    chosen, recording = [i for i in sorted(poses) if i in numbers], folder.sequence()
+    cameras = [recording.camera_of(i) for i in chosen]
+    return ZoomWidening(recording.camera, [poses[i] for i in chosen], zoom, cameras)
 
 
 def _format_named(name: str) -> ExportFormat:

@@ -15,6 +15,7 @@ from ggslam.jobs.export.map_files import object_file_name
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.volumes.frames import PosedFrame, frames_of_run
 from ggslam.jobs.volumes.outputs import SMALLEST_PIECE
+from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.table import ObjectTable
 from ggslam.rendering.cpu import CpuRasterizer
@@ -22,6 +23,7 @@ from ggslam.reporting.pictures import color_to_uint8
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MapInParts
 from ggslam.runs.objects_in_parts import ObjectsInParts
+from ggslam.runs.records.keyframes import KeyframeRecord
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.system.atomic import make_folder
@@ -143,15 +145,16 @@ def _map_views(folder: RunFolder) -> _Views:
     keyframes = folder.keyframes().keyframes
     if not keyframes:
         raise RunFolderError(f"{folder.path}: no frame of this run was located")
-    poses = [keyframe.T_world_camera for keyframe in keyframes]
-    return _Views(_renders(folder, poses), len(poses), f"depth rendered at {len(poses)} keyframes")
+    return _Views(_renders(folder, keyframes), len(keyframes), f"depth rendered at {len(keyframes)} keyframes")
 
 
-def _renders(folder: RunFolder, poses: list[np.ndarray]) -> Iterator[PosedFrame]:
-    camera, rasterizer = folder.sequence().camera, CpuRasterizer()
+def _renders(folder: RunFolder, keyframes: list[KeyframeRecord]) -> Iterator[PosedFrame]:
+    recording, rasterizer = folder.sequence(), CpuRasterizer()
     objects = ObjectsInParts.of(folder) if folder.has_objects() else None
     parts: MapInParts = folder.map_in_parts() if objects is None else objects.map
-    for index, T in enumerate(poses):
+    for index, keyframe in enumerate(keyframes):
+        T = keyframe.T_world_camera
+        camera = recording.camera if keyframe.frame == ELSEWHERE else recording.camera_of(keyframe.frame)
         gaussians = parts.in_view(camera, inverse(T))
         view = rasterizer.forward(gaussians, camera, inverse(T), features=objects is not None)
         alpha = view.alpha.numpy()

@@ -25,11 +25,12 @@ IMAGES, DEPTHS, MODEL = "images", "depth", "sparse/0"
 
 @dataclass(frozen=True)
 class _View:
-    """A frame that is exported: its index in the run, pose, and whether it was kept away from training."""
+    """A frame that is exported: its index in the run, pose, whether it was kept away from training, and camera."""
 
     index: int
     T_world_camera: np.ndarray
     held_out: bool
+    camera: Camera
 
     @property
     def name(self) -> str:
@@ -41,14 +42,11 @@ class _Views:
     sequence: Sequence
     views: list[_View]
 
-    @property
-    def camera(self) -> Camera:
-        return self.sequence.camera
-
     def summary(self) -> str:
         """For people."""
         held_out = sum(view.held_out for view in self.views)
-        return f"{len(self.views)} images of {self.camera.width}x{self.camera.height} ({held_out} held out)"
+        sizes = dict.fromkeys(f"{view.camera.width}x{view.camera.height}" for view in self.views)
+        return f"{len(self.views)} images of {', '.join(sizes)} ({held_out} held out)"
 
 
 def export_colmap(
@@ -76,8 +74,8 @@ def export_colmap(
     make_folder(out / MODEL)
     written = list(_write_images(views, out, with_depth=False))
     write_colmap_model(
-        out / MODEL, views.camera, [v.name for v in written], [v.T_world_camera for v in written], cloud.points,
-        cloud.colors,
+        out / MODEL, [v.camera for v in written], [v.name for v in written], [v.T_world_camera for v in written],
+        cloud.points, cloud.colors,
     )  # fmt: skip
     write_text(out / MODEL / "test.txt", "".join(f"{v.name}\n" for v in written if v.held_out))
     return f"wrote {out}: {_Views(views.sequence, written).summary()}, {len(cloud)} points, COLMAP"
@@ -93,9 +91,10 @@ def export_nerfstudio(
     written = list(_write_images(views, out, with_depth=True))
     write_metric_points(out / "points.ply", cloud)
     frames = [
-        TransformsFrame(f"{IMAGES}/{v.name}", f"{DEPTHS}/{v.name}", v.T_world_camera, v.held_out) for v in written
+        TransformsFrame(f"{IMAGES}/{v.name}", f"{DEPTHS}/{v.name}", v.T_world_camera, v.held_out, v.camera)
+        for v in written
     ]
-    write_transforms(out / "transforms.json", views.camera, frames, "points.ply")
+    write_transforms(out / "transforms.json", frames, "points.ply")
     return f"wrote {out}: {_Views(views.sequence, written).summary()} with depth, {len(cloud)} points, nerfstudio"
 
 
@@ -103,12 +102,10 @@ def _views(folder: RunFolder, keyframes_only: bool, recording: Path | None) -> _
     record, evaluation = folder.keyframes(), folder.config().evaluation
     keyframes = record.keyframe_numbers()
     read, views = folder.sequence(), []
-    if len({part.camera for part in read.parts or []}) > 1:
-        raise ConfigError(f"{folder.path}: was merged from recordings of several cameras, and these formats know one")
     for index, T_world_camera in sorted(record.poses().items()):
         held_out = evaluation.is_held_out(read.own_number(index)) and index not in keyframes
         if held_out or index in keyframes or not keyframes_only:
-            views.append(_View(index, T_world_camera, held_out))
+            views.append(_View(index, T_world_camera, held_out, read.camera_of(index)))
     if not views:
         raise RunFolderError(f"{folder.path}: no frame of this run was located")
     return _Views(open_recording_of(folder, recording), views)

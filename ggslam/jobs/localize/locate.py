@@ -26,6 +26,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.sequences.rig import one_camera
 from ggslam.sequences.sequence import Sequence
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
@@ -178,7 +179,7 @@ def _open_recording(request: LocalizeRequest) -> Sequence | ScanSequence:
     if request.sequence.format is None and scan_files(path):
         wanted = request.sequence
         return ScanSequence(path, wanted.start, wanted.stop, wanted.stride, request.columns)
-    return request.sequence.open()
+    return one_camera(request.sequence.open(), "localising")
 
 
 def _start(request: LocalizeRequest, truth: np.ndarray | None) -> np.ndarray | None:

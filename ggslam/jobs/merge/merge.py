@@ -14,20 +14,19 @@ import torch
 
 from ggslam.errors import ConfigError
 from ggslam.jobs.merge.merged_run import MergedRun
+from ggslam.jobs.merge.placing import find_joint_poses, place_maps
 from ggslam.jobs.merge.seams import SeamTraining, keyframes_of
 from ggslam.jobs.merge.sources import MergeSource, read_sources
 from ggslam.jobs.progress import Observer, SilentObserver
-from ggslam.merging.common_ground import CommonGround, find_common_ground
 from ggslam.merging.coverage import Coverage, PlacedRun
-from ggslam.merging.joint_graph import JointPoses, Pair, attachment_order, solve_joint_graph
-from ggslam.merging.moving import append_map, move_map, with_channels
+from ggslam.merging.joint_graph import JointPoses
+from ggslam.merging.moving import append_map
 from ggslam.merging.objects import UnitedObjects
 from ggslam.merging.ownership import Ownership
 from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import delay_interrupts
 
@@ -125,9 +124,9 @@ class _Merge:
     def run(self) -> MergeOutcome:
         """From places to a run folder."""
         sources, notes = self.sources, list[str]()
-        poses = self._find_poses()
+        poses = find_joint_poses(sources, self.settings, self.context, self.observer, self.clock.lap)
         outcome = MergeOutcome(self.folder, poses, seconds=self.clock.seconds, notes=notes)
-        placed = self._place(poses)
+        placed = place_maps(sources, poses)
         objects = UnitedObjects(self.settings.uniting)
         seams = self._find_seams(placed)
         gaussians = self._join(placed, objects, outcome)
@@ -153,56 +152,9 @@ class _Merge:
         self.clock.lap("write")
         return outcome
 
-    def _find_poses(self) -> JointPoses:
-        """Common ground of all pairs of runs, and where their keyframes are by it.
-
-        Raises:
-            ConfigError: a run has too little in common with the others.
-        """
-        runs = [source.known for source in self.sources]
-        needed = min(self.settings.confirmations, *(len(run) for run in runs))
-        grounds: dict[Pair, CommonGround] = {}
-        for b in range(1, len(runs)):
-            for a in range(b):
-                self.observer.begin(f"common ground of {a + 1} and {b + 1}", min(len(runs[b]), self.settings.queries))
-                found = find_common_ground(runs[a], runs[b], self.settings, self.context, self.observer.advance)
-                grounds[a, b] = found
-        self.clock.lap("ground")
-        order = attachment_order(len(runs), grounds, needed)
-        joined = {0, *(new for _, new in order)}
-        for alone in range(len(runs)):
-            if alone not in joined:
-                raise ConfigError(self._refusal(alone, joined, grounds, needed))
-        poses = solve_joint_graph(runs, grounds, order, needed, self.settings)
-        self.clock.lap("graph")
-        return poses
-
-    def _refusal(self, alone: int, joined: set[int], grounds: dict[Pair, CommonGround], needed: int) -> str:
-        """Why a run cannot be merged, by the run that has most in common with it."""
-        tried = {other: grounds[min(alone, other), max(alone, other)] for other in joined}
-        other = max(tried, key=lambda k: (len(tried[k].agreeing), len(tried[k].links), tried[k].score))
-        return (
-            f"{self.sources[alone].name}: no common ground with {self.sources[other].name}: "
-            f"{tried[other].verdict(needed)}"
-        )
-
     def _median_depth(self) -> float:
         """Of what keyframes measured, metres."""
         return float(np.median(np.concatenate([p[:, 2] for s in self.sources for p in s.known.points])))
-
-    def _place(self, poses: JointPoses) -> list[PlacedRun]:
-        """All maps in the first run's world, with the same channels."""
-        for source in self.sources:
-            source.read_map()
-        degree = max(source.gaussians.sh_degree for source in self.sources)
-        channels = IDENTITY_CHANNELS if any(source.objects is not None for source in self.sources) else 0
-        placed = []
-        for source, T_new_old in zip(self.sources, poses.T_new_old, strict=True):
-            move_map(source.gaussians, T_new_old)
-            source.gaussians = with_channels(source.gaussians, degree, channels)
-            T_world_camera = T_new_old @ source.known.keyframe_poses
-            placed.append(PlacedRun(source.gaussians, source.known.cameras, T_world_camera))
-        return placed
 
     def _find_seams(self, placed: list[PlacedRun]) -> list[np.ndarray]:
         """Which keyframes of each run see what another run's map shows, bool [K] each."""

@@ -107,7 +107,8 @@ class MergeSource:
         """Its recordings as parts of the whole's, with their own numbering of masks."""
         if self.recording.parts is not None:
             return list(self.recording.parts)
-        values = {name: getattr(self.recording, name) for name in ("open", "format", "camera")}
+        names = ("open", "format", "camera", *(("rig",) if self.recording.rig is not None else ()))
+        values = {name: getattr(self.recording, name) for name in names}
         return [PartRecord(run=self.place, frames=self.frame_count, **values)]
 
     def run_objects(self) -> RunObjects | None:

@@ -25,7 +25,6 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MapInParts
 from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.runs.publishing import change_in_run
-from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 from ggslam.system.atomic import make_folder
@@ -72,26 +71,25 @@ def render_frames(
     unknown = [kind for kind in what if kind not in KINDS]
     if unknown:
         raise ConfigError(f"`what`: expected some of {','.join(KINDS)}, found {unknown[0]!r}")
-    camera = folder.sequence().camera
-    if width is not None:
-        camera = camera.resize(width, round(camera.height * width / camera.width))
     objects = ObjectsInParts.of(folder) if set(what) & set(OBJECT_KINDS) else None
     parts = folder.map_in_parts() if objects is None else objects.map
     make_folder(out)
     with change_in_run(out):
-        return _render(folder, frames, what, out, camera, parts, objects, progress)
+        return _render(folder, frames, what, out, width, parts, objects, progress)
 
 
 def _render(
-    folder: RunFolder, frames: list[int], what: list[str], out: Path, camera: Camera, parts: MapInParts,
+    folder: RunFolder, frames: list[int], what: list[str], out: Path, width: int | None, parts: MapInParts,
     objects: ObjectsInParts | None, progress: Callable[[int], None],
 ) -> list[Path]:  # fmt: skip
     rasterizer = CpuRasterizer()
     painters = _painters() if objects is None else {**_painters(), **_object_painters(objects, rasterizer, what)}
-    poses = folder.keyframes().poses()
+    poses, recording = folder.keyframes().poses(), folder.sequence()
     written = []
     for done, frame in enumerate(frames):
-        T_camera_world = inverse(poses[frame])
+        T_camera_world, camera = inverse(poses[frame]), recording.camera_of(frame)
+        if width is not None:
+            camera = camera.resize(width, round(camera.height * width / camera.width))
         gaussians = parts.in_view(camera, T_camera_world)
         view = rasterizer.forward(gaussians, camera, T_camera_world, features=objects is not None)
         for kind in what:

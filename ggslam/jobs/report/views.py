@@ -39,11 +39,12 @@ def saved_views(folder: RunFolder) -> list[FrameView]:
     """The pictures that scoring left, cut apart."""
     files = sorted(folder.path.glob("renders/compare*.png"))
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, VIEWS).round().astype(int))] if files else []
-    camera = folder.sequence().camera if chosen else None
+    recording = folder.sequence() if chosen else None
     views = []
     for path in chosen:
         number = re.fullmatch(r"compare(\d+)", path.stem)
-        if camera is not None and number is not None:
+        if recording is not None and number is not None:
+            camera = recording.camera_of(int(number[1]))
             views.append(FrameView(int(number[1]), _cut(path, camera.height, camera.width)))
     return views
 
@@ -80,12 +81,12 @@ def rendered_views(folder: RunFolder, sequence: Sequence | None, frames: Iterabl
         sequence: its recording, or None.
         frames: indices of frames that were located.
     """
-    camera, poses = folder.sequence().camera, folder.keyframes().poses()
+    recording, poses = folder.sequence(), folder.keyframes().poses()
     objects = ObjectsInParts.of(folder) if folder.has_objects() else None
     parts = folder.map_in_parts() if objects is None else objects.map
     rasterizer, views = CpuRasterizer(), []
     for number in frames:
-        T_camera_world = inverse(poses[number])
+        T_camera_world, camera = inverse(poses[number]), recording.camera_of(number)
         gaussians = parts.in_view(camera, T_camera_world)
         shown = rasterizer.forward(gaussians, camera, T_camera_world, features=objects is not None)
         color = color_to_uint8(shown.image.numpy())

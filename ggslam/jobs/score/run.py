@@ -34,10 +34,13 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
 from ggslam.sequences.rig import RigSequence
+from ggslam.slam.camera_fixtures import CameraFixtures, find_fixtures
 from ggslam.system.atomic import make_folder, write_text
 
 PICTURES = 6
 """Comparison pictures written to renders/, spread over the recording."""
+LOOKED_AT = 48
+"""Frames in which is looked for what is fixed to the camera, spread likewise, if there is anything."""
 
 
 def score_run(
@@ -72,7 +75,9 @@ def _score(
     scorer = _object_scorer(folder, sequence, sets)
     rig = RigScores(sequence, sets) if isinstance(sequence, RigSequence) else None
     asked = sets if rig is None else {**sets, **rig.sets()}
-    images = _images(folder, record, sequence, asked, scorer, metric, observer)
+    looked_at = _spread(poses, LOOKED_AT if rig is None else 0)
+    fixtures = find_fixtures((sequence.frame(i) for i in looked_at), poses)
+    images = _images(folder, record, sequence, asked, scorer, metric, observer, fixtures)
     metrics = MetricsRecord.of({
         "trajectory": _trajectory(sequence, poses) if rig is None else rig.trajectory(poses),
         "images": {name: images[name] for name in sets},
@@ -87,6 +92,9 @@ def _score(
         notes.append("no frame was held out; every score is over frames that the map was or could be trained on")
     if len(poses) and max(poses) + 1 < len(sequence):
         notes.append(f"the run ends at frame {max(poses)} of {len(sequence)}; scores are of its part")
+    if fixtures.mask is not None:
+        share = fixtures.mask.mean()
+        notes.append(f"{share:.0%} of every image is fixed to the camera; its pixels count as without depth")
     lost = [f.frame for f in record.frames if f.is_lost]
     if lost:
         notes.append(f"{len(lost)} frames were lost (the first: {lost[0]}); they have no pose and are in no score")
@@ -154,12 +162,11 @@ def _segmentation_notes(folder: RunFolder, scored: bool, masks: Path | None) -> 
 
 def _images(
     folder: RunFolder, record: KeyframesRecord, sequence: Sequence, sets: dict[str, set[int]],
-    scorer: ObjectScorer | None, lpips: Lpips | None, observer: Observer,
+    scorer: ObjectScorer | None, lpips: Lpips | None, observer: Observer, fixtures: CameraFixtures,
 ) -> dict[str, Any]:  # fmt: skip
     poses = record.poses()
     keyframes, held_out = sets["keyframes"], sets["held_out"]
-    spread = np.linspace(0, len(poses) - 1, min(PICTURES, len(poses))).round().astype(int)
-    pictured = set(np.array(sorted(poses))[spread].tolist())
+    pictured = set(_spread(poses, PICTURES))
     make_folder(folder.path / "renders")
     show = _shower(folder, poses, pictured, scorer, any(k.is_exposed for k in record.keyframes))
     rows: list[dict[str, Any]] = []
@@ -173,10 +180,16 @@ def _images(
     frames = _up_to(max(poses, default=-1), sequence, masks=scorer is not None and sequence.has_masks)
     if isinstance(sequence, RigSequence):
         frames = (frame for frame in frames if shows_anything(frame))
-    means = score_images(show, frames, sets, lpips, note)
+    means = score_images(show, map(fixtures.clean, frames), sets, lpips, note)
     observer.advance(len(sequence), len(sequence))
     _write_rows(folder, rows)
     return {name: mean.to_dict() for name, mean in means.items()}
+
+
+def _spread(poses: dict[int, np.ndarray], count: int) -> list[int]:
+    """Frames with a pose, no more than `count`, spread evenly."""
+    rows = np.linspace(0, len(poses) - 1, min(count, len(poses))).round().astype(int)
+    return [int(frame) for frame in np.array(sorted(poses), int)[rows]]
 
 
 def _up_to(last: int, sequence: Sequence, masks: bool) -> Iterator[Frame]:

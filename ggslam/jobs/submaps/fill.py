@@ -20,6 +20,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import MARKER
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.scene.frame import Frame
+from ggslam.sequences.rig import one_camera
 from ggslam.submaps.cell_records import CellChange
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
@@ -164,7 +165,7 @@ def _open(
     if scan_files(request.source):
         scans = ScanSequence(request.source, wanted.start, wanted.stop, wanted.stride, request.columns)
         return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights()
-    frames = wanted.open()
+    frames = one_camera(wanted.open(), "a store of cells")
     sights = FrameSights(frames.camera, NativeContext())
     return frames.stream(masks=False), _poses(request, frames.timestamps, frames.ground_truth), sights
 

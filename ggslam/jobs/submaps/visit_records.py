@@ -9,10 +9,11 @@ import logging
 
 import numpy as np
 
-from ggslam.errors import GgslamError
+from ggslam.errors import ConfigError, GgslamError
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.rendering.exposure import identity_exposure
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import open_recorded
 from ggslam.runs.records.keyframes import KeyframeRecord
 from ggslam.runs.records.visit import VisitRecord
 from ggslam.slam.config import config_to_dict
@@ -60,3 +61,27 @@ def read_record(store: GridStore, visit: str) -> VisitRecord | None:
     """
     data = read_visit(store, visit)
     return None if data is None else VisitRecord.parse(data, str(visit_file(store.path, visit)))
+
+
+def records_of_store(store: GridStore) -> list[VisitRecord]:
+    """What is known of the runs that filled a store, in the order of their visits.
+
+    Raises:
+        ConfigError: nothing, or the recording of one is not there any more; says which.
+        FormatError: a record is damaged.
+    """
+    records = []
+    for visit in store.visits():
+        record = read_record(store, visit)
+        if record is None:
+            continue
+        try:
+            open_recorded(record.sequence, record.run)
+        except GgslamError as error:
+            raise ConfigError(f"{store.path}: the recording of visit {visit!r} is needed: {error}") from None
+        records.append(record)
+    if not records:
+        raise ConfigError(
+            f"{store.path}: nothing is known of the recordings that it is from: make it again from its runs"
+        )
+    return records

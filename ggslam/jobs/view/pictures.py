@@ -40,22 +40,22 @@ class ViewPictures:
     Args:
         gaussians: the map.
         segmented: the same with its objects, if it has any.
-        camera: of the recording.
+        camera_of: tells the camera of a frame.
         recorded: gives a frame's images, None if the recording is not there.
     """
 
     def __init__(
-        self, gaussians: GaussianMap, segmented: SegmentedMap | None, camera: Camera,
+        self, gaussians: GaussianMap, segmented: SegmentedMap | None, camera_of: Callable[[int], Camera],
         recorded: Callable[[int], Frame | None],
     ) -> None:  # fmt: skip
-        self._gaussians, self._segmented, self._camera, self._recorded = gaussians, segmented, camera, recorded
+        self._gaussians, self._segmented, self._camera_of, self._recorded = gaussians, segmented, camera_of, recorded
         self._rasterizer = CpuRasterizer()
         self.identity: IdentityColors | None = None if segmented is None else _identity_colors(segmented)
 
     def compare(self, frame: int, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `ViewedMap.frame_picture`."""
-        segmented = self._segmented
-        camera = self._camera.resize(CELL_WIDTH, round(self._camera.height * CELL_WIDTH / self._camera.width))
+        segmented, whole = self._segmented, self._camera_of(frame)
+        camera = whole.resize(CELL_WIDTH, round(whole.height * CELL_WIDTH / whole.width))
         view = self._rasterizer.forward(
             self._gaussians, camera, inverse(T_world_camera), features=segmented is not None
         )

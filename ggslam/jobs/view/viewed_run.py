@@ -59,7 +59,8 @@ class ViewedRun:
         self._edits: list[Edit] = []
         self._texts: list[str] = []
         record = folder.keyframes()
-        self.camera: Camera = folder.sequence().camera
+        self._record = folder.sequence()
+        self.camera: Camera = self._record.camera
         self.frame_poses: dict[int, np.ndarray] = dict(sorted(record.poses().items()))
         self.keyframe_poses = np.array([k.T_world_camera for k in record.keyframes]).reshape(-1, 4, 4)
         if not self.frame_poses:
@@ -85,7 +86,9 @@ class ViewedRun:
 
     def _map_changed(self) -> None:
         """What was worked out of the map before an edit holds no more."""
-        self._pictures = ViewPictures(self._gaussians, self._segmented, self.camera, self._recorded_frame)
+        self._pictures = ViewPictures(
+            self._gaussians, self._segmented, self._record.camera_of, self._recorded_frame
+        )
         self._shown: tuple[np.ndarray, Splats] | None = None
 
     def _recorded_frame(self, frame: int) -> Frame | None:

@@ -107,7 +107,7 @@ def frames_of_run(
             source.label = _own_mask
         else:
             keyframes = record.keyframe_numbers()
-            source.label = _RenderedIds(segmented, folder.sequence().camera, keyframes)
+            source.label = _RenderedIds(segmented, folder.sequence().camera_of, keyframes)
     return source
 
 
@@ -148,15 +148,15 @@ def _own_mask(frame: Frame, T_world_camera: np.ndarray) -> np.ndarray | None:
 class _RenderedIds:
     """Object ids as a run's map shows them, in its keyframes."""
 
-    def __init__(self, segmented: SegmentedMap, camera: Camera, keyframes: set[int]) -> None:
-        self._segmented, self._camera, self._keyframes = segmented, camera, keyframes
+    def __init__(self, segmented: SegmentedMap, camera_of: Callable[[int], Camera], keyframes: set[int]) -> None:
+        self._segmented, self._camera_of, self._keyframes = segmented, camera_of, keyframes
         self._rasterizer = CpuRasterizer()
 
     def __call__(self, frame: Frame, T_world_camera: np.ndarray) -> np.ndarray | None:
         if frame.index not in self._keyframes:
             return None
         gaussians, T_camera_world = self._segmented.gaussians, inverse(T_world_camera)
-        view = self._rasterizer.forward(gaussians, self._camera, T_camera_world, features=True)
+        view = self._rasterizer.forward(gaussians, self._camera_of(frame.index), T_camera_world, features=True)
         ids = object_ids(self._rasterizer, view, self._segmented)
         size = (frame.camera.width, frame.camera.height)
         return ids if ids.shape[::-1] == size else cv2.resize(ids, size, interpolation=cv2.INTER_NEAREST)

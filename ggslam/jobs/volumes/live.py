@@ -42,9 +42,8 @@ class LiveVolumes:
         if report.frame.status == TrackingStatus.LOST.value:
             return
         T = slam.pose_of(report.frame)
-        newest = slam.mapper.keyframes[-1] if slam.mapper.keyframes else None
-        known = self._objects and newest is not None and newest.frame_index == frame.index
-        labels = newest.mask if known and newest is not None else None
+        newest = slam.mapper.keyframes[-len(slam.cameras) :] if self._objects else []
+        labels = next((keyframe.mask for keyframe in newest if keyframe.frame_index == frame.index), None)
         self.maps.add(frame, T, labels, report.seconds + time.perf_counter() - start)
         self._saw(frame, T)
 

@@ -23,6 +23,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.exposure import change_of, measure_exposure, without_exposure
 from ggslam.rendering.types import RenderBuffers
+from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -70,6 +71,10 @@ class CpuMapper(Mapper):
         self._pose_optimizers = [PoseAdam() for _ in keyframes]
         self._exposure_optimizers = [ExposureAdam(self.settings.exposure) for _ in keyframes]
 
+    def render_view(self, camera: Camera, T_camera_world: np.ndarray) -> RenderBuffers:
+        """The map as a camera sees it from a pose [4, 4], without identities; not beside `run`."""
+        return self._rasterizer.forward(self.map, camera, T_camera_world, features=False)
+
     def _new_keyframe(self, frame: Frame, T_world_camera: np.ndarray) -> Keyframe:
         self._pose_optimizers.append(PoseAdam())
         self._exposure_optimizers.append(ExposureAdam(self.settings.exposure))
@@ -86,6 +91,9 @@ class CpuMapper(Mapper):
             where = find_unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
             color = self._compensate(keyframe, depth, view)
+        valid = self._valid_of(keyframe)
+        if valid is not None:
+            alpha = np.where(valid, alpha, np.float32(1))  # where images show nothing there is nothing to fill
         if self.identity is not None and labeller is not None:
             self._take_labels(keyframe, labeller(keyframe, show))
         parts = [new_gaussians(color, depth, keyframe.camera, T_world_camera, where, s)]

@@ -68,6 +68,7 @@ void CandidateSearch::search(std::size_t cell, CandidateCount& count, std::vecto
 
 void CandidateSearch::descend(BlockCoordinates at, int side, CandidateCount& count,
                               std::vector<Candidate>& out) const {
+  if (!wanted(at, side)) return;
   const Cube cube = this->cube(at, side);
   Footprint area;
   if (!footprint(cube, side, area)) return;
@@ -91,7 +92,16 @@ void CandidateSearch::descend(BlockCoordinates at, int side, CandidateCount& cou
     descend({at.x + half * (child & 1), at.y + half * (child >> 1 & 1), at.z + half * (child >> 2)}, half, count, out);
 }
 
+bool CandidateSearch::wanted(BlockCoordinates at, int side) const {
+  if (settings_.bounded == 0) return true;
+  const int32_t first[3] = {at.x, at.y, at.z};
+  for (int a = 0; a < 3; ++a)
+    if (first[a] >= settings_.high[a] || first[a] + side <= settings_.low[a]) return false;
+  return true;
+}
+
 void CandidateSearch::emit(BlockCoordinates at, Sight sight, CandidateCount& count, std::vector<Candidate>& out) const {
+  if (!wanted(at, 1)) return;
   const auto row = static_cast<int32_t>(map_.find(at));
   count.add(1, sight == Sight::surface || (sight == Sight::partial && row < 0));
   out.push_back({at, sight, cube(at, 1).centre[2], row});

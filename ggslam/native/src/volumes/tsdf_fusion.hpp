@@ -111,6 +111,8 @@ class CandidateSearch {
   Vec3i first_, count_;
 
   void descend(BlockCoordinates at, int side, CandidateCount& count, std::vector<Candidate>& out) const;
+  // Whether a cube of side^3 blocks has some that are looked at.
+  bool wanted(BlockCoordinates at, int side) const;
   void emit(BlockCoordinates at, Sight sight, CandidateCount& count, std::vector<Candidate>& out) const;
   void emit_free(BlockCoordinates at, int side, CandidateCount& count, std::vector<Candidate>& out) const;
   Cube cube(BlockCoordinates at, int side) const;

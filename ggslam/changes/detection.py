@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which objects were added, removed, moved or changed in look between two visits, and of which nothing can be said."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from ggslam.changes.settings import ChangeSettings
+from ggslam.changes.shapes import Fit, Shape, fit_shapes
+from ggslam.changes.sightings import Sightings, Surface, Tolerance, Visit
+from ggslam.changes.things import UNNAMED, JudgedSurface, Thing, things_by_id, things_by_surface
+from ggslam.native.loader import NativeContext
+from ggslam.scene.poses import transform_points, turning_angle
+from ggslam.volumes.upright import estimate_up
+
+Kind = Literal["moved", "removed", "added", "look", "unseen"]
+_SAME_PLACE = 0.03
+"""Metres: points of two visits so near to each other may be one thing's."""
+_SAMPLE, _FAR_TOLERANCES = 20_000, 4
+"""Points that usual differences are measured at, up to so many times the least tolerance."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What became of a thing.
+
+    Attributes:
+        kind: see `Kind`; "unseen": of the older visit, and the newer one did not look there.
+        old, new: the thing in either visit; None: it is not there.
+        T_new_old: float64 [4, 4], world: what moved; None of other kinds.
+        fit: how a moved thing's surfaces lie upon each other.
+        confidence: 0 to 1.
+    """
+
+    kind: Kind
+    old: Thing | None
+    new: Thing | None
+    T_new_old: np.ndarray | None = None
+    fit: Fit | None = None
+    confidence: float = 1.0
+
+
+@dataclass
+class Detection:
+    """What was found.
+
+    Attributes:
+        changes: of all kinds but "unseen", the surest first.
+        unseen: of the older visit.
+        ids_believed: whether one id means one thing in both visits.
+        stayed: number of objects of the older visit that are where they were.
+        tolerance: how near surfaces had to be to be one.
+        notes: what the user should know.
+    """
+
+    changes: list[Change] = field(default_factory=list)
+    unseen: list[Change] = field(default_factory=list)
+    ids_believed: bool = False
+    stayed: int = 0
+    tolerance: Tolerance = field(default_factory=lambda: Tolerance(0.0, 0.0))
+    notes: list[str] = field(default_factory=list)
+
+
+class ChangeDetector:
+    """Compares two visits.
+
+    Args:
+        old, new: the visits, in one world.
+        settings: see there.
+        context: threads.
+        ids: whether one id is one thing in both visits; None: it is found out.
+    """
+
+    def __init__(
+        self, old: Visit, new: Visit, settings: ChangeSettings, context: NativeContext, ids: bool | None = None
+    ) -> None:
+        self.visits, self.settings, self._ids = (old, new), settings, ids
+        self.sights = [Sightings(visit, settings, context) for visit in self.visits]
+        self._up = estimate_up(old.T_world_camera, old.measured, old.normals).up
+        self.judged: list[JudgedSurface] = []
+        self.things: list[list[Thing]] = [[], []]
+
+    def detect(self) -> Detection:
+        """Finds all changes."""
+        found = Detection()
+        surfaces = [sights.surface(self.settings.spacing_m) for sights in self.sights]
+        found.tolerance = self._usual_tolerance(surfaces)
+        self.judged = [self._judge(number, surface, found.tolerance) for number, surface in enumerate(surfaces)]
+        both = all(visit.has_objects for visit in self.visits)
+        found.ids_believed = both and (self._ids_agree() if self._ids is None else self._ids)
+        if not both:
+            found.notes.append("a visit has no objects: changes are told by surfaces alone")
+        split = things_by_id if found.ids_believed else things_by_surface
+        self.things = [split(judged, self.settings) for judged in self.judged]
+        self._compare(found)
+        found.changes.sort(key=lambda change: -change.confidence)
+        return found
+
+    # --- evidence ----------------------------------------------------------------------------------------------------
+
+    def _usual_tolerance(self, surfaces: list[Surface]) -> Tolerance:
+        """How near surfaces have to be to be one: by how much the visits differ where nothing changed."""
+        s, offsets = self.settings, []
+        for number, surface in enumerate(surfaces):
+            sample = surface.points[:: max(1, len(surface.points) // _SAMPLE)]
+            least = Tolerance(_FAR_TOLERANCES * s.tolerance_m, _FAR_TOLERANCES * s.tolerance_relative)
+            other = self.sights[1 - number].look_up(sample, least)
+            offsets.append(np.abs(other.offset[np.isfinite(other.offset)]))
+        usual = np.concatenate(offsets)
+        spread = float(np.median(usual)) if len(usual) else 0.0
+        return Tolerance(s.tolerance_m, max(s.tolerance_relative, s.tolerance_spread * spread))
+
+    def _judge(self, number: int, surface: Surface, tolerance: Tolerance) -> JudgedSurface:
+        own = self.sights[number].look_up(surface.points, tolerance)
+        kept = (own.through <= self.settings.contradicted * own.present) & (own.present >= self.settings.min_views)
+        points, ids = surface.points[kept], surface.labels[kept].astype(np.int64)
+        other = self.sights[1 - number].look_up(points, tolerance)
+        distance = cKDTree(self.visits[number].T_world_camera[:, :3, 3]).query(points)[0]
+        return JudgedSurface(points, surface.colors[kept], ids, other, tolerance.at(distance))
+
+    def _ids_agree(self) -> bool:
+        """Whether things that stayed have the same ids in both visits."""
+        same, count = 0, 0
+        old, new = self.judged
+        tree = cKDTree(new.points) if len(new.points) else None
+        stayed = old.other.is_there(self.settings.min_views) & (old.ids > 0)
+        for i in np.unique(old.ids[stayed]).tolist():
+            own = old.ids == i
+            rows = np.flatnonzero(stayed & own)
+            if tree is None or len(rows) < max(self.settings.min_points, self.settings.whole * own.sum()):
+                continue  # what stayed of a thing that went are the places where it touched others
+            apart, nearest = tree.query(old.points[rows], distance_upper_bound=_SAME_PLACE)
+            names = new.ids[nearest[np.isfinite(apart)]]
+            if len(names):
+                count += 1
+                same += int(np.bincount(names).argmax() == i)
+        return count > 0 and same >= self.settings.ids_alike * count
+
+    # --- verdicts ----------------------------------------------------------------------------------------------------
+
+    def _compare(self, found: Detection) -> None:
+        gone, come = ([t for t in things if self._is_changed(t, found.ids_believed)] for things in self.things)
+        if found.ids_believed:
+            self._pair_by_id(found, gone, come)
+            self._find_replaced(gone, come)
+        else:
+            self._pair_by_shape(found, gone, come)
+            self._find_swapped(gone, come)
+        found.changes += [Change("removed", thing, None, confidence=_confidence(thing)) for thing in gone]
+        found.changes += [Change("added", None, thing, confidence=_confidence(thing)) for thing in come]
+        self._compare_looks(found)
+        known = {id(change.old) for change in found.changes}
+        for thing in self.things[0]:
+            if thing.seen < self.settings.min_seen:
+                found.unseen.append(Change("unseen", thing, None))
+            elif id(thing) not in known:
+                found.stayed += 1
+
+    def _is_changed(self, thing: Thing, ids_believed: bool) -> bool:
+        """Where ids say nothing, what is gone of an object is a thing of its own."""
+        s = self.settings
+        changed = thing.seen >= s.min_seen and thing.changed >= s.min_changed
+        return changed and (ids_believed or thing.label >= UNNAMED)
+
+    def _shape(self, number: int, thing: Thing) -> Shape:
+        judged = self.judged[number]
+        return Shape(judged.points[thing.rows], judged.colors[thing.rows])
+
+    def _fit(self, old: Thing, new: Thing) -> Fit | None:
+        before, after = self._shape(0, old), self._shape(1, new)
+        if min(len(before.points), len(after.points)) < self.settings.min_points:
+            return None
+        small, large = sorted((before.extent(), after.extent()))
+        if large > self.settings.max_size_ratio * small:
+            return None
+        return fit_shapes(before, after, self.sights[0], self.sights[1], self._up, self.settings)
+
+    def _motion_change(self, old: Thing, new: Thing, fit: Fit) -> Change | None:
+        """The change that a fit tells; None: it did not move by more than the maps err."""
+        s, shape = self.settings, self._shape(0, old)
+        middle, error = shape.points.mean(0), 0.5 * float(self.judged[0].within[old.rows].mean())
+        shift = float(np.linalg.norm(transform_points(middle[None], fit.T_new_old)[0] - middle))
+        turn = float(np.degrees(turning_angle(fit.T_new_old, np.eye(4))))
+        least_turn = max(s.least_turn_deg, float(np.degrees(error / (0.5 * shape.extent()))))
+        if shift < max(s.least_motion_m, error) and turn < least_turn:
+            return None
+        confidence = fit.share * min(1.0, max(0.0, 1 - fit.color_apart))
+        return Change("moved", old, new, fit.T_new_old, fit, confidence)
+
+    def _pair_by_id(self, found: Detection, gone: list[Thing], come: list[Thing]) -> None:
+        """What has one id in both visits, and is elsewhere: takes it from `gone` and `come`."""
+        s, ours, theirs = self.settings, *({t.label: t for t in things} for things in self.things)
+        for label in sorted({t.label for t in (*gone, *come) if t.label < UNNAMED}):
+            old, new = ours.get(label), theirs.get(label)
+            if old is None or new is None:
+                continue
+            unseen = min(old.seen, new.seen) < s.min_seen  # of what one visit hardly saw nothing is said
+            for things, thing in ((gone, old), (come, new)):
+                if thing in things:
+                    things.remove(thing)
+            fit = None if unseen else self._fit(old, new)
+            # Where surfaces do not fit, as of a cloth, both places have to have changed as a whole.
+            if fit is not None and min(old.changed, new.changed) >= (
+                s.min_changed if fit.share >= s.min_fit else s.whole
+            ):
+                change = self._motion_change(old, new, fit)
+                if change is not None:
+                    found.changes.append(change)
+
+    def _find_replaced(self, gone: list[Thing], come: list[Thing]) -> None:
+        """What stands where something else of another id stood: that was removed, and this was added."""
+        s, ours, theirs = self.settings, *({t.label: t for t in things} for things in self.things)
+        for label, old in ours.items():
+            if label in theirs or label >= UNNAMED or old.seen < s.min_seen:
+                continue
+            new = theirs.get(self._counterpart(old))
+            if new is not None and new.label not in ours and self._differ(old, new, s.look):
+                for things, thing in ((gone, old), (come, new)):
+                    if thing not in things:
+                        things.append(thing)
+
+    def _differ(self, old: Thing, new: Thing, look: float) -> bool:
+        """Whether things at one place have different shapes or colours."""
+        shapes = max(old.changed, new.changed) >= self.settings.min_changed
+        return shapes or max(_or_zero(old.color_apart), _or_zero(new.color_apart)) > look
+
+    def _counterpart(self, old: Thing) -> int:
+        """Id of what the newer visit has where a thing of the older one stood; 0: nothing with one."""
+        new = self.judged[1]
+        apart, nearest = cKDTree(new.points).query(self.judged[0].points[old.rows], distance_upper_bound=_SAME_PLACE)
+        ids = new.ids[nearest[np.isfinite(apart)]]
+        return int(np.bincount(ids).argmax()) if len(ids) else 0
+
+    def _pair_by_shape(self, found: Detection, gone: list[Thing], come: list[Thing]) -> None:
+        """What went and what came that is one thing by shape and colour: takes it from `gone` and `come`."""
+        s = self.settings
+        fits = {(a, b): self._fit(old, new) for a, old in enumerate(gone) for b, new in enumerate(come)}
+        cost = np.full((len(gone), len(come)), 10.0)
+        for pair, fit in fits.items():
+            if fit is not None and fit.share >= s.min_fit and fit.color_apart <= s.max_color:
+                cost[pair] = 1 - fit.quality()
+        taken: list[tuple[int, int]] = [
+            (int(a), int(b)) for a, b in zip(*linear_sum_assignment(cost), strict=True) if cost[a, b] < 10
+        ]
+        for a, b in taken:
+            fit = fits[a, b]
+            assert fit is not None
+            change = self._motion_change(gone[a], come[b], fit)
+            if change is not None:
+                found.changes.append(change)
+        for things, numbers in ((gone, {a for a, _ in taken}), (come, {b for _, b in taken})):
+            things[:] = [thing for k, thing in enumerate(things) if k not in numbers]
+
+    def _find_swapped(self, gone: list[Thing], come: list[Thing]) -> None:
+        """Objects that stand where others stood, of another shape and other colours: what went and what came there are
+        parts of them."""
+        s, theirs = self.settings, {t.label: t for t in self.things[1]}
+        for old in [t for t in self.things[0] if t.label < UNNAMED]:
+            new = theirs.get(self._counterpart(old))
+            if new is None or new.label >= UNNAMED or min(old.seen, new.seen) < s.min_seen:
+                continue
+            parts = [self._parts(0, gone, old), self._parts(1, come, new)]
+            if any(parts) and max(_or_zero(old.color_apart), _or_zero(new.color_apart)) > s.swapped:
+                for things, own, whole in zip((gone, come), parts, (old, new), strict=True):
+                    things[:] = [t for t in things if t not in own] + [whole]
+
+    def _parts(self, number: int, things: list[Thing], whole: Thing) -> list[Thing]:
+        """Those that lie in an object for the most part."""
+        ids = self.judged[number].ids
+        return [t for t in things if (ids[t.rows] == whole.label).mean() > 0.5]
+
+    def _compare_looks(self, found: Detection) -> None:
+        """What stayed and looks otherwise."""
+        s = self.settings
+        known = {id(change.old) for change in found.changes}
+        theirs = {t.label: t for t in self.things[1]}
+        for old in self.things[0]:
+            stays = id(old) not in known and old.seen >= s.min_seen and old.changed < s.min_changed
+            if stays and old.label < UNNAMED and _or_zero(old.color_apart) > s.look:
+                new = theirs.get(self._counterpart(old))
+                if new is not None and _or_zero(new.color_apart) > s.look:
+                    found.changes.append(Change("look", old, new, confidence=min(1.0, old.color_apart / (2 * s.look))))
+
+
+def _or_zero(value: float) -> float:
+    return value if np.isfinite(value) else 0.0
+
+
+def _confidence(thing: Thing) -> float:
+    """Of something that went or came."""
+    return min(1.0, 2 * thing.seen) * max(thing.changed, _or_zero(thing.color_apart))

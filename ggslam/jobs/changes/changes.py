@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is different between the visits of two finished runs: what `ggslam changes` does, usable from Python."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.changes.detection import ChangeDetector
+from ggslam.changes.found import ChangeTable
+from ggslam.changes.settings import ChangeSettings
+from ggslam.changes.sightings import Visit
+from ggslam.errors import ConfigError
+from ggslam.jobs.changes.pictures import picture_of_change
+from ggslam.jobs.merge.placing import find_joint_poses, place_maps
+from ggslam.jobs.merge.sources import MergeSource, read_sources
+from ggslam.jobs.progress import Observer, SilentObserver
+from ggslam.merging.coverage import PlacedRun
+from ggslam.merging.settings import MergeSettings
+from ggslam.native.loader import NativeContext
+from ggslam.reporting.pictures import write_picture
+from ggslam.scene.poses import transform_points
+from ggslam.system.atomic import write_text
+from ggslam.system.json_files import json_ready
+
+CHANGES_FILE = "changes.json"
+
+
+@dataclass(frozen=True)
+class ChangesOutcome:
+    """What came of a comparison.
+
+    Attributes:
+        table: the changes, in the world of the older run.
+        visits: the two maps in that world.
+        seconds: that it took.
+        context: threads.
+    """
+
+    table: ChangeTable
+    visits: tuple[Visit, Visit]
+    seconds: float
+    context: NativeContext
+
+
+def find_changes(
+    old: str | Path, new: str | Path, *, ids: bool | None = None, settings: ChangeSettings | None = None,
+    observer: Observer | None = None,
+) -> ChangesOutcome:  # fmt: skip
+    """Compares two visits to one place, object by object.
+
+    Args:
+        old, new: folders of the runs, or containers of them (`map.ggz`).
+        ids: whether one object id means one thing in both runs; None: that is found out.
+        settings: see there.
+        observer: receives progress updates.
+
+    Raises:
+        ConfigError: the runs have no ground in common; the message tells the best that was found.
+        RunFolderError: a run is damaged or has no places.
+        MissingDependency: gtsam is not installed.
+    """
+    start, context, observer = time.perf_counter(), NativeContext(None), observer or SilentObserver()
+    with tempfile.TemporaryDirectory(prefix="ggslam-changes-") as unpacked:
+        sources = read_sources([Path(old), Path(new)], context, Path(unpacked))
+        poses = find_joint_poses(sources, MergeSettings(), context, observer)
+        placed = place_maps(sources, poses)
+    older, newer = (_visit(s, p, T) for s, p, T in zip(sources, placed, poses.T_new_old, strict=True))
+    observer.begin("comparing surfaces", 1)
+    detector = ChangeDetector(older, newer, settings or ChangeSettings(), context, ids)
+    found = detector.detect()
+    observer.advance(1, 1)
+    names = [{} if s.objects is None else {o.id: o.name for o in s.objects.table.objects} for s in sources]
+    table = ChangeTable(found, detector.judged, (names[0], names[1]))
+    return ChangesOutcome(table, (older, newer), time.perf_counter() - start, context)
+
+
+def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str | Path) -> list[Path]:
+    """Writes pictures and, last, changes.json.
+
+    Args:
+        outcome: of `find_changes`.
+        out: folder; made if it is not there.
+        old, new: the runs, as the file shall name them.
+
+    Raises:
+        ConfigError: `out` is a file or cannot be made.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be made: {error.strerror}") from None
+    values, written = outcome.table.to_dict(), []
+    for number, change in enumerate(outcome.table.found.changes):
+        path = out / f"change{number:02d}_{change.kind}.png"
+        write_picture(path, picture_of_change(change, outcome.table, outcome.visits, outcome.context))
+        values["changes"][number]["picture"] = path.name
+        written.append(path)
+    values = {"old": str(old), "new": str(new), "world": "of the old run", **values}
+    write_text(out / CHANGES_FILE, json.dumps(json_ready(values), indent=1) + "\n")
+    return [*written, out / CHANGES_FILE]
+
+
+def _visit(source: MergeSource, placed: PlacedRun, T_new_old: np.ndarray) -> Visit:
+    known = source.known
+    poses = T_new_old @ known.poses
+    points = [transform_points(p.astype(float), T) for p, T in zip(known.points, poses, strict=True)]
+    normals = [n.astype(float) @ T[:3, :3].T for n, T in zip(known.normals, poses, strict=True)]
+    return Visit(
+        placed.gaussians, placed.cameras, placed.T_world_camera, np.concatenate(points), np.concatenate(normals),
+        source.objects is not None,
+    )  # fmt: skip

@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Volumes of a grid store, cell by cell: what `ggslam volumes STORE` does.
+
+    OUT/                       a grid store of the same cells
+        cells/.../tsdf.npz     the signed distances of a cell's blocks
+        cells/.../mesh.npz     its triangles
+        cells/.../esdf.npz     distances to the nearest surface in its voxels
+        mesh.ply               the surface of all cells, whose seams are closed
+
+First every cell is fused, then meshed (and its distances found) with the blocks of the cells around it. Cells that are
+done stay if this is cut off; the same call goes on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam import __version__
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.formats.mesh_files import write_mesh
+from ggslam.jobs.progress import Observer, SilentObserver
+from ggslam.jobs.submaps.visit_records import records_of_store
+from ggslam.jobs.tasks.engines import Engine
+from ggslam.jobs.tasks.outcomes import Failure
+from ggslam.jobs.volumes.cell_volumes import (
+    BlocksTask,
+    CellBlocks,
+    CellPart,
+    FuseTask,
+    LookTask,
+    field_cell,
+    fuse_cell,
+    look_at_frames,
+    mesh_cell,
+    mesh_from_bytes,
+)
+from ggslam.jobs.volumes.outputs import SMALLEST_PIECE
+from ggslam.runs.records.visit import VisitRecord
+from ggslam.scene.arrays import arrays_of, arrays_to_bytes
+from ggslam.submaps.cell_keys import CellKey
+from ggslam.submaps.grid import INDEX, GridStore
+from ggslam.volumes.esdf import FieldSettings
+from ggslam.volumes.mesh import Mesh, join_meshes, without_small_pieces
+from ggslam.volumes.tsdf_file import blocks_within, join_blocks
+from ggslam.volumes.volume_settings import VolumeSettings
+
+TSDF, MESH, ESDF = "tsdf.npz", "mesh.npz", "esdf.npz"
+WHOLE_MESH = "mesh.ply"
+_CELLS_IN_MEMORY = 32
+"""TSDFs of cells that are remembered: each is asked for by all its neighbours."""
+_FUSED = "fused"
+"""A visit of the results, begun when all cells are fused."""
+_LOOKS = 16
+"""Frames that a worker looks through at a time."""
+
+
+@dataclass
+class StoreVolumes:
+    """What came of it.
+
+    Attributes:
+        out: folder of the results, a grid store with a mesh of the whole.
+        cells: with blocks.
+        blocks: of the TSDF in all cells.
+        triangles: of the whole mesh.
+        failures: cells that could not be made, and why.
+        seconds: by stage.
+    """
+
+    out: Path
+    cells: int = 0
+    blocks: int = 0
+    triangles: int = 0
+    failures: dict[CellKey, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def make_store_volumes(
+    path: str | Path, out: str | Path | None = None, *, settings: VolumeSettings | None = None, esdf: bool = False,
+    engine: Engine | None = None, observer: Observer | None = None,
+) -> StoreVolumes:  # fmt: skip
+    """Fuses the frames of the runs that filled a store, cell by cell.
+
+    Args:
+        path: of the store.
+        out: folder of the results; None: `volumes` in the store.
+        settings: of TSDF and distance field.
+        esdf: whether distances are wanted.
+        engine: where; None: on this machine.
+        observer: receives progress updates.
+
+    Raises:
+        ConfigError: nothing is known of the recordings that the store is from.
+        GgslamError: a recording is not there any more, or the results cannot be written.
+    """
+    path, settings = Path(path), settings or VolumeSettings()
+    out = path / "volumes" if out is None else Path(out)
+    with GridStore.open(path) as store:
+        records = records_of_store(store)
+        work = _Work(store, records, settings)
+        with _open_results(out, store, work.name(esdf)) as results:
+            return _Volumes(work, results, engine or Engine(), observer or SilentObserver()).run(esdf)
+
+
+def _open_results(out: Path, store: GridStore, work: str) -> GridStore:
+    """The results of the same work that was cut off, or new ones in the place of others."""
+    if (out / INDEX).is_file():
+        results = GridStore.open(out, write=True)
+        if results.visits()[:1] in ([], [work]):
+            results.begin_visit(work)
+            return results
+        results.close()
+        if not _is_ours(out):
+            raise RunFolderError(f"{out}: is another grid store; choose another folder with `out`")
+        shutil.rmtree(out)
+    results = GridStore.create(out, store.settings)
+    results.begin_visit(work)
+    return results
+
+
+def _is_ours(out: Path) -> bool:
+    """Whether a store holds volumes and nothing else."""
+    with GridStore.open(out) as store:
+        return all(set(store.cell(key).parts) <= {TSDF, MESH, ESDF} for key in store.cells())
+
+
+class _Work:
+    """Which cells are made of which frames."""
+
+    def __init__(self, store: GridStore, records: list[VisitRecord], settings: VolumeSettings) -> None:
+        self.store, self.settings = store, settings
+        self.texts = tuple(json.dumps(r.model_copy(update={"poses": {}}).values()) for r in records)
+        self.poses = [(visit, frame, T) for visit, r in enumerate(records) for frame, T in sorted(r.poses.items())]
+        self.seen = np.zeros((len(self.poses), 0), bool)
+        """Which of the cells `keys` each frame may tell about, once that was looked up."""
+
+    def name(self, esdf: bool) -> str:
+        """Made of all that the result depends on."""
+        poses = [[visit, frame, T.tolist()] for visit, frame, T in self.poses]
+        wanted = [asdict(self.settings.tsdf), asdict(self.settings.esdf) if esdf else None]
+        return hashlib.sha256(json.dumps([__version__, wanted, self.texts, poses]).encode()).hexdigest()
+
+    def blocks(self, key: CellKey) -> CellBlocks:
+        """Of a cell."""
+        return CellBlocks.of(self.store.grid, key, self.settings.tsdf.voxel)
+
+    def keys(self) -> list[CellKey]:
+        """Cells that may have blocks, sorted: those around the store's cells and the cameras."""
+        there = [*self.store.cells(), *(self.store.key_of(T[:3, 3]) for _, _, T in self.poses)]
+        spans = self.store.grid.spans
+        low, high = np.min(there, axis=0) - spans, np.max(there, axis=0) + spans
+        return [(x, y, z) for x in range(low[0], high[0] + 1) for y in range(low[1], high[1] + 1)
+                for z in range(low[2], high[2] + 1)]  # fmt: skip
+
+    def looks(self, keys: list[CellKey]) -> list[LookTask]:
+        """What finding out which frames tell about which cells needs."""
+        blocks = [self.blocks(key) for key in keys]
+        low = np.array([b.low for b in blocks], float) * blocks[0].edge
+        high = (np.array([b.high for b in blocks], float) + 1) * blocks[0].edge
+        return [
+            LookTask(first, self.texts, tuple(self.poses[first : first + _LOOKS]), low, high, self.settings.tsdf)
+            for first in range(0, len(self.poses), _LOOKS)
+        ]
+
+    def tasks(self, keys: list[CellKey]) -> list[FuseTask]:
+        """What fusing the cells needs that a frame tells about."""
+        found = []
+        for column, key in enumerate(keys):
+            views = tuple(self.poses[row] for row in np.flatnonzero(self.seen[:, column]))
+            if views:
+                found.append(FuseTask(key, self.blocks(key), self.texts, views, self.settings.tsdf))
+        return found
+
+
+@dataclass
+class _Volumes:
+    """Volumes about to be made."""
+
+    work: _Work
+    results: GridStore
+    engine: Engine
+    observer: Observer
+    failures: dict[CellKey, Failure] = field(default_factory=dict)
+    done: int = 0
+
+    def run(self, esdf: bool) -> StoreVolumes:
+        """All stages."""
+        outcome = StoreVolumes(self.results.path)
+        self._look_and_fuse(outcome)
+        counts = {key: self.results.cell(key).parts[TSDF].count for key in self.results.cells()}
+        filled = sorted(key for key, count in counts.items() if count)
+        if not filled:
+            raise ConfigError(f"{self.work.store.path}: no depth of its runs' frames could be fused")
+        outcome.cells, outcome.blocks, there = len(filled), sum(counts.values()), set(filled)
+        todo = [key for key in filled if not self._has(key, MESH)]
+        self._stage("mesh", mesh_cell, self._blocks_tasks(todo, there, 1, None), len(todo), MESH, outcome)
+        if esdf:
+            field_settings = self.work.settings.esdf
+            reach = math.ceil(field_settings.max_distance / self.work.blocks(filled[0]).edge) + 1
+            todo = [key for key in filled if not self._has(key, ESDF)]
+            tasks_of_fields = self._blocks_tasks(todo, there, reach, field_settings)
+            self._stage("distances", field_cell, tasks_of_fields, len(todo), ESDF, outcome)
+        start = time.perf_counter()
+        mesh = self.whole_mesh(filled)
+        write_mesh(self.results.path / WHOLE_MESH, mesh.vertices, mesh.triangles, mesh.normals, mesh.colors)
+        outcome.triangles, outcome.seconds["join"] = len(mesh.triangles), time.perf_counter() - start
+        outcome.failures = {key: failure.line for key, failure in sorted(self.failures.items())}
+        return outcome
+
+    def _look_and_fuse(self, outcome: StoreVolumes) -> None:
+        """Finds the frames of each cell, and fuses them."""
+        if _FUSED in self.results.visits():
+            return
+        start, keys, work = time.perf_counter(), self.work.keys(), self.work
+        work.seen = np.zeros((len(work.poses), len(keys)), bool)
+        looks = work.looks(keys)
+        self.observer.begin("look", len(looks))
+
+        def take(task: LookTask, found: np.ndarray | Failure) -> None:
+            if isinstance(found, Failure):
+                raise _error(found, found.line)
+            work.seen[task.key : task.key + len(found)] = found
+            self.observer.advance(task.key // _LOOKS + 1, len(looks))
+
+        self.engine.do(look_at_frames, looks, take)
+        outcome.seconds["look"] = time.perf_counter() - start
+        tasks = [task for task in work.tasks(keys) if not self._has(task.key, TSDF)]
+        self._stage("fuse", fuse_cell, tasks, len(tasks), TSDF, outcome)
+        self.results.begin_visit(_FUSED)
+
+    def whole_mesh(self, keys: list[CellKey]) -> Mesh:
+        """The meshes of all cells as one: vertices on their seams are the same."""
+        there = [key for key in keys if self._has(key, MESH)]
+        parts = [mesh_from_bytes(self.results.get(key, MESH), f"{self.results.path}: cell {key}") for key in there]
+        return without_small_pieces(join_meshes(parts), SMALLEST_PIECE)
+
+    def _has(self, key: CellKey, part: str) -> bool:
+        return key in self.results and part in self.results.cell(key).parts
+
+    def _stage(
+        self, name: str, work: Callable[[Any], CellPart], tasks: Any, total: int, part: str, outcome: StoreVolumes
+    ) -> None:
+        start, done = time.perf_counter(), 0
+        self.observer.begin(name, total)
+
+        def take(task: FuseTask | BlocksTask, found: CellPart | Failure) -> None:
+            nonlocal done
+            if isinstance(found, Failure):
+                self.failures[task.key] = found
+            else:
+                self.results.put(found.key, {part: found.data}, counts={part: found.count})
+            done += 1
+            self.observer.advance(done, total)
+
+        self.engine.do(work, tasks, take)
+        outcome.seconds[name] = time.perf_counter() - start
+        ours = [failure for failure in self.failures.values() if failure.exit_code == 1]
+        if ours:
+            raise _error(ours[0], f"{self.results.path}: {len(ours)} cells could not be made: {ours[0].line}")
+
+    def _tsdf(self, key: CellKey) -> dict[str, np.ndarray]:
+        """The arrays of a cell's TSDF."""
+        held, what = io.BytesIO(self.results.get(key, TSDF)), f"{self.results.path}: cell {key}: no TSDF"
+        return arrays_of(held, what, lambda found: {name: found[name] for name in found.files})
+
+    def _blocks_tasks(
+        self, keys: list[CellKey], filled: set[CellKey], around: int, settings: FieldSettings | None
+    ) -> Iterator[BlocksTask]:
+        """Cells with their blocks and so many around them; `filled`: cells with blocks."""
+        read, edge = lru_cache(_CELLS_IN_MEMORY)(self._tsdf), self.work.blocks(next(iter(filled))).edge
+        steps = math.ceil(around * edge / self.work.store.grid.spacing + 0.5)
+        for key in keys:
+            blocks, parts = self.work.blocks(key), list[dict[str, np.ndarray]]()
+            reach = steps * self.work.store.grid.spacing * math.sqrt(3) * 1.01
+            there = self.results.part_versions(TSDF, self.results.centre_of(key), reach)
+            for other in sorted(there):
+                if other in filled and max(abs(a - b) for a, b in zip(key, other, strict=True)) <= steps:
+                    parts.append(blocks_within(read(other), *blocks.around(around)))
+            yield BlocksTask(key, blocks, arrays_to_bytes(**join_blocks(parts)), settings)
+
+
+def _error(failure: Failure, text: str) -> GgslamError:
+    error = GgslamError(text)
+    error.exit_code = failure.exit_code
+    return error

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a camera is by the colours it sees: its image is laid onto the map as rendered from near by.
+
+Depth whose errors are shared by neighbouring pixels pulls a pose along with them, however many points there are. The
+map is the mean over many frames, and a picture of it fits a camera's image to a tenth of a pixel.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from ggslam.mapping.settings import ViewAlignmentSettings
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import se3_exp, transform_points
+
+BLURS = (2.0, 1.0)
+"""Standard deviations in pixels of the smoothing, one after the other: the first reaches farther."""
+FEWEST_POINTS = 500
+"""Textured pixels that are needed."""
+HUBER = 0.05
+"""Grey difference from which a residual counts linearly."""
+_GREY = np.array([0.299, 0.587, 0.114], np.float32)
+_CHUNK = 1024  # columns of the images that cv2.remap is asked for: it takes no more than 32767
+
+
+def grey_of(color: np.ndarray) -> np.ndarray:
+    """Grey values in [0, 1], float32 [H, W], of colours uint8 or float32 in [0, 1], [H, W, 3]."""
+    scale = np.float32(1 / 255 if color.dtype == np.uint8 else 1)
+    return color.astype(np.float32) @ _GREY * scale
+
+
+def align_view(
+    grey: np.ndarray, rendered: np.ndarray, depth: np.ndarray, alpha: np.ndarray, camera: Camera,
+    settings: ViewAlignmentSettings,
+) -> np.ndarray | None:  # fmt: skip
+    """How the camera that saw an image stands to the pose that a map was rendered from.
+
+    Gauss-Newton over pose, gain and offset of the grey values, with Huber weights (direct image alignment). The points
+    are those of the rendering, so that the image's own depth plays no part.
+
+    Args:
+        grey: of the image, float32 [H, W] in [0, 1].
+        rendered: grey values of the map, the same.
+        depth: of the map [H, W], metres.
+        alpha: of the map [H, W].
+        camera: of both.
+        settings: number of points and iterations.
+
+    Returns:
+        T_camera_rendered [4, 4], None if too little texture is seen or the solution leaves the image.
+    """
+    T, exposure = np.eye(4), np.array([1.0, 0.0])
+    for blur in BLURS:
+        ours, theirs = (cv2.GaussianBlur(image, (0, 0), blur) for image in (grey, rendered))
+        pixels = _choose_textured(theirs, depth, alpha, settings)
+        if len(pixels) < FEWEST_POINTS:
+            return None
+        points = camera.rays().reshape(-1, 3)[pixels].astype(np.float64) * depth.reshape(-1)[pixels, None]
+        channels = np.dstack([ours, *_gradients(ours)])
+        values = theirs.reshape(-1)[pixels]
+        for _ in range(settings.iterations):
+            step = _step(points, values, channels, camera, T, exposure)
+            if step is None:
+                return None
+            T, exposure = se3_exp(step[:6]) @ T, exposure + step[6:]
+            if np.abs(step[:6]).max() < settings.tolerance:
+                break
+    return T
+
+
+def _gradients(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives by column and row."""
+    return tuple(cv2.Sobel(image, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))  # type: ignore[return-value]
+
+
+def _choose_textured(
+    rendered: np.ndarray, depth: np.ndarray, alpha: np.ndarray, settings: ViewAlignmentSettings
+) -> np.ndarray:
+    """Flat indices of pixels that the map covers and that have contrast, evenly thinned to the number set."""
+    du, dv = _gradients(rendered)
+    good = (alpha > 0.9) & (depth > 0.05) & (du * du + dv * dv > settings.min_gradient**2)
+    pixels = np.flatnonzero(good)
+    if len(pixels) <= settings.points:
+        return pixels
+    return pixels[np.linspace(0, len(pixels) - 1, settings.points).astype(np.int64)]
+
+
+def _step(
+    points: np.ndarray, values: np.ndarray, channels: np.ndarray, camera: Camera, T: np.ndarray, exposure: np.ndarray
+) -> np.ndarray | None:
+    """A step of Gauss-Newton: twist (translation first) and change of gain and offset, [8]; None: nothing is seen."""
+    moved = transform_points(points, T)
+    z = np.maximum(moved[:, 2], 0.05)
+    u, v = camera.fx * moved[:, 0] / z + camera.cx, camera.fy * moved[:, 1] / z + camera.cy
+    inside = (u > 1) & (v > 1) & (u < camera.width - 2) & (v < camera.height - 2)
+    if inside.sum() < FEWEST_POINTS:
+        return None
+    grey, du, dv = _sample(channels, u, v)
+    residual = grey - (exposure[0] * values + exposure[1])
+    weight = np.where(inside, np.minimum(1, HUBER / np.maximum(np.abs(residual), 1e-6)), 0)
+    gx, gy = du * camera.fx / z, dv * camera.fy / z
+    by_point = np.stack([gx, gy, -(gx * moved[:, 0] + gy * moved[:, 1]) / z], 1)
+    jacobian = np.column_stack([by_point, np.cross(moved, by_point), -values, -np.ones(len(values))])
+    weighted = jacobian * weight[:, None]
+    hessian = jacobian.T @ weighted + np.diag([1e-6] * 6 + [1e-3] * 2)
+    step = np.linalg.solve(hessian, -weighted.T @ residual)
+    return step if np.isfinite(step).all() else None
+
+
+def _sample(channels: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Bilinear samples [3, n] of an image [H, W, 3]."""
+    padding = (0, -len(u) % _CHUNK)
+    columns, rows = (np.pad(x.astype(np.float32), padding).reshape(-1, _CHUNK) for x in (u, v))
+    found = cv2.remap(channels, columns, rows, cv2.INTER_LINEAR)
+    return found.reshape(-1, channels.shape[2])[: len(u)].T.astype(np.float64)

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One room at two visits: things were moved, turned, taken away and put there in between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.synthetic.room import furnished_room
+from ggslam.synthetic.scene import Kind, Scene, Shape
+
+MOST_CHANGES = 10
+_MOVABLE = (
+    "mug", "book pile", "ball", "beach ball", "pouf", "vase", "waste basket", "laptop", "chair", "desk chair",
+    "keyboard", "desk lamp",
+)  # fmt: skip
+_GAP, _TRIES = 0.015, 200
+"""Metres that a moved thing stays away from all others; places that are tried for it."""
+_SHIFTS, _TURNS = (0.08, 0.5), (-90.0, 90.0)
+"""Metres and degrees by which things move."""
+_AWAY = np.array([0.0, 0.0, -60.0])
+"""Where things are that are not there: textures are drawn shape by shape, so every shape stays in the scene."""
+_TOUCHING = 0.02
+"""Metres between a thing and what it stands on, at most."""
+
+
+@dataclass(frozen=True)
+class MadeChange:
+    """What was done to an instance between the visits.
+
+    Attributes:
+        kind: what.
+        instance: id in the masks.
+        name: of it.
+        T_new_old: float64 [4, 4], world; None: it was not moved.
+    """
+
+    kind: Literal["moved", "removed", "added"]
+    instance: int
+    name: str
+    T_new_old: np.ndarray | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        T = None if self.T_new_old is None else self.T_new_old.tolist()
+        return {"kind": self.kind, "instance": self.instance, "name": self.name, "T_new_old": T}
+
+
+def room_at_two_visits(seed: int, count: int) -> tuple[Scene, Scene, list[MadeChange]]:
+    """The furnished room of a seed at a first and at a second visit, and what is different.
+
+    Args:
+        seed: of the room, and of what changes.
+        count: of the changes: every third one takes something away or puts something there, the others move things
+            along what they stand on by 8 to 50 cm and turn them by up to 90 degrees.
+
+    Raises:
+        SequenceError: fewer than 0 or more than `MOST_CHANGES`.
+    """
+    if not 0 <= count <= MOST_CHANGES:
+        raise SequenceError(f"changes: expected 0 to {MOST_CHANGES}, found {count}")
+    rng = np.random.default_rng([seed, 7])
+    first, second = furnished_room(seed), furnished_room(seed)
+    names = first.instance_names
+    candidates = [i for i, name in names.items() if name in _MOVABLE]
+    made: list[MadeChange] = []
+    for instance in rng.permutation(candidates).tolist():
+        if len(made) == count:
+            break
+        if len(made) % 3 == 2:
+            kind: Literal["removed", "added"] = "removed" if len(made) % 2 else "added"
+            _move(second if kind == "removed" else first, instance, _shift(_AWAY))
+            made.append(MadeChange(kind, instance, names[instance]))
+            continue
+        T = _free_motion(second, instance, rng)
+        if T is not None:
+            _move(second, instance, T)
+            made.append(MadeChange("moved", instance, names[instance], T))
+    if len(made) < count:
+        raise SequenceError(f"changes: no more than {len(made)} of {count} things found a free place")
+    return first, second, made
+
+
+def _free_motion(scene: Scene, instance: int, rng: np.random.Generator) -> np.ndarray | None:
+    """A motion [4, 4] along what the instance stands on, to where nothing else is; None: none was found."""
+    own = [shape for shape in scene.shapes if shape.instance == instance]
+    others = [shape for shape in scene.shapes if shape.instance != instance]
+    points = np.concatenate([_outline(shape) for shape in own])
+    middle, bottom = points.mean(0), float(points[:, 2].min())
+    supports = [s for s in others if _is_flat(s) and abs(_top(s) - bottom) < _TOUCHING and _carries(s, points, bottom)]
+    for _ in range(_TRIES if supports else 0):
+        heading, turn = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*_TURNS))
+        T = _turn_about(middle, turn)
+        T[:2, 3] += rng.uniform(*_SHIFTS) * np.array([np.cos(heading), np.sin(heading)])
+        moved = points @ T[:3, :3].T + T[:3, 3]
+        if not any(_carries(support, moved, bottom) for support in supports):
+            continue
+        raised = np.concatenate([moved, _fill(moved)])
+        raised[:, 2] = np.maximum(raised[:, 2], bottom + _TOUCHING + _GAP)
+        if all((shape.distance(raised) > _GAP).all() for shape in others):
+            return T
+    return None
+
+
+def _move(scene: Scene, instance: int, T: np.ndarray) -> None:
+    scene.shapes = [
+        replace(shape, T_world_shape=T @ shape.T_world_shape) if shape.instance == instance else shape
+        for shape in scene.shapes
+    ]
+
+
+def _outline(shape: Shape) -> np.ndarray:
+    """Corners [8, 3] of a shape's bounding box, world."""
+    corners = np.array(list(product((-1, 1), repeat=3))) * shape.bounds()
+    return corners @ shape.T_world_shape[:3, :3].T + shape.T_world_shape[:3, 3]
+
+
+def _fill(points: np.ndarray) -> np.ndarray:
+    """Points [n, 3] all over the box around some, which lie no farther from each other than what may stand between."""
+    low, high = points.min(0), points.max(0)
+    axes = [np.linspace(a, b, max(2, int((b - a) / 0.04) + 1)) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes), -1).reshape(-1, 3)
+
+
+def _is_flat(shape: Shape) -> bool:
+    """Whether things stand on it."""
+    return shape.kind in (Kind.BOX, Kind.FRUSTUM) and bool(shape.T_world_shape[2, 2] > 0.999)
+
+
+def _top(shape: Shape) -> float:
+    return float(shape.T_world_shape[2, 3] + shape.half[2])
+
+
+def _carries(shape: Shape, points: np.ndarray, bottom: float) -> bool:
+    """Whether all that is low of the points [n, 3] is over the top of a flat shape."""
+    low = points[points[:, 2] < bottom + 0.1]
+    local = (low - shape.T_world_shape[:3, 3]) @ shape.T_world_shape[:3, :3]
+    if shape.kind == Kind.FRUSTUM:
+        return bool((np.linalg.norm(local[:, :2], axis=1) < shape.half[0] * shape.top).all())
+    return bool((np.abs(local[:, :2]) < np.array(shape.half[:2])).all())
+
+
+def _shift(by: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = by
+    return T
+
+
+def _turn_about(middle: np.ndarray, angle: float) -> np.ndarray:
+    """Turn about the vertical through a point."""
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    T[:2, 3] = middle[:2] - T[:2, :2] @ middle[:2]
+    return T

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames are aligned to the map by colour where depth errs more than its images show, and nowhere else."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ggslam.evaluation.trajectory import score_trajectory
+from ggslam.mapping.settings import ViewAlignmentSettings
+from ggslam.mapping.view_alignment import align_view, grey_of
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse, se3_exp, se3_log
+from ggslam.sequences import open_sequence
+from ggslam.slam import color_poses
+from ggslam.slam.config import load_config
+from ggslam.slam.slam import Slam
+from ggslam.synthetic import write_synthetic_sequence
+from ggslam.tracking.points import FramePoints
+from ggslam.tracking.residual_noise import FEWEST, ResidualNoise
+from ggslam.tracking.settings import DepthNoise
+
+CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+SETTINGS = ViewAlignmentSettings()
+MOTION = se3_exp(np.array([0.012, -0.008, 0.01, 0.006, -0.004, 0.008]))
+
+
+def corner(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Grey values and depth of two painted walls that meet 2.5 m in front of the first camera."""
+    rays = CAMERA.rays().astype(float) @ T_world_camera[:3, :3].T
+    origin, depth = T_world_camera[:3, 3], np.full((120, 160), np.inf)
+    for normal in (np.array([0.6, 0.1, 0.8]), np.array([-0.6, 0.0, 0.8])):
+        depth = np.minimum(depth, (2 - normal @ origin) / (rays @ normal))
+    x, y, z = np.moveaxis(origin + rays * depth[..., None], -1, 0)
+    grey = 0.5 + 0.2 * np.sin(9 * x + 5 * z) * np.cos(7 * y) + 0.2 * np.sin(4 * y + 3 * x)
+    return grey.astype(np.float32), depth.astype(np.float32)
+
+
+def error(T: np.ndarray | None) -> np.ndarray:
+    """Of what `align_view` says of a camera that has moved by `MOTION`."""
+    assert T is not None
+    return np.abs(se3_log(T @ MOTION))
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.7, 0.1)])
+def test_a_view_is_laid_onto_the_map(gain: float, offset: float) -> None:
+    rendered, depth = corner(np.eye(4))
+    seen = gain * corner(MOTION)[0] + np.float32(offset)
+    found = error(align_view(seen, rendered, depth, np.ones_like(depth), CAMERA, SETTINGS))
+    assert found[:3].max() < 1e-3 and found[3:].max() < 5e-4  # of 12 mm and 8 mrad; a pixel is 8 mrad
+
+
+def test_without_texture_or_map_there_is_no_pose() -> None:
+    rendered, depth = corner(np.eye(4))
+    full, blank = np.ones_like(depth), np.full_like(rendered, 0.5)
+    assert align_view(rendered, blank, depth, full, CAMERA, SETTINGS) is None
+    assert align_view(rendered, rendered, depth, 0 * full, CAMERA, SETTINGS) is None
+    assert align_view(rendered, rendered, 0 * depth, full, CAMERA, SETTINGS) is None
+
+
+def test_grey_values() -> None:
+    color = np.random.default_rng(0).integers(0, 256, (5, 4, 3), dtype=np.uint8)
+    expected = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY) / 255
+    assert np.abs(grey_of(color) - expected).max() < 0.003
+    assert np.allclose(grey_of(color.astype(np.float32) / 255), grey_of(color))
+
+
+def test_hidden_noise_is_what_residuals_say_of_it() -> None:
+    rng, noise, residuals = np.random.default_rng(0), DepthNoise(2.5e-4, 0.0), ResidualNoise()
+    points = np.zeros((2000, 3), np.float32)
+    points[:, 2] = 2
+    frame = FramePoints(
+        points, points, np.zeros((2000, 6), np.float32), np.zeros((2000, 2), np.int32), np.ones(2000, np.float32)
+    )
+    for _ in range(FEWEST):
+        noise = residuals.observe(frame, (0.008 * rng.standard_normal(2000)) ** 2, noise)
+    assert 28 < residuals.hidden < 36 and abs(noise.sigma(2) - 0.008) < 1e-3
+    exact = ResidualNoise()
+    for _ in range(FEWEST):
+        exact.observe(frame, (0.0005 * rng.standard_normal(2000)) ** 2, DepthNoise(2.5e-4, 0.0))
+    assert exact.hidden == 1
+
+
+class Drift:
+    """Depth times an error of 1 % that neighbours share, in the image and from frame to frame."""
+
+    def __init__(self) -> None:
+        self._random = np.random.default_rng(1)
+        self._knots = self._random.standard_normal((6, 8))
+
+    def spoil(self, frame: Frame) -> Frame:
+        """The frame with such depth."""
+        field = cv2.resize(self._knots, frame.depth.shape[::-1], interpolation=cv2.INTER_CUBIC)
+        self._knots = 0.88 * self._knots + 0.47 * self._random.standard_normal(self._knots.shape)
+        return dataclasses.replace(frame, depth=(frame.depth * (1 + 0.01 * field)).astype(np.float32))
+
+
+def tracked(room: Path, *settings: str, drift: bool) -> tuple[Slam, float]:
+    """A run over the room, and the root mean square of its trajectory's error, metres."""
+    sequence, spoiled = open_sequence(room), Drift()
+    slam = Slam(sequence.camera, load_config(None, ["masks.source=none", "refine_iterations=0", *settings]))
+    truth = []
+    for index in range(len(sequence)):
+        frame = sequence.frame(index)
+        slam.step(spoiled.spoil(frame) if drift else frame)
+        truth.append(sequence.ground_truth[index])  # type: ignore[index]
+    slam.finish()
+    scores = score_trajectory([slam.pose_of(f) for f in slam.frames], np.array(truth))
+    assert scores is not None
+    return slam, scores.ate_rmse_m
+
+
+@pytest.mark.long("three runs over a small room")
+def test_it_pays_where_depth_drifts(tmp_path: Path) -> None:
+    room = write_synthetic_sequence(tmp_path / "exact", frames=24, width=160, height=120, noise=False)
+    slam, error = tracked(room, drift=True)
+    _, without = tracked(room, "mapping.view_alignment.enabled=false", drift=True)
+    assert slam.tracker.state.residuals.hidden > 8
+    assert error < 0.7 * without
+    exact, _ = tracked(room, drift=False)
+    assert not exact.color_poses._is_due
+    assert len(exact.color_poses.images) <= color_poses.UNDECIDED
+
+
+def test_a_pose_that_contradicts_the_tracker_is_not_believed(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence = open_sequence(room)
+    slam = Slam(sequence.camera, load_config(None, ["masks.source=none", "refine_iterations=0"]))
+    slam.step(sequence.frame(0))
+    slam.tracker.state.residuals.hidden = 100
+    for shift, believed in ((1e-3, True), (0.5, False)):
+        moved = se3_exp(np.array([shift, 0, 0, 0, 0, 0]))
+        monkeypatch.setattr(color_poses, "align_view", lambda *_, moved=moved: moved)
+        frame = slam.receive(sequence.frame(1))
+        before, align = [], slam.color_poses.align
+        monkeypatch.setattr(slam.color_poses, "align", lambda f, r, a=align, b=before: (b.append(r), a(f, r))[1])
+        found = slam.track(frame)
+        assert np.allclose(found.T_world_camera, before[-1].T_world_camera @ inverse(moved if believed else np.eye(4)))
+        slam.tracker.state.motion.velocity = np.eye(4)
