@@ -128,7 +128,7 @@ def make_mapper(
     channels = IDENTITY_CHANNELS if learns else 0
     if library is None:
         learner = CpuIdentityLearner(config.identity, config.seed) if learns else None
-        compact = compact and config.identity.schedule != "dense"
+        compact = compact and learns and config.identity.schedule != "dense"
         gaussians = GaussianMap(config.sh_degree, channels, compact_features=compact)
         return CpuMapper(gaussians, config.mapping, context, config.seed, learner)
     device = library.whole_device(None)
