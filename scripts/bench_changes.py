@@ -100,7 +100,7 @@ def score(table: ChangeTable, T_truth: np.ndarray, truth: list[dict[str, Any]], 
             left.remove(match)
             if known:
                 result.right += 1
-                note_pose(result, match, made, table, T_truth, shown)
+                note_pose(result, match, made, T_truth)
         elif known:
             result.missed.append(f"{made['kind']} {made['name']} ({i})")
     result.invented = [f"{c.kind} {table.label(c)}" for c in left]
@@ -119,14 +119,12 @@ def is_it(c: Change, made: dict[str, Any], table: ChangeTable, T_truth: np.ndarr
     return True
 
 
-def note_pose(
-    result: Score, c: Change, made: dict[str, Any], table: ChangeTable, T_truth: np.ndarray, shown: list[Any]
-) -> None:
+def note_pose(result: Score, c: Change, made: dict[str, Any], T_truth: np.ndarray) -> None:
     """Error of a moved thing's pose: at its middle, and of its turn."""
     if c.T_new_old is None:
         return
     found, true = T_truth @ c.T_new_old @ inverse(T_truth), np.array(made["T_new_old"])
-    middle = shown[0][made["instance"]][0].mean(0, keepdims=True)
+    middle = np.array([made["middle"]])
     off = transform_points(middle, found) - transform_points(middle, true)
     result.off_cm.append(100 * float(np.linalg.norm(off)))
     if made["name"] not in ROUND:

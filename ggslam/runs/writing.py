@@ -124,13 +124,13 @@ def write_trajectories(folder: Path, sequence: SequenceRecord, result: SlamResul
     if sequence.rig is None:
         write_tum(folder / "trajectory.txt", times, poses)
         return
-    places = sequence.rig.places[[frame.frame_index for frame in result.frames]].reshape(-1, 2)
-    _, first = np.unique(places[:, 0], return_index=True)
-    of_rig = [sequence.rig.pose_of_first(poses[k], places[k, 1]) for k in first]
+    frames = [frame.frame_index for frame in result.frames]
+    first = sequence.rig.first_of_instants(frames)
+    of_rig = [sequence.rig.pose_of_first(poses[k], frames[k]) for k in first]
     write_tum(folder / "trajectory.txt", times[first], np.array(of_rig).reshape(-1, 4, 4))
     make_folder(folder / TRAJECTORIES)
     for number, name in enumerate(sequence.rig.names):
-        own = places[:, 1] == number
+        own = sequence.rig.places[frames, 1] == number
         write_tum(folder / TRAJECTORIES / f"{name}.txt", times[own], poses[own])
 
 

@@ -36,18 +36,21 @@ class MadeChange:
         kind: what.
         instance: id in the masks.
         name: of it.
+        middle: float64 [3], of it where it is in the visit that has it, the first if both do; world.
         T_new_old: float64 [4, 4], world; None: it was not moved.
     """
 
     kind: Literal["moved", "removed", "added"]
     instance: int
     name: str
+    middle: np.ndarray
     T_new_old: np.ndarray | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         T = None if self.T_new_old is None else self.T_new_old.tolist()
-        return {"kind": self.kind, "instance": self.instance, "name": self.name, "T_new_old": T}
+        middle = self.middle.tolist()
+        return {"kind": self.kind, "instance": self.instance, "name": self.name, "middle": middle, "T_new_old": T}
 
 
 def room_at_two_visits(seed: int, count: int) -> tuple[Scene, Scene, list[MadeChange]]:
@@ -71,15 +74,16 @@ def room_at_two_visits(seed: int, count: int) -> tuple[Scene, Scene, list[MadeCh
     for instance in rng.permutation(candidates).tolist():
         if len(made) == count:
             break
+        middle = np.concatenate([_outline(shape) for shape in first.shapes if shape.instance == instance]).mean(0)
         if len(made) % 3 == 2:
             kind: Literal["removed", "added"] = "removed" if len(made) % 2 else "added"
             _move(second if kind == "removed" else first, instance, _shift(_AWAY))
-            made.append(MadeChange(kind, instance, names[instance]))
+            made.append(MadeChange(kind, instance, names[instance], middle))
             continue
         T = _free_motion(second, instance, rng)
         if T is not None:
             _move(second, instance, T)
-            made.append(MadeChange("moved", instance, names[instance], T))
+            made.append(MadeChange("moved", instance, names[instance], middle, T))
     if len(made) < count:
         raise SequenceError(f"changes: no more than {len(made)} of {count} things found a free place")
     return first, second, made

@@ -44,6 +44,9 @@ def test_a_run_has_scores_and_poses_of_each_camera(done: Path) -> None:
     assert len(of_rig) == len(front) == len(back) == 12
     np.testing.assert_allclose(of_rig.T_world_camera, front.T_world_camera)
     np.testing.assert_allclose(back.timestamps - front.timestamps, 0.01, atol=1e-6)
+    truth = read_tum(done / "ground_truth.txt")
+    np.testing.assert_allclose(truth.timestamps, of_rig.timestamps)
+    assert "held-out images of camera" in (done / "report.html").read_text()
 
 
 @pytest.mark.long("six commands on one run")

@@ -11,24 +11,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import ggslam
-from kept import build_once, generated_recording, session_folder
+from kept import generated_recording, session_folder
+from small_runs import run_of
 
 from ggslam.errors import ConfigError, RunFolderError, SequenceError
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.formats.trajectory import read_tum
 from ggslam.jobs.edit.edits import Edit, edit_run
 from ggslam.jobs.merge.merge import MergeOutcome, merge_runs
-from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.score.evaluate_run import evaluate_run
 from ggslam.merging.settings import MergeSettings
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.recordings import SequenceRequest, open_recording_of
+from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.starting import start_in_map
 from ggslam.sequences.joined import JoinedSequence
 from ggslam.slam.slam import Slam
 
 pytest.importorskip("gtsam")
-FEW = ["mapping.iterations_per_frame=2", "refine_iterations=10"]
 FAST = MergeSettings(steps=24)
 
 
@@ -44,14 +43,6 @@ class Halves:
     def merged(self) -> RunFolder:
         """The run that both became."""
         return RunFolder.open(self.outcome.folder.path)
-
-
-def run_of(recording: Path, out: Path, start: int, stop: int, scale: float = 1.0, more: tuple[str, ...] = ()) -> Path:
-    def build(folder: Path) -> None:
-        request = SequenceRequest(recording, start=start, stop=stop, scale=scale)
-        execute(RunRequest(request, out=folder, overrides=[*FEW, *more], evaluate=False))
-
-    return build_once(out, build)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.publishing import publish_run
 from ggslam.runs.records.mark import RunRecord
-from ggslam.runs.writing import OBJECT_FILES, POINTS, REPORT_FILE, TRUTH_FILE, write_objects
+from ggslam.runs.writing import OBJECT_FILES, POINTS, REPORT_FILE, TRAJECTORIES, TRUTH_FILE, write_objects
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.atomic import make_folder
@@ -77,6 +77,8 @@ def _stage(
     for name in kept:
         if (source.path / name).is_file():
             shutil.copyfile(source.path / name, staged / name)
+    if (source.path / TRAJECTORIES).is_dir():
+        shutil.copytree(source.path / TRAJECTORIES, staged / TRAJECTORIES, dirs_exist_ok=True)
     if named_only and (source.path / "renders").is_dir():
         shutil.copytree(source.path / "renders", staged / "renders", dirs_exist_ok=True)
     source.timing().model_copy(update={"gaussians": len(scene.gaussians)}).write(staged)

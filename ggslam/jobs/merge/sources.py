@@ -137,6 +137,9 @@ class MergeSource:
             at = np.clip(np.searchsorted(truth.timestamps, times - _SAME_TIME_S), 0, max(0, len(truth) - 1))
             if len(truth):
                 known = np.abs(truth.timestamps[at] - times) < 2 * _SAME_TIME_S
+                if self.recording.rig is not None:  # the others' truth is not in the file
+                    numbers = self.recording.rig.places[[f.frame for f in frames], 1]
+                    known &= numbers == 0
                 found[known] = truth.T_world_camera[at[known]]
         elif self.sequence is not None and self.sequence.ground_truth is not None:
             inside = [k for k, f in enumerate(frames) if f.frame < len(self.sequence)]

@@ -24,7 +24,7 @@ from ggslam.runs.publishing import publish_run
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.saving_parts import save_points_of_map
-from ggslam.runs.writing import RUN_FILES, TRUTH_FILE, write_objects
+from ggslam.runs.writing import RUN_FILES, TRAJECTORIES, TRUTH_FILE, write_objects
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
 from ggslam.slam.saved_places import PLACES_FILE
@@ -142,6 +142,8 @@ def _save(
         for name in _STAY:
             if (source.path / name).is_file():
                 shutil.copyfile(source.path / name, staged / name)
+        if (source.path / TRAJECTORIES).is_dir():
+            shutil.copytree(source.path / TRAJECTORIES, staged / TRAJECTORIES, dirs_exist_ok=True)
         record = source.keyframes()
         changed = [
             k.model_copy(update={"iterations": k.iterations + steps.get(k.frame, 0)}) for k in record.keyframes

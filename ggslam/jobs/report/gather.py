@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as ListOf
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
-from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.runs.records.sequence import RigRecord, SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.writing import REPORT_FILE, TRUTH_FILE
 from ggslam.sequences import Sequence
@@ -123,7 +124,7 @@ def level_axes(folder: RunFolder, record: KeyframesRecord) -> LevelAxes:
 
 
 def path_of_run(folder: RunFolder, record: KeyframesRecord, sequence: Sequence | None = None) -> Path3D:
-    """The camera's path from keyframes.json, with the truth laid upon it if it is known.
+    """The camera's path from keyframes.json, of a rig its first camera's, with the truth laid upon it if it is known.
 
     Args:
         folder: of the run.
@@ -131,8 +132,8 @@ def path_of_run(folder: RunFolder, record: KeyframesRecord, sequence: Sequence |
         sequence: the recording, if it is at hand.
     """
     poses = record.poses()
-    frames = np.array(sorted(poses), int)
-    positions = np.array([poses[f][:3, 3] for f in frames]).reshape(-1, 3)
+    frames = _frames_of_path(folder, sorted(poses))
+    positions = _of_path(folder, frames, np.array([poses[f] for f in frames.tolist()]).reshape(-1, 4, 4))[:, :3, 3]
     times = {f.frame: f.timestamp for f in record.frames}
     seconds = np.array([times[f] for f in frames], float)
     start = seconds[0] if len(seconds) else 0.0
@@ -167,18 +168,39 @@ def _truth(
     if sequence.ground_truth is None:
         return found, "the recording has no ground-truth poses"
     inside = frames < len(sequence.ground_truth)
-    found[inside] = sequence.ground_truth[frames[inside], :3, 3]
+    found[inside] = _of_path(folder, frames[inside], sequence.ground_truth[frames[inside]])[:, :3, 3]
     return found, ""
+
+
+def _rig_of(folder: RunFolder) -> RigRecord | None:
+    recording = SequenceRecord.read_if_there(folder.path)
+    return None if recording is None else recording.rig
+
+
+def _frames_of_path(folder: RunFolder, frames: ListOf[int]) -> np.ndarray:
+    """Those of the frames that trajectory.txt has a pose of, int64 [n]: all, of a rig the first ones of each instant.
+    """
+    rig, chosen = _rig_of(folder), np.array(frames, int)
+    return chosen if rig is None else chosen[rig.first_of_instants(frames)]
+
+
+def _of_path(folder: RunFolder, frames: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
+    """Poses [n, 4, 4] of frames as trajectory.txt has them: of a rig as its first camera's."""
+    rig = _rig_of(folder)
+    if rig is None or not len(frames):
+        return T_world_camera
+    return np.stack([rig.pose_of_first(T, f) for T, f in zip(T_world_camera, frames.tolist(), strict=True)])
 
 
 def save_truth(folder: RunFolder, sequence: Sequence) -> None:
     """Writes the true poses of the run's frames, if the recording knows any, with the times of trajectory.txt."""
     if sequence.ground_truth is None:
         return
-    frames = [f for f in folder.keyframes().frames if f.frame < len(sequence.ground_truth)]
-    poses = np.array([sequence.ground_truth[f.frame] for f in frames]).reshape(-1, 4, 4)
+    times = {f.frame: f.timestamp for f in folder.keyframes().frames if f.frame < len(sequence.ground_truth)}
+    frames = _frames_of_path(folder, list(times))
+    poses = _of_path(folder, frames, sequence.ground_truth[frames])
     if np.isfinite(poses).all((1, 2)).any():
-        write_tum(folder.path / TRUTH_FILE, np.array([f.timestamp for f in frames], float), poses)
+        write_tum(folder.path / TRUTH_FILE, np.array([times[f] for f in frames.tolist()], float), poses)
 
 
 # --- what a user should know -----------------------------------------------------------------------------------------

@@ -65,7 +65,7 @@ _IMAGE_COLUMNS = (
 def _scores(run: RunData) -> Html:
     if run.metrics is None:
         return p.tag("p", "This run was not scored; ggslam eval does that, and writes this page anew.")
-    parts = [_image_scores(run.metrics), _trajectory_scores(run, run.metrics)]
+    parts = [_image_scores(run.metrics), *_camera_scores(run.metrics), _trajectory_scores(run, run.metrics)]
     if run.metrics.segmentation is not None:
         parts.append(_object_scores(run.metrics.segmentation))
     return p.join(parts)
@@ -80,6 +80,17 @@ def _image_scores(metrics: MetricsRecord) -> Html:
     sets = metrics.images.sets()
     rows = [[name.replace("_", " "), *_numbers(scores, _IMAGE_COLUMNS)] for name, scores in sets.items()]
     return p.table(["images of", *(title for title, *_ in _IMAGE_COLUMNS)], rows)
+
+
+def _camera_scores(metrics: MetricsRecord) -> list[Html]:
+    """Held-out images and trajectory of each camera of a rig."""
+    rows = [
+        [name, *_numbers(of_camera.trajectory, (("", "ate_rmse_m", 100.0, ".2f"),)),
+         *_numbers(of_camera.images.held_out, _IMAGE_COLUMNS)]
+        for name, of_camera in (metrics.cameras or {}).items()
+    ]  # fmt: skip
+    columns = ["held-out images of camera", "ATE RMSE, cm", *(title for title, *_ in _IMAGE_COLUMNS)]
+    return [p.table(columns, rows)] if rows else []
 
 
 def _trajectory_scores(run: RunData, metrics: MetricsRecord) -> Html:

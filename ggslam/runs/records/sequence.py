@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
 from typing import Annotated, Any, ClassVar
@@ -81,9 +82,14 @@ class RigRecord(Record):
         places = np.concatenate([np.zeros((0, 2), int), *rows])
         return places[np.lexsort((places[:, 1], places[:, 0]))]
 
-    def pose_of_first(self, T_world_camera: np.ndarray, number: int) -> np.ndarray:
-        """T_world_first [4, 4] by the pose of camera `number`."""
-        return T_world_camera @ inverse(self.T_first_camera[number])
+    def first_of_instants(self, frames: Sequence[int]) -> np.ndarray:
+        """Of frames, in order, the positions in the list of those that are the first of their instants: they stand for
+        the rig, in trajectory.txt and ground_truth.txt."""
+        return np.unique(self.places[np.array(frames, int), 0], return_index=True)[1]
+
+    def pose_of_first(self, T_world_camera: np.ndarray, frame: int) -> np.ndarray:
+        """T_world_first [4, 4] by the pose of a frame, whichever camera took it."""
+        return T_world_camera @ inverse(self.T_first_camera[self.places[frame, 1]])
 
 
 class PartRecord(Record):
