@@ -13,16 +13,15 @@ from __future__ import annotations
 
 import argparse
 import os
+import secrets
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
-
-import ray
 
 from ggslam.jobs.batch.batch import run_batch
 from ggslam.jobs.batch.job_states import JobState, State
@@ -93,16 +92,31 @@ def differences(states: Sequence[JobState], alone: Path) -> list[str]:
     ]  # fmt: skip
 
 
+@contextmanager
+def two_workers() -> Iterator[str]:
+    """A Ray cluster of this machine with room for two runs, whatever processors it has, in a process of its own; gives
+    its address. Whoever joins it needs a token, which is made here and handed on by the environment."""
+    os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
+    program = (
+        f"import ray, sys; ray.init(num_cpus={2 * PROCESSORS}, include_dashboard=False, log_to_driver=False); "
+        "print(ray.get_runtime_context().gcs_address, flush=True); sys.stdin.read(); ray.shutdown()"
+    )
+    words = [sys.executable, "-c", program]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as cluster:
+        assert cluster.stdin is not None and cluster.stdout is not None
+        try:
+            yield cluster.stdout.readline().strip()
+        finally:
+            cluster.stdin.close()
+
+
 def run_part(engine: str, path: Path, folder: Path) -> None:
     """One engine's batch, and its line of the table."""
-    killer, start = Killer(after_s=3), time.perf_counter()
-    more: dict[str, Any] = {}
-    if engine == "ray":
-        # Two workers of Ray, whatever the machine has: the cluster is begun here and joined by its address.
-        ray.init(num_cpus=2 * PROCESSORS, include_dashboard=False, log_to_driver=False)
-        more = {"engine": "ray", "address": ray.get_runtime_context().gcs_address}
-    outcome = run_batch(read_manifest(path, folder / engine), changed=killer.look if more else ignore, **more)
-    seconds = time.perf_counter() - start
+    killer, jobs = Killer(after_s=3), read_manifest(path, folder / engine)
+    with two_workers() if engine == "ray" else nullcontext() as address:
+        start, more = time.perf_counter(), {} if address is None else {"engine": "ray", "address": address}
+        outcome = run_batch(jobs, changed=killer.look if more else ignore, **more)
+        seconds = time.perf_counter() - start
     done = sum(state.state in (State.DONE, State.SKIPPED) for state in outcome.states)
     said = differences(outcome.states, folder / "alone")
     killed = f", worker of {killer.killed} killed" if killer.killed else ""

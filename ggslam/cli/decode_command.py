@@ -22,15 +22,24 @@ EPILOG = """
   ggslam decode kitchen.bin part.pcd --slice 2
 
   ggslam decode kitchen.ggz runs/kitchen
+
+  ggslam decode house.ggc house.grid
 """
 
 
 def decode(
     source: Annotated[
-        Path, typer.Argument(metavar="STREAM", help="Stream of the first edition of G-PCC, or the .ggz of a run.")
+        Path,
+        typer.Argument(
+            metavar="STREAM", help="Stream of the first edition of G-PCC, the .ggz of a run, or the .ggc of a store."
+        ),
     ],
     out: Annotated[
-        Path, typer.Argument(metavar="OUT", help="PLY or PCD file; of Gaussians a 3DGS PLY; of a .ggz a run folder.")
+        Path,
+        typer.Argument(
+            metavar="OUT",
+            help="PLY or PCD file; of Gaussians a 3DGS PLY; of a .ggz a run folder, of a .ggc a grid store.",
+        ),
     ],
     slice_id: Annotated[int | None, typer.Option("--slice", help="Decode this slice alone.", min=0)] = None,
     box: Annotated[
@@ -40,8 +49,11 @@ def decode(
 ) -> None:
     """Decode an MPEG G-PCC stream, or one slice or box of it."""
     from ggslam.jobs.code.coding import decode_file
+    from ggslam.jobs.code.store_coding import is_cells_file
     from ggslam.runs.map_container import is_container
 
+    if is_cells_file(source):
+        return _unpack_cells(source, out, slice_id is not None or box is not None, threads)
     if is_container(source):
         _unpack(source, out, slice_id is not None or box is not None, threads)
         return
@@ -58,6 +70,16 @@ def _unpack(source: Path, out: Path, in_part: bool, threads: int | None) -> None
         raise ConfigError("--slice and --box are for streams; a .ggz is decoded as a whole")
     folder = read_container(source, out, threads=threads)
     console.print(f"wrote {folder.path}: a run of {folder.timing().gaussians} Gaussians", highlight=False, markup=False)
+
+
+def _unpack_cells(source: Path, out: Path, in_part: bool, threads: int | None) -> None:
+    """A grid store from a file of coded cells."""
+    from ggslam.jobs.code.store_coding import decode_store
+
+    if in_part:
+        raise ConfigError("--slice and --box are for streams; a .ggc is decoded as a whole")
+    count = decode_store(source, out, threads)
+    console.print(f"wrote {out}: a grid store of {count} Gaussians", highlight=False, markup=False)
 
 
 def _corners(text: str) -> tuple[list[float], list[float]]:

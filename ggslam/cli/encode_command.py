@@ -28,6 +28,8 @@ EPILOG = """
 
   ggslam encode runs/kitchen kitchen.ggz --slices 4
 
+  ggslam encode house.grid house.ggc --workers 4
+
   ggslam encode runs/kitchen study/ --sweep both
 """
 
@@ -64,17 +66,26 @@ class Sweep(str, Enum):
     both = "both"
 
 
+Slicing = Annotated[
+    Split, typer.Option(help="Equal numbers of points or equal intervals of the longest axis, or octree cubes.")
+]
+Source = Annotated[
+    Path,
+    typer.Argument(metavar="INPUT", help="PLY, 3DGS PLY or PCD file, folder that `ggslam run` wrote, or grid store."),
+]
+Out = Annotated[
+    Path,
+    typer.Argument(
+        metavar="OUT", help="Stream to write; a .ggz: of a run, with all that merging needs; a .ggc: of a grid store, "
+        "cell by cell; with --sweep a folder."
+    ),
+]  # fmt: skip
+
+
 def encode(
     context: typer.Context,
-    source: Annotated[
-        Path, typer.Argument(metavar="INPUT", help="PLY, 3DGS PLY or PCD file, or folder that `ggslam run` wrote.")
-    ],
-    out: Annotated[
-        Path,
-        typer.Argument(
-            metavar="OUT", help="Stream to write; a .ggz: of a run, with all that merging needs; with --sweep a folder."
-        ),
-    ],
+    source: Source,
+    out: Out,
     qp: Annotated[
         int, typer.Option(help="Quantiser of colours and reflectance; 6 more double the step.", min=4, max=51)
     ] = 22,
@@ -87,9 +98,7 @@ def encode(
         int, typer.Option(help="Bits of the longest side of a cloud without a grid.", min=1, max=21)
     ] = 10,
     slices: Annotated[int, typer.Option(help="Slices, coded side by side.", min=1, max=65536)] = 1,
-    split: Annotated[
-        Split, typer.Option(help="Equal numbers of points or equal intervals of the longest axis, or octree cubes.")
-    ] = Split.by_count,
+    split: Slicing = Split.by_count,
     threads: options.Threads = None,
     preset: Annotated[
         Preset, typer.Option(help="pointcloud: positions and what they carry; splat: whole Gaussians of a 3DGS PLY.")
@@ -102,14 +111,21 @@ def encode(
         Sweep | None, typer.Option(help="Write a study over QPs or geometry scales: tables, plots, pictures.")
     ] = None,
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw a study's plots.")] = True,
+    engine: options.CellEngine = options.EngineName.local,
+    workers: options.CellWorkers = None,
+    address: options.CellAddress = None,
 ) -> None:
     """Encode a point cloud or a Gaussian map as an MPEG G-PCC stream (ISO/IEC 23090-9), in parallel slices."""
     from ggslam.coding import CodecSettings
     from ggslam.jobs.code.coding import encode_file
+    from ggslam.jobs.code.store_coding import is_cells_file
+    from ggslam.jobs.submaps.stores import is_store
     from ggslam.runs.map_container import is_container
 
-    contained = is_container(out)
-    _refuse_ignored(context, Preset.splat if contained else preset, sweep)
+    contained, of_store = is_container(out), is_cells_file(out)
+    _refuse_ignored(context, Preset.splat if contained or of_store else preset, sweep, of_store)
+    if of_store != is_store(source):
+        raise ConfigError(f"a grid store becomes a .ggc, and nothing else does: found {source} and {out}")
     settings = CodecSettings(
         qp=qp, chroma_offset=chroma_offset, geometry_scale=geometry_scale, voxel_size=voxel, geometry_bits=bits,
         slices=slices, split="cube" if split is Split.by_octree else split.value, threads=threads,
@@ -117,14 +133,39 @@ def encode(
     if sweep is not None:
         _study(source, out, settings, ["qp", "geometry"] if sweep is Sweep.both else [sweep.value], plots)
         return
+    if of_store:
+        return _encode_store(source, out, settings, rate, (engine, workers, address))
     if contained:
-        _contain(source, out, settings, rate)
-        return
+        return _contain(source, out, settings, rate)
     done = encode_file(source, out, settings, preset.value, rate.value, ids)
     _print_report(done.report)
     for note in done.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
     console.print(f"wrote {done.path}", highlight=False, markup=False)
+
+
+def _encode_store(
+    source: Path, out: Path, settings: CodecSettings, rate: Rate,
+    where: tuple[options.EngineName, int | None, str | None],
+) -> None:  # fmt: skip
+    """The Gaussians of a store, cell by cell."""
+    from ggslam.cli.observer import ProgressObserver
+    from ggslam.jobs.code.store_coding import encode_store
+    from ggslam.jobs.tasks.engines import Engine
+
+    with progress_bar() as bar:
+        engine = Engine(where[0].value, *where[1:])
+        done = encode_store(source, out, rate.value, settings, engine, ProgressObserver(bar))
+    total = out.stat().st_size
+    console.print(
+        f"{done.gaussians} Gaussians in {len(done.sizes)} cells: {total} bytes, {total / max(1, done.gaussians):.1f} "
+        f"a Gaussian; in the store {done.store_bytes}, {done.store_bytes / max(1, total):.1f} times as many; "
+        f"{done.seconds:.1f} s", highlight=False,
+    )  # fmt: skip
+    for line in (f"wrote {out}", *(f"left out: {line}" for line in done.failures.values())):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if done.failures:
+        raise typer.Exit(1)
 
 
 def _contain(source: Path, out: Path, settings: CodecSettings, rate: Rate) -> None:
@@ -144,10 +185,14 @@ def _contain(source: Path, out: Path, settings: CodecSettings, rate: Rate) -> No
     console.print(f"wrote {out}", highlight=False, markup=False)
 
 
-def _refuse_ignored(context: typer.Context, preset: Preset, sweep: Sweep | None) -> None:
+def _refuse_ignored(context: typer.Context, preset: Preset, sweep: Sweep | None, of_store: bool) -> None:
     """Raises ConfigError for an option that the others leave without effect."""
     sources = {name: context.get_parameter_source(name) for name in context.params}
     given = {name for name, source in sources.items() if source is not None and source.name != "DEFAULT"}
+    if not of_store and given & {"engine", "workers", "address"}:
+        raise ConfigError("--engine, --workers and --address are for grid stores, and this is none")
+    if of_store and "threads" in given:
+        raise ConfigError("--threads is not for grid stores: their cells are coded by --workers")
     if preset is Preset.splat:
         for name in ("qp", "chroma_offset", "bits", "sweep"):
             if name in given:

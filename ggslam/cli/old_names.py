@@ -10,7 +10,6 @@ from typer.core import TyperCommand
 OLD_NAMES = {
     "compare": {"--json": "--out"},
     "decode": {"--workers": "--threads"},
-    "encode": {"--workers": "--threads"},
     "export": {"--recording": "--sequence"},
     "localize": {"--first": "--start"},
     "submaps": {"--first": "--start"},

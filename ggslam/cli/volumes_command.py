@@ -130,9 +130,8 @@ def volumes(
     from ggslam.jobs.submaps.stores import is_store
     from ggslam.jobs.volumes.fuse import VolumesRequest
     from ggslam.runs.recordings import SequenceRequest
-    from ggslam.volumes.safety import Braking, Latencies
 
-    braking = Braking(Latencies(sensor_ms / 1e3, 0.0, plan_ms / 1e3, network_ms / 1e3), friction)
+    braking = _make_braking(sensor_ms, plan_ms, network_ms, friction)
     reading = SequenceRequest(
         source, format=format_name, start=start, stop=stop, stride=stride, scale=scale,
         depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
@@ -144,12 +143,21 @@ def volumes(
         onto=onto, slice_height=slice_height, band=_band(band), latency=driving, device=device, config=config,
         overrides=settings or [], overwrite=overwrite,
     )  # fmt: skip
-    where = (engine, workers, address)
     if is_store(source):
-        return _make_of_store(request, *where)
-    if where != (options.EngineName.local, None, None):
-        raise ConfigError("--engine, --workers and --address are for grid stores, and this is none")
+        return _make_of_store(request, engine, workers, address)
+    _refuse_workers(engine, workers, address)
     return _make_and_show(request, _numbers("--speeds", speeds), braking)
+
+
+def _refuse_workers(engine: options.EngineName, workers: int | None, address: str | None) -> None:
+    if (engine, workers, address) != (options.EngineName.local, None, None):
+        raise ConfigError("--engine, --workers and --address are for grid stores, and this is none")
+
+
+def _make_braking(sensor_ms: float, plan_ms: float, network_ms: float, friction: float) -> Braking:
+    from ggslam.volumes.safety import Braking, Latencies
+
+    return Braking(Latencies(sensor_ms / 1e3, 0.0, plan_ms / 1e3, network_ms / 1e3), friction)
 
 
 def _make_of_store(

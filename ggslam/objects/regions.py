@@ -79,12 +79,13 @@ def find_borders(
         found.append((low << 32 | high, np.stack(columns, 1)))
     codes, place = np.unique(np.concatenate([codes for codes, _ in found]), return_inverse=True)
     values = np.concatenate([values for _, values in found])
-    sums = [np.bincount(place, values[:, k], len(codes)).astype(np.int64) for k in range(values.shape[1] - 1)]
+    length, closed, judged, concave, bent = (
+        np.bincount(place, values[:, k], len(codes)).astype(np.int64) for k in range(values.shape[1] - 1)
+    )
     order = np.lexsort((values[:, -1], place))
-    middle = np.cumsum(sums[0]) - (sums[0] + 1) // 2
-    length, closed, judged, concave, bent = sums
-    pairs, contrast = np.stack([codes >> 32, codes & 0xFFFFFFFF], 1), values[order[middle], -1]
-    return Borders(pairs, length, closed, judged, concave, bent, contrast)
+    middle = np.cumsum(length) - (length + 1) // 2
+    pairs = np.stack([codes >> 32, codes & 0xFFFFFFFF], 1)
+    return Borders(pairs, length, closed, judged, concave, bent, values[order[middle], -1])
 
 
 def _link_ends(regions: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:

@@ -274,6 +274,8 @@ class CpuRasterizer:
             updates=address(map.updates), schedule=address(schedule), schedule_rows=schedule.shape[0],
             beta1=optimizer.beta1, beta2=optimizer.beta2, epsilon=optimizer.epsilon,
         )  # fmt: skip
+        if map.compact_features and grad_features is not None:
+            raise RenderError("backward_step: the moments of the map's features are compact")
         for name, (first, second) in map.moments.items():
             setattr(adam, name, structures.AdamArrays(address(getattr(map, name)), address(first), address(second)))
         twist = np.zeros(6)

@@ -162,10 +162,11 @@ class CpuPixelTerms:
             raise RenderError("step: the map was made without moments")
         schedule = optimizer.schedule()
         first, second = gaussians.moments["features"]
+        compact = gaussians.compact_features
         adam = structures.FeatureAdam(
-            len(gaussians), address(gaussians.features), address(first), address(second),
+            len(gaussians), address(gaussians.features), None if compact else address(first), address(second),
             address(gaussians.feature_updates), schedule.ctypes.data, len(schedule), channels,
-            optimizer.beta1, optimizer.beta2, optimizer.epsilon,
+            optimizer.beta1, optimizer.beta2, optimizer.epsilon, address(first) if compact else None,
         )  # fmt: skip
         return np.ascontiguousarray(gradient), adam
 

@@ -65,9 +65,10 @@ class RunParts:
 
 
 def make_parts(
-    camera: Camera, config: Config, has_masks: bool | None, paging: Path | None, library: CudaLibrary | None
-) -> RunParts:
-    """The parts that the settings name; arguments and errors as of `Slam`."""
+    camera: Camera, config: Config, has_masks: bool | None, paging: Path | None, library: CudaLibrary | None,
+    compact: bool = True,
+) -> RunParts:  # fmt: skip
+    """The parts that the settings name; arguments and errors as of `Slam`, `compact` as of `make_mapper`."""
     if min(camera.width, camera.height) < SMALLEST_SIDE:
         size = f"{camera.width}x{camera.height}"
         raise ConfigError(f"images of {size} pixels are too small: at least {SMALLEST_SIDE} each way are needed")
@@ -81,7 +82,7 @@ def make_parts(
     # A device makes the voxels' shapes itself; features are tracked on the CPU, which has them made here.
     surface.finish = library is None or config.tracker != "gicp"
     loops = LoopCloser(camera, config.loops, surface, tracker, context) if config.loops.enabled else None
-    mapper = make_mapper(config, masks.active, context, library)
+    mapper = make_mapper(config, masks.active, context, library, compact)
     if pager is not None:
         pager.serve(mapper)
     return RunParts(context, masks, tracker, mapper, surface, pager, loops, library is not None, notes)
@@ -111,7 +112,9 @@ def device_name(device: torch.device) -> str:
     return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
 
 
-def make_mapper(config: Config, learns: bool, context: NativeContext, library: CudaLibrary | None) -> Mapper:
+def make_mapper(
+    config: Config, learns: bool, context: NativeContext, library: CudaLibrary | None, compact: bool = True
+) -> Mapper:
     """A mapper with an empty map.
 
     Args:
@@ -119,12 +122,15 @@ def make_mapper(config: Config, learns: bool, context: NativeContext, library: C
         learns: whether there can be object masks to learn from.
         context: threads of the CPU.
         library: CUDA kernels to compute with; None: on the CPU.
+        compact: whether identity vectors may have compact moments: they are never trained with everything else.
     """
     learns = learns and config.identity.enabled
     channels = IDENTITY_CHANNELS if learns else 0
     if library is None:
         learner = CpuIdentityLearner(config.identity, config.seed) if learns else None
-        return CpuMapper(GaussianMap(config.sh_degree, channels), config.mapping, context, config.seed, learner)
+        compact = compact and learns and config.identity.schedule != "dense"
+        gaussians = GaussianMap(config.sh_degree, channels, compact_features=compact)
+        return CpuMapper(gaussians, config.mapping, context, config.seed, learner)
     device = library.whole_device(None)
     device_learner = CudaIdentityLearner(config.identity, config.seed, device, library) if learns else None
     return CudaMapper(

@@ -127,14 +127,19 @@ def check_state(slam: Slam) -> None:
 
 
 def _save_map(gaussians: GaussianMap) -> dict[str, Any]:
-    counters = ("sh_degree", "feature_channels", "with_moments", "count", "version", "order", "growth")
+    counters = (
+        "sh_degree", "feature_channels", "with_moments", "compact_features", "count", "version", "order", "growth",
+    )  # fmt: skip
     rows = {name: array[: gaussians.count] for name, array in gaussians._storage.items()}
     return {**{name: getattr(gaussians, name) for name in counters}, "capacity": gaussians.capacity, "rows": rows}
 
 
 def _take_map(gaussians: GaussianMap, saved: dict[str, Any]) -> None:
     rows, capacity, count = saved.pop("rows"), saved.pop("capacity"), saved["count"]
-    expected = GaussianMap(saved["sh_degree"], saved["feature_channels"], with_moments=saved["with_moments"])
+    expected = GaussianMap(
+        saved["sh_degree"], saved["feature_channels"], with_moments=saved["with_moments"],
+        compact_features=saved["compact_features"],
+    )  # fmt: skip
     vars(gaussians).update(vars(expected))
     gaussians.append(rows)  # checks them
     if gaussians.count != count or not count <= capacity <= 4 * count + 65536:

@@ -77,7 +77,7 @@ class Slam:
         check_arguments(camera, config, extra_loss)
         self.camera = camera
         self.config = config or Config()
-        parts = make_parts(camera, self.config, has_masks, paging, library)
+        parts = make_parts(camera, self.config, has_masks, paging, library, compact=extra_loss is None)
         self.context, self.masks, self.tracker, self.surface = parts.context, parts.masks, parts.tracker, parts.surface
         self.mapper, self.pager, self.loops = parts.mapper, parts.pager, parts.loops
         self._notes, self._on_device = parts.notes, parts.on_device

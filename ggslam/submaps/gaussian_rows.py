@@ -19,7 +19,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 
 Rows = Mapping[str, torch.Tensor]
 """What `GaussianMap.take` gives."""
-_DTYPES = {np.dtype(name).str for name in ("float32", "float64", "int32", "int64", "uint8", "bool")}
+_DTYPES = {np.dtype(name).str for name in ("float32", "float64", "int16", "int32", "int64", "uint8", "bool")}
 
 
 def encode_rows(rows: Rows) -> bytes:
@@ -54,7 +54,10 @@ def decode_rows(data: bytes, source: str) -> dict[str, torch.Tensor]:
 def map_like(gaussians: GaussianMap, rows: Rows | None = None) -> GaussianMap:
     """A map with the channels of another one, and these rows."""
     channels = gaussians.features.shape[1]
-    out = GaussianMap(gaussians.sh_degree, channels, with_moments=gaussians.with_moments, growth=0.0)
+    out = GaussianMap(
+        gaussians.sh_degree, channels, with_moments=gaussians.with_moments, growth=0.0,
+        compact_features=gaussians.compact_features,
+    )  # fmt: skip
     if rows is not None and len(rows["means"]):
         out.append(rows)
     return out

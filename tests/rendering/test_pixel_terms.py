@@ -10,6 +10,7 @@ from rendering_scenes import CAMERA, POSE, make_scene
 
 from ggslam.errors import RenderError
 from ggslam.native.loader import available_instruction_sets
+from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.pixel_terms import CpuPixelTerms, FeatureAdamSettings
 from ggslam.scene.gaussian_map import GaussianMap
@@ -17,9 +18,9 @@ from ggslam.scene.gaussian_map import GaussianMap
 ALL = np.arange(CAMERA.width * CAMERA.height)
 
 
-def make_map(features: int = 16) -> GaussianMap:
+def make_map(features: int = 16, compact: bool = False) -> GaussianMap:
     scene = make_scene(300, features)
-    gaussians = GaussianMap(0, features)
+    gaussians = GaussianMap(0, features, compact_features=compact)
     gaussians.insert(
         scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits, torch.rand(300, 3), scene.features
     )
@@ -74,10 +75,50 @@ def test_the_step_is_adam_on_the_summed_gradient() -> None:
     assert np.array_equal(gaussians.feature_updates.numpy(), 3 * touched)
 
 
-def test_threads_do_not_change_a_step() -> None:
+def test_compact_moments_step_all_channels_by_one_length() -> None:
+    gaussians, rasterizer = make_map(compact=True), CpuRasterizer()
+    terms = CpuPixelTerms.of_gaussians(np.array([3, 7]), 2, rasterizer.context)
+    before = gaussians.features.numpy().copy()
+    first, second, random = np.zeros((2, 16)), np.zeros(2), np.random.default_rng(0)
+    expected = before[[3, 7]].astype(float)
+    for step in range(1, 6):
+        gradient = random.normal(size=(2, 16)).astype(np.float32)
+        first, second = 0.9 * first + 0.1 * gradient, 0.99 * second + 0.01 * (gradient**2).mean(1)
+        expected -= 0.05 * first / (1 - 0.9**step) / np.sqrt(second / (1 - 0.99**step))[:, None]
+        terms.step(gaussians, gradient, FeatureAdamSettings())
+    after = gaussians.features.numpy()
+    assert np.allclose(after[[3, 7]], expected, atol=2e-3) and not np.allclose(after[[3, 7]], before[[3, 7]], atol=0.05)
+    assert np.array_equal(np.delete(after, [3, 7], 0), np.delete(before, [3, 7], 0))
+    rasterizer.forward(gaussians, CAMERA, POSE)
+    with pytest.raises(RenderError, match="compact"):
+        rasterizer.backward_step(
+            gaussians, None, grad_features=torch.zeros(16, CAMERA.height, CAMERA.width), optimizer=AdamSettings()
+        )
+
+
+@pytest.mark.parametrize("compact", [False, True])
+def test_learning_is_a_step_and_votes(compact: bool) -> None:
+    results = []
+    gradient = np.random.default_rng(1).normal(size=(len(ALL), 16)).astype(np.float32)
+    labels, weights = (ALL % 9).astype(np.uint16), np.linspace(0, 2, len(ALL), dtype=np.float32)
+    for at_once in (False, True):
+        gaussians, rasterizer = make_map(compact=compact), CpuRasterizer()
+        rasterizer.forward(gaussians, CAMERA, POSE, features=False)
+        terms = rasterizer.pixel_terms(ALL)
+        if at_once:
+            terms.learn(gaussians, gradient, FeatureAdamSettings(), labels, weights)
+        else:
+            terms.step(gaussians, gradient, FeatureAdamSettings())
+            terms.vote(gaussians, labels, weights)
+        results.append((gaussians.features.numpy().copy(), gaussians.vote_weights.numpy().copy()))
+    assert np.array_equal(results[0][0], results[1][0]) and np.array_equal(results[0][1], results[1][1])
+
+
+@pytest.mark.parametrize("compact", [False, True])
+def test_threads_do_not_change_a_step(compact: bool) -> None:
     results = []
     for threads in (1, 3):
-        gaussians, rasterizer = make_map(), CpuRasterizer(threads)
+        gaussians, rasterizer = make_map(compact=compact), CpuRasterizer(threads)
         rasterizer.forward(gaussians, CAMERA, POSE, features=False)
         terms = rasterizer.pixel_terms(ALL)
         gradient = np.random.default_rng(1).normal(size=(len(ALL), 16)).astype(np.float32)

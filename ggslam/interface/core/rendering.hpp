@@ -76,6 +76,9 @@ struct FeatureAdam {
   const float* schedule;        // [rows][2]: step size over bias correction, 1 / sqrt of the second correction
   std::int32_t schedule_rows, channels;
   float beta1, beta2, epsilon;
+  // If not null, the first moments as bfloat16 [N, channels]; second_moments are then means over the channels [N], and
+  // first_moments are not used.
+  std::uint16_t* short_moments;
 };
 
 // Votes of Gaussians, and the labels that pixels give them.

@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_float, c_int, c_int32, c_int64, c_void_
 from typing import Any
 
 HEADER = "core/rendering.hpp"
-HEADER_SHA256 = "53230ddfaa07e6d4a3638b308f7454efef108cf89398029613d54b3b2d17840a"
+HEADER_SHA256 = "da97117ddcf9b8bb887fa508013b07f0608be4c70ebf4d0a4078266b0703a930"
 
 
 class GaussianArrays(Structure):
@@ -89,7 +89,7 @@ class FeatureAdam(Structure):
     _fields_ = [
         ("gaussians", c_int64), ("features", c_void_p), ("first_moments", c_void_p), ("second_moments", c_void_p),
         ("updates", c_void_p), ("schedule", c_void_p), ("schedule_rows", c_int32), ("channels", c_int32),
-        ("beta1", c_float), ("beta2", c_float), ("epsilon", c_float),
+        ("beta1", c_float), ("beta2", c_float), ("epsilon", c_float), ("short_moments", c_void_p),
     ]
 
 

@@ -49,6 +49,7 @@ constexpr std::size_t kLayout[] = {
     offsetof(FeatureAdam, first_moments), offsetof(FeatureAdam, second_moments), offsetof(FeatureAdam, updates),
     offsetof(FeatureAdam, schedule), offsetof(FeatureAdam, schedule_rows), offsetof(FeatureAdam, channels),
     offsetof(FeatureAdam, beta1), offsetof(FeatureAdam, beta2), offsetof(FeatureAdam, epsilon),
+    offsetof(FeatureAdam, short_moments),
     sizeof(TermVotes), offsetof(TermVotes, labels), offsetof(TermVotes, pixel_weights), offsetof(TermVotes, ids),
     offsetof(TermVotes, weights), offsetof(TermVotes, slots),
     sizeof(MeshPictureInput), offsetof(MeshPictureInput, positions), offsetof(MeshPictureInput, colors),

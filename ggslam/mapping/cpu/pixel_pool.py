@@ -8,8 +8,8 @@ import numpy as np
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
 
-TILE = 16
-"""Pixels across a tile, as the rasterizer has them."""
+TILE = 8
+"""Pixels across a tile: half of one of the rasterizer's."""
 
 
 def draw_pool(

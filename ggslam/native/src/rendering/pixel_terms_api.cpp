@@ -144,7 +144,8 @@ const FeatureAdam& check_adam(const FeatureAdam* pointer, const PixelTerms& term
   const FeatureAdam& adam = object_of<FeatureAdam>(pointer);
   check_range("channels", adam.channels, 0, kMaxTermChannels);
   check_range("schedule_rows", adam.schedule_rows, 1, std::numeric_limits<std::int32_t>::max());
-  const void* const arrays[] = {adam.features, adam.first_moments, adam.second_moments, adam.updates, adam.schedule};
+  const void* const first = adam.short_moments != nullptr ? static_cast<const void*>(adam.short_moments) : adam.first_moments;
+  const void* const arrays[] = {adam.features, first, adam.second_moments, adam.updates, adam.schedule};
   for (const void* array : arrays) check_array("features and moments", array, adam.gaussians);
   check_array("gradient", gradient, terms.pixels);
   return adam;
