@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import secrets
 import signal
 import subprocess
 import sys
@@ -94,7 +95,8 @@ def differences(states: Sequence[JobState], alone: Path) -> list[str]:
 @contextmanager
 def two_workers() -> Iterator[str]:
     """A Ray cluster of this machine with room for two runs, whatever processors it has, in a process of its own; gives
-    its address."""
+    its address. Whoever joins it needs a token, which is made here and handed on by the environment."""
+    os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
     program = (
         f"import ray, sys; ray.init(num_cpus={2 * PROCESSORS}, include_dashboard=False, log_to_driver=False); "
         "print(ray.get_runtime_context().gcs_address, flush=True); sys.stdin.read(); ray.shutdown()"

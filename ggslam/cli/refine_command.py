@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -76,15 +77,14 @@ def refine(
         _show_store(outcome)
         return
     _print([
-        f"{done.steps} steps on {done.keyframes} keyframes: {done.before:.2f} dB before, {done.after:.2f} dB after",
+        f"{done.steps} steps on {done.keyframes} keyframes{_gain(done.before, done.after)}",
         *(f"note: {note}" for note in done.notes), f"wrote {done.folder.path} in {done.seconds:.1f} s",
     ])  # fmt: skip
 
 
 def _show_store(outcome: StoreRefinement) -> None:
-    lines = [f"{outcome.trained} of {outcome.cells} cells trained, {outcome.steps} steps"]
-    if outcome.trained:
-        lines[0] += f": {outcome.before:.2f} dB before, {outcome.after:.2f} dB after"
+    gain = _gain(outcome.before, outcome.after)
+    lines = [f"{outcome.trained} of {outcome.cells} cells trained, {outcome.steps} steps{gain}"]
     if outcome.resumed:
         lines.append(f"{outcome.resumed} cells were done by an earlier call")
     if outcome.unseen:
@@ -94,6 +94,10 @@ def _show_store(outcome: StoreRefinement) -> None:
     if outcome.failures:
         _print([f"as it was: {line}" for line in outcome.failures.values()])
         raise typer.Exit(1)
+
+
+def _gain(before: float, after: float) -> str:
+    return "" if math.isnan(before) else f": {before:.2f} dB before, {after:.2f} dB after"
 
 
 def _print(lines: list[str]) -> None:

@@ -131,7 +131,7 @@ def volumes(
     from ggslam.jobs.volumes.fuse import VolumesRequest
     from ggslam.runs.recordings import SequenceRequest
 
-    braking = _braking(sensor_ms, plan_ms, network_ms, friction)
+    braking = _make_braking(sensor_ms, plan_ms, network_ms, friction)
     reading = SequenceRequest(
         source, format=format_name, start=start, stop=stop, stride=stride, scale=scale,
         depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
@@ -154,7 +154,7 @@ def _refuse_workers(engine: options.EngineName, workers: int | None, address: st
         raise ConfigError("--engine, --workers and --address are for grid stores, and this is none")
 
 
-def _braking(sensor_ms: float, plan_ms: float, network_ms: float, friction: float) -> Braking:
+def _make_braking(sensor_ms: float, plan_ms: float, network_ms: float, friction: float) -> Braking:
     from ggslam.volumes.safety import Braking, Latencies
 
     return Braking(Latencies(sensor_ms / 1e3, 0.0, plan_ms / 1e3, network_ms / 1e3), friction)

@@ -118,17 +118,19 @@ class StillMapper(CpuMapper):
             progress: told how many of how many are done.
 
         Returns:
-            PSNR of what counts, before the first steps on each keyframe and before the last ones, mean in dB; NaN
-            without steps.
+            PSNR of what counts, before the first step on each keyframe and before the last one, mean in dB over those
+            that were trained on more than once; NaN if none was.
         """
-        random, turn, found = np.random.default_rng(seed), list[int](), list[float]()
+        random, turn, found = np.random.default_rng(seed), list[int](), dict[int, list[float]]()
         for step in range(steps):
             turn = turn or random.permutation(len(self.keyframes)).tolist()
-            self.iterate(self.keyframes[turn.pop()], self.settings.refine_decay ** (step / max(1, steps - 1)))
-            found.append(self.last_psnr)
+            keyframe = self.keyframes[turn.pop()]
+            self.iterate(keyframe, self.settings.refine_decay ** (step / max(1, steps - 1)))
+            found.setdefault(keyframe.index, []).append(self.last_psnr)
             progress(step + 1, steps)
-        turns = min(len(self.keyframes), max(1, steps // 2))
-        return (float(np.mean(found[:turns])), float(np.mean(found[-turns:]))) if found else (np.nan, np.nan)
+        ends = [(values[0], values[-1]) for values in found.values() if len(values) > 1]
+        before, after = np.mean(ends, axis=0) if ends else (np.nan, np.nan)
+        return float(before), float(after)
 
     def _valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
         return self._counted[keyframe.index]

@@ -190,10 +190,11 @@ class _Refinement:
         outcome.steps = self.settings.steps * len(seen)
         outcome.failures = {key: failure.line for key, failure in sorted(self.failures.items())}
         outcome.notes += [f"not among the Gaussians around its neighbours: {line}" for line in cells.damaged.values()]
-        if seen:
-            views = [cell.views for cell in seen]
-            outcome.before = float(np.average([cell.before for cell in seen], weights=views))
-            outcome.after = float(np.average([cell.after for cell in seen], weights=views))
+        judged = [cell for cell in seen if np.isfinite(cell.before)]
+        if judged:
+            views = [cell.views for cell in judged]
+            outcome.before = float(np.average([cell.before for cell in judged], weights=views))
+            outcome.after = float(np.average([cell.after for cell in judged], weights=views))
 
 
 def _name_of_work(cells: StoreCells) -> str:
