@@ -243,7 +243,7 @@ class Soak:
             slam.gaussian_count, len(slam.mapper.keyframes), len(slam.surface.active),
             0 if loops is None else sum(event.kind == "closed" for event in loops.events),
             sum(f.status == "lost" for f in slam.frames[-every:]), threading_count(), open_files(),
-            100 * float(np.linalg.norm(slam.poses.newest()[:3, 3] - truth[:3, 3])),
+            100 * float(np.linalg.norm(slam.pose_of(slam.frames[-1])[:3, 3] - truth[:3, 3])),
         )  # fmt: skip
 
 

@@ -277,7 +277,7 @@ def _check_common(file: RigFile, parts: list[RigPart], instants: np.ndarray) -> 
             spans = [f"'{p.name}' {p.times.min():.3f} to {p.times.max():.3f} s" for p in (part, other)]
             raise SequenceError(
                 f"{file.path}: no image of '{part.name}' was taken within {file.tolerance:g} s of one of another "
-                f"camera ({', '.join(spans)}); see `tolerance` and `time_offset`"
+                f"camera ({', '.join(spans)}); see 'tolerance' and 'time_offset' there"
             )
 
 

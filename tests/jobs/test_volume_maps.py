@@ -35,6 +35,7 @@ class Played:
 
     def __init__(self) -> None:
         self.corrections = 0
+        self.cameras = [None]
         self.mapper: Any = SimpleNamespace(keyframes=[], identity=None)
         self.poses: dict[int, np.ndarray] = {}
 

@@ -14,7 +14,7 @@ from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.identity import CpuIdentityLearner, cross_entropy
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
-from ggslam.mapping.cpu.pixel_pool import TILE, at_boundary, draw_pool
+from ggslam.mapping.cpu.pixel_pool import at_boundary, draw_pool
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
 from ggslam.mapping.labelling import KeyframeLabels
 from ggslam.mapping.mapper import Mapper
@@ -305,18 +305,6 @@ def test_the_sample_is_balanced_and_its_votes_are_not() -> None:
     assert at_boundary(ids).reshape(-1)[pool.pixels].mean() > 0.5
     votes = np.bincount(drawn, pool.vote_weights)
     assert votes[2] / votes.sum() == pytest.approx(100 / 9000, rel=0.1)
-
-
-def test_a_sample_by_tiles_is_the_same_in_another_order() -> None:
-    ids = np.random.default_rng(0).integers(0, 4, (60, 70)).astype(np.uint16)
-    settings = IdentitySettings()
-    mixed, by_tile = (draw_pool(ids, 800, settings, np.random.default_rng(5), flag) for flag in (False, True))
-    assert np.array_equal(np.sort(mixed.pixels), np.sort(by_tile.pixels))
-    rows, columns = np.divmod(np.stack([pool.pixels[:200] for pool in (mixed, by_tile)]), 70)
-    tiles = [len(np.unique(row)) for row in rows // TILE * 70 + columns // TILE]
-    assert tiles[1] < 0.5 * tiles[0]
-    empty = draw_pool(np.zeros_like(ids), 10, settings, np.random.default_rng(0), True)
-    assert not len(empty.pixels)
 
 
 def test_members_are_what_the_classifier_takes_for_an_object_rather_than_for_its_rival() -> None:

@@ -20,6 +20,7 @@ def poses_of(scene: Scene, instance: int) -> np.ndarray:
     return np.array([shape.T_world_shape for shape in scene.shapes if shape.instance == instance])
 
 
+@pytest.mark.long("rooms are furnished four times")
 @pytest.mark.parametrize("seed", [0, 3])
 def test_what_changed_is_what_is_said(seed: int) -> None:
     first, second, made = room_at_two_visits(seed, 6)

@@ -115,8 +115,7 @@ class CpuIdentityLearner(IdentityLearner):
 
     def _new_pool(self, keyframe: MaskedKeyframe, wanted: int) -> PixelPool[np.ndarray]:
         assert keyframe.mask is not None
-        by_tile = self.table.count <= MANY_CLASSES  # else the softmax would miss the classes of other tiles
-        return draw_pool(self.current(keyframe.mask), wanted, self.settings, self._rng, by_tile)
+        return draw_pool(self.current(keyframe.mask), wanted, self.settings, self._rng)
 
     def _dense(
         self, gaussians: GaussianMap, rasterizer: CpuRasterizer, keyframe: MaskedKeyframe, view: RenderBuffers

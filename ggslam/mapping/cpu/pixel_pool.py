@@ -8,12 +8,9 @@ import numpy as np
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
 
-TILE = 8
-"""Pixels across a tile: half of one of the rasterizer's."""
-
 
 def draw_pool(
-    ids: np.ndarray, wanted: int, settings: IdentitySettings, rng: np.random.Generator, by_tile: bool = False
+    ids: np.ndarray, wanted: int, settings: IdentitySettings, rng: np.random.Generator
 ) -> PixelPool[np.ndarray]:
     """Draws labelled pixels: a share `settings.boundary` of them at the boundaries of objects, where nearly all errors
     are, the others anywhere; in both parts an object of n pixels comes with a share that goes with n^(1 - balance).
@@ -21,7 +18,6 @@ def draw_pool(
     Args:
         ids: object of each pixel, uint16 [H, W]; 0 is never drawn.
         wanted: how many; a pixel may come twice.
-        by_tile: those that come together are of a few tiles of the image, and quicker to composite.
     """
     flat = ids.reshape(-1)
     edge = np.flatnonzero(at_boundary(ids))
@@ -36,18 +32,9 @@ def draw_pool(
     sums = density.cumsum()
     places = np.minimum((np.arange(wanted) + rng.random()) * (sums[-1] / wanted), np.nextafter(sums[-1], 0))
     pixels = np.searchsorted(sums, places, side="right").astype(np.int32)
-    pixels = _tile_by_tile(pixels, ids.shape, rng) if by_tile else rng.permutation(pixels)
+    pixels = rng.permutation(pixels)
     weights = 1 / density[pixels]
     return PixelPool(pixels, (weights / weights.mean()).astype(np.float32))
-
-
-def _tile_by_tile(pixels: np.ndarray, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Pixels (flat indices [M]) of an image [H, W] in a random order of tiles."""
-    rows, columns = np.divmod(pixels, shape[1])
-    across = -(-shape[1] // TILE)
-    tile = rows // TILE * across + columns // TILE
-    place = rng.permutation(int(tile.max(initial=0)) + 1)
-    return pixels[np.argsort(place[tile], kind="stable")]
 
 
 def _odds(ids: np.ndarray, balance: float) -> np.ndarray | None:
