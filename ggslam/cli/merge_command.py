@@ -35,8 +35,12 @@ def merge(
     ],
     out: Annotated[Path, typer.Option(help="Folder for the merged run.")],
     steps: Annotated[
-        int, typer.Option(help="Optimisation steps where the maps meet, if the recordings are there; 0: none.", min=0)
-    ] = 300,
+        int,
+        typer.Option(
+            help="Optimisation steps where maps meet for each run that joins, if the recordings are there; 0: none.",
+            min=0,
+        ),
+    ] = 400,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already at --out.")] = False,
 ) -> None:
     """Merge runs that share a part of a scene: one world, one map, one id for each object."""

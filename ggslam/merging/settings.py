@@ -38,8 +38,8 @@ class MergeSettings:
     """Keyframes before and after one that is tried whose points make its local map."""
     confirmations: int = setting(3, 1, 10**6)
     """Keyframes that have to agree on how two runs lie to each other."""
-    steps: int = setting(300, 0, 10**7)
-    """Optimisation steps at the seams."""
+    steps: int = setting(400, 0, 10**7)
+    """Optimisation steps at the seams, for each run that joins the first."""
     verification: VerificationSettings = field(default_factory=VerificationSettings)
     graph: GraphSettings = field(default_factory=GraphSettings)
     uniting: UnitingSettings = field(default_factory=UnitingSettings)

@@ -140,8 +140,9 @@ class _Merge:
             learned = objects if with_masks and objects.supervision is not None else None
             config = replace(sources[0].folder.config(), sh_degree=gaussians.sh_degree)
             training = SeamTraining(gaussians, keyframes, seam, learned, config, sigma)
-            training.run(self.settings.steps, self.context, self.observer)
-            outcome.trained, outcome.steps = len(seam), self.settings.steps
+            steps = self.settings.steps * (len(sources) - 1)
+            training.run(steps, self.context, self.observer)
+            outcome.trained, outcome.steps = len(seam), steps
         self.clock.lap("train")
         notes += objects.notes
         outcome.gaussians, outcome.united = len(gaussians), objects.united
