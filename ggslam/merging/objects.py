@@ -14,11 +14,13 @@ from ggslam.mapping.votes import merge_votes
 from ggslam.objects.encoding import code_of, with_class
 from ggslam.objects.settings import UnitingSettings
 from ggslam.objects.table import ObjectTable, Observation, Supervision
-from ggslam.objects.uniting import LabelledVoxels, find_counterparts
+from ggslam.objects.uniting import LabelledVoxels, find_counterparts, sizes_of
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
 
 _IDS = 1 << 16
+_SMALL = 4
+"""Things that fill fewer than this many times the voxels that two have to share are compared in finer ones, too."""
 _SUREST: tuple[Supervision, ...] = ("geometry", "model", "associated masks", "masks")
 """What taught objects, the least sure first: a merged map's are as sure as the least sure of them."""
 
@@ -129,7 +131,13 @@ class UnitedObjects:
     def _by_surface(self, base: GaussianMap, gaussians: GaussianMap) -> dict[int, int]:
         voxel = self.settings.voxel
         first, second = LabelledVoxels.of_map(base, voxel), LabelledVoxels.of_map(gaussians, voxel)
-        return {found.second: found.first for found in find_counterparts(first, second, self.settings)}
+        found = {pair.second: pair.first for pair in find_counterparts(first, second, self.settings)}
+        small = [np.flatnonzero(sizes_of(voxels) < _SMALL * self.settings.min_shared) for voxels in (first, second)]
+        for finer in (voxel / 2, voxel / 4):  # small things fill too few voxels
+            maps = [LabelledVoxels.of_map(g, finer, only) for g, only in zip((base, gaussians), small, strict=True)]
+            more = {pair.second: pair.first for pair in find_counterparts(maps[0], maps[1], self.settings)}
+            found = {**more, **found}
+        return found
 
     # --- what they are called ----------------------------------------------------------------------------------------
 

@@ -38,12 +38,19 @@ class LabelledVoxels:
         return LabelledVoxels(present, (pairs[best] & 0xFFFF).astype(np.uint16))
 
     @staticmethod
-    def of_map(gaussians: GaussianMap, voxel: float) -> LabelledVoxels:
-        """Of a map whose Gaussians have objects."""
+    def of_map(gaussians: GaussianMap, voxel: float, only: np.ndarray | None = None) -> LabelledVoxels:
+        """Of a map whose Gaussians have objects; of these objects alone, if `only` names some."""
         opacities = gaussians.opacities.numpy()
         seen = opacities >= FAINT
+        if only is not None:
+            seen &= np.isin(gaussians.object_id.numpy(), only)
         labels = gaussians.object_id.numpy()[seen].astype(np.int64)
         return LabelledVoxels.of(gaussians.means.numpy()[seen], labels, opacities[seen], voxel)
+
+
+def sizes_of(voxels: LabelledVoxels) -> np.ndarray:
+    """Number of voxels of each object, int64 [65536]."""
+    return np.bincount(voxels.labels, minlength=1 << 16)
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,7 @@ def find_counterparts(
     _, a, b = np.intersect1d(first.keys, second.keys, assume_unique=True, return_indices=True)
     ours, theirs = first.labels[a].astype(np.int64), second.labels[b].astype(np.int64)
     sizes, their_sizes = np.bincount(ours, minlength=1 << 16), np.bincount(theirs, minlength=1 << 16)
-    whole, their_whole = (np.bincount(of_map.labels, minlength=1 << 16) for of_map in (first, second))
+    whole, their_whole = sizes_of(first), sizes_of(second)
     both = (ours > 0) & (theirs > 0)
     pairs, shared = np.unique(ours[both] << 16 | theirs[both], return_counts=True)
     best: dict[int, Counterpart] = {}

@@ -142,3 +142,17 @@ def test_a_run_without_objects_adds_none() -> None:
 def test_a_merged_map_is_as_sure_as_the_least_sure_run(order: tuple[str, str]) -> None:
     united, _ = unite(learned({1: SOFA}, order[0], {}), learned({1: TABLE}, order[1], {}))
     assert united.supervision == "geometry"
+
+
+def test_small_things_are_known_again() -> None:
+    """A tile of 6 x 4 x 2 cm fills two or three voxels; one beside it is another thing."""
+    maps = []
+    for ids, off in (((2, 3), 0.0), ((8, 9), 0.002)):
+        out = GaussianMap(0)
+        for i, centre in zip(ids, ((0.0, 0, 1), (0.12, 0, 1)), strict=True):
+            points = torch.from_numpy(box(centre, (0.06, 0.04, 0.02), 0.004) + off).float()
+            count, ids_of = len(points), torch.full((len(points),), i, dtype=torch.int32)
+            turns = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
+            out.insert(points, turns, torch.full((count, 3), -5.0), 2.0, torch.zeros((count, 3)), object_id=ids_of)
+        maps.append(out)
+    assert UnitedObjects(SETTINGS)._by_surface(*maps) == {8: 2, 9: 3}
