@@ -83,6 +83,8 @@ class ChangeDetector:
         self.sights = [Sightings(visit, settings, context) for visit in self.visits]
         self._up = estimate_up(old.T_world_camera, old.measured, old.normals).up
         self.judged: list[JudgedSurface] = []
+        self._newer: cKDTree | None = None
+        """Of the newer visit's points, if there are any."""
         self.things: list[list[Thing]] = [[], []]
 
     def detect(self) -> Detection:
@@ -91,6 +93,7 @@ class ChangeDetector:
         surfaces = [sights.surface(self.settings.spacing_m) for sights in self.sights]
         found.tolerance = self._usual_tolerance(surfaces)
         self.judged = [self._judge(number, surface, found.tolerance) for number, surface in enumerate(surfaces)]
+        self._newer = cKDTree(self.judged[1].points) if len(self.judged[1].points) else None
         both = all(visit.has_objects for visit in self.visits)
         found.ids_believed = both and (self._ids_agree() if self._ids is None else self._ids)
         if not both:
@@ -126,19 +129,17 @@ class ChangeDetector:
     def _ids_agree(self) -> bool:
         """Whether things that stayed have the same ids in both visits."""
         same, count = 0, 0
-        old, new = self.judged
-        tree = cKDTree(new.points) if len(new.points) else None
+        old = self.judged[0]
         stayed = old.other.is_there(self.settings.min_views) & (old.ids > 0)
         for i in np.unique(old.ids[stayed]).tolist():
             own = old.ids == i
             rows = np.flatnonzero(stayed & own)
-            if tree is None or len(rows) < max(self.settings.min_points, self.settings.whole * own.sum()):
+            if len(rows) < max(self.settings.min_points, self.settings.whole * own.sum()):
                 continue  # what stayed of a thing that went are the places where it touched others
-            apart, nearest = tree.query(old.points[rows], distance_upper_bound=_SAME_PLACE)
-            names = new.ids[nearest[np.isfinite(apart)]]
-            if len(names):
+            there = self._id_at(old.points[rows])
+            if there is not None:
                 count += 1
-                same += int(np.bincount(names).argmax() == i)
+                same += int(there == i)
         return count > 0 and same >= self.settings.ids_alike * count
 
     # --- verdicts ----------------------------------------------------------------------------------------------------
@@ -219,22 +220,27 @@ class ChangeDetector:
             if label in theirs or label >= UNNAMED or old.seen < s.min_seen:
                 continue
             new = theirs.get(self._counterpart(old))
-            if new is not None and new.label not in ours and self._differ(old, new, s.look):
+            if new is not None and new.label not in ours and self._differ(old, new):
                 for things, thing in ((gone, old), (come, new)):
                     if thing not in things:
                         things.append(thing)
 
-    def _differ(self, old: Thing, new: Thing, look: float) -> bool:
+    def _differ(self, old: Thing, new: Thing) -> bool:
         """Whether things at one place have different shapes or colours."""
         shapes = max(old.changed, new.changed) >= self.settings.min_changed
-        return shapes or max(_or_zero(old.color_apart), _or_zero(new.color_apart)) > look
+        return shapes or max(_or_zero(old.color_apart), _or_zero(new.color_apart)) > self.settings.look
 
     def _counterpart(self, old: Thing) -> int:
         """Id of what the newer visit has where a thing of the older one stood; 0: nothing with one."""
-        new = self.judged[1]
-        apart, nearest = cKDTree(new.points).query(self.judged[0].points[old.rows], distance_upper_bound=_SAME_PLACE)
-        ids = new.ids[nearest[np.isfinite(apart)]]
-        return int(np.bincount(ids).argmax()) if len(ids) else 0
+        return self._id_at(self.judged[0].points[old.rows]) or 0
+
+    def _id_at(self, points: np.ndarray) -> int | None:
+        """The id that the newer visit has most of at points [n, 3], 0 for no object; None: it has nothing there."""
+        if self._newer is None:
+            return None
+        apart, nearest = self._newer.query(points, distance_upper_bound=_SAME_PLACE)
+        ids = self.judged[1].ids[nearest[np.isfinite(apart)]]
+        return int(np.bincount(ids).argmax()) if len(ids) else None
 
     def _pair_by_shape(self, found: Detection, gone: list[Thing], come: list[Thing]) -> None:
         """What went and what came that is one thing by shape and colour: takes it from `gone` and `come`."""

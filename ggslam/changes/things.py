@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Evidence
 
-UNNAMED = 40_000
+UNNAMED = 1 << 16
 """Labels from here on are those of things that no object of the map is."""
 
 
@@ -62,9 +62,10 @@ class JudgedSurface:
 
     def thing(self, label: int, ids: tuple[int, ...], rows: np.ndarray, settings: ChangeSettings) -> Thing:
         """Some rows as a thing."""
-        gone, there = self.other.is_gone(settings.min_views)[rows], self.other.is_there(settings.min_views)[rows]
+        other = self.other.at(rows)
+        gone, there = other.is_gone(settings.min_views), other.is_there(settings.min_views)
         judged = int(gone.sum() + there.sum())
-        apart = color_apart(self.colors[rows[there]], self.other.color[rows[there]])
+        apart = color_apart(self.colors[rows[there]], other.color[there])
         return Thing(label, ids, rows, judged / max(1, len(rows)), int(gone.sum()) / max(1, judged), apart)
 
 
