@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import ggslam, refuse, succeed
-from kept import build_once, session_folder
+from small_runs import store_of
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.jobs.refine import refine_store as refine_store_module
@@ -24,7 +24,6 @@ from ggslam.jobs.refine.refine_run import refine_run
 from ggslam.jobs.refine.refine_store import refine_store
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, cell_arrays, gaussians_of_cell
-from ggslam.jobs.submaps.stores import INDOORS, store_of_run
 from ggslam.jobs.tasks.engines import Engine
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.runs.folder import RunFolder
@@ -40,13 +39,7 @@ FEW = RefineSettings(steps=12)
 
 @pytest.fixture(scope="module")
 def store(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The room's map in cells. Who changes it works on a copy."""
-
-    def build(out: Path) -> None:
-        with GridStore.create(out, INDOORS) as made:
-            store_of_run(room_run.path, made)
-
-    return build_once(session_folder(tmp_path_factory) / "stores" / "room", build)
+    return store_of(room_run, tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

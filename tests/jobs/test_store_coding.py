@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 import torch
 from command_line import ggslam, refuse, succeed
-from kept import build_once, session_folder
+from small_runs import store_of
 
 from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
 from ggslam.coding.splats import gaussians_of, splat_attributes, splat_settings
 from ggslam.errors import FormatError
 from ggslam.jobs.code.store_coding import CodedCells, decode_store, encode_store
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, gaussians_of_cell
-from ggslam.jobs.submaps.stores import INDOORS, store_of_run
 from ggslam.jobs.tasks.engines import Engine
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
@@ -27,11 +26,7 @@ from ggslam.submaps.store_copy import copy_store
 
 @pytest.fixture(scope="module")
 def store(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    def build(out: Path) -> None:
-        with GridStore.create(out, INDOORS) as made:
-            store_of_run(room_run.path, made)
-
-    return build_once(session_folder(tmp_path_factory) / "stores" / "room", build)
+    return store_of(room_run, tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

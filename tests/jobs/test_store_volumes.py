@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import ggslam, refuse, succeed
-from kept import build_once, session_folder
+from small_runs import store_of
 
 from ggslam.formats.triangle_mesh import read_mesh
-from ggslam.jobs.submaps.stores import INDOORS, store_of_run
 from ggslam.jobs.submaps.visit_records import records_of_store
 from ggslam.jobs.tasks.engines import Engine
 from ggslam.jobs.volumes.cell_volumes import mesh_from_bytes
@@ -43,11 +42,7 @@ class Both:
 
 @pytest.fixture(scope="module")
 def store(room_run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    def build(out: Path) -> None:
-        with GridStore.create(out, replace(INDOORS, spacing=1.3)) as made:
-            store_of_run(room_run.path, made)
-
-    return build_once(session_folder(tmp_path_factory) / "stores" / "room-small-cells", build)
+    return store_of(room_run, tmp_path_factory, "room-small-cells", 1.3)
 
 
 @pytest.fixture(scope="module")
