@@ -29,6 +29,7 @@ JOBS = (
     {"volumes"},
     {"run"},
     {"report"},
+    {"update"},
     {"changes"},
     {"score", "edit", "localize", "compare", "code", "render", "doctor", "batch", "merge", "refine"},
     {"submaps", "tasks"},

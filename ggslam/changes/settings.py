@@ -63,3 +63,5 @@ class ChangeSettings:
     """A thing of which a part changed, and whose colours differ by more than this, is another thing."""
     ids_alike: float = setting(0.9, 0, 1)
     """Where so many of the things that stayed have the same id in both visits, ids are believed."""
+    favour: float = setting(4.0, 1, 1e6)
+    """To bring a map up to date: what the newer visit measured counts so many times where both measured a place."""

@@ -50,17 +50,22 @@ def changes(
     """List what was added, removed, moved or changed its look between two visits to one place."""
     from ggslam.jobs.changes.changes import find_changes, write_changes
 
-    believed = {IdsName.auto: None, IdsName.yes: True, IdsName.no: False}[ids]
     with progress_bar() as bar:
-        outcome = find_changes(old, new, ids=believed, observer=ProgressObserver(bar))
+        outcome = find_changes(old, new, ids=believed(ids), observer=ProgressObserver(bar))
         written = [] if out is None else write_changes(outcome, out, old, new)
-    _print(outcome.table)
+    print_changes(outcome.table)
     console.print(f"took {outcome.seconds:.1f} s", highlight=False)
     if out is not None:
         console.print(f"wrote {out}: {len(written)} files", highlight=False, markup=False, soft_wrap=True)
 
 
-def _print(found: ChangeTable) -> None:
+def believed(ids: IdsName) -> bool | None:
+    """As jobs take it."""
+    return {IdsName.auto: None, IdsName.yes: True, IdsName.no: False}[ids]
+
+
+def print_changes(found: ChangeTable) -> None:
+    """A table, and what else is to be known."""
     rows = [_row(change, found) for change in found.found.changes]
     if rows:
         console.print(table("changes", ["", "object", "moved", "turned", "confidence"], rows))

@@ -43,6 +43,23 @@ class RunObjects:
     first_frame: int
 
 
+@dataclass(frozen=True)
+class ToldIds:
+    """What somebody knows of a run's ids before surfaces are compared.
+
+    Attributes:
+        names: what some of its ids are called in the runs before.
+        new: ids of things that no run before has; they get ids that nothing had.
+        all: whether its other ids mean what they mean in the runs before, or something that these do not have.
+        taken: ids of things that are not there any more.
+    """
+
+    names: Mapping[int, int]
+    new: frozenset[int] = frozenset()
+    all: bool = False
+    taken: frozenset[int] = frozenset()
+
+
 @dataclass
 class UnitedObjects:
     """The objects of the runs so far.
@@ -66,7 +83,9 @@ class UnitedObjects:
     notes: list[str] = field(default_factory=list)
     _sources: list[str | None] = field(default_factory=list)
 
-    def add(self, base: GaussianMap, gaussians: GaussianMap, objects: RunObjects | None) -> None:
+    def add(
+        self, base: GaussianMap, gaussians: GaussianMap, objects: RunObjects | None, told: ToldIds | None = None
+    ) -> None:
         """The objects of the next run join those of the runs before; its Gaussians get their ids, votes and identity
         vectors.
 
@@ -74,6 +93,7 @@ class UnitedObjects:
             base: the map so far, of the runs before.
             gaussians: the run's map in the same world; changed.
             objects: of the run; None: it has none.
+            told: what is known of the run's ids.
 
         Raises:
             ConfigError: there are more than 65,535 objects.
@@ -83,7 +103,7 @@ class UnitedObjects:
             self._sources.append(None)
             return
         first = self.supervision is None
-        ids = {i: i for i in objects.table.ids()} if first else self._match(base, gaussians, objects)
+        ids = {i: i for i in objects.table.ids()} if first else self._match(base, gaussians, objects, told)
         self.ids.append(ids)
         self._sources.append(objects.source)
         self._take_words(objects, ids)
@@ -101,17 +121,22 @@ class UnitedObjects:
 
     # --- which is which ----------------------------------------------------------------------------------------------
 
-    def _match(self, base: GaussianMap, gaussians: GaussianMap, objects: RunObjects) -> dict[int, int]:
+    def _match(
+        self, base: GaussianMap, gaussians: GaussianMap, objects: RunObjects, told: ToldIds | None
+    ) -> dict[int, int]:
         """What the run's ids are called."""
         known = set(self.observations) | set(self.names) | set(self.classifier.class_ids.tolist())
         known |= {i for of_run in self.ids for i in of_run.values()}
-        found = self._by_source(objects)
-        if found is None:
-            found = self._by_surface(base, gaussians)
         own = objects.table.ids()
+        found = self._by_source(objects) if told is None else None
+        if found is None:
+            all_told = told is not None and told.all
+            found = {i: i for i in own} if all_told else self._by_surface(base, gaussians)
+        if told is not None:
+            found = {i: name for i, name in found.items() if i not in told.new} | dict(told.names)
         ids = {i: found[i] for i in own if i in found}
-        self.united += [(new, len(self.ids), old) for old, new in ids.items()]
-        taken = known | set(ids.values())
+        self.united += [(new, len(self.ids), old) for old, new in ids.items() if new in known]
+        taken = known | set(ids.values()) | (set() if told is None else told.taken)
         free = iter([i for i in range(1, _IDS) if i not in taken and i not in own])
         for i in own:
             if i not in ids:

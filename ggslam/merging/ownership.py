@@ -8,6 +8,7 @@ lies where both saw it about as well.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 
 import numpy as np
@@ -28,15 +29,23 @@ class Ownership:
         runs: what their keyframes measured.
         poses: T_world_camera of each run's keyframes in the common world, float64 [K, 4, 4].
         voxel: edge of a place, metres.
+        factor: of run `number` and world points float64 [n, 3] that it measured how much each counts, [n]; None: all
+            count alike.
     """
 
-    def __init__(self, runs: list[KnownRun], poses: list[np.ndarray], voxel: float) -> None:
+    def __init__(
+        self, runs: list[KnownRun], poses: list[np.ndarray], voxel: float,
+        factor: Callable[[int, np.ndarray], np.ndarray] | None = None,
+    ) -> None:  # fmt: skip
         keys, weights, owners = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0, np.int64)]
         for number, (run, own) in enumerate(zip(runs, poses, strict=True)):
-            for points, T in zip(run.points, own, strict=True):
-                keys.append(voxel_keys(transform_points(points.astype(float), T), voxel))
-                weights.append(1 / np.maximum(points[:, 2].astype(float), _NEAREST) ** 2)  # pixels a square metre
-                owners.append(np.full(len(points), number))
+            world = [transform_points(points.astype(float), T) for points, T in zip(run.points, own, strict=True)]
+            depths = np.concatenate([np.zeros(0), *(points[:, 2].astype(float) for points in run.points)])
+            places = np.concatenate([np.zeros((0, 3)), *world])
+            weight = 1 / np.maximum(depths, _NEAREST) ** 2  # pixels a square metre
+            keys.append(voxel_keys(places, voxel))
+            weights.append(weight if factor is None else weight * factor(number, places))
+            owners.append(np.full(len(places), number))
         found, where = np.unique(np.concatenate(keys), return_inverse=True)
         index = where.reshape(-1) * len(runs) + np.concatenate(owners)
         measured = np.bincount(index, np.concatenate(weights), len(found) * len(runs)).reshape(-1, len(runs))

@@ -322,10 +322,11 @@ def rebuild_table(
     scene: SegmentedMap, names: Mapping[int, str] | None = None, seen: Mapping[int, Observation] | None = None
 ) -> None:
     """Lists the objects anew, with the names and observations of the former table unless others are given."""
-    scene.table = ObjectTable.build(
+    table = ObjectTable.build(
         scene.gaussians, scene.classifier, scene.table.supervision,
         _names(scene.table) if names is None else names, _observations(scene.table) if seen is None else seen,
     )  # fmt: skip
+    scene.table = replace(table, history=scene.table.history)
 
 
 def _centroid(gaussians: GaussianTensors) -> np.ndarray:

@@ -18,6 +18,7 @@ import pydantic
 from ggslam.errors import ConfigError, FormatError, InputError
 from ggslam.objects.boxes import OrientedBox, Vector, middle_of, oriented_box
 from ggslam.objects.colors import id_palette
+from ggslam.objects.history import History
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.system.atomic import write_text
@@ -83,11 +84,13 @@ class ObjectTable:
         supervision: where the ids came from.
         unlabelled_gaussians: Gaussians that belong to none.
         objects: the records.
+        history: what became of objects from visit to visit; None: the map is of one visit.
     """
 
     supervision: Supervision
     unlabelled_gaussians: Count
     objects: list[ObjectRecord] = field(default_factory=list)
+    history: History | None = None
 
     @staticmethod
     def build(
@@ -211,8 +214,11 @@ class ObjectTable:
     # --- on disk -----------------------------------------------------------------------------------------------------
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON, as `from_dict` reads it."""
-        return asdict(self)
+        """For JSON, as `load` reads it."""
+        values = asdict(self)
+        if self.history is None:
+            del values["history"]
+        return values
 
     def save(self, path: str | Path) -> None:
         """Writes the table as JSON, atomically."""

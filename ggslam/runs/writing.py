@@ -35,6 +35,8 @@ OBJECT_FILES = ("objects.json", "classifier.npz", "votes.npz")
 TRUTH_FILE = "ground_truth.txt"
 """True poses of the frames that have both, with the times of trajectory.txt; written by the report."""
 REPORT_FILE = "report.html"
+CHANGES_FOLDER = "changes"
+"""Of a run that was brought up to date: what changed, as `ggslam changes --out` writes it."""
 POINTS = ("points.ply", "points_grid.ply")
 TRAJECTORIES = "trajectories"
 """Folder with a trajectory of each camera of a rig; trajectory.txt is that of the rig."""
@@ -42,6 +44,7 @@ RUN_FILES = (
     *OBJECT_FILES, "map.ply", MAP_INDEX, "trajectory.txt", KeyframesRecord.FILE, LoopsRecord.FILE, SequenceRecord.FILE,
     TimingRecord.FILE, "config.yaml", "metrics.json", "frames.csv", *POINTS, PLACES_FILE, STEPS_FILE, TRUTH_FILE,
     REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES,
+    CHANGES_FOLDER,
 )  # fmt: skip
 """Files and folders that a run may have besides run.json."""
 

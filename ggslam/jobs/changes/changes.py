@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from ggslam.jobs.merge.placing import find_joint_poses, place_maps
 from ggslam.jobs.merge.sources import MergeSource, read_sources
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.merging.coverage import PlacedRun
+from ggslam.merging.joint_graph import JointPoses
 from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.reporting.pictures import write_picture
@@ -38,12 +39,14 @@ class ChangesOutcome:
     Attributes:
         table: the changes, in the world of the older run.
         visits: the two maps in that world.
+        detector: which compared them.
         seconds: that it took.
         context: threads.
     """
 
     table: ChangeTable
     visits: tuple[Visit, Visit]
+    detector: ChangeDetector
     seconds: float
     context: NativeContext
 
@@ -70,14 +73,24 @@ def find_changes(
         sources = read_sources([Path(old), Path(new)], context, Path(unpacked))
         poses = find_joint_poses(sources, MergeSettings(), context, observer)
         placed = place_maps(sources, poses)
+        outcome = compare_placed(sources, placed, poses, settings or ChangeSettings(), context, observer, ids)
+    return replace(outcome, seconds=time.perf_counter() - start)
+
+
+def compare_placed(
+    sources: list[MergeSource], placed: list[PlacedRun], poses: JointPoses, settings: ChangeSettings,
+    context: NativeContext, observer: Observer, ids: bool | None = None,
+) -> ChangesOutcome:  # fmt: skip
+    """Compares two visits whose maps are in one world; arguments as of `find_joint_poses` and `find_changes`."""
+    start = time.perf_counter()
     older, newer = (_visit(s, p, T) for s, p, T in zip(sources, placed, poses.T_new_old, strict=True))
     observer.begin("comparing surfaces", 1)
-    detector = ChangeDetector(older, newer, settings or ChangeSettings(), context, ids)
+    detector = ChangeDetector(older, newer, settings, context, ids)
     found = detector.detect()
     observer.advance(1, 1)
     names = [{} if s.objects is None else {o.id: o.name for o in s.objects.table.objects} for s in sources]
     table = ChangeTable(found, detector.judged, (names[0], names[1]))
-    return ChangesOutcome(table, (older, newer), time.perf_counter() - start, context)
+    return ChangesOutcome(table, (older, newer), detector, time.perf_counter() - start, context)
 
 
 def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str | Path) -> list[Path]:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import ConfigError
+from ggslam.jobs.merge.clock import Clock
 from ggslam.jobs.merge.merged_run import MergedRun
 from ggslam.jobs.merge.placing import find_joint_poses, place_maps
 from ggslam.jobs.merge.seams import SeamTraining, keyframes_of
@@ -84,7 +84,7 @@ def merge_runs(
     out, settings = Path(out), settings or MergeSettings()
     if any(out.resolve() in (Path(run).resolve(), *Path(run).resolve().parents) for run in runs):
         raise ConfigError(f"`out` {out}: is one of the runs that are merged, or holds it; choose another folder")
-    clock, context = _Clock(), NativeContext(None)
+    clock, context = Clock(), NativeContext(None)
     with tempfile.TemporaryDirectory(prefix="ggslam-merge-") as unpacked:
         sources = read_sources([Path(run) for run in runs], context, Path(unpacked))
         clock.lap("read")
@@ -97,19 +97,6 @@ def merge_runs(
             raise
 
 
-class _Clock:
-    """Seconds by part."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, part: str) -> None:
-        now = time.perf_counter()
-        self.seconds[part] = self.seconds.get(part, 0.0) + now - self._last
-        self._last = now
-
-
 @dataclass
 class _Merge:
     """A merge on its way."""
@@ -119,7 +106,7 @@ class _Merge:
     settings: MergeSettings
     observer: Observer
     context: NativeContext
-    clock: _Clock
+    clock: Clock
 
     def run(self) -> MergeOutcome:
         """From places to a run folder."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from ggslam.jobs.merge.truth import truth_transforms
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.merging.joint_graph import JointPoses
 from ggslam.merging.objects import UnitedObjects
+from ggslam.objects.history import History
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.runs.environment import environment
 from ggslam.runs.folder import RunFolder
@@ -58,6 +59,10 @@ class MergedRun:
         objects: of the map.
         doubles: Gaussians of each run that were left out.
         steps: optimisation steps at the seams.
+        holds: by number of a source, which of the points that its keyframes measured still hold, bool [n]; of other
+            sources all.
+        past: how many of the sources, the first ones, show an earlier state than the map.
+        history: of the objects; None: the map is of one state.
         notes: what the user should know.
     """
 
@@ -68,14 +73,20 @@ class MergedRun:
     objects: UnitedObjects
     doubles: list[int]
     steps: int
+    holds: Mapping[int, np.ndarray] = field(default_factory=dict)
+    past: int = 0
+    history: History | None = None
     notes: list[str] = field(default_factory=list)
 
-    def save(self, folder: RunFolder, seconds: Mapping[str, float]) -> None:
+    def save(
+        self, folder: RunFolder, seconds: Mapping[str, float], more: Callable[[Path], None] = lambda folder: None
+    ) -> None:
         """Writes all files, each whole or not at all.
 
         Args:
             folder: where to.
             seconds: that the merge has taken so far, by part.
+            more: writes further files into a folder.
 
         Raises:
             RunFolderError: a file cannot be written.
@@ -86,6 +97,7 @@ class MergedRun:
             self._write_map(staged)
             write_bytes(staged / PLACES_FILE, self._places())
             save_points_of_map(staged, self.gaussians, self.objects.supervision is not None)
+            more(staged)
             return self._mark()
 
         publish_run(folder.path, write, RUN_FILES, f"{folder.path}: the merged run cannot be written")
@@ -100,7 +112,9 @@ class MergedRun:
             for source, double, ids in zip(self.sources, self.doubles, self.objects.ids, strict=True)
         ]  # fmt: skip
         made_with = {**environment(), "device": "cpu"}
-        return RunRecord(ggslam=__version__, complete=True, environment=made_with, merged=merged)
+        return RunRecord(
+            ggslam=__version__, complete=True, environment=made_with, merged=merged, updated=self.past > 0
+        )
 
     # --- records -----------------------------------------------------------------------------------------------------
 
@@ -179,6 +193,7 @@ class MergedRun:
         parts = []
         for part in source.parts():
             changes: dict[str, Any] = {"time_shift_s": part.time_shift_s + source.time_shift_s}
+            changes |= {"past": True} if part.past or number < self.past else {}
             if T is not None:
                 before = np.eye(4) if part.T_joint_truth is None else part.T_joint_truth
                 changes["T_joint_truth"] = T @ before
@@ -235,13 +250,15 @@ class MergedRun:
         if self.objects.supervision is None:
             write_gaussian_ply(folder / "map.ply", self.gaussians)
             return
-        table, votes = self.objects.table(self.gaussians), ObjectVotes.of(self.gaussians)
+        table = replace(self.objects.table(self.gaussians), history=self.history)
+        votes = ObjectVotes.of(self.gaussians)
         write_objects(folder, SegmentedMap(self.gaussians, self.objects.classifier, table, votes))
 
     def _places(self) -> bytes:
         """places.npz of all runs' keyframes."""
         sources = self.sources
         own = [read_all_arrays(source.folder.path / PLACES_FILE, "the places of a run") for source in sources]
+        own = [_with_points(arrays, self.holds[k]) if k in self.holds else arrays for k, arrays in enumerate(own)]
         joined = {name: np.concatenate([arrays[name] for arrays in own]) for name in _STACKED}
         numbers = [a["loops_places_numbers"] + s.first_keyframe for a, s in zip(own, sources, strict=True)]
         moved = list(zip(own, self.poses.T_new_old, strict=True))
@@ -256,3 +273,11 @@ class MergedRun:
             scale=np.array(sources[0].known.scale), birth=self.gaussians.birth_keyframe.numpy(),
             **{KEYFRAME_CAMERAS: np.stack([camera_row(keyframe.camera) for keyframe in self.keyframes])},
         )  # fmt: skip
+
+
+def _with_points(arrays: dict[str, np.ndarray], holds: np.ndarray) -> dict[str, np.ndarray]:
+    """The places of a run with some of the points that its keyframes measured, bool [n]."""
+    ends = np.cumsum(arrays["surface_counts"])
+    counts = np.diff(np.append(0, np.append(0, np.cumsum(holds))[ends]))
+    kept = {name: arrays[name][holds] for name in ("surface_points", "surface_normals")}
+    return {**arrays, **kept, "surface_counts": counts.astype(arrays["surface_counts"].dtype)}

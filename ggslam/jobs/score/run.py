@@ -95,6 +95,10 @@ def _score(
     if fixtures.mask is not None:
         share = fixtures.mask.mean()
         notes.append(f"{share:.0%} of every image is fixed to the camera; its pixels count as without depth")
+    past = sum(part.frames for part in folder.sequence().parts or [] if part.past)
+    if past:
+        notes.append(f"{past} frames are of earlier visits, which the map was brought up to date from; images and "
+                     "objects are not scored against them")  # fmt: skip
     lost = [f.frame for f in record.frames if f.is_lost]
     if lost:
         notes.append(f"{len(lost)} frames were lost (the first: {lost[0]}); they have no pose and are in no score")
@@ -130,9 +134,10 @@ def _sets(folder: RunFolder, record: KeyframesRecord, every: int) -> dict[str, s
     """Frames that each kind of score is about."""
     keyframes = record.keyframe_numbers()
     evaluation = folder.config().evaluation
-    chosen = {i for i in range(max(record.poses(), default=-1) + 1) if i % every == 0}
-    own_number = folder.sequence().own_number
-    held_out = {i for i in chosen if evaluation.is_held_out(own_number(i)) and i not in keyframes}
+    recording = folder.sequence()
+    every_nth = (i for i in range(max(record.poses(), default=-1) + 1) if i % every == 0)
+    chosen = {i for i in every_nth if not recording.is_past(i)}
+    held_out = {i for i in chosen if evaluation.is_held_out(recording.own_number(i)) and i not in keyframes}
     return {"keyframes": keyframes & chosen, "held_out": held_out, "all": chosen}
 
 

@@ -60,6 +60,7 @@ class RunRecord(RecordFile):
         edits: what was done to the map since, as sentences.
         displaced: objects that edits moved, as `Displacement.to_json` gives them.
         merged: the runs that this one was merged from; None: it was made of one recording.
+        updated: whether of these the last one is a later visit, whose state the map shows.
     """
 
     FILE: ClassVar[str] = "run.json"
@@ -73,6 +74,7 @@ class RunRecord(RecordFile):
     edits: list[str] = []
     displaced: dict[str, list[list[float]] | None] = {}
     merged: list[MergedRecord] | None = None
+    updated: bool = False
 
     @pydantic.field_validator("displaced", mode="before")
     @classmethod
@@ -102,6 +104,8 @@ class RunRecord(RecordFile):
         notes = [f"the run stopped early: {self.stopped_by}"] if self.stopped_by else []
         notes += [f"asked for, but not there: {', '.join(self.missing)}"] if self.missing else []
         notes += [f"{verdict.severity}: {verdict.text}" for verdict in self.verdicts]
-        if self.merged:
+        if self.merged and self.updated:
+            notes.append(f"{self.merged[0].run}, brought up to date by {self.merged[-1].run}")
+        elif self.merged:
             notes.append(f"merged from {', '.join(part.run for part in self.merged)}")
         return notes + ([f"the map was edited: {'; '.join(self.edits)}"] if self.edits else [])

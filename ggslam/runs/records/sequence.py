@@ -101,6 +101,7 @@ class PartRecord(Record):
         time_shift_s: seconds added to its times, so that those of the whole rise.
         T_joint_truth: [4, 4], brings its true poses into the world of the first recording's.
         mask_ids: what its mask ids are called in the merged run; None: as they are.
+        past: whether it shows an earlier state of the place than the map, so that the map is not scored against it.
     """
 
     run: str
@@ -112,6 +113,7 @@ class PartRecord(Record):
     T_joint_truth: Array | None = None
     mask_ids: dict[int, int] | None = None
     rig: RigRecord | None = None
+    past: bool = False
 
 
 class SequenceRecord(RecordFile):
@@ -147,6 +149,11 @@ class SequenceRecord(RecordFile):
         number itself."""
         part, own = self._part_of(frame)
         return own if part.rig is None else int(part.rig.places[own, 0])
+
+    def is_past(self, frame: int) -> bool:
+        """Whether a frame shows an earlier state of the place than the map."""
+        part = self._part_of(frame)[0]
+        return isinstance(part, PartRecord) and part.past
 
     def camera_of(self, frame: int) -> Camera:
         """The camera that took a frame, as the run saw its images."""
