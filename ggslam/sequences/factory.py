@@ -31,7 +31,7 @@ from ggslam.sequences.formats.vmap import VmapFormat
 from ggslam.sequences.masks import find_masks
 from ggslam.sequences.own_camera import read_own_camera, use_own_camera
 from ggslam.sequences.pose_conventions import convert_poses
-from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat
+from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat, select
 from ggslam.sequences.rig import LAYOUT as RIG_LAYOUT
 from ggslam.sequences.rig import NAME as RIG
 from ggslam.sequences.rig import open_rig
@@ -122,7 +122,7 @@ def open_sequence(
         depth_scale, _options(depth_camera, min_confidence, topics, camera, intrinsics), pose_convention,
     )  # fmt: skip
     recording = read()
-    selection = _selection(recording, start, stop, stride)
+    selection = select(recording.path, len(recording.files), start, stop, stride)
     sequence = Sequence(recording, selection, scale=scale, on_bad_frame=on_bad_frame, reopen=read)
     sequence.options = {
         "path": Path(path).expanduser(), "format": format, "scale": sequence.scale,
@@ -257,14 +257,3 @@ def _contents(folder: Path, shown: int = 8) -> str:
         return "nothing"
     more = f" and {len(names) - shown} more" if len(names) > shown else ""
     return ", ".join(names[:shown]) + more
-
-
-def _selection(recording: Recording, start: int, stop: int | None, stride: int) -> range:
-    count = len(recording.files)
-    if not 0 <= start < count:
-        raise SequenceError(f"{recording.path}: start must be from 0 to {count - 1}, found {start}")
-    if stride < 1:
-        raise SequenceError(f"{recording.path}: stride must be at least 1, found {stride}")
-    if stop is not None and stop <= start:
-        raise SequenceError(f"{recording.path}: stop must be above start {start}, found {stop}")
-    return range(start, count if stop is None else min(stop, count), stride)
