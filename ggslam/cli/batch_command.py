@@ -58,7 +58,7 @@ Source = Annotated[
 ]
 Replica = Annotated[
     Path | None,
-    typer.Option(help="Folder with Replica's scenes (room0 ... office4): all of them, with the preset replica."),
+    typer.Option(help="Folder with Replica's scenes (room0 ... office4): all of them."),
 ]
 Out = Annotated[
     Path | None, typer.Option(help="Folder of runs and tables; default runs/NAME, or as the manifest says.")
@@ -136,7 +136,7 @@ def _manifest(
         raise ConfigError("expected a MANIFEST (or a folder of recordings), or --replica with a folder")
     words, numbers = _split(options), _numbers(seeds)
     if replica is not None:
-        return manifest_of_folder(replica, out, numbers, ["--config", "replica", *words], REPLICA)
+        return manifest_of_folder(replica, out, numbers, words, REPLICA)
     assert manifest is not None
     if manifest.is_dir():
         return manifest_of_folder(manifest, out, numbers, words)

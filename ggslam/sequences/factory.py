@@ -31,13 +31,13 @@ from ggslam.sequences.formats.vmap import VmapFormat
 from ggslam.sequences.masks import find_masks
 from ggslam.sequences.own_camera import read_own_camera, use_own_camera
 from ggslam.sequences.pose_conventions import convert_poses
-from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat
+from ggslam.sequences.recording import ReadOptions, Recording, RecordingFormat, select
 from ggslam.sequences.rig import LAYOUT as RIG_LAYOUT
 from ggslam.sequences.rig import NAME as RIG
 from ggslam.sequences.rig import open_rig
 from ggslam.sequences.rig_file import find_rig_file
 from ggslam.sequences.sequence import OnBadFrame, Sequence
-from ggslam.system.foreign import refuse_links
+from ggslam.system.foreign import given_path, refuse_links
 
 FORMATS: tuple[RecordingFormat, ...] = (
     SyntheticFormat(),
@@ -108,28 +108,28 @@ def open_sequence(
         SequenceError: the recording cannot be read; the message names the file, what was expected and what was found.
     """
     topics = tuple(topics)
-    rig = find_rig_file(Path(path).expanduser()) if format in (None, RIG) else None
+    rig = find_rig_file(given_path(path)) if format in (None, RIG) else None
     if rig is not None:
         of_cameras = {
             "masks": masks, "depth_scale": depth_scale, "depth_camera": depth_camera, "min_confidence": min_confidence,
             "topics": topics or None, "pose_convention": pose_convention, "camera": camera, "intrinsics": intrinsics,
         }  # fmt: skip
-        return _open_rig(Path(path).expanduser(), rig, start, stop, stride, scale, on_bad_frame, of_cameras)
+        return _open_rig(given_path(path), rig, start, stop, stride, scale, on_bad_frame, of_cameras)
     if format == RIG:
         raise SequenceError(f"{path}: expected {RIG_LAYOUT}")
     read = partial(
-        _read_recording, Path(path).expanduser(), format, None if masks is None else Path(masks).expanduser(),
+        _read_recording, given_path(path), format, None if masks is None else given_path(masks),
         depth_scale, _options(depth_camera, min_confidence, topics, camera, intrinsics), pose_convention,
     )  # fmt: skip
     recording = read()
-    selection = _selection(recording, start, stop, stride)
+    selection = select(recording.path, len(recording.files), start, stop, stride)
     sequence = Sequence(recording, selection, scale=scale, on_bad_frame=on_bad_frame, reopen=read)
     sequence.options = {
-        "path": Path(path).expanduser(), "format": format, "scale": sequence.scale,
-        "masks": None if masks is None else Path(masks).expanduser(), "depth_scale": depth_scale,
-        "on_bad_frame": on_bad_frame, "depth_camera": None if depth_camera is None else Path(depth_camera).expanduser(),
+        "path": given_path(path), "format": format, "scale": sequence.scale,
+        "masks": None if masks is None else given_path(masks), "depth_scale": depth_scale,
+        "on_bad_frame": on_bad_frame, "depth_camera": None if depth_camera is None else given_path(depth_camera),
         "min_confidence": min_confidence, "topics": topics, "pose_convention": pose_convention,
-        "camera": None if camera is None else Path(camera).expanduser(), "intrinsics": intrinsics,
+        "camera": None if camera is None else given_path(camera), "intrinsics": intrinsics,
     }  # fmt: skip
     return sequence
 
@@ -154,7 +154,7 @@ def _read_recording(
     pose_convention: str | None,
 ) -> Recording:  # fmt: skip
     """Reads a recording's description and applies the user's options; arguments and errors as in `open_sequence`."""
-    if not folder.exists():
+    if not os.path.exists(folder):  # noqa: PTH110 (Path's raises for impossible names)
         raise SequenceError(f"{folder}: no such folder or file")
     found = _find_format(folder, format)
     if folder.is_dir():
@@ -224,8 +224,8 @@ def _options(
         if role not in ROLES or not topic:
             raise SequenceError(f"topic: expected ROLE=TOPIC with a role of {', '.join(ROLES)}, found '{text}'")
         by_role[role] = topic
-    own = read_own_camera(None if camera is None else Path(camera).expanduser(), intrinsics)
-    return ReadOptions(None if depth_camera is None else Path(depth_camera).expanduser(), by_role, min_confidence, own)
+    own = read_own_camera(None if camera is None else given_path(camera), intrinsics)
+    return ReadOptions(None if depth_camera is None else given_path(depth_camera), by_role, min_confidence, own)
 
 
 def recognise_format(path: str | Path) -> str | None:
@@ -233,7 +233,7 @@ def recognise_format(path: str | Path) -> str | None:
     place = Path(path)
     if find_rig_file(place) is not None:
         return RIG
-    return next((f.name for f in FORMATS if place.exists() and f.matches(place)), None)
+    return next((f.name for f in FORMATS if os.path.exists(place) and f.matches(place)), None)  # noqa: PTH110
 
 
 def _find_format(folder: Path, name: str | None) -> RecordingFormat:
@@ -257,14 +257,3 @@ def _contents(folder: Path, shown: int = 8) -> str:
         return "nothing"
     more = f" and {len(names) - shown} more" if len(names) > shown else ""
     return ", ".join(names[:shown]) + more
-
-
-def _selection(recording: Recording, start: int, stop: int | None, stride: int) -> range:
-    count = len(recording.files)
-    if not 0 <= start < count:
-        raise SequenceError(f"{recording.path}: start must be from 0 to {count - 1}, found {start}")
-    if stride < 1:
-        raise SequenceError(f"{recording.path}: stride must be at least 1, found {stride}")
-    if stop is not None and stop <= start:
-        raise SequenceError(f"{recording.path}: stop must be above start {start}, found {stop}")
-    return range(start, count if stop is None else min(stop, count), stride)

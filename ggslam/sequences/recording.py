@@ -281,3 +281,18 @@ def read_text(path: Path) -> str:
         SequenceError: missing, unreadable, too large or not text.
     """
     return read_foreign_text(path, SequenceError)
+
+
+def select(path: Path, count: int, start: int, stop: int | None, stride: int) -> range:
+    """Numbers start, start + stride, ... below stop (None: to the end) of `count` frames or instants.
+
+    Raises:
+        SequenceError: there are none; names `path`.
+    """
+    if not 0 <= start < count:
+        raise SequenceError(f"{path}: start must be from 0 to {count - 1}, found {start}")
+    if stride < 1:
+        raise SequenceError(f"{path}: stride must be at least 1, found {stride}")
+    if stop is not None and stop <= start:
+        raise SequenceError(f"{path}: stop must be above start {start}, found {stop}")
+    return range(start, count if stop is None else min(stop, count), stride)

@@ -16,7 +16,7 @@ from ggslam.errors import SequenceError
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.scene.rig import Rig
-from ggslam.sequences.recording import FrameFiles
+from ggslam.sequences.recording import FrameFiles, select
 from ggslam.sequences.rig_file import RigCamera, RigFile, read_rig_file
 from ggslam.sequences.rig_times import find_instants, gaps
 from ggslam.sequences.sequence import OnBadFrame, ReadMasks, Sequence, SkippedFrame
@@ -283,14 +283,7 @@ def _check_common(file: RigFile, parts: list[RigPart], instants: np.ndarray) -> 
 
 def _select(sequence: RigSequence, start: int, stop: int | None, stride: int) -> None:
     """Chooses instants as `open_sequence` chooses frames."""
-    count = len(sequence.instants)
-    if not 0 <= start < count:
-        raise SequenceError(f"{sequence.path}: start must be from 0 to {count - 1}, found {start}")
-    if stride < 1:
-        raise SequenceError(f"{sequence.path}: stride must be at least 1, found {stride}")
-    if stop is not None and stop <= start:
-        raise SequenceError(f"{sequence.path}: stop must be above start {start}, found {stop}")
-    sequence.selected = range(start, count if stop is None else min(stop, count), stride)
+    sequence.selected = select(sequence.path, len(sequence.instants), start, stop, stride)
     sequence._take(sequence.instants[sequence.selected.start : sequence.selected.stop : stride])
 
 

@@ -21,6 +21,7 @@ what the arguments of `open_sequence` of these names do.
 from __future__ import annotations
 
 import difflib
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,7 @@ from ggslam.errors import SequenceError
 from ggslam.sequences.association import TOLERANCE
 from ggslam.sequences.calibration import number_entry, transform_entry
 from ggslam.sequences.recording import read_text
+from ggslam.system.foreign import given_path
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml, repeated_key
 
 FILE = "rig.yaml"
@@ -82,8 +84,8 @@ def find_rig_file(path: Path) -> Path | None:
 
     A YAML file is one of a rig if it has an entry `cameras`.
     """
-    file = path / FILE if path.is_dir() else path
-    if file.suffix.lower() not in (".yaml", ".yml") or not file.is_file():
+    file = path / FILE if os.path.isdir(path) else path  # noqa: PTH112 (Path's raises for impossible names)
+    if file.suffix.lower() not in (".yaml", ".yml") or not os.path.isfile(file):  # noqa: PTH113
         return None
     try:
         return file if re.search(r"^cameras\s*:", read_text(file), re.MULTILINE) else None
@@ -134,7 +136,7 @@ def _camera(path: Path, number: int, entry: Any) -> RigCamera:
     if not isinstance(recording, str) or not recording:
         raise SequenceError(f"{place}: expected 'recording' to name a folder or file, found '{recording}'")
     return RigCamera(
-        name, path.parent / Path(recording).expanduser(), transform_entry(place, entry, "T_rig_camera"),
+        name, path.parent / given_path(recording), transform_entry(place, entry, "T_rig_camera"),
         _number(place, entry, "time_offset", -_LARGEST_OFFSET, _LARGEST_OFFSET) or 0.0,
         _number(place, entry, "scale", 1e-3, 1.0), _options(path, place, entry),
     )  # fmt: skip
@@ -147,7 +149,7 @@ def _options(path: Path, place: str, entry: dict[str, Any]) -> dict[str, Any]:
         if key in entry:
             if not isinstance(entry[key], str):
                 raise SequenceError(f"{place}: expected a text for '{key}', found '{entry[key]}'")
-            options[key] = path.parent / Path(entry[key]).expanduser() if key in _PATHS else entry[key]
+            options[key] = path.parent / given_path(entry[key]) if key in _PATHS else entry[key]
     if "depth_scale" in entry:
         options["depth_scale"] = _number(place, entry, "depth_scale", 0.0, np.inf)
     if "min_confidence" in entry:

@@ -23,6 +23,11 @@ _LONGEST_NAME = 255
 """Bytes of a file's name, on all usual file systems."""
 
 
+def given_path(path: str | Path) -> Path:
+    """A path as somebody wrote it, with `~` for a home; that of an unknown user stays as it is."""
+    return Path(os.path.expanduser(path))  # noqa: PTH111 (Path's raises for unknown users)
+
+
 def open_foreign(path: str | Path, error: type[GgslamError] = FormatError) -> BinaryIO:
     """Opens a regular file for reading; a pipe, a device or a folder of that name is refused, not waited for.
 

@@ -156,6 +156,12 @@ def test_impossible_options(make: Make, options: dict[str, object], message: str
         open_sequence(make("replica"), **options)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("name", ["x" * 300, "~nobody-of-that-name/room", "room\0"])
+def test_impossible_names(name: str) -> None:
+    with pytest.raises(SequenceError, match="no such folder or file"):
+        open_sequence(name)
+
+
 def test_short_trajectory(make: Make) -> None:
     folder = make("replica")
     lines = (folder / "traj.txt").read_text().splitlines()

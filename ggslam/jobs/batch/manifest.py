@@ -12,7 +12,7 @@ from typing import Any
 
 from ggslam.errors import ConfigError
 from ggslam.sequences import recognise_format
-from ggslam.system.foreign import read_foreign_text
+from ggslam.system.foreign import given_path, read_foreign_text
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 
 REPLICA = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
@@ -143,7 +143,7 @@ def _recording(path: Path, number: int, item: Any) -> tuple[str, Path, tuple[str
         item = {"path": item}
     if not isinstance(item, dict) or set(item) - {"path", "name", "options"} or not isinstance(item.get("path"), str):
         raise ConfigError(f"{path}: {where}: expected a path, or path, name and options, found {item!r}")
-    place = (path.parent / Path(item["path"]).expanduser()).absolute()
+    place = (path.parent / given_path(item["path"])).absolute()
     name = str(item.get("name") or place.resolve().name)
     return name, place, _options(path, f"{where}.options", item.get("options"))
 
