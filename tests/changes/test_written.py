@@ -23,7 +23,7 @@ def test_every_change_has_numbers_and_a_picture(tmp_path: Path) -> None:
     visits, context = (old.build(), new.build()), NativeContext(2)
     detector = ChangeDetector(*visits, ChangeSettings(), context)
     table = ChangeTable(detector.detect(), detector.judged, ({2: "cup"}, {2: "cup", 3: "crate"}))
-    written = write_changes(ChangesOutcome(table, visits, 0.0, context), tmp_path / "out", "a", "b")
+    written = write_changes(ChangesOutcome(table, visits, detector, 0.0, context), tmp_path / "out", "a", "b")
     values = json.loads((tmp_path / "out" / "changes.json").read_text())
     assert [values["old"], values["new"]] == ["a", "b"] and len(written) == 3
     by_kind = {entry["kind"]: entry for entry in values["changes"]}
