@@ -51,7 +51,7 @@ def changes(
     from ggslam.jobs.changes.changes import find_changes, write_changes
 
     with progress_bar() as bar:
-        outcome = find_changes(old, new, ids=believed(ids), observer=ProgressObserver(bar))
+        outcome = find_changes(old, new, ids=choice_of_ids(ids), observer=ProgressObserver(bar))
         written = [] if out is None else write_changes(outcome, out, old, new)
     print_changes(outcome.table)
     console.print(f"took {outcome.seconds:.1f} s", highlight=False)
@@ -59,7 +59,7 @@ def changes(
         console.print(f"wrote {out}: {len(written)} files", highlight=False, markup=False, soft_wrap=True)
 
 
-def believed(ids: IdsName) -> bool | None:
+def choice_of_ids(ids: IdsName) -> bool | None:
     """As jobs take it."""
     return {IdsName.auto: None, IdsName.yes: True, IdsName.no: False}[ids]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ggslam.cli.changes_command import IdsName, believed, print_changes
+from ggslam.cli.changes_command import IdsName, choice_of_ids, print_changes
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
 
@@ -52,7 +52,7 @@ def update(
 
     with progress_bar() as bar:
         outcome = update_run(
-            old, new, out, overwrite=overwrite, ids=believed(ids), merging=MergeSettings(steps=steps),
+            old, new, out, overwrite=overwrite, ids=choice_of_ids(ids), merging=MergeSettings(steps=steps),
             observer=ProgressObserver(bar),
         )  # fmt: skip
     print_changes(outcome.changes.table)

@@ -68,7 +68,7 @@ class History:
         """Objects that are not there any more."""
         return {past.id for past in self.objects if past.gone_since is not None}
 
-    def followed_by(
+    def after_visit(
         self, visit: VisitRecord, seen: Mapping[int, str | None], gone: Iterable[int],
         T_new_old: Mapping[int, np.ndarray],
     ) -> History:  # fmt: skip

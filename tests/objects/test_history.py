@@ -24,8 +24,8 @@ def shift(x: float) -> np.ndarray:
 def history() -> History:
     """A cup that is moved twice, a crate that goes and comes back, a plate that comes."""
     first = History.of_first(VisitRecord("monday", "a"), {1: "cup", 2: "crate"})
-    second = first.followed_by(VisitRecord("tuesday", "b"), {1: None, 3: "plate"}, {2}, {1: shift(0.2)})
-    return second.followed_by(VisitRecord("wednesday", "c"), {1: None, 2: None}, set(), {1: shift(0.3)})
+    second = first.after_visit(VisitRecord("tuesday", "b"), {1: None, 3: "plate"}, {2}, {1: shift(0.2)})
+    return second.after_visit(VisitRecord("wednesday", "c"), {1: None, 2: None}, set(), {1: shift(0.3)})
 
 
 def test_objects_are_followed_from_visit_to_visit(history: History) -> None:
@@ -39,7 +39,7 @@ def test_objects_are_followed_from_visit_to_visit(history: History) -> None:
 
 
 def test_what_is_gone_stays_in_the_history(history: History) -> None:
-    after = history.followed_by(VisitRecord("thursday", "d"), {1: None}, {2, 9}, {})
+    after = history.after_visit(VisitRecord("thursday", "d"), {1: None}, {2, 9}, {})
     assert after.ids_gone() == {2} and after.objects[1].gone_since == 3
     assert history.ids_gone() == set()  # the former is as it was
 

@@ -41,7 +41,7 @@ def history_after(
             gone |= set(own) - present
         elif change.T_new_old is not None:
             T_new_old |= dict.fromkeys(own, change.T_new_old)
-    return history.followed_by(_visit(new), seen, gone, T_new_old)
+    return history.after_visit(_visit(new), seen, gone, T_new_old)
 
 
 def _history_of(run: MergeSource) -> History:

@@ -143,7 +143,7 @@ class _Update:
         left_out = [source.gaussian_count - kept for source, kept in zip(sources, outcome.kept, strict=True)]
         merged = MergedRun(
             sources, poses, keyframes, gaussians, objects, left_out, outcome.steps,
-            {OLD: renewal.holds(self._measured(poses, OLD))}, past=1, history=history,
+            {OLD: renewal.holds(self._measured_points(poses, OLD))}, past=1, history=history,
         )  # fmt: skip
         with delay_interrupts():
             merged.save(self.folder, self.clock.seconds, lambda staged: self._write_changes(changes, staged))
@@ -154,7 +154,7 @@ class _Update:
     def _write_changes(self, changes: ChangesOutcome, staged: Path) -> None:
         write_changes(changes, staged / CHANGES_FOLDER, *(source.place for source in self.sources))
 
-    def _measured(self, poses: JointPoses, number: int) -> np.ndarray:
+    def _measured_points(self, poses: JointPoses, number: int) -> np.ndarray:
         """Points that a run's keyframes measured, world, float64 [n, 3]."""
         known = self.sources[number].known
         T_world_camera = poses.T_new_old[number] @ known.poses
@@ -168,14 +168,15 @@ class _Update:
         self, placed: list[PlacedRun], objects: UnitedObjects, renewal: Renewal, outcome: UpdateOutcome
     ) -> GaussianMap:
         """What both maps hold of the latest state, with one set of objects."""
-        old, new = (run.gaussians for run in placed)
+        new = placed[NEW].gaussians
+        old = placed[OLD].gaussians.copy(new.device)  # pictures show it as it was
         came, fate = renewal.came(new), renewal.renew(old)
         base = GaussianMap(old.sh_degree, old.feature_channels)
         objects.add(base, old, self.sources[OLD].run_objects())
         append_map(base, old, self.sources[OLD].first_keyframe)
         known = base.copy(base.device)
         known.keep(torch.from_numpy(~fate.gone | fate.moved))
-        objects.add(known, new, self.sources[NEW].run_objects(), self._told(renewal))
+        objects.add(known, new, self.sources[NEW].run_objects(), self._told_ids(renewal))
         append_map(base, new, self.sources[NEW].first_keyframe)
         kept = self._choose(outcome.poses, (old, new), fate, came, renewal)
         outcome.gone, outcome.kept = int(fate.gone.sum()), (int(kept[OLD].sum()), int(kept[NEW].sum()))
@@ -192,7 +193,7 @@ class _Update:
         owners = [ownership.of(gaussians.means.numpy()) for gaussians in maps]
         return [~fate.gone & ((owners[OLD] == OLD) | fate.moved), came | (owners[NEW] == NEW)]
 
-    def _told(self, renewal: Renewal) -> ToldIds:
+    def _told_ids(self, renewal: Renewal) -> ToldIds:
         """What the changes tell of the newer run's ids."""
         objects = self.sources[OLD].objects
         history = None if objects is None else objects.table.history
