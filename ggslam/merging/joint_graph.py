@@ -52,6 +52,10 @@ class JointPoses:
     links: list[JudgedLink]
     seconds: float
 
+    def of(self, runs: list[KnownRun]) -> list[np.ndarray]:
+        """T_world_camera of the keyframes in each run's places in the common world, float64 [K, 4, 4]."""
+        return [T @ run.poses for T, run in zip(self.T_new_old, runs, strict=True)]
+
 
 def attachment_order(count: int, grounds: Mapping[Pair, CommonGround], needed: int) -> list[Pair]:
     """How runs hang together: (a run that is in, one that joins by it), the surest first, beginning with run 0. Runs

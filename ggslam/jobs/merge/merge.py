@@ -3,20 +3,19 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from ggslam.errors import ConfigError
 from ggslam.jobs.merge.clock import Clock
+from ggslam.jobs.merge.joint_folder import joint_folder
 from ggslam.jobs.merge.merged_run import MergedRun
 from ggslam.jobs.merge.placing import find_joint_poses, place_maps
-from ggslam.jobs.merge.seams import SeamTraining, keyframes_of
-from ggslam.jobs.merge.sources import MergeSource, read_sources
+from ggslam.jobs.merge.seams import train_seams
+from ggslam.jobs.merge.sources import MergeSource
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.merging.coverage import Coverage, PlacedRun
 from ggslam.merging.joint_graph import JointPoses
@@ -27,7 +26,6 @@ from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import delay_interrupts
 
 
@@ -81,20 +79,9 @@ def merge_runs(
         RunFolderError: a run is damaged or has no places, or `out` cannot be written.
         MissingDependency: gtsam is not installed.
     """
-    out, settings = Path(out), settings or MergeSettings()
-    if any(out.resolve() in (Path(run).resolve(), *Path(run).resolve().parents) for run in runs):
-        raise ConfigError(f"`out` {out}: is one of the runs that are merged, or holds it; choose another folder")
-    clock, context = Clock(), NativeContext(None)
-    with tempfile.TemporaryDirectory(prefix="ggslam-merge-") as unpacked:
-        sources = read_sources([Path(run) for run in runs], context, Path(unpacked))
-        clock.lap("read")
-        folder = RunFolder.create(out, overwrite)
-        try:
-            with folder_lock(folder.path):
-                return _Merge(sources, folder, settings, observer or SilentObserver(), context, clock).run()
-        except BaseException:
-            folder.discard()
-            raise
+    clock, context, settings = Clock(), NativeContext(None), settings or MergeSettings()
+    with joint_folder(runs, out, overwrite, context, clock, "merged") as (sources, folder):
+        return _Merge(sources, folder, settings, observer or SilentObserver(), context, clock).run()
 
 
 @dataclass
@@ -118,31 +105,19 @@ class _Merge:
         seams = self._find_seams(placed)
         gaussians = self._join(placed, objects, outcome)
         self.clock.lap("join")
-        with_masks = objects.supervision == "masks"
-        keyframes, seam = keyframes_of(sources, [p.T_world_camera for p in placed], seams, with_masks, objects)
-        missing = [source for source in sources if source.sequence is None]
-        notes += [f"{s.name}: not trained on, its recording is not there: {s.reason}" for s in missing]
-        if seam and self.settings.steps:
-            sigma = max(s.known.noise.sigma(self._median_depth()) for s in sources)
-            learned = objects if with_masks and objects.supervision is not None else None
-            config = replace(sources[0].folder.config(), sh_degree=gaussians.sh_degree)
-            training = SeamTraining(gaussians, keyframes, seam, learned, config, sigma)
-            steps = self.settings.steps * (len(sources) - 1)
-            training.run(steps, self.context, self.observer)
-            outcome.trained, outcome.steps = len(seam), steps
+        steps = self.settings.steps * (len(sources) - 1)
+        trained = train_seams(sources, placed, seams, gaussians, objects, steps, self.context, self.observer)
+        outcome.trained, outcome.steps = trained.count, trained.steps
+        notes += trained.notes
         self.clock.lap("train")
         notes += objects.notes
         outcome.gaussians, outcome.united = len(gaussians), objects.united
-        merged = MergedRun(sources, poses, keyframes, gaussians, objects, outcome.doubles, outcome.steps)
+        merged = MergedRun(sources, poses, trained.keyframes, gaussians, objects, outcome.doubles, outcome.steps)
         with delay_interrupts():
             merged.save(self.folder, self.clock.seconds)
         notes += merged.notes
         self.clock.lap("write")
         return outcome
-
-    def _median_depth(self) -> float:
-        """Of what keyframes measured, metres."""
-        return float(np.median(np.concatenate([p[:, 2] for s in self.sources for p in s.known.points])))
 
     def _find_seams(self, placed: list[PlacedRun]) -> list[np.ndarray]:
         """Which keyframes of each run see what another run's map shows, bool [K] each."""
@@ -156,8 +131,7 @@ class _Merge:
         """One map of all, with one set of objects: of each run what lies where it measured best."""
         base = GaussianMap(placed[0].gaussians.sh_degree, placed[0].gaussians.feature_channels)
         known = [source.known for source in self.sources]
-        poses = [T @ run.poses for T, run in zip(outcome.poses.T_new_old, known, strict=True)]
-        ownership = Ownership(known, poses, self.settings.seams.voxel * known[0].scale)
+        ownership = Ownership(known, outcome.poses.of(known), self.settings.seams.voxel * known[0].scale)
         kept = []
         for number, (source, run) in enumerate(zip(self.sources, placed, strict=True)):
             objects.add(base, run.gaussians, source.run_objects())

@@ -12,6 +12,7 @@ from ggslam.jobs.merge.sources import MergeSource
 from ggslam.jobs.progress import Observer
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
 from ggslam.mapping.mapper import Mapper
+from ggslam.merging.coverage import PlacedRun
 from ggslam.merging.objects import UnitedObjects
 from ggslam.native.loader import NativeContext
 from ggslam.scene.gaussian_map import GaussianMap
@@ -65,6 +66,52 @@ class SeamTraining:
             factor = self.config.mapping.refine_decay ** (step / max(1, steps - 1))
             mapper.iterate(self.keyframes[turn.pop()], factor)
             observer.advance(step + 1, steps)
+
+
+@dataclass(frozen=True)
+class TrainedSeams:
+    """What came of it.
+
+    Attributes:
+        keyframes: of all runs, as training left their poses.
+        count: of those that were trained on.
+        steps: that were made.
+        notes: what the user should know.
+    """
+
+    keyframes: list[Keyframe]
+    count: int
+    steps: int
+    notes: list[str]
+
+
+def train_seams(
+    sources: ListOf[MergeSource], placed: ListOf[PlacedRun], seams: ListOf[np.ndarray], gaussians: GaussianMap,
+    objects: UnitedObjects, steps: int, context: NativeContext, observer: Observer,
+) -> TrainedSeams:  # fmt: skip
+    """Trains the map of several runs where they meet, on the keyframes whose recordings are there.
+
+    Args:
+        sources, placed: the runs, and where they are in the common world.
+        seams: whether each run's keyframes are to be trained on, bool [K] each.
+        gaussians: the map; changed.
+        objects: of the map; changed where masks teach them.
+        steps: optimisation steps.
+        context: threads.
+        observer: receives progress updates.
+    """
+    with_masks = objects.supervision == "masks"
+    keyframes, seam = keyframes_of(sources, [run.T_world_camera for run in placed], seams, with_masks, objects)
+    missing = [source for source in sources if source.sequence is None]
+    notes = [f"{s.name}: not trained on, its recording is not there: {s.reason}" for s in missing]
+    if not seam or not steps:
+        return TrainedSeams(keyframes, 0, 0, notes)
+    depth = float(np.median(np.concatenate([p[:, 2] for source in sources for p in source.known.points])))
+    sigma = max(source.known.noise.sigma(depth) for source in sources)
+    config = replace(sources[0].folder.config(), sh_degree=gaussians.sh_degree)
+    learned = objects if with_masks else None
+    SeamTraining(gaussians, keyframes, seam, learned, config, sigma).run(steps, context, observer)
+    return TrainedSeams(keyframes, len(seam), steps, notes)
 
 
 def keyframes_of(

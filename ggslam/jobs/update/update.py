@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import tempfile
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +11,15 @@ import torch
 
 from ggslam.changes.renewal import NEW, OLD, Fate, Renewal
 from ggslam.changes.settings import ChangeSettings
-from ggslam.errors import ConfigError
 from ggslam.jobs.changes.changes import ChangesOutcome, compare_placed, write_changes
 from ggslam.jobs.merge.clock import Clock
+from ggslam.jobs.merge.joint_folder import joint_folder
 from ggslam.jobs.merge.merged_run import MergedRun
 from ggslam.jobs.merge.placing import find_joint_poses, place_maps
-from ggslam.jobs.merge.seams import SeamTraining, keyframes_of
-from ggslam.jobs.merge.sources import MergeSource, read_sources
+from ggslam.jobs.merge.seams import train_seams
+from ggslam.jobs.merge.sources import MergeSource
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.update.histories import history_after
-from ggslam.mapping.keyframe import Keyframe
 from ggslam.merging.coverage import Coverage, PlacedRun
 from ggslam.merging.joint_graph import JointPoses
 from ggslam.merging.moving import append_map
@@ -33,7 +31,6 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.writing import CHANGES_FOLDER
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
-from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import delay_interrupts
 
 _FEW_POINTS = 20
@@ -89,24 +86,13 @@ def update_run(
         RunFolderError: a run is damaged or has no places, or `out` cannot be written.
         MissingDependency: gtsam is not installed.
     """
-    out = Path(out)
-    if any(out.resolve() in (Path(run).resolve(), *Path(run).resolve().parents) for run in (old, new)):
-        raise ConfigError(f"`out` {out}: is one of the runs that are compared, or holds it; choose another folder")
     clock, context = Clock(), NativeContext(None)
-    with tempfile.TemporaryDirectory(prefix="ggslam-update-") as unpacked:
-        sources = read_sources([Path(old), Path(new)], context, Path(unpacked))
-        clock.lap("read")
-        folder = RunFolder.create(out, overwrite)
-        try:
-            with folder_lock(folder.path):
-                update = _Update(
-                    sources, folder, merging or MergeSettings(), settings or ChangeSettings(),
-                    observer or SilentObserver(), context, clock, ids,
-                )  # fmt: skip
-                return update.run()
-        except BaseException:
-            folder.discard()
-            raise
+    with joint_folder([old, new], out, overwrite, context, clock, "compared") as (sources, folder):
+        update = _Update(
+            sources, folder, merging or MergeSettings(), settings or ChangeSettings(), observer or SilentObserver(),
+            context, clock, ids,
+        )  # fmt: skip
+        return update.run()
 
 
 @dataclass
@@ -135,14 +121,17 @@ class _Update:
         objects = UnitedObjects(self.merging.uniting)
         gaussians = self._join(placed, objects, renewal, outcome)
         self.clock.lap("join")
-        keyframes = self._train(placed, seams, gaussians, objects, outcome)
+        trained = train_seams(
+            sources, placed, seams, gaussians, objects, self.merging.steps, self.context, self.observer
+        )
+        outcome.trained, outcome.steps = trained.count, trained.steps
         self.clock.lap("train")
-        outcome.notes += objects.notes + changes.table.found.notes
+        outcome.notes += trained.notes + objects.notes + changes.table.found.notes
         outcome.gaussians = len(gaussians)
         history = history_after(sources, changes.table.found, objects, set(gaussians.object_id.unique().tolist()))
         left_out = [source.gaussian_count - kept for source, kept in zip(sources, outcome.kept, strict=True)]
         merged = MergedRun(
-            sources, poses, keyframes, gaussians, objects, left_out, outcome.steps,
+            sources, poses, trained.keyframes, gaussians, objects, left_out, outcome.steps,
             {OLD: renewal.holds(self._measured_points(poses, OLD))}, past=1, history=history,
         )  # fmt: skip
         with delay_interrupts():
@@ -157,7 +146,7 @@ class _Update:
     def _measured_points(self, poses: JointPoses, number: int) -> np.ndarray:
         """Points that a run's keyframes measured, world, float64 [n, 3]."""
         known = self.sources[number].known
-        T_world_camera = poses.T_new_old[number] @ known.poses
+        T_world_camera = poses.of([source.known for source in self.sources])[number]
         return np.concatenate([
             transform_points(points.astype(float), T) for points, T in zip(known.points, T_world_camera, strict=True)
         ])  # fmt: skip
@@ -188,8 +177,7 @@ class _Update:
     ) -> list[np.ndarray]:
         """Which Gaussians of both maps stay, bool [N] each."""
         known = [source.known for source in self.sources]
-        joint = [T @ run.poses for T, run in zip(poses.T_new_old, known, strict=True)]
-        ownership = Ownership(known, joint, self.merging.seams.voxel * known[0].scale, renewal.weights)
+        ownership = Ownership(known, poses.of(known), self.merging.seams.voxel * known[0].scale, renewal.weights)
         owners = [ownership.of(gaussians.means.numpy()) for gaussians in maps]
         return [~fate.gone & ((owners[OLD] == OLD) | fate.moved), came | (owners[NEW] == NEW)]
 
@@ -217,22 +205,3 @@ class _Update:
         shared = [coverage.shared_views(placed[1 - k].gaussians, run) >= share for k, run in enumerate(placed)]
         changed = [renewal.shows_changes(run.cameras, run.T_world_camera, _FEW_POINTS) for run in placed]
         return [shared[OLD] & ~changed[OLD], shared[NEW] | changed[NEW]]
-
-    def _train(
-        self, placed: list[PlacedRun], seams: list[np.ndarray], gaussians: GaussianMap, objects: UnitedObjects,
-        outcome: UpdateOutcome,
-    ) -> list[Keyframe]:  # fmt: skip
-        """Trains where the maps meet and where something changed; returns the keyframes of both runs."""
-        sources, with_masks = self.sources, objects.supervision == "masks"
-        keyframes, seam = keyframes_of(sources, [p.T_world_camera for p in placed], seams, with_masks, objects)
-        missing = [source for source in sources if source.sequence is None]
-        outcome.notes += [f"{s.name}: not trained on, its recording is not there: {s.reason}" for s in missing]
-        if seam and self.merging.steps:
-            depths = np.concatenate([p[:, 2] for s in sources for p in s.known.points])
-            sigma = max(s.known.noise.sigma(float(np.median(depths))) for s in sources)
-            learned = objects if with_masks and objects.supervision is not None else None
-            config = replace(sources[OLD].folder.config(), sh_degree=gaussians.sh_degree)
-            training = SeamTraining(gaussians, keyframes, seam, learned, config, sigma)
-            training.run(self.merging.steps, self.context, self.observer)
-            outcome.trained, outcome.steps = len(seam), self.merging.steps
-        return keyframes
