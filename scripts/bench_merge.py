@@ -12,6 +12,7 @@ Cases:
     thirds       livingroom in three pieces
     redkitchen   frames 0-149 and 110-249, objects by geometry
     loop         a walk through a generated house (`ggslam synth --scene loop`) in two halves
+    containers   the pieces of livingroom as files for the wire (.ggz): bytes, what the trip costs, merged from them
     refused      livingroom and redkitchen: nothing in common
 
 Prints for each: error of the trajectory, PSNR of held-out frames and mIoU (where there are true masks) of each piece,
@@ -23,6 +24,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +47,7 @@ PIECES = {
     "loop": ("loop", [(0, 280), (200, 480)]),
 }  # fmt: skip
 """Recording, and first frame and the one after the last of each piece."""
+CASES = (*PIECES, "containers", "refused")
 
 
 @dataclass(frozen=True)
@@ -57,8 +60,8 @@ class Bench:
 
     def case(self, name: str) -> None:
         """Prints one case."""
-        if name == "refused":
-            self.refused()
+        if name in ("refused", "containers"):
+            getattr(self, name)()
             return
         recording, pieces = PIECES[name]
         path = self.recording(recording)
@@ -75,6 +78,30 @@ class Bench:
                 print(f"    {line}")
         for folder in (*runs, merged, single):
             self.report(folder, path if name == "renamed" else None)
+        print(f"    merging took {took.seconds:.0f} s, {took.peak_mb:.0f} MB", flush=True)
+
+    def containers(self) -> None:
+        """Pieces sent as one file each, decoded and merged; the pieces and their merged run are those of livingroom."""
+        recording, pieces = PIECES["livingroom"]
+        path, files = self.recording(recording), list[Path]()
+        print(f"containers: {path}, images at {self.scale:g}", flush=True)
+        for piece in pieces:
+            run = self.run(path, recording, *piece)
+            file = self.folder / f"{run.name}.ggz"
+            encoded = usage(["encode", str(run), str(file)])
+            again = self.folder / f"{run.name}-decoded"
+            shutil.rmtree(again, ignore_errors=True)
+            decoded = usage(["decode", str(file), str(again)])
+            files.append(file)
+            for line in encoded.said.splitlines():
+                if "Gaussians; " in line or "the file" in line:
+                    print(f"    {file.name}: {line.strip(' │')}")
+            print(f"    {encoded.seconds:.0f} s there, {decoded.seconds:.0f} s back", flush=True)
+            self.report(run, None)
+            self.report(again, None)
+        merged = self.folder / "containers-merged"
+        took = usage(["merge", *map(str, files), "--out", str(merged), "--overwrite"])
+        self.report(merged, None)
         print(f"    merging took {took.seconds:.0f} s, {took.peak_mb:.0f} MB", flush=True)
 
     def refused(self) -> None:
@@ -149,7 +176,7 @@ def truth_masks(recording: Path) -> Path:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True, help="for runs; kept, to be used again")
-    parser.add_argument("--cases", nargs="+", default=[*PIECES, "refused"], choices=[*PIECES, "refused"])
+    parser.add_argument("--cases", nargs="+", default=CASES, choices=CASES)
     parser.add_argument("--scale", type=float, default=0.5, help="of the images")
     parser.add_argument("--every", type=int, default=1, help="score only every n-th frame")
     arguments = parser.parse_args()

@@ -83,8 +83,8 @@ class ChangeDetector:
         self.sights = [Sightings(visit, settings, context) for visit in self.visits]
         self._up = estimate_up(old.T_world_camera, old.measured, old.normals).up
         self.judged: list[JudgedSurface] = []
-        self._newer: cKDTree | None = None
-        """Of the newer visit's points, if there are any."""
+        self._trees: list[cKDTree | None] = [None, None]
+        """Of each visit's points, if there are any."""
         self.things: list[list[Thing]] = [[], []]
 
     def detect(self) -> Detection:
@@ -93,7 +93,7 @@ class ChangeDetector:
         surfaces = [sights.surface(self.settings.spacing_m) for sights in self.sights]
         found.tolerance = self._usual_tolerance(surfaces)
         self.judged = [self._judge(number, surface, found.tolerance) for number, surface in enumerate(surfaces)]
-        self._newer = cKDTree(self.judged[1].points) if len(self.judged[1].points) else None
+        self._trees = [cKDTree(judged.points) if len(judged.points) else None for judged in self.judged]
         both = all(visit.has_objects for visit in self.visits)
         found.ids_believed = both and (self._ids_agree() if self._ids is None else self._ids)
         if not both:
@@ -196,15 +196,20 @@ class ChangeDetector:
     def _pair_by_id(self, found: Detection, gone: list[Thing], come: list[Thing]) -> None:
         """What has one id in both visits, and is elsewhere: takes it from `gone` and `come`."""
         s, ours, theirs = self.settings, *({t.label: t for t in things} for things in self.things)
-        for label in sorted({t.label for t in (*gone, *come) if t.label < UNNAMED}):
-            old, new = ours.get(label), theirs.get(label)
-            if old is None or new is None:
+        changed = {t.label for t in (*gone, *come)}
+        for label in sorted(label for label in ours.keys() & theirs.keys() if label < UNNAMED):
+            old, new = ours[label], theirs[label]
+            shifted = label not in changed and self._has_shifted(old, new)
+            if label not in changed and not shifted:
                 continue
             unseen = min(old.seen, new.seen) < s.min_seen  # of what one visit hardly saw nothing is said
             for things, thing in ((gone, old), (come, new)):
                 if thing in things:
                     things.remove(thing)
             fit = None if unseen else self._fit(old, new)
+            if shifted and fit is not None and fit.share >= s.min_fit and fit.color_apart <= s.max_color:
+                found.changes += filter(None, [self._motion_change(old, new, fit)])
+                continue
             # Where surfaces do not fit, as of a cloth, both places have to have changed as a whole.
             if fit is not None and min(old.changed, new.changed) >= (
                 s.min_changed if fit.share >= s.min_fit else s.whole
@@ -236,11 +241,25 @@ class ChangeDetector:
 
     def _id_at(self, points: np.ndarray) -> int | None:
         """The id that the newer visit has most of at points [n, 3], 0 for no object; None: it has nothing there."""
-        if self._newer is None:
-            return None
-        apart, nearest = self._newer.query(points, distance_upper_bound=_SAME_PLACE)
-        ids = self.judged[1].ids[nearest[np.isfinite(apart)]]
+        ids = self._ids_at(1, points)
         return int(np.bincount(ids).argmax()) if len(ids) else None
+
+    def _ids_at(self, number: int, points: np.ndarray) -> np.ndarray:
+        """The ids that a visit has at those of the points [n, 3] at which it has a surface, 0 for no object."""
+        tree = self._trees[number]
+        if tree is None:
+            return np.zeros(0, np.int64)
+        apart, nearest = tree.query(points, distance_upper_bound=_SAME_PLACE)
+        return self.judged[number].ids[nearest[np.isfinite(apart)]]
+
+    def _has_shifted(self, old: Thing, new: Thing) -> bool:
+        """Whether much of where either visit has a thing is something else in the other one: what is thin and was
+        pushed along its support leaves no gap."""
+        for number, thing in enumerate((old, new)):
+            ids = self._ids_at(1 - number, self.judged[number].points[thing.rows])
+            if thing.seen < self.settings.min_seen or (ids != thing.label).sum() < self.settings.shifted * len(thing):
+                return False
+        return True
 
     def _pair_by_shape(self, found: Detection, gone: list[Thing], come: list[Thing]) -> None:
         """What went and what came that is one thing by shape and colour: takes it from `gone` and `come`."""

@@ -36,6 +36,9 @@ class ChangeSettings:
     """Nothing is said of a thing of which less than this share was seen by the other visit."""
     min_changed: float = setting(0.12, 0, 1)
     """A thing of which less than this share changed is where it was."""
+    shifted: float = setting(0.25, 0, 1)
+    """Where ids are believed, a thing was pushed along what it lies on if this share of it or more is something else in
+    the other visit, both ways."""
     min_width: float = setting(2.0, 0, 100)
     """What is gone and is no object by itself has to be so many times as wide as surfaces differ: at outlines maps err
     by slivers."""

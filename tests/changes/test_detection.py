@@ -58,6 +58,15 @@ def test_a_thing_turned_in_place_is_moved() -> None:
     check_moved(found.changes[0], CUP, turned)
 
 
+def test_a_thin_thing_that_was_pushed_along_the_floor_is_moved() -> None:
+    before, after = (Box(5, at, (0.3, 0.12, 0.006), turn=turn) for at, turn in (((-0.1, -0.3), 0), ((-0.02, -0.26), 30)))
+    found, detector = detect(SmallVisit([before, CUP, BRICK]), SmallVisit([after, CUP, BRICK]))
+    thing = next(t for t in detector.things[0] if t.label == 5)
+    assert thing.changed < detector.settings.min_changed  # neither gone nor come by its surface
+    assert kinds(found) == ["moved"]
+    check_moved(found.changes[0], before, after)
+
+
 def test_ids_that_were_shuffled_are_not_believed_and_not_needed() -> None:
     moved = Box(4, (-0.05, -0.3), turn=30)
     found, _ = detect(SmallVisit([CUP, CRATE, BRICK]), SmallVisit([moved, Box(2, CRATE.at, CRATE.size, 20, 2.0),
