@@ -59,7 +59,8 @@ def test_a_thing_turned_in_place_is_moved() -> None:
 
 
 def test_a_thin_thing_that_was_pushed_along_the_floor_is_moved() -> None:
-    before, after = (Box(5, at, (0.3, 0.12, 0.006), turn=turn) for at, turn in (((-0.1, -0.3), 0), ((-0.02, -0.26), 30)))
+    size = (0.3, 0.12, 0.006)
+    before, after = Box(5, (-0.1, -0.3), size), Box(5, (-0.02, -0.26), size, turn=30)
     found, detector = detect(SmallVisit([before, CUP, BRICK]), SmallVisit([after, CUP, BRICK]))
     thing = next(t for t in detector.things[0] if t.label == 5)
     assert thing.changed < detector.settings.min_changed  # neither gone nor come by its surface
