@@ -64,7 +64,7 @@ def _lines(outcome: MergeOutcome, names: list[str]) -> list[str]:
         lines.append(f"{names[pair[0]]} and {names[pair[1]]}: {believed} of {len(own)} links believed")
     lines.append(f"{outcome.gaussians} Gaussians, {sum(outcome.doubles)} double ones left out")
     if outcome.united:
-        lines.append(f"{len(outcome.united)} objects were seen in more than one run and have one id now")
+        lines.append(f"{outcome.shared_objects} objects were seen in more than one run and have one id now")
     if outcome.trained:
         lines.append(f"{outcome.steps} steps on {outcome.trained} keyframes at the seams")
     lines += [f"note: {note}" for note in outcome.notes]

@@ -82,6 +82,7 @@ class UnitedObjects:
     united: list[tuple[int, int, int]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     _sources: list[str | None] = field(default_factory=list)
+    _learned: dict[str | None, list[int]] = field(default_factory=dict)
 
     def add(
         self, base: GaussianMap, gaussians: GaussianMap, objects: RunObjects | None, told: ToldIds | None = None
@@ -109,6 +110,7 @@ class UnitedObjects:
         self._take_words(objects, ids)
         if first:
             self.classifier = objects.classifier
+            self._learned = {objects.source: objects.classifier.class_ids.tolist()}
         else:
             self._relabel(base, gaussians, objects, ids)
 
@@ -135,7 +137,8 @@ class UnitedObjects:
         if told is not None:
             found = {i: name for i, name in found.items() if i not in told.new} | dict(told.names)
         ids = {i: found[i] for i in own if i in found}
-        self.united += [(new, len(self.ids), old) for old, new in ids.items() if new in known]
+        objects_before = {i for of_run in self.ids for i in of_run.values()}
+        self.united += [(new, len(self.ids), old) for old, new in ids.items() if new in objects_before]
         taken = known | set(ids.values()) | (set() if told is None else told.taken)
         free = iter([i for i in range(1, _IDS) if i not in taken and i not in own])
         for i in own:
@@ -151,7 +154,9 @@ class UnitedObjects:
         of_source = [k for k, source in enumerate(self._sources) if source is not None and source == objects.source]
         if not of_source:
             return None
-        return {i: name for k in reversed(of_source) for i, name in self.ids[k].items()}
+        called = {i: name for k in reversed(of_source) for i, name in self.ids[k].items()}
+        too_little_seen = self._learned.get(objects.source, [])  # by the first run, for its map to have them
+        return {i: i for i in too_little_seen} | called
 
     def _by_surface(self, base: GaussianMap, gaussians: GaussianMap) -> dict[int, int]:
         voxel = self.settings.voxel

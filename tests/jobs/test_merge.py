@@ -153,6 +153,19 @@ def test_without_the_recordings_it_merges_and_says_so(
     assert len(outcome.folder.segmented_map().gaussians) == outcome.gaussians
 
 
+def test_runs_without_objects_are_named(halves: Halves, room: Path, places: Path, tmp_path: Path) -> None:
+    bare = run_of(room, places / "bare", 4, 12, more=("masks.source=none",))
+    outcome = merge_runs([halves.first.path, bare], tmp_path / "out", settings=MergeSettings(steps=0))
+    assert [str(bare) in note for note in outcome.notes if "has no objects" in note] == [True]
+    assert outcome.shared_objects == 0
+
+
+def test_what_three_runs_saw_is_counted_once(halves: Halves) -> None:
+    """Two runs found object 4 again, one of them in two pieces."""
+    outcome = MergeOutcome(halves.merged, halves.outcome.poses, united=[(4, 1, 4), (4, 2, 7), (4, 2, 8), (5, 2, 1)])
+    assert outcome.shared_objects == 2
+
+
 @pytest.mark.long("a run of another room is made")
 def test_two_rooms_are_refused_by_name(
     halves: Halves, places: Path, tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
@@ -181,6 +194,9 @@ def test_what_cannot_be_merged_is_said(halves: Halves, tmp_path: Path) -> None:
         merge_runs([first, second], first, overwrite=True)
     with pytest.raises(RunFolderError, match="there is a run already"):
         merge_runs([first, second], halves.merged.path)
+    shutil.copytree(first, tmp_path / "again")
+    with pytest.raises(ConfigError, match="again: is the same run as"):
+        merge_runs([second, first, tmp_path / "again"], tmp_path / "out")
     edited = tmp_path / "edited"
     shutil.copytree(second, edited)
     (edited / "places.npz").unlink()

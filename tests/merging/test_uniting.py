@@ -130,6 +130,18 @@ def test_ids_of_the_same_masks_are_believed_whatever_is_seen() -> None:
     assert united.supervision == "masks"
 
 
+def test_ids_of_the_same_masks_stay_where_the_first_run_saw_too_little_of_a_thing() -> None:
+    """The first run's masks told of object 5, but none of its Gaussians is of it."""
+    first, objects = learned({1: SOFA}, "masks", {})
+    classifier = with_class(objects.classifier, 5, first.features.numpy())
+    objects = RunObjects(objects.table, classifier, objects.source, 0)
+    united, base = unite((first, objects), learned({1: SOFA, 5: LAMP}, "masks", {}))
+    assert united.ids[1] == {1: 1, 5: 5} and united.table(base).ids() == [1, 5]
+    assert united.united == [(1, 1, 1)]
+    labels, _ = united.classifier.labels(base.features.numpy())
+    assert (labels == base.object_id.numpy()).mean() > 0.99
+
+
 def test_a_run_without_objects_adds_none() -> None:
     bare = GaussianMap(0, 16)
     bare.insert(torch.zeros((3, 3)), torch.ones((3, 4)), torch.zeros((3, 3)), 1.0, torch.zeros((3, 3)))

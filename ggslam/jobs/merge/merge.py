@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ggslam.errors import ConfigError
 from ggslam.jobs.merge.clock import Clock
 from ggslam.jobs.merge.joint_folder import joint_folder
 from ggslam.jobs.merge.merged_run import MergedRun
@@ -25,6 +26,7 @@ from ggslam.merging.ownership import Ownership
 from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import fingerprint
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.interrupts import delay_interrupts
 
@@ -55,6 +57,11 @@ class MergeOutcome:
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def shared_objects(self) -> int:
+        """Things that more than one run has."""
+        return len({thing for thing, _, _ in self.united})
+
 
 def merge_runs(
     runs: ListOf[str | Path], out: str | Path, *, overwrite: bool = False, settings: MergeSettings | None = None,
@@ -74,14 +81,32 @@ def merge_runs(
         What came of it.
 
     Raises:
-        ConfigError: fewer than two runs, one given twice, `out` is one of them, or a run has too little ground in
-            common with the others; the message names it and the best that was found.
+        ConfigError: fewer than two runs, one given twice (also as a copy or a container), `out` is one of them, or
+            a run has too little ground in common with the others; the message names it and the best that was found.
         RunFolderError: a run is damaged or has no places, or `out` cannot be written.
         MissingDependency: gtsam is not installed.
     """
     clock, context, settings = Clock(), NativeContext(None), settings or MergeSettings()
     with joint_folder(runs, out, overwrite, context, clock, "merged") as (sources, folder):
+        _refuse_copies(sources)
         return _Merge(sources, folder, settings, observer or SilentObserver(), context, clock).run()
+
+
+def _refuse_copies(sources: list[MergeSource]) -> None:
+    """A run and its container, or a copy of it, would count its frames twice."""
+    known: dict[str, MergeSource] = {}
+    for source in sources:
+        first = known.setdefault(fingerprint(source.folder), source)
+        if first is not source:
+            raise ConfigError(f"{source.name}: is the same run as {first.name}; a run is not merged with itself")
+
+
+def _bare_runs(sources: list[MergeSource], objects: UnitedObjects) -> list[str]:
+    """Notes on the runs that have no objects, where others have some."""
+    if objects.supervision is None:
+        return []
+    without = [source.name for source in sources if source.objects is None]
+    return [f"{name}: has no objects; what it measured best belongs to none in the merged map" for name in without]
 
 
 @dataclass
@@ -110,7 +135,7 @@ class _Merge:
         outcome.trained, outcome.steps = trained.count, trained.steps
         notes += trained.notes
         self.clock.lap("train")
-        notes += objects.notes
+        notes += objects.notes + _bare_runs(sources, objects)
         outcome.gaussians, outcome.united = len(gaussians), objects.united
         merged = MergedRun(sources, poses, trained.keyframes, gaussians, objects, outcome.doubles, outcome.steps)
         with delay_interrupts():
