@@ -105,8 +105,7 @@ class RunFolder:
         if not (Path(path) / MARKER).is_file():
             if has_checkpoints(Path(path)):
                 raise RunFolderError(f"{path}: the run was cut off before it was saved; go on with it: `resume`")
-            reason = "is not a run of ggslam (no run.json)" if Path(path).is_dir() else "no such folder"
-            raise RunFolderError(f"{path}: {reason}")
+            raise RunFolderError(f"{path}: {_why_no_run(Path(path))}")
         refuse_links(path, RunFolderError)
         if is_being_saved(Path(path), MARKER):
             with folder_lock(Path(path), wait_s=5):
@@ -331,3 +330,12 @@ def as_written(path: Path) -> Iterator[None]:
         yield
     except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         raise RunFolderError(f"{path}: not as ggslam writes it: {error!r}") from error
+
+
+def _why_no_run(path: Path) -> str:
+    """What is there instead of a run."""
+    if path.is_dir():
+        return "is not a run of ggslam (no run.json)"
+    if not path.is_file():
+        return "no such folder"
+    return "is a file, and a run is a folder" + ("; `ggslam decode` makes one of it" if path.suffix == ".ggz" else "")

@@ -17,7 +17,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.scene.rig import Rig
 from ggslam.sequences.recording import FrameFiles, select
-from ggslam.sequences.rig_file import RigCamera, RigFile, read_rig_file
+from ggslam.sequences.rig_file import RigCamera, RigFile, find_rig_file, read_rig_file
 from ggslam.sequences.rig_times import find_instants, gaps
 from ggslam.sequences.sequence import OnBadFrame, ReadMasks, Sequence, SkippedFrame
 
@@ -257,15 +257,14 @@ def open_rig(
 def _open_part(
     file: RigFile, camera: RigCamera, open_one: Callable[..., Sequence], scale: float | None, on_bad_frame: OnBadFrame
 ) -> Sequence:
+    if find_rig_file(camera.recording) is not None:  # before it is opened: it may name itself
+        raise SequenceError(f"{file.path}: camera '{camera.name}': {camera.recording} is a rig itself")
     own, times = camera.scale, 1.0 if scale is None else scale
     wanted = own * times if own is not None else times if times != 1 else None
     try:
-        sequence = open_one(camera.recording, scale=wanted, on_bad_frame=on_bad_frame, **camera.options)
+        return open_one(camera.recording, scale=wanted, on_bad_frame=on_bad_frame, **camera.options)
     except SequenceError as error:
         raise SequenceError(f"{file.path}: camera '{camera.name}': {error}") from None
-    if isinstance(sequence, RigSequence):
-        raise SequenceError(f"{file.path}: camera '{camera.name}': {camera.recording} is a rig itself")
-    return sequence
 
 
 def _check_common(file: RigFile, parts: list[RigPart], instants: np.ndarray) -> None:

@@ -11,6 +11,7 @@ import pytest
 import ggslam
 from ggslam.errors import ConfigError, RunFolderError, SequenceError
 from ggslam.objects.lookup import objects_at
+from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.slam.result import SlamResult, StepReport
 
@@ -101,6 +102,13 @@ def test_a_whole_run_of_a_part(room: Path, tmp_path: Path) -> None:
         ggslam.run_recording(room, tmp_path / "again", strid=2)
     with pytest.raises(SequenceError, match="no such folder"):
         ggslam.run_recording(tmp_path / "nothing", tmp_path / "again")
+
+
+def test_a_file_is_no_run(tmp_path: Path) -> None:
+    container = tmp_path / "map.ggz"
+    container.write_bytes(b"PK")
+    with pytest.raises(RunFolderError, match="is a file, and a run is a folder; `ggslam decode` makes one of it"):
+        RunFolder.open(container)
 
 
 def test_unknown_exports(made: Made, tmp_path: Path) -> None:

@@ -48,6 +48,13 @@ def open_rig(path: Path, **options: Any) -> RigSequence:
     return sequence
 
 
+def test_a_rig_in_a_rig_is_refused_also_itself(two: Path) -> None:
+    path = write_rig(two, entry("a", TUM), entry("b", "rig.yaml"))
+    with pytest.raises(SequenceError) as refused:
+        open_sequence(path)
+    assert str(refused.value) == f"{path}: camera 'b': {path} is a rig itself"
+
+
 def test_instants_pair_the_nearest_and_keep_the_others() -> None:
     first, second, third = np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.115, 0.195, 0.25, 0.4]), np.array([0.405, 0.0])
     rows = find_instants([first, second, third], 0.02)
