@@ -16,7 +16,7 @@ ELSEWHERE = -1
 """Frame index of keyframes that are of another recording than the run's: of the map that it began with."""
 DEPTH_UNITS_PER_METRE = 5000.0
 """Depth of keyframes is kept as uint16 in units of 0.2 mm (range 13.1 m), the resolution of the TUM recordings."""
-_IMAGES = ("color", "depth", "mask")
+_IMAGES = ("color", "depth", "mask", "moving")
 
 
 @dataclass
@@ -31,6 +31,7 @@ class Keyframe:
         T_camera_world: float64 [4, 4], the pose as refined so far.
         exposure: float64 [3, 2], gain and offset per channel applied to the rendered colour.
         mask: uint16 [H, W] or None.
+        moving: bool [H, W], what is not of the map because it moved; None: nothing, as far as is known.
     """
 
     index: int
@@ -48,6 +49,7 @@ class Keyframe:
     camera_number: int = 0
     instant: int | None = None
     """Of a rig, see `Frame`."""
+    moving: np.ndarray | None = field(default_factory=lambda: None)
 
     def put_away(self, archive: ArrayArchive) -> None:
         """Hands the images to an archive, which keeps them in memory or not. They must not be changed any more."""
@@ -84,6 +86,7 @@ def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyfr
     return Keyframe(
         index, frame.index, frame.timestamp, frame.camera, np.ascontiguousarray(frame.color), units,
         inverse(T_world_camera), frame.mask, camera_number=frame.camera_number, instant=frame.instant,
+        moving=frame.moving,
     )  # fmt: skip
 
 

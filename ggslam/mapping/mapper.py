@@ -209,11 +209,13 @@ class Mapper(ABC):
         keyframe.mask = labels.mask
         if labels.mask is None or self.identity is None:
             return
+        if keyframe.moving is not None:
+            keyframe.mask = np.where(keyframe.moving, np.uint16(0), labels.mask)
         self.identity.merge(self.map, labels.merges)
         if labels.forgotten:
             self.identity.forget(self.map, labels.forgotten)
-        self.identity.observe(labels.mask)
-        self.identity.split(self.map, self._rasterizer, labels.mask, labels.splits)
+        self.identity.observe(keyframe.mask)
+        self.identity.split(self.map, self._rasterizer, keyframe.mask, labels.splits)
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 
@@ -230,7 +232,11 @@ class Mapper(ABC):
     def _valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
         """Where a keyframe shows something, bool [H, W]; None: everywhere, or it is of another recording."""
         valid = self._valid.get(keyframe.camera_number) if keyframe.frame_index != ELSEWHERE else None
-        return valid if valid is not None and valid.shape == keyframe.color.shape[:2] else None
+        if valid is not None and valid.shape != keyframe.color.shape[:2]:
+            valid = None
+        if keyframe.moving is None:
+            return valid
+        return ~keyframe.moving if valid is None else valid & ~keyframe.moving
 
     def _trainable(self) -> Sequence[int]:
         return range(len(self.keyframes)) if self.residency is None else self.residency.trainable()

@@ -27,6 +27,7 @@ class Frame:
         mask_loader: reads the mask on demand; see `load_mask`.
         valid: bool [H, W], False where colour shows nothing (beyond the border of an undistorted image); the same array
             for all frames of a recording; None: all of it shows something.
+        moving: bool [H, W], True where something is seen that moves; None: nothing, as far as is known.
         depth_delay: seconds after `timestamp`, which is that of colour, at which depth was taken.
         camera_number: of the camera in its rig; 0 without one.
         instant: number of the instant at which the cameras of a rig took their images together; None without a rig.
@@ -42,6 +43,7 @@ class Frame:
     T_world_camera: np.ndarray | None = None
     mask_loader: Callable[[], np.ndarray | None] | None = field(default=None, repr=False, compare=False)
     valid: np.ndarray | None = field(default=None, repr=False, compare=False)
+    moving: np.ndarray | None = field(default=None, repr=False, compare=False)
     depth_delay: float = 0.0
     camera_number: int = 0
     instant: int | None = None

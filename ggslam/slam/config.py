@@ -19,6 +19,7 @@ import yaml
 from ggslam.errors import ConfigError
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.settings import MapperSettings
+from ggslam.movers.settings import MoverSettings
 from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.object_masks import MaskSettings
 from ggslam.submaps.paging_settings import PagingSettings
@@ -83,6 +84,7 @@ class Config:
     mapping: MapperSettings = field(default_factory=MapperSettings)
     identity: IdentitySettings = field(default_factory=IdentitySettings)
     masks: MaskSettings = field(default_factory=MaskSettings)
+    movers: MoverSettings = field(default_factory=MoverSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     paging: PagingSettings = field(default_factory=PagingSettings)
     volumes: VolumeSettings = field(default_factory=VolumeSettings)

@@ -80,6 +80,7 @@ class RealtimeSlam:
         frame = slam.receive(frame)
         with self._beside_mapper:
             tracking = slam.track(frame)
+        frame = slam.without_movers(frame)
         is_keyframe = self._jobs.qsize() < MAX_WAITING and slam.wants_keyframe(frame, tracking)
         if is_keyframe:
             slam.poses.add_keyframe(tracking.T_world_camera)

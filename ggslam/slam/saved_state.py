@@ -38,6 +38,8 @@ from ggslam.objects.consistency import ConsistencyJudge
 from ggslam.objects.evidence import PairEvidence, _Pair
 from ggslam.objects.fragments import Fragment, FragmentMemory
 from ggslam.objects.table import Observation
+from ggslam.movers.detector import MoverDetector
+from ggslam.movers.evidence import CoarseView
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
@@ -52,6 +54,7 @@ from ggslam.slam.object_masks import ObjectMasks
 from ggslam.slam.result import LearnedObjects, SlamTimes, TrackedFrame
 from ggslam.slam.rig_clock import RigClock
 from ggslam.slam.rig_slam import RigSlam
+from ggslam.slam.run_movers import RunMovers
 from ggslam.slam.run_objects import RunObjects
 from ggslam.slam.shutter_times import ShutterTimes
 from ggslam.slam.slam import Slam
@@ -198,6 +201,8 @@ RULES: Rules = {
     FramePoses: Rule(growing=_names("frames")),
     MapCorrections: _but("_surface", "_mapper", "_pager", "_masks", "_publishing"),
     RunObjects: _but("_masks"),
+    RunMovers: _but("_reads_masks"),
+    MoverDetector: _but("settings"),
     ObjectMasks: _but("settings", "_segment"),
     # tracking
     GicpTracker: _but("_given_engine", "_features"),
@@ -226,13 +231,13 @@ RULES: Rules = {
     # mapping
     CpuMapper: _but("settings", "residency", "extra_loss", "_rasterizer", "_loss", "_standard_adam"),
     GaussianMap: Rule(save=_save_map, take=_take_map),
-    Keyframe: Rule(fixed=_names("color", "depth", "mask")),
+    Keyframe: Rule(fixed=_names("color", "depth", "mask", "moving")),
     CpuIdentityLearner: _but("settings", "seed"),
     PixelPool: Rule(save=_save_pool),
     NeighbourIndex: Rule(save=_save_index, take=_take_index),
     # plain values
     **dict.fromkeys(
-        (Camera, CameraFixtures, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame,
+        (Camera, CameraFixtures, CoarseView, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame,
          StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam,
          ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier, LearnedObjects, Observation,
          Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory, ShutterTimes, RigClock),

@@ -35,6 +35,7 @@ from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.parts import check_arguments, device_name, make_parts
 from ggslam.slam.result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
+from ggslam.slam.run_movers import RunMovers
 from ggslam.slam.run_objects import RunObjects
 from ggslam.slam.saved_places import saved_places_to_bytes
 from ggslam.slam.shutter_times import ShutterTimes
@@ -100,6 +101,7 @@ class Slam:
         self._objects = RunObjects(self.masks)
         self.color_poses = ColorPoses(self.mapper, self.poses, self.tracker.state)
         self._depth_edges, self._shutters, self._fixtures = DepthEdges(), ShutterTimes(), CameraFixtures()
+        self.movers = RunMovers(self.config.movers, self.config.masks.source in ("auto", "recording"))
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
         """Starts in a map made before; `surface` and `loops` hold its keyframes already. The camera counts as lost
@@ -136,6 +138,7 @@ class Slam:
         self.times.start()
         frame = self.receive(frame)
         tracking = self.track(frame)
+        frame = self.without_movers(frame)
         is_keyframe = self.wants_keyframe(frame, tracking)
         if is_keyframe:
             self.tracker.target = None  # the surface may be made anew; the next frame gets what it is then
@@ -262,7 +265,7 @@ class Slam:
         self._follow_moves()
         if not len(self.surface):
             self.use_scale(scene_scale(frame.depth))
-        result = self.tracker.track(frame)
+        result = self.tracker.track(self.movers.expect(frame))
         if result.status is TrackingStatus.LOST and self.loops is not None and self.tracker.target is not None:
             found = self.loops.find(frame, result)
             if found is not None:
@@ -273,9 +276,14 @@ class Slam:
         self._shutters.follow(located)
         self._fixtures.follow(self.camera, located)
         self._tell_noise(result.median_depth_m)
+        result = self.movers.look(frame, result, self.tracker.noise)
         self.times.tracking_by_frame.append(time.perf_counter() - start)
         self.times.tracking += self.times.tracking_by_frame[-1]
         return result
+
+    def without_movers(self, frame: Frame) -> Frame:
+        """The frame that was tracked last as the map gets it: without depth where something moves."""
+        return self.movers.clean(frame)
 
     def _tell_noise(self, median_depth: float) -> None:
         """The mapper learns what the tracker says of the noise, on the first frame and whenever it says more."""
@@ -298,6 +306,7 @@ class Slam:
         for T_new_old in moves:
             self.tracker.move(T_new_old)
             self._shutters.move(T_new_old)
+            self.movers.move(T_new_old)
             self.policy.move(T_new_old)
             self.poses.move(T_new_old)
         if target is not None:

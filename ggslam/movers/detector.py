@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds what moves, frame after frame.
+
+A place of a frame is evidence if several frames before it looked past it at something farther: something has come
+there. Such places are gathered into whole things, by segments where there are any, else by what is connected; what is
+seen once, or is too small, is noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+from ggslam.movers.evidence import CoarseView, Margin, compare
+from ggslam.movers.segments import Gathering, gather
+from ggslam.movers.settings import MoverSettings
+from ggslam.scene.frame import Frame
+
+AGES = (1, 2, 4, 8, 12, 16)
+"""Each frame is compared with those so many frames before it."""
+GROWN = 2
+"""Pixels of a 320 pixel wide image by which masks of movers are larger than what was found: outlines are blurred."""
+PREDICTED = 3
+"""Times as many pixels are expected to move in the next frame."""
+
+
+@dataclass
+class MoverDetector:
+    """Looks at located frames, each once and in their order.
+
+    Attributes:
+        settings: see there.
+        mask: bool [H, W], what moves in the latest frame; None: nothing.
+        views: coarse depth of the latest frames, the newest last.
+        found: small mask of what moves, or may, in the latest frame.
+    """
+
+    settings: MoverSettings
+    mask: np.ndarray | None = None
+    views: list[CoarseView] = field(default_factory=list)
+    found: np.ndarray | None = None
+
+    def expect(self, frame: Frame) -> Frame:
+        """The frame to locate: without depth where something is expected to move."""
+        if self.mask is None or self.mask.shape != frame.depth.shape:
+            return frame
+        moves = grow(self.mask, PREDICTED * GROWN)
+        return replace(frame, depth=np.where(moves, np.float32(0), frame.depth))
+
+    def look(self, frame: Frame, T_world_camera: np.ndarray | None, sigma: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Finds what moves in a frame: `mask`.
+
+        Args:
+            frame: as the camera saw it.
+            T_world_camera: [4, 4], where it is; None: not known, which breaks the row of frames.
+            sigma: standard deviation in metres of the depth camera at depths in metres.
+        """
+        self.mask = None
+        if T_world_camera is None:
+            self.views, self.found = [], None
+            return
+        s, factor = self.settings, max(1, round(frame.camera.width / self.settings.columns))
+        view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera)
+        earlier, self.views = self.views, [*self.views[-AGES[-1] :], view]
+        margin: Margin = lambda z: np.float32(s.margin_m) + np.float32(s.margin_sigmas) * sigma(z)  # noqa: E731
+        passed, fresh = np.zeros(view.depth.shape, np.int8), view.depth > 0
+        same = np.zeros(view.depth.shape, np.int8)
+        for age in AGES:
+            if age > len(earlier):
+                continue
+            evidence = compare(view, earlier[-age], margin)
+            passed += evidence.passed
+            same += evidence.same
+            if age <= s.rest_frames:
+                fresh &= evidence.same
+        novel = (passed >= s.min_passed) & (passed > same - 2)
+        before, self.found = self.found, None
+        if novel.sum() < min(s.min_pixels, 3):
+            return
+        found = gather(Gathering(novel, fresh, view.depth, same > passed, factor, frame.depth.shape), frame.load_mask, s)
+        if found is None or found.small.mean() > s.max_share:
+            return
+        self.found = found.small
+        if before is not None:
+            seen_twice = found.seen_in(before)
+            if seen_twice is not None:
+                self.mask = grow(seen_twice, GROWN)
+
+    def clean(self, frame: Frame) -> Frame:
+        """The frame at hand without depth where something moves, which `Frame.moving` tells."""
+        if self.mask is None:
+            return frame
+        return replace(frame, depth=np.where(self.mask, np.float32(0), frame.depth), moving=self.mask)
+
+    def move(self, T_new_old: np.ndarray) -> None:
+        """Follows a correction [4, 4] of the world about the camera."""
+        self.views = [view.moved(T_new_old) for view in self.views]
+
+
+def grow(mask: np.ndarray, pixels: int) -> np.ndarray:
+    """A mask bool [H, W] larger by some pixels of a 320 pixel wide image."""
+    reach = max(1, round(pixels * mask.shape[1] / 320))
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0

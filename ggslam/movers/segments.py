@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Places that are evidence of motion, gathered into whole things."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ggslam.movers.evidence import thin_out
+from ggslam.movers.settings import MoverSettings
+
+SAME_THING = 0.03
+"""Neighbouring places whose depths differ by less than this share are of one thing."""
+REACH = 2
+"""Places by which a thing is larger than its evidence, at most."""
+_AROUND = np.ones((3, 3), np.uint8)
+
+
+@dataclass(frozen=True)
+class Gathering:
+    """What is known of each place of a small image, bool [h, w] unless it says otherwise.
+
+    Attributes:
+        novel: something has come there.
+        rests: it is where all the latest frames saw it.
+        depth: float32, metres.
+        world: frames before saw the same there.
+        factor: how many times the image is smaller.
+        shape: of the whole image, (H, W).
+    """
+
+    novel: np.ndarray
+    rests: np.ndarray
+    depth: np.ndarray
+    world: np.ndarray
+    factor: int
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class MovingThings:
+    """Things that move in a frame.
+
+    Attributes:
+        small: bool [h, w], the places of all of them.
+        parts: int32 [h, w], number of the thing at each place, 0 without one.
+        full: int32 [H, W], the same for each pixel.
+    """
+
+    small: np.ndarray
+    parts: np.ndarray
+    full: np.ndarray
+
+    def seen_in(self, before: np.ndarray) -> np.ndarray | None:
+        """Pixels, bool [H, W], of those that meet places bool [h, w] of the frame before; None without any."""
+        near = cv2.dilate(before.astype(np.uint8), _AROUND) > 0
+        numbers = np.unique(self.parts[near])
+        numbers = numbers[numbers > 0]
+        return np.isin(self.full, numbers) if len(numbers) else None
+
+
+def gather(
+    places: Gathering, load_segments: Callable[[], np.ndarray | None], settings: MoverSettings
+) -> MovingThings | None:
+    """The things that move, None without any.
+
+    Args:
+        places: see there.
+        load_segments: gives ids uint16 [H, W] of the frame's segments, 0 = none, or None. Asked only where something
+            may move.
+        settings: how much of a thing has to have come.
+    """
+    blobs = _large(places.novel, settings.min_pixels)
+    segments = load_segments()
+    if segments is None:
+        return _as_things(_blobs_that_move(blobs, places, settings), places, None, {})
+    small = thin_out(segments, places.factor)
+    moving = {
+        number: k + 1 for k, number in enumerate(_segments_that_move(small, places, settings))
+    }  # fmt: skip
+    of_segments = np.isin(small, list(moving)) & (small > 0)
+    left = _large(blobs & ~(cv2.dilate(of_segments.astype(np.uint8), _AROUND) > 0), settings.min_pixels)
+    left &= small == 0
+    return _as_things(_blobs_that_move(_large(left, settings.min_pixels), places, settings), places, segments, moving)
+
+
+def _segments_that_move(small: np.ndarray, places: Gathering, s: MoverSettings) -> list[int]:
+    """Ids of segments of which enough has come and that do not rest."""
+    known = places.depth > 0
+    count, novel, rest = (np.bincount(small[m].reshape(-1)) for m in (known, known & places.novel, known & places.rests))
+    found = []
+    for number in np.flatnonzero(novel):
+        enough = max(s.min_pixels / 4, s.min_share * count[number])
+        still = rest[number] if number < len(rest) else 0
+        if number and novel[number] >= enough and still < s.at_rest * count[number]:
+            found.append(int(number))
+    return found
+
+
+def _blobs_that_move(blobs: np.ndarray, places: Gathering, s: MoverSettings) -> np.ndarray:
+    """Numbers int32 [h, w] of connected places that do not rest, each with what is connected to it."""
+    count, labels = cv2.connectedComponents(blobs.astype(np.uint8), connectivity=8)
+    for number in range(1, count):
+        if places.rests[labels == number].mean() >= s.at_rest:
+            labels[labels == number] = 0
+    for _ in range(REACH):
+        labels = _spread(labels, places)
+    return labels
+
+
+def _spread(labels: np.ndarray, places: Gathering) -> np.ndarray:
+    """Things take in neighbouring places of like depth that are not known to be of the world."""
+    depth, grown = places.depth, labels.copy()
+    for step in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        beside, z = np.roll(labels, step, (0, 1)), np.roll(depth, step, (0, 1))
+        joins = (grown == 0) & (beside > 0) & ~places.world & (np.abs(z - depth) < SAME_THING * depth)
+        grown[joins] = beside[joins]
+    return grown
+
+
+def _large(mask: np.ndarray, least: int) -> np.ndarray:
+    """The connected parts of a mask bool [h, w] that have at least so many places."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    sizes = np.bincount(labels.reshape(-1), minlength=count)
+    sizes[0] = 0
+    return (sizes >= least)[labels]
+
+
+def _as_things(
+    labels: np.ndarray, places: Gathering, segments: np.ndarray | None, moving: dict[int, int]
+) -> MovingThings | None:
+    """Connected places and segments with their numbers, as things."""
+    if not moving and not labels.any():
+        return None
+    (h, w), factor = labels.shape, places.factor
+    parts, full = labels.astype(np.int32), np.zeros(places.shape, np.int32)
+    large = cv2.resize(labels.astype(np.uint16), (w * factor, h * factor), interpolation=cv2.INTER_NEAREST)
+    full[: h * factor, : w * factor] = large
+    if segments is not None:
+        small, first = thin_out(segments, factor), int(labels.max())
+        for number, k in moving.items():
+            full[segments == number] = first + k
+            parts[small == number] = first + k
+    return MovingThings(parts > 0, parts, full)

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Things that move while a recording is made: what they cost a run, as printed in docs/movers.md.
+
+    python scripts/bench_movers.py ../shared/data                     # all of it
+    python scripts/bench_movers.py ../shared/data --only movers       # one part: movers, still
+    python scripts/bench_movers.py ../shared/data --masks none
+
+movers: `livingroom_movers`, with the search for movers and without, beside its twin in which nothing moves: error of the
+trajectory, held-out PSNR over pixels that no mover covers, and behind the movers, where the twin's images tell what is
+there; overlap of the masks that were found with the true ones, and when each mover was found first.
+still: recordings in which nothing moves, with the search and without: frames in which something was found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.evaluation.trajectory import align_points
+from ggslam.scene.poses import inverse, transform_points
+from ggslam.sequences import open_sequence
+from ggslam.slam.config import load_config
+from ggslam.slam.slam import Slam
+
+FEWEST_PIXELS = 30
+"""Of a mover at half size: fewer are not asked for."""
+STILL = ("livingroom_movers_static", "livingroom", "redkitchen", "rgbd_dataset_freiburg3_cabinet")
+
+
+@dataclass
+class Run:
+    """What a run gives that is scored."""
+
+    slam: Slam
+    seconds: float
+    masks: dict[int, np.ndarray] = field(default_factory=dict)
+
+
+def run(path: Path, settings: list[str], stop: int | None) -> Run:
+    """A run of a recording at half size."""
+    sequence = open_sequence(path, scale=0.5, stop=stop)
+    slam, masks, seconds = Slam(sequence.camera, load_config(None, settings)), {}, 0.0
+    for frame in sequence:
+        start = time.process_time()
+        slam.step(frame)
+        seconds += time.process_time() - start
+        if slam.movers.mask is not None:
+            masks[frame.index] = slam.movers.mask
+    slam.finish()
+    return Run(slam, seconds, masks)
+
+
+def ate_cm(done: Run, path: Path, stop: int | None) -> float:
+    """Root mean square error of the trajectory."""
+    sequence = open_sequence(path, scale=0.5, stop=stop)
+    found, true = [], []
+    for tracked, frame in zip(done.slam.frames, sequence, strict=True):
+        if tracked.status != "lost" and frame.T_world_camera is not None:
+            found.append(done.slam.pose_of(tracked)[:3, 3])
+            true.append(frame.T_world_camera[:3, 3])
+    T_true_found, _ = align_points(np.array(found), np.array(true))
+    distances = np.linalg.norm(transform_points(np.array(found), T_true_found) - np.array(true), axis=1)
+    return 100 * float(np.sqrt((distances**2).mean()))
+
+
+def psnr(error: list[np.ndarray]) -> float:
+    """Of squared errors of colours from 0 to 1."""
+    return float(-10 * np.log10(np.concatenate(error).mean())) if error else float("nan")
+
+
+def scores(done: Run, twin: Path, movers: list[np.ndarray], stop: int | None) -> tuple[float, float]:
+    """Held-out PSNR against the twin's images over pixels that no mover covers, and over all frames behind movers.
+
+    Args:
+        done: the run.
+        twin: recording of the same camera path without movers.
+        movers: bool [H, W] of each frame, where movers are.
+        stop: frames.
+    """
+    free, behind = [], []
+    for tracked, frame, covered in zip(done.slam.frames, open_sequence(twin, scale=0.5, stop=stop), movers, strict=True):
+        held_out = done.slam.config.evaluation.is_held_out(frame.index)
+        if tracked.status == "lost" or not (held_out or covered.any()):
+            continue
+        view = done.slam.mapper.render_view(frame.camera, inverse(done.slam.pose_of(tracked)))
+        wrong = (view.image.numpy().transpose(1, 2, 0).clip(0, 1) - frame.color / np.float32(255)) ** 2
+        if held_out:
+            free.append(wrong[~covered].reshape(-1))
+        behind.append(wrong[covered].reshape(-1))
+    return psnr(free), psnr(behind)
+
+
+def bench_movers(data: Path, more: list[str], stop: int | None) -> None:
+    """The recording with movers against its twin."""
+    path, twin = data / "livingroom_movers", data / "livingroom_movers_static"
+    truth = json.loads((path / "movers.json").read_text())["frames"]
+    sequence = open_sequence(path, scale=0.5, stop=stop)
+    ids, numbers = [], {m["instance_id"] for m in truth[0]["movers"]}
+    for frame in sequence:
+        mask = frame.load_mask()
+        assert mask is not None
+        ids.append(mask)
+    covered = [np.isin(mask, list(numbers)) for mask in ids]
+    print("| run | ATE cm | free pixels dB | behind movers dB | Gaussians | processor s |")
+    print("|---|---|---|---|---|---|")
+    for name, where, settings in (
+        ("twin", twin, []), ("movers", path, ["movers.enabled=true"]), ("without the search", path, ["movers.enabled=false"]),
+    ):  # fmt: skip
+        done = run(where, [*settings, *more], stop)
+        free, behind = scores(done, twin, covered, stop)
+        print(f"| {name} | {ate_cm(done, where, stop):.3f} | {free:.2f} | {behind:.2f} | {done.slam.map.count} | {done.seconds:.1f} |", flush=True)  # noqa: E501
+        if name == "movers":
+            found = done
+    print_masks(found, ids, truth)
+
+
+def print_masks(done: Run, ids: list[np.ndarray], truth: list[dict]) -> None:
+    """How the masks that were found compare with the true ones."""
+    overlaps, onsets, invented = [], {}, []
+    for index, mask in enumerate(ids):
+        found = done.masks.get(index, np.zeros(mask.shape, bool))
+        wanted = np.zeros(mask.shape, bool)
+        for mover in truth[index]["movers"]:
+            own = mask == mover["instance_id"]
+            if not mover["moving"]:
+                continue
+            wanted |= own
+            if own.sum() >= FEWEST_PIXELS:
+                begun = onsets.setdefault(mover["instance_id"], [index, None])
+                if begun[1] is None and (found & own).sum() > own.sum() / 2:
+                    begun[1] = index
+        if wanted.sum() >= FEWEST_PIXELS:
+            overlaps.append((found & wanted).sum() / (found | wanted).sum())
+        elif found.any():
+            invented.append(index)
+    print(f"\nIoU {np.mean(overlaps):.3f} over {len(overlaps)} frames; frames with a mover where none moves: {invented}")
+    for number, (first, seen) in onsets.items():
+        print(f"mover {number}: moves from frame {first}, found in frame {seen}")
+
+
+def bench_still(data: Path, more: list[str], stop: int | None) -> None:
+    """Recordings in which nothing moves."""
+    print("| recording | frames with a mover | most pixels | ATE cm with, without | processor s with, without |")
+    print("|---|---|---|---|---|")
+    for name in STILL:
+        on, off = (run(data / name, [f"movers.enabled={v}", *more], stop) for v in ("true", "false"))
+        most = max((mask.mean() for mask in on.masks.values()), default=0)
+        ates = ", ".join(f"{ate_cm(r, data / name, stop):.3f}" for r in (on, off))
+        print(f"| {name} | {len(on.masks)} | {most:.2%} | {ates} | {on.seconds:.1f}, {off.seconds:.1f} |", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, help="folder of the recordings")
+    parser.add_argument("--only", choices=["movers", "still"])
+    parser.add_argument("--masks", choices=["recording", "none", "geometry", "auto"], default="auto")
+    parser.add_argument("--stop", type=int, help="frames of each recording")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting")
+    given = parser.parse_args()
+    more = [f"masks.source={given.masks}", *given.set]
+    if given.only != "still":
+        bench_movers(given.data, more, given.stop)
+    if given.only != "movers":
+        bench_still(given.data, more, given.stop)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
