@@ -223,6 +223,11 @@ class IdentityLearner(ABC):
         self.times.count += 1
         return gradient
 
+    def forget_pixels(self, keyframes: Sequence[int]) -> None:
+        """Keyframes by number whose masks have changed: their pixels are drawn anew."""
+        for number in keyframes:
+            self._pools.pop(number, None)
+
     def _draw(self, keyframe: Any) -> tuple[Any, Any]:
         """The next pixels of a keyframe, int32 [P], and the weight each has as a vote."""
         pool = self._pools.get(keyframe.index)

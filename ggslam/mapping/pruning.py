@@ -29,6 +29,20 @@ def prune(gaussians: GaussianMap, settings: PruningSettings) -> int:
     return gaussians.keep(good)
 
 
+def drop_moved(gaussians: GaussianMap, parts: Sequence[tuple[Keyframe, np.ndarray]]) -> None:
+    """Takes out what keyframes have mapped, and measured, in parts of their images, bool [H, W]: it has moved since."""
+    birth, means = gaussians.birth_keyframe.cpu().numpy(), gaussians.means.detach().cpu().numpy()
+    stays = np.ones(len(gaussians), bool)
+    for keyframe, part in parts:
+        rows = np.flatnonzero(birth == keyframe.index)
+        stays[rows] = ~is_in_image_part(transform_points(means[rows], keyframe.T_camera_world), part, keyframe.camera)
+        keyframe.moving = part if keyframe.moving is None else keyframe.moving | part
+        keyframe.depth = np.where(part, np.uint16(0), keyframe.depth)
+        if keyframe.mask is not None:
+            keyframe.mask = np.where(part, np.uint16(0), keyframe.mask)
+    gaussians.keep(torch.from_numpy(stays))
+
+
 def drop_pixels(gaussians: GaussianMap, keyframes: Sequence[Keyframe], part: np.ndarray, nearest: float) -> None:
     """Takes out what keyframes have mapped, and measured, in a part of their images, bool [H, W], or nearer than some
     metres. Keyframes of other recordings, and those with images of another size, are left alone."""

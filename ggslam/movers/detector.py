@@ -8,15 +8,16 @@ seen once, or is too small, is noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
-from ggslam.movers.evidence import CoarseView, Margin, compare
+from ggslam.movers.evidence import CoarseView, Margin, compare, thin_out
 from ggslam.movers.segments import Gathering, gather
 from ggslam.movers.settings import MoverSettings
+from ggslam.movers.trail import Trail
+from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 
 AGES = (1, 2, 4, 8, 12, 16)
@@ -35,6 +36,7 @@ class MoverDetector:
         settings: see there.
         mask: bool [H, W], what moves in the latest frame; None: nothing.
         views: coarse depth of the latest frames, the newest last.
+        trail: where movers have been.
         found: small mask of what moves, or may, in the latest frame.
     """
 
@@ -42,6 +44,7 @@ class MoverDetector:
     mask: np.ndarray | None = None
     views: list[CoarseView] = field(default_factory=list)
     found: np.ndarray | None = None
+    trail: Trail = field(default_factory=Trail)
 
     def expect(self, frame: Frame) -> Frame:
         """The frame to locate: without depth where something is expected to move."""
@@ -50,22 +53,21 @@ class MoverDetector:
         moves = grow(self.mask, PREDICTED * GROWN)
         return replace(frame, depth=np.where(moves, np.float32(0), frame.depth))
 
-    def look(self, frame: Frame, T_world_camera: np.ndarray | None, sigma: Callable[[np.ndarray], np.ndarray]) -> None:
+    def look(self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin) -> None:
         """Finds what moves in a frame: `mask`.
 
         Args:
             frame: as the camera saw it.
             T_world_camera: [4, 4], where it is; None: not known, which breaks the row of frames.
-            sigma: standard deviation in metres of the depth camera at depths in metres.
+            margin: see there.
         """
         self.mask = None
         if T_world_camera is None:
             self.views, self.found = [], None
             return
-        s, factor = self.settings, max(1, round(frame.camera.width / self.settings.columns))
+        s, factor = self.settings, coarse_factor(frame.camera, self.settings)
         view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera)
         earlier, self.views = self.views, [*self.views[-AGES[-1] :], view]
-        margin: Margin = lambda z: np.float32(s.margin_m) + np.float32(s.margin_sigmas) * sigma(z)  # noqa: E731
         passed, fresh = np.zeros(view.depth.shape, np.int8), view.depth > 0
         same = np.zeros(view.depth.shape, np.int8)
         for age in AGES:
@@ -88,6 +90,7 @@ class MoverDetector:
             seen_twice = found.seen_in(before)
             if seen_twice is not None:
                 self.mask = grow(seen_twice, GROWN)
+                self.trail.add(view, thin_out(seen_twice, factor))
 
     def clean(self, frame: Frame) -> Frame:
         """The frame at hand without depth where something moves, which `Frame.moving` tells."""
@@ -98,6 +101,11 @@ class MoverDetector:
     def move(self, T_new_old: np.ndarray) -> None:
         """Follows a correction [4, 4] of the world about the camera."""
         self.views = [view.moved(T_new_old) for view in self.views]
+
+
+def coarse_factor(camera: Camera, settings: MoverSettings) -> int:
+    """How many times smaller the images are that are compared."""
+    return max(1, round(camera.width / settings.columns))
 
 
 def grow(mask: np.ndarray, pixels: int) -> np.ndarray:

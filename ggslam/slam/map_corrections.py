@@ -9,16 +9,22 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.mapping.mapper import Mapper
-from ggslam.mapping.pruning import drop_pixels
+from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.pruning import drop_moved, drop_pixels
 from ggslam.objects.uniting import FAINT, LabelledVoxels
 from ggslam.scene.frame import Frame
 from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.loop_closing import Correction, LoopCloser
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_masks import ObjectMasks
+from ggslam.slam.run_movers import RunMovers
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import TrackingResult
+
+
+LOOKED_BACK = 64
+"""So many of the latest keyframes are searched for what has moved since."""
 
 
 class MapCorrections:
@@ -70,6 +76,23 @@ class MapCorrections:
             drop_pixels(self._mapper.map, self._mapper.keyframes, fixtures.mask, fixtures.nearest)
             with self._publishing:
                 self._surface.drop_pixels(fixtures.mask, fixtures.nearest, self._mapper.keyframes[-1].camera)
+
+    def take_out(self, movers: RunMovers, newest: Frame) -> None:
+        """What was mapped before it began to move goes from map, keyframes and surface, as far as the newest frame,
+        which has just become a keyframe, looks through where it was. What is on disk where memory is limited stays."""
+        if not movers.has_trail or self._pager is not None:
+            return
+        keyframes = self._mapper.keyframes
+        latest, earlier = keyframes[-1], [k for k in keyframes[-1 - LOOKED_BACK : -1] if k.frame_index != ELSEWHERE]
+        gone = movers.gone_since([(k.depth_m(), k.T_world_camera, k.mask) for k in earlier], newest, latest.T_world_camera)
+        parts = [(k, part) for k, part in zip(earlier, gone, strict=True) if part is not None]
+        if not parts:
+            return
+        drop_moved(self._mapper.map, parts)
+        if self._mapper.identity is not None:
+            self._mapper.identity.forget_pixels([k.index for k, _ in parts])
+        with self._publishing:
+            self._surface.drop_pixels_of({k.index: (part, k.camera) for k, part in parts})
 
     def apply(self, correction: Correction, loops: LoopCloser) -> None:
         """Moves the map after its keyframes, unites objects that both ends have mapped, takes out what is double now,

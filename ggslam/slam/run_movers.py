@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from ggslam.movers.detector import MoverDetector
+from ggslam.movers.detector import GROWN, MoverDetector, coarse_factor, grow
+from ggslam.movers.evidence import CoarseView, Margin
 from ggslam.movers.settings import MoverSettings
+from ggslam.movers.trail import gone_since
 from ggslam.scene.frame import Frame
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
@@ -29,6 +32,7 @@ class RunMovers:
     def __init__(self, settings: MoverSettings, reads_masks: bool) -> None:
         self.detector = MoverDetector(settings)
         self._reads_masks = reads_masks
+        self._margin = _margin(settings, DepthNoise())
 
     @property
     def active(self) -> bool:
@@ -49,10 +53,10 @@ class RunMovers:
         if not self.active:
             return result
         noise = noise or DepthNoise()
-        constant, square = np.float32(noise.constant), np.float32(noise.square)
+        self._margin = _margin(self.detector.settings, noise)
         known = result.status not in DOUBTFUL
         shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
-        self.detector.look(shown, result.T_world_camera if known else None, lambda z: constant + square * z * z)
+        self.detector.look(shown, result.T_world_camera if known else None, self._margin)
         mask = self.detector.mask
         return result if mask is None else replace(result, points=_without(result.points, mask))
 
@@ -60,9 +64,48 @@ class RunMovers:
         """The frame that `look` saw last without depth where something moves, which `Frame.moving` tells."""
         return self.detector.clean(frame) if self.active else frame
 
+    @property
+    def has_trail(self) -> bool:
+        """Whether anything was ever found."""
+        return self.active and len(self.detector.trail.keys) > 0
+
+    def gone_since(
+        self, earlier: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray | None]], newest: Frame,
+        T_world_newest: np.ndarray,
+    ) -> list[np.ndarray | None]:  # fmt: skip
+        """What earlier views show where something has moved since, and the newest frame looks through.
+
+        Args:
+            earlier: depth float32 [H, W], metres, T_world_camera [4, 4] and segments uint16 [H, W] of each.
+            newest: without what moves in it.
+            T_world_newest: [4, 4].
+
+        Returns:
+            Of each, bool [H, W]; None: nothing.
+        """
+        settings, camera, trail = self.detector.settings, newest.camera, self.detector.trail
+        factor = coarse_factor(camera, settings)
+        view = CoarseView.of(newest.depth, camera, factor, T_world_newest)
+        found: list[np.ndarray | None] = []
+        for depth, T_world_camera, segments in earlier:
+            if depth.shape != newest.depth.shape:
+                found.append(None)
+                continue
+            old = CoarseView.of(depth, camera, factor, T_world_camera)
+            part = gone_since(old, view, trail, segments, depth.shape, self._margin, settings)
+            found.append(None if part is None else grow(part, GROWN))
+        return found
+
     def move(self, T_new_old: np.ndarray) -> None:
         """Follows a correction [4, 4] of the world about the camera."""
         self.detector.move(T_new_old)
+
+
+def _margin(settings: MoverSettings, noise: DepthNoise) -> Margin:
+    """What depths of one surface may differ by."""
+    constant = np.float32(settings.margin_m + settings.margin_sigmas * noise.constant)
+    square = np.float32(settings.margin_sigmas * noise.square)
+    return lambda z: constant + square * z * z
 
 
 def _without(points: PointSource, mask: np.ndarray) -> DeferredPoints:

@@ -40,6 +40,7 @@ from ggslam.objects.fragments import Fragment, FragmentMemory
 from ggslam.objects.table import Observation
 from ggslam.movers.detector import MoverDetector
 from ggslam.movers.evidence import CoarseView
+from ggslam.movers.trail import Trail
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
@@ -201,7 +202,7 @@ RULES: Rules = {
     FramePoses: Rule(growing=_names("frames")),
     MapCorrections: _but("_surface", "_mapper", "_pager", "_masks", "_publishing"),
     RunObjects: _but("_masks"),
-    RunMovers: _but("_reads_masks"),
+    RunMovers: _but("_reads_masks", "_margin"),
     MoverDetector: _but("settings"),
     ObjectMasks: _but("settings", "_segment"),
     # tracking
@@ -237,7 +238,7 @@ RULES: Rules = {
     NeighbourIndex: Rule(save=_save_index, take=_take_index),
     # plain values
     **dict.fromkeys(
-        (Camera, CameraFixtures, CoarseView, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame,
+        (Camera, CameraFixtures, CoarseView, Trail, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame,
          StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam,
          ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier, LearnedObjects, Observation,
          Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory, ShutterTimes, RigClock),

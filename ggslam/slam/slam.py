@@ -350,6 +350,7 @@ class Slam:
         added = self.map.count - before
         self._corrections.add_points(tracking)
         self._corrections.leave_out(self._fixtures, frame)
+        self._corrections.take_out(self.movers, frame)
         if self.loops is not None:
             correction = self.loops.add(frame, tracking)
             if correction is not None:

@@ -142,6 +142,18 @@ class MeasuredSurface:
         if self.target is not None:
             self.gather_again()
 
+    def drop_pixels_of(self, parts: Mapping[int, tuple[np.ndarray, Camera]]) -> None:
+        """Takes out the points that some keyframes, by number, have in parts of their images, bool [H, W], of their
+        cameras; those in an archive stay."""
+        if self._archive is not None or not parts:
+            return
+        for number, (part, camera) in parts.items():
+            old = self._parts[number]
+            stays = ~is_in_image_part(old.points, part, camera)
+            self._parts[number] = _Part(number, old.points[stays], old.normals[stays], old.T_world_camera, None)
+        if self.target is not None:
+            self.gather_again()
+
     def gather_again(self) -> None:
         """Makes the target from the keyframes in the order in which it came to be, so that it is the same bit for
         bit."""

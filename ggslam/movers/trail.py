@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where movers have been, and which parts of earlier views showed something there that is gone now."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ggslam.geometry.voxels import neighbour_step, voxel_keys
+from ggslam.movers.evidence import CoarseView, Margin, compare
+from ggslam.movers.segments import Gathering, gather
+from ggslam.movers.settings import MoverSettings
+from ggslam.scene.poses import transform_points
+
+VOXEL = 0.05
+"""Metres."""
+_STEPS = [neighbour_step(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
+
+
+@dataclass
+class Trail:
+    """Voxels in and next to which something was seen that moved.
+
+    Attributes:
+        keys: int64 [n], sorted.
+        growths: how many times it has grown.
+    """
+
+    keys: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
+    growths: int = 0
+
+    def add(self, view: CoarseView, places: np.ndarray) -> None:
+        """Adds what a view shows at some places, bool [h, w]."""
+        keys = np.unique(voxel_keys(_world_points(view)[(places & (view.depth > 0)).reshape(-1)], VOXEL))
+        around = np.unique((keys[:, None] + np.array(_STEPS)).reshape(-1))
+        joined = np.union1d(self.keys, around)
+        if len(joined) > len(self.keys):
+            self.keys, self.growths = joined, self.growths + 1
+
+    def contains(self, view: CoarseView) -> np.ndarray:
+        """Which places of a view are in it, bool [h, w]."""
+        keys = voxel_keys(_world_points(view), VOXEL)
+        if not len(self.keys):
+            return np.zeros(view.depth.shape, bool)
+        at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        return (self.keys[at] == keys).reshape(view.depth.shape) & (view.depth > 0)
+
+
+def gone_since(
+    earlier: CoarseView, newest: CoarseView, trail: Trail, segments: np.ndarray | None,
+    shape: tuple[int, int], margin: Margin, settings: MoverSettings,
+) -> np.ndarray | None:  # fmt: skip
+    """What an earlier view shows where a mover has been since, and the newest view looks through.
+
+    Args:
+        earlier: a view.
+        newest: without what moves in it now.
+        trail: of movers.
+        segments: ids uint16 [H, W] of the earlier view, or None.
+        shape: of its image, (H, W).
+        margin: see there.
+        settings: how much of a segment has to be gone.
+
+    Returns:
+        bool [H, W]; None: nothing.
+    """
+    near = trail.contains(earlier)
+    if near.sum() < settings.min_pixels / 4:
+        return None
+    evidence = compare(earlier, newest, margin)
+    passed = evidence.passed & near
+    if passed.sum() < settings.min_pixels / 4:
+        return None
+    factor = shape[1] // earlier.camera.width
+    rests = np.zeros(passed.shape, bool)
+    found = gather(Gathering(passed, rests, earlier.depth, evidence.same | ~near, factor, shape), lambda: segments, settings)
+    return None if found is None else found.full > 0
+
+
+def _world_points(view: CoarseView) -> np.ndarray:
+    return transform_points(view.camera.back_project(view.depth).reshape(-1, 3), view.T_world_camera)
