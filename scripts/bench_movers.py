@@ -5,9 +5,10 @@
     python scripts/bench_movers.py ../shared/data --only movers       # one part: movers, still
     python scripts/bench_movers.py ../shared/data --masks none
 
-movers: `livingroom_movers`, with the search for movers and without, beside its twin in which nothing moves: error of the
-trajectory, held-out PSNR over pixels that no mover covers, and behind the movers, where the twin's images tell what is
-there (places where a thing rests before it moves, or afterwards, are left out of both: no one map is right there); overlap of the masks that were found with the true ones, and when each mover was found first.
+movers: `livingroom_movers`, with the search and without, beside its twin in which nothing moves: error of the
+trajectory, held-out PSNR over pixels that no mover covers, and behind the movers, where the twin tells what is
+there (places where a thing rests before it moves, or afterwards, are left out of both: no one map is right there);
+overlap of the masks that were found with the true ones, and when each mover was found first.
 still: recordings in which nothing moves, with the search and without: frames in which something was found.
 """
 
@@ -147,8 +148,8 @@ def bench_movers(data: Path, more: list[str], stop: int | None) -> None:
     ):
         done = run(where, [*settings, *more], stop)
         free, behind = scores(done, twin, covered, rests, stop)
-        row = f"{ate_cm(done, where, stop):.3f} | {free:.2f} | {behind:.2f} | {done.slam.map.count} | {done.seconds:.1f}"
-        print(f"| {name} | {row} |", flush=True)
+        error, count = ate_cm(done, where, stop), done.slam.map.count
+        print(f"| {name} | {error:.3f} | {free:.2f} | {behind:.2f} | {count} | {done.seconds:.1f} |", flush=True)
         if name == "movers":
             found = done
     print_masks(found, ids, truth)

@@ -209,13 +209,13 @@ class Mapper(ABC):
         keyframe.mask = labels.mask
         if labels.mask is None or self.identity is None:
             return
-        if keyframe.moving is not None:
-            keyframe.mask = np.where(keyframe.moving, np.uint16(0), labels.mask)
+        mask = labels.mask if keyframe.moving is None else np.where(keyframe.moving, np.uint16(0), labels.mask)
+        keyframe.mask = mask
         self.identity.merge(self.map, labels.merges)
         if labels.forgotten:
             self.identity.forget(self.map, labels.forgotten)
-        self.identity.observe(keyframe.mask)
-        self.identity.split(self.map, self._rasterizer, keyframe.mask, labels.splits)
+        self.identity.observe(mask)
+        self.identity.split(self.map, self._rasterizer, mask, labels.splits)
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 

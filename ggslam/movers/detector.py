@@ -20,7 +20,7 @@ from ggslam.movers.trail import Trail
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 
-AGES = (1, 2, 4, 8, 12, 16)
+AGES = (1, 2, 4, 8, 16, 32, 48)
 """Each frame is compared with those so many frames before it."""
 GROWN = 2
 """Pixels of a 320 pixel wide image by which masks of movers are larger than what was found: outlines are blurred."""
@@ -78,16 +78,17 @@ class MoverDetector:
             same += evidence.same
             if age <= s.rest_frames:
                 fresh &= evidence.same
-        novel = (passed >= s.min_passed) & (passed > same - 2)
+        novel = passed >= s.min_passed
         before, self.found = self.found, None
         if novel.sum() < min(s.min_pixels, 3):
             return
-        found = gather(Gathering(novel, fresh, view.depth, same > passed, factor, frame.depth.shape), frame.load_mask, s)
-        if found is None or found.small.mean() > s.max_share:
+        places = Gathering(novel, fresh, view.depth, same > passed, factor, frame.depth.shape)
+        found = gather(places, frame.load_mask, s)
+        if found is None or found.small.sum() > s.max_share * ((passed > 0) | (same > 0)).sum():
             return
         self.found = found.small
         if before is not None:
-            seen_twice = found.seen_in(before)
+            seen_twice = found.pixels_near(before)
             if seen_twice is not None:
                 self.mask = grow(seen_twice, GROWN)
                 self.trail.add(view, thin_out(seen_twice, factor))
@@ -100,7 +101,7 @@ class MoverDetector:
 
     def move(self, T_new_old: np.ndarray) -> None:
         """Follows a correction [4, 4] of the world about the camera."""
-        self.views = [view.moved(T_new_old) for view in self.views]
+        self.views = [view.move(T_new_old) for view in self.views]
 
 
 def coarse_factor(camera: Camera, settings: MoverSettings) -> int:

@@ -55,7 +55,7 @@ class CoarseView:
             edge[:] = _NO_DEPTH
         return CoarseView(small, np.array(T_world_camera, float), thin_out(depth, factor), near, far)
 
-    def moved(self, T_new_old: np.ndarray) -> CoarseView:
+    def move(self, T_new_old: np.ndarray) -> CoarseView:
         """The same after the world about it was moved by [4, 4]."""
         return CoarseView(self.camera, T_new_old @ self.T_world_camera, self.depth, self.near, self.far)
 

@@ -54,7 +54,7 @@ class MovingThings:
     parts: np.ndarray
     full: np.ndarray
 
-    def seen_in(self, before: np.ndarray) -> np.ndarray | None:
+    def pixels_near(self, before: np.ndarray) -> np.ndarray | None:
         """Pixels, bool [H, W], of those that meet places bool [h, w] of the frame before; None without any."""
         near = cv2.dilate(before.astype(np.uint8), _AROUND) > 0
         numbers = np.unique(self.parts[near])
@@ -90,12 +90,12 @@ def gather(
 def _segments_that_move(small: np.ndarray, places: Gathering, s: MoverSettings) -> list[int]:
     """Ids of segments of which enough has come and that do not rest."""
     known = places.depth > 0
-    count, novel, rest = (np.bincount(small[m].reshape(-1)) for m in (known, known & places.novel, known & places.rests))
+    counted = (known, known & places.novel, known & places.rests)
+    count, novel, rest = (np.bincount(small[mask], minlength=int(small.max()) + 1) for mask in counted)
     found = []
     for number in np.flatnonzero(novel):
         enough = max(s.min_pixels / 4, s.min_share * count[number])
-        still = rest[number] if number < len(rest) else 0
-        if number and novel[number] >= enough and still < s.at_rest * count[number]:
+        if number and novel[number] >= enough and rest[number] < s.at_rest * count[number]:
             found.append(int(number))
     return found
 

@@ -15,9 +15,9 @@ class MoverSettings:
     columns: int = setting(107, 16, 10**4, "px")
     """Width of the images that are compared, about."""
     margin_m: float = setting(0.004, 0, 10, "m")
-    """Depths of one surface differ by no more than this..."""
+    """Depths of one surface differ by no more than this and `margin_sigmas` standard deviations of the depth camera."""
     margin_sigmas: float = setting(5.0, 0, 100)
-    """...and so many standard deviations of the depth camera more."""
+    """See `margin_m`."""
     min_passed: int = setting(2, 1, 100)
     """So many frames have to have looked past a place at something farther."""
     min_pixels: int = setting(8, 1, 10**6)
@@ -29,4 +29,4 @@ class MoverSettings:
     rest_frames: int = setting(8, 1, 1000)
     """See `at_rest`."""
     max_share: float = setting(0.75, 0, 1)
-    """Where more than this share of an image seems to move the pose is wrong, and nothing is said."""
+    """Where more than this share of what can be compared seems to move the pose is wrong, and nothing is said."""

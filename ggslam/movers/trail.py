@@ -73,8 +73,8 @@ def gone_since(
     if passed.sum() < settings.min_pixels / 4:
         return None
     factor = shape[1] // earlier.camera.width
-    rests = np.zeros(passed.shape, bool)
-    found = gather(Gathering(passed, rests, earlier.depth, evidence.same | ~near, factor, shape), lambda: segments, settings)
+    rests, world = np.zeros(passed.shape, bool), evidence.same | ~near
+    found = gather(Gathering(passed, rests, earlier.depth, world, factor, shape), lambda: segments, settings)
     return None if found is None else found.full > 0
 
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.pruning import drop_moved, drop_pixels
 from ggslam.objects.uniting import FAINT, LabelledVoxels
 from ggslam.scene.frame import Frame
@@ -21,7 +21,6 @@ from ggslam.slam.run_movers import RunMovers
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import TrackingResult
-
 
 LOOKED_BACK = 64
 """So many of the latest keyframes are searched for what has moved since."""
@@ -84,7 +83,8 @@ class MapCorrections:
             return
         keyframes = self._mapper.keyframes
         latest, earlier = keyframes[-1], [k for k in keyframes[-1 - LOOKED_BACK : -1] if k.frame_index != ELSEWHERE]
-        gone = movers.gone_since([(k.depth_m(), k.T_world_camera, k.mask) for k in earlier], newest, latest.T_world_camera)
+        views = [(k.depth_m(), k.T_world_camera, k.mask) for k in earlier]
+        gone = movers.gone_since(views, newest, latest.T_world_camera)
         parts = [(k, part) for k, part in zip(earlier, gone, strict=True) if part is not None]
         if not parts:
             return

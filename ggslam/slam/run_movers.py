@@ -114,8 +114,9 @@ def _without(points: PointSource, mask: np.ndarray) -> DeferredPoints:
     def choose() -> FramePoints:
         read = points.read()
         stays = ~mask[read.pixels[:, 1], read.pixels[:, 0]]
-        depths = None if read.depths is None else read.depths[stays]
-        arrays = (read.points, read.normals, read.covariances, read.pixels, read.weights)
-        return FramePoints(*(array[stays] for array in arrays), depths)
+        return FramePoints(
+            read.points[stays], read.normals[stays], read.covariances[stays], read.pixels[stays], read.weights[stays],
+            None if read.depths is None else read.depths[stays],
+        )  # fmt: skip
 
     return DeferredPoints(choose, points.median_depth)

@@ -33,14 +33,14 @@ from ggslam.mapping.keyframe import Keyframe, PoseAdam
 from ggslam.mapping.mapper import LossSums, MapperTimes
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.sampling import KeyframeSampler
+from ggslam.movers.detector import MoverDetector
+from ggslam.movers.evidence import CoarseView
+from ggslam.movers.trail import Trail
 from ggslam.objects.association import Associator
 from ggslam.objects.consistency import ConsistencyJudge
 from ggslam.objects.evidence import PairEvidence, _Pair
 from ggslam.objects.fragments import Fragment, FragmentMemory
 from ggslam.objects.table import Observation
-from ggslam.movers.detector import MoverDetector
-from ggslam.movers.evidence import CoarseView
-from ggslam.movers.trail import Trail
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
@@ -238,10 +238,11 @@ RULES: Rules = {
     NeighbourIndex: Rule(save=_save_index, take=_take_index),
     # plain values
     **dict.fromkeys(
-        (Camera, CameraFixtures, CoarseView, Trail, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind, FeatureCounts, TrackedFrame,
-         StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes, KeyframeSampler, PoseAdam,
-         ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier, LearnedObjects, Observation,
-         Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory, ShutterTimes, RigClock),
+        (Camera, CameraFixtures, CoarseView, Trail, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind,
+         FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes,
+         KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier,
+         LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
+         ShutterTimes, RigClock),
         Rule(),
     ),
 }  # fmt: skip

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What moves is found, whole, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ggslam.movers.detector import MoverDetector
+from ggslam.movers.evidence import CoarseView, compare
+from ggslam.movers.settings import MoverSettings
+from ggslam.movers.trail import Trail, gone_since
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+
+CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
+WALL, BOX = 3.0, 1.5
+NOISE = 0.002
+
+
+def pose(n: int) -> np.ndarray:
+    """The camera goes to the right, a centimetre a frame."""
+    T = np.eye(4)
+    T[0, 3] = 0.01 * n
+    return T
+
+
+def frame(n: int, box_at: float | None, seed: int | None = None, ids: bool = False) -> Frame:
+    """A wall, and 1.5 m away the front of a box 0.4 m wide whose middle is at `box_at` (metres, world x)."""
+    depth = np.full((240, 320), WALL, np.float32)
+    mask = np.ones((240, 320), np.uint16)
+    if box_at is not None:
+        x = (np.arange(320) - CAMERA.cx) / CAMERA.fx * BOX + 0.01 * n
+        columns = np.abs(x - box_at) < 0.2
+        depth[80:160, columns], mask[80:160, columns] = BOX, 7
+    if seed is not None:
+        depth += np.random.default_rng(1000 * seed + n).normal(0, NOISE, depth.shape).astype(np.float32)
+    color = np.zeros((240, 320, 3), np.uint8)
+    return Frame(n, n, n / 30, color, depth, CAMERA, mask if ids else None)
+
+
+def margin(z: np.ndarray) -> np.ndarray:
+    return np.full_like(z, 0.004 + 5 * NOISE)
+
+
+def look_at(boxes: list[float | None], seed: int | None = 0, ids: bool = False) -> list[np.ndarray | None]:
+    """The masks of frames in which a box is here and there."""
+    detector, found = MoverDetector(MoverSettings(enabled=True)), []
+    for n, at in enumerate(boxes):
+        detector.look(frame(n, at, seed, ids), pose(n), margin)
+        found.append(detector.mask)
+    return found
+
+
+def overlap(mask: np.ndarray | None, wanted: np.ndarray) -> float:
+    assert mask is not None
+    return float((mask & wanted).sum() / (mask | wanted).sum())
+
+
+@pytest.mark.parametrize("ids", [False, True])
+def test_a_box_that_comes_in_is_found_whole(ids: bool) -> None:
+    boxes = [None] * 24 + [-0.4 + 0.03 * n for n in range(12)]
+    found = look_at(boxes, ids=ids)
+    assert all(mask is None for mask in found[:25])
+    for n in range(26, 36):
+        assert overlap(found[n], frame(n, boxes[n]).depth < 2) > 0.8
+
+
+@pytest.mark.parametrize("ids", [False, True])
+def test_nothing_is_found_where_only_the_camera_moves(ids: bool) -> None:
+    assert all(mask is None for mask in look_at([0.1] * 30, ids=ids))
+
+
+def test_a_box_that_was_there_and_begins_to_move_is_found_by_its_segment() -> None:
+    boxes: list[float | None] = [0.0] * 10 + [0.01 * n for n in range(20)]
+    found = look_at(boxes, ids=True)
+    assert all(mask is None for mask in found[:11])
+    first = next(n for n, mask in enumerate(found) if mask is not None)
+    assert first <= 20  # 10 cm
+    assert overlap(found[first], frame(first, boxes[first]).depth < 2) > 0.8
+
+
+def test_what_has_come_to_rest_is_no_mover_any_more() -> None:
+    boxes: list[float | None] = [None] * 6 + [-0.6 + 0.05 * n for n in range(10)] + [-0.15] * 14
+    found = look_at(boxes)
+    assert found[15] is not None
+    assert all(mask is None for mask in found[-4:])
+
+
+def test_a_lost_frame_breaks_the_row() -> None:
+    detector = MoverDetector(MoverSettings(enabled=True))
+    for n in range(6):
+        detector.look(frame(n, None), pose(n), margin)
+    detector.look(frame(6, 0.0), None, margin)
+    detector.look(frame(7, 0.0), pose(7), margin)
+    assert detector.mask is None and len(detector.views) == 1
+
+
+def test_the_next_frame_is_located_without_the_mover() -> None:
+    detector = MoverDetector(MoverSettings(enabled=True))
+    for n, at in enumerate([None] * 6 + [-0.3, -0.27, -0.24]):
+        detector.look(frame(n, at), pose(n), margin)
+    following = frame(9, -0.21)
+    assert not detector.expect(following).depth[following.depth < 2].any()
+    now = frame(8, -0.24)
+    cleaned = detector.clean(now)
+    assert cleaned.moving is not None and not cleaned.depth[cleaned.moving].any()
+    assert (cleaned.depth[~cleaned.moving] == now.depth[~cleaned.moving]).all()
+
+
+def test_a_wrong_pose_is_no_mover_as_large_as_the_image() -> None:
+    detector = MoverDetector(MoverSettings(enabled=True))
+    for n in range(8):
+        T = pose(n)
+        T[2, 3] = -0.5 if n > 5 else 0.0  # the wall seems to have come nearer
+        detector.look(frame(n, None), T, margin)
+        assert detector.mask is None
+
+
+def test_evidence_says_what_was_passed_and_what_was_there() -> None:
+    before, now = frame(0, None), frame(1, 0.0)
+    views = [CoarseView.of(f.depth, CAMERA, 3, pose(f.index)) for f in (before, now)]
+    found, box = compare(views[1], views[0], margin), views[1].depth < 2
+    assert found.passed[box].all() and not found.passed[~box].any()
+    assert not found.same[box].any() and found.same[~box].mean() > 0.9
+
+
+def test_depth_next_to_holes_says_nothing() -> None:
+    before, now = frame(0, None), frame(1, 0.0)
+    depth = before.depth.copy()
+    depth[::6, ::6] = 0
+    views = [CoarseView.of(depth, CAMERA, 3, pose(0)), CoarseView.of(now.depth, CAMERA, 3, pose(1))]
+    assert not compare(views[1], views[0], margin).passed.any()
+
+
+@pytest.mark.parametrize("ids", [False, True])
+def test_what_an_earlier_view_shows_at_the_trail_is_gone(ids: bool) -> None:
+    settings, trail = MoverSettings(enabled=True), Trail()
+    before, now = frame(0, 0.0, ids=ids), frame(20, None)
+    old, new = (CoarseView.of(f.depth, CAMERA, 3, pose(f.index)) for f in (before, now))
+    assert gone_since(old, new, trail, before.mask, (240, 320), margin, settings) is None  # nothing has moved
+    trail.add(old, (old.depth < 2))
+    gone = gone_since(old, new, trail, before.mask, (240, 320), margin, settings)
+    assert overlap(gone, before.depth < 2) > 0.8
+    still = replace(now, depth=frame(20, 0.0).depth)
+    there = CoarseView.of(still.depth, CAMERA, 3, pose(20))
+    assert gone_since(old, there, trail, before.mask, (240, 320), margin, settings) is None
