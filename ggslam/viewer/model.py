@@ -60,6 +60,10 @@ class ViewedMap(Protocol):
         """T_world_camera [4, 4] of the frames that were located, in order; at least one."""
 
     @property
+    def walks(self) -> list[np.ndarray]:
+        """Positions [n, 3] of the located frames, by recording and camera."""
+
+    @property
     def keyframe_poses(self) -> np.ndarray:
         """T_world_camera [K, 4, 4]."""
 

@@ -78,9 +78,10 @@ class SceneNodes:
 
     # --- lines -------------------------------------------------------------------------------------------------------
 
-    def set_path(self, positions: np.ndarray) -> None:
-        """The way of the camera, [K, 3]."""
-        self._lines("/camera/path", np.stack([positions[:-1], positions[1:]], axis=1), _PATH, 3.0)
+    def set_path(self, walks: list[np.ndarray]) -> None:
+        """The ways of the cameras, [K, 3] each."""
+        lines = np.concatenate([np.stack([walk[:-1], walk[1:]], axis=1) for walk in walks])
+        self._lines("/camera/path", lines, _PATH, 3.0)
 
     def set_keyframes(self, T_world_camera: np.ndarray, camera: Camera, depth: float) -> None:
         """Pyramids at the keyframes, [K, 4, 4]."""

@@ -62,10 +62,9 @@ class Stage:
                 self.nodes.set_visible(object_id, object_id not in self.hidden)
 
     def _draw_camera(self) -> None:
-        poses = np.stack(list(self.model.frame_poses.values()))
         extent = np.ptp(self.centers, axis=0) if len(self.centers) else np.zeros(3)  # all objects may have been removed
         self.depth = float(np.clip(0.01 * np.linalg.norm(extent), 0.02, 0.06))
-        self.nodes.set_path(poses[:, :3, 3])
+        self.nodes.set_path(self.model.walks)
         self.nodes.set_keyframes(self.model.keyframe_poses, self.model.camera, self.depth)
 
     def describe(self) -> None:

@@ -94,7 +94,7 @@ def static_page(
         "objects": [_object_values(record) for record in objects], "unlabelled": int((owners == 0).sum()),
         "about": model.describe(), "up": model.up, "fov": fov,
         "views": {"Start": _view(start), "Top": _view(top)},
-        "path": poses[:: max(1, len(poses) // _PATH), :3, 3].round(4),
+        "path": [walk[:: max(1, len(poses) // _PATH)].round(4) for walk in model.walks],
         "frames": [
             {"frame": frame, "picture": _jpeg(model.frame_picture(frame)[0]),
              "view": _view(view_of_pose(model.frame_poses[frame], _LOOK_AHEAD_M))} for frame in shown

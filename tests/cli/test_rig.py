@@ -14,6 +14,7 @@ from command_line import ggslam, refuse, succeed
 from ggslam.formats.trajectory import read_tum
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run.pipeline import RunRequest, execute
+from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.slam.result import StepReport
@@ -47,6 +48,13 @@ def test_a_run_has_scores_and_poses_of_each_camera(done: Path) -> None:
     truth = read_tum(done / "ground_truth.txt")
     np.testing.assert_allclose(truth.timestamps, of_rig.timestamps)
     assert "held-out images of camera" in (done / "report.html").read_text()
+
+
+def test_the_way_of_each_camera_is_a_line_of_its_own(done: Path) -> None:
+    walks = ViewedRun(RunFolder.open(done)).walks
+    assert [len(walk) for walk in walks] == [12, 12]
+    steps = [float(np.linalg.norm(np.diff(walk, axis=0), axis=1).max()) for walk in walks]
+    assert max(steps) < 0.08 < np.linalg.norm(walks[0][0] - walks[1][0])  # the cameras are 12 cm apart
 
 
 @pytest.mark.long("six commands on one run")

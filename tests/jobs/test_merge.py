@@ -19,7 +19,9 @@ from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.formats.trajectory import read_tum
 from ggslam.jobs.edit.edits import Edit, edit_run
 from ggslam.jobs.merge.merge import MergeOutcome, merge_runs
+from ggslam.jobs.report.gather import path_of_run
 from ggslam.jobs.score.evaluate_run import evaluate_run
+from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.merging.settings import MergeSettings
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
@@ -115,6 +117,14 @@ def test_it_can_be_edited(halves: Halves, tmp_path: Path) -> None:
     name = str(halves.outcome.united[0][0])
     edited = edit_run(halves.merged, [Edit("rename", name, "found twice"), Edit("remove", name)], tmp_path / "edited")
     assert int(name) not in edited.folder.object_table().ids()
+
+
+def test_the_ways_of_its_runs_are_drawn_apart(halves: Halves) -> None:
+    path = path_of_run(halves.merged, halves.merged.keyframes())
+    drawn = path.in_order(path.positions)
+    assert np.flatnonzero(np.isnan(drawn).all(1)).tolist() == [16, 33]
+    assert np.array_equal(drawn[17:33], path.positions[16:])
+    assert [len(walk) for walk in ViewedRun(halves.merged).walks] == [16, 16]
 
 
 def test_another_run_can_start_in_it(halves: Halves) -> None:

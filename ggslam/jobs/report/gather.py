@@ -138,15 +138,15 @@ def path_of_run(folder: RunFolder, record: KeyframesRecord, sequence: Sequence |
     seconds = np.array([times[f] for f in frames], float)
     start = seconds[0] if len(seconds) else 0.0
     truth, reason = _truth(folder, frames, seconds, sequence)
-    known, level = np.isfinite(truth).all(1), level_axes(folder, record)
+    known, level, walks = np.isfinite(truth).all(1), level_axes(folder, record), _walks(folder, frames)
     if not reason and known.sum() < FEWEST_POSES:
         reason = f"fewer than {FEWEST_POSES} frames have both poses"
     if reason:
-        return Path3D(frames, seconds - start, positions, reason=reason, level=level)
+        return Path3D(frames, seconds - start, positions, reason=reason, level=level, walks=walks)
     T, _ = align_points(truth[known], positions[known])
     moved = truth @ T[:3, :3].T + T[:3, 3]
     error = np.linalg.norm(moved - positions, axis=1)
-    return Path3D(frames, seconds - start, positions, moved, error, level=level)
+    return Path3D(frames, seconds - start, positions, moved, error, level=level, walks=walks)
 
 
 def _truth(
@@ -175,6 +175,15 @@ def _truth(
 def _rig_of(folder: RunFolder) -> RigRecord | None:
     recording = SequenceRecord.read_if_there(folder.path)
     return None if recording is None else recording.rig
+
+
+def _walks(folder: RunFolder, frames: np.ndarray) -> list[np.ndarray]:
+    """Rows of the frames of each recording and camera of a merged run; none of another run."""
+    recording = SequenceRecord.read_if_there(folder.path)
+    if recording is None or recording.parts is None:
+        return []
+    of_frames = np.array([recording.walk_of(frame) for frame in frames.tolist()]).reshape(-1, 2)
+    return [np.flatnonzero((of_frames == walk).all(1)) for walk in np.unique(of_frames, axis=0)]
 
 
 def _frames_of_path(folder: RunFolder, frames: ListOf[int]) -> np.ndarray:

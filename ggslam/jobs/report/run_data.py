@@ -42,6 +42,7 @@ class Path3D:
         error_m: float [N], distance to the truth so laid, metres.
         reason: why there is no truth.
         level: the directions in which it is shown.
+        walks: rows of each recording and camera of a merged run; none: all are one walk.
     """
 
     frames: np.ndarray
@@ -51,6 +52,12 @@ class Path3D:
     error_m: np.ndarray | None = None
     reason: str = ""
     level: LevelAxes = field(default_factory=LevelAxes)
+    walks: list[np.ndarray] = field(default_factory=list)
+
+    def in_order(self, points: np.ndarray) -> np.ndarray:
+        """Points [N, 3] of the path in the order in which they are drawn, with NaN between walks."""
+        gap = np.full((1, 3), np.nan)
+        return np.concatenate([part for rows in self.walks for part in (points[rows], gap)]) if self.walks else points
 
 
 @dataclass(frozen=True)

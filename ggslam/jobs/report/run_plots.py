@@ -31,12 +31,13 @@ def trajectory_plots(runs: Sequence[RunData]) -> list[Plot]:
 
 def _paths(runs: Sequence[RunData], project: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> list[Series]:
     series = []
-    truth = next((run.camera_path.truth for run in runs if run.camera_path.truth is not None), None)
-    if truth is not None:
-        series.append(Series("truth", *project(truth), color=_TRUTH, dashed=True))
+    known = next((run.camera_path for run in runs if run.camera_path.truth is not None), None)
+    if known is not None and known.truth is not None:
+        series.append(Series("truth", *project(known.in_order(known.truth)), color=_TRUTH, dashed=True))
     for number, run in enumerate(runs):
         label = "estimate" if len(runs) == 1 else run.name
-        series.append(_curve(label, *project(run.camera_path.positions), number))
+        path = run.camera_path
+        series.append(_curve(label, *project(path.in_order(path.positions)), number))
     if len(runs) == 1:
         path = runs[0].camera_path
         made = np.isin(path.frames, runs[0].keyframes)

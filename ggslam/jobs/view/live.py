@@ -130,7 +130,7 @@ class LiveView:
         picture = self._compare(snapshot, camera)
         with self._server.atomic():
             self._nodes.set_splats({0: splats_of(snapshot.gaussians, rows)})
-            self._nodes.set_path(snapshot.poses[:, :3, 3])
+            self._nodes.set_path([snapshot.poses[:, :3, 3]])
             self._nodes.set_keyframes(snapshot.keyframes, camera, _MARK_M)
             if snapshot.T_world_camera is not None:
                 self._nodes.set_frame(snapshot.T_world_camera, camera, 2 * _MARK_M, snapshot.frame.color)

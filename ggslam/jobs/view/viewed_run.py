@@ -70,6 +70,14 @@ class ViewedRun:
         self._read_map()
         self.up = upright_of(self._gaussians, np.stack(list(self.frame_poses.values()))).up
 
+    @property
+    def walks(self) -> list[np.ndarray]:
+        """See `ViewedMap`."""
+        found: dict[tuple[int, int], list[np.ndarray]] = {}
+        for frame, pose in self.frame_poses.items():
+            found.setdefault(self._record.walk_of(frame), []).append(pose[:3, 3])
+        return [np.stack(positions) for positions in found.values()]
+
     def _open_recording(self, path: Path | None) -> Sequence | None:
         try:
             return open_recording_of(self.folder, path)

@@ -155,6 +155,12 @@ class SequenceRecord(RecordFile):
         part = self._part_of(frame)[0]
         return isinstance(part, PartRecord) and part.past
 
+    def walk_of(self, frame: int) -> tuple[int, int]:
+        """Numbers of a frame's recording and, of a rig, of its camera: frames of one walk follow one another."""
+        part, own = self._part_of(frame)
+        recording = 0 if part is self else [part is other for other in self.parts or []].index(True)
+        return recording, 0 if part.rig is None else int(part.rig.places[own, 1])
+
     def camera_of(self, frame: int) -> Camera:
         """The camera that took a frame, as the run saw its images."""
         part, own = self._part_of(frame)

@@ -93,7 +93,9 @@ class SplatRenderer {
     gl.bufferData(gl.ARRAY_BUFFER, Uint32Array.from({ length: splats.count }, (_, i) => i), gl.DYNAMIC_DRAW);
     gl.enableVertexAttribArray(which); gl.vertexAttribIPointer(which, 1, gl.UNSIGNED_INT, 0, 0); gl.vertexAttribDivisor(which, 1);
     this.strip = gl.createVertexArray(); gl.bindVertexArray(this.strip);
-    this.attribute(this.lines, "point", new Float32Array(path.flat()), 3, 0); this.stripLength = path.length;
+    this.attribute(this.lines, "point", new Float32Array(path.flat(2)), 3, 0);
+    let first = 0;  // a strip for each camera of each recording
+    this.strips = path.map((walk) => { const strip = [first, walk.length]; first += walk.length; return strip; });
     this.worker = new Worker(URL.createObjectURL(new Blob([`(${sorter})()`], { type: "text/javascript" })));
     this.worker.onmessage = (event) => {
       this.sorting = false; this.sorted = true;
@@ -169,7 +171,7 @@ class SplatRenderer {
     gl.activeTexture(gl.TEXTURE0); gl.bindTexture(gl.TEXTURE_2D, this.splatTexture);
     for (const [program, array, draw] of [
       [this.program, this.quad, () => gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.splats.count)],
-      [this.lines, this.strip, () => gl.drawArrays(gl.LINE_STRIP, 0, this.stripLength)]]) {
+      [this.lines, this.strip, () => { for (const [from, n] of this.strips) gl.drawArrays(gl.LINE_STRIP, from, n); }]]) {
       const place = (name) => gl.getUniformLocation(program, name);
       gl.useProgram(program); gl.bindVertexArray(array);
       gl.uniformMatrix4fv(place("view"), false, view); gl.uniform2f(place("focal"), this.focal, this.focal);
