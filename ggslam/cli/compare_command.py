@@ -88,6 +88,11 @@ def _print(c: Comparison, max_distance: float) -> None:
     if c.align != "none":
         console.print(f"A is moved into the frame of B: {_ALIGNED[c.align]}", highlight=False)
     console.print(table(f"overlap within {100 * max_distance:g} cm", ["", "fitness", "inlier RMSE"], _overlaps(c)))
+    if max(c.a_on_b.fitness, c.b_on_a.fitness) < _HARDLY:
+        console.print(
+            "note: hardly anything of the two lies together: they show different places, or lie in different worlds "
+            "(--align); the distances below mean nothing then", highlight=False, markup=False, soft_wrap=True
+        )  # fmt: skip
     if c.icp is not None:
         console.print(
             f"ICP moves A by {100 * c.icp.moved_m:.2f} cm, {c.icp.turned_deg:.3f} deg", highlight=False, markup=False
@@ -111,6 +116,8 @@ def _print(c: Comparison, max_distance: float) -> None:
 _ALIGNED = {
     "truth": "by the true poses", "icp": "by ICP", "trajectory": "by camera positions at common times",
 }  # fmt: skip
+_HARDLY = 0.05
+"""Share of points with a partner below which the two do not show the same thing as they lie."""
 
 
 def _overlaps(c: Comparison) -> list[list[str]]:

@@ -123,6 +123,17 @@ def test_true_poses_bring_worlds_together(run: Path, shifted: Path, tmp_path: Pa
     assert own["align"] == "none" and own["geometry"]["thresholds"][0]["f1"] == 1 and "by the true" not in text
 
 
+def test_what_hardly_lies_together_is_said(tmp_path: Path) -> None:
+    """Two clouds a hundred metres apart: numbers, and that they mean nothing."""
+    points = np.random.default_rng(0).uniform(0, 1, (400, 3))
+    for name, offset in (("a.ply", 0), ("b.ply", 100)):
+        write_point_cloud(tmp_path / name, points + offset, {})
+    _, text = compared(tmp_path / "a.ply", tmp_path / "b.ply", "--align", "none", out=tmp_path)
+    assert "hardly anything of the two lies together" in text
+    _, text = compared(tmp_path / "a.ply", tmp_path / "a.ply", "--align", "none", out=tmp_path)
+    assert "hardly" not in text
+
+
 def test_nonsense_is_refused(run: Path, tmp_path: Path) -> None:
     """No true poses, true poses of another trajectory, and a registration under which nothing lies on anything."""
     other = Path(shutil.copytree(run, tmp_path / "wrong"))
