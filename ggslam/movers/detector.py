@@ -37,13 +37,15 @@ class MoverDetector:
         mask: bool [H, W], what moves in the latest frame; None: nothing.
         views: coarse depth of the latest frames, the newest last.
         trail: where movers have been.
-        found: small mask of what moves, or may, in the latest frame.
+        found: small mask of what moves, or may, in the latest frame...
+        small: ...and of what does, as `mask`.
     """
 
     settings: MoverSettings
     mask: np.ndarray | None = None
     views: list[CoarseView] = field(default_factory=list)
     found: np.ndarray | None = None
+    small: np.ndarray | None = None
     trail: Trail = field(default_factory=Trail)
 
     def expect(self, frame: Frame) -> Frame:
@@ -53,45 +55,51 @@ class MoverDetector:
         moves = grow(self.mask, PREDICTED * GROWN)
         return replace(frame, depth=np.where(moves, np.float32(0), frame.depth))
 
-    def look(self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin) -> None:
+    def look(self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin, sure: bool = True) -> None:
         """Finds what moves in a frame: `mask`.
 
         Args:
             frame: as the camera saw it.
             T_world_camera: [4, 4], where it is; None: not known, which breaks the row of frames.
             margin: see there.
+            sure: whether the pose is; if it is not, nothing begins to move.
         """
         self.mask = None
         if T_world_camera is None:
-            self.views, self.found = [], None
+            self.views, self.found, self.small = [], None, None
             return
         s, factor = self.settings, coarse_factor(frame.camera, self.settings)
         view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera)
         earlier, self.views = self.views, [*self.views[-AGES[-1] :], view]
-        passed, fresh = np.zeros(view.depth.shape, np.int8), view.depth > 0
-        same = np.zeros(view.depth.shape, np.int8)
+        passed, clearly, same = np.zeros((3, *view.depth.shape), np.int8)
+        fresh = view.depth > 0
         for age in AGES:
             if age > len(earlier):
                 continue
             evidence = compare(view, earlier[-age], margin)
             passed += evidence.passed
+            clearly += evidence.clearly
             same += evidence.same
             if age <= s.rest_frames:
                 fresh &= evidence.same
         novel = passed >= s.min_passed
-        before, self.found = self.found, None
+        before, moved, self.found, self.small = self.found, self.small, None, None
         if novel.sum() < min(s.min_pixels, 3):
             return
         places = Gathering(novel, fresh, view.depth, same > passed, factor, frame.depth.shape)
         found = gather(places, frame.load_mask, s)
         if found is None or found.small.sum() > s.max_share * ((passed > 0) | (same > 0)).sum():
             return
+        found = found.keep_credible(novel, (clearly >= s.min_passed) & sure, moved)
+        if found is None:
+            return
         self.found = found.small
         if before is not None:
             seen_twice = found.pixels_near(before)
             if seen_twice is not None:
                 self.mask = grow(seen_twice, GROWN)
-                self.trail.add(view, thin_out(seen_twice, factor))
+                self.small = thin_out(seen_twice, factor)
+                self.trail.add(view, self.small)
 
     def clean(self, frame: Frame) -> Frame:
         """The frame at hand without depth where something moves, which `Frame.moving` tells."""

@@ -71,11 +71,13 @@ class PairEvidence:
     """What another view says of each place of a view, bool [h, w] each.
 
     Attributes:
-        passed: the other view looked past it, at something farther.
+        passed: the other view looked past it, at something farther...
+        clearly: ...by twice the margin.
         same: the other view saw a surface there.
     """
 
     passed: np.ndarray
+    clearly: np.ndarray
     same: np.ndarray
 
 
@@ -92,6 +94,6 @@ def compare(view: CoarseView, other: CoarseView, margin: Margin) -> PairEvidence
     where = np.where(inside, v * camera.width + u, 0)
     near, far, slack = other.near.reshape(-1)[where], other.far.reshape(-1)[where], margin(z)
     known = inside & np.isfinite(far)
-    passed = known & (near > z + slack)
+    passed, clearly = known & (near > z + slack), known & (near > z + 2 * slack)
     same = known & (near < z + slack) & (far > z - slack)
-    return PairEvidence(passed.reshape(view.depth.shape), same.reshape(view.depth.shape))
+    return PairEvidence(*(found.reshape(view.depth.shape) for found in (passed, clearly, same)))

@@ -14,6 +14,9 @@ from ggslam.movers.settings import MoverSettings
 
 SAME_THING = 0.03
 """Neighbouring places whose depths differ by less than this share are of one thing."""
+CLEAR = 0.5
+"""Where a thing begins to move, this share of its evidence has to be clear: what differs by little more than noise
+would may be a pose's or a camera's error."""
 REACH = 2
 """Places by which a thing is larger than its evidence, at most."""
 _AROUND = np.ones((3, 3), np.uint8)
@@ -54,10 +57,23 @@ class MovingThings:
     parts: np.ndarray
     full: np.ndarray
 
+    def keep_credible(self, novel: np.ndarray, clear: np.ndarray, before: np.ndarray | None) -> MovingThings | None:
+        """Those whose places bool [h, w] of evidence are clear to more than a half, and those that meet what moved in
+        the frame before; None without any."""
+        numbers = []
+        for number in np.unique(self.parts[self.small]):
+            own = self.parts == number
+            known = before is not None and bool((own & _grow(before)).any())
+            if known or (own & clear).sum() > CLEAR * (own & novel).sum():
+                numbers.append(number)
+        if not numbers:
+            return None
+        small, pixels = np.isin(self.parts, numbers), np.isin(self.full, numbers)
+        return MovingThings(small, np.where(small, self.parts, 0), np.where(pixels, self.full, 0))
+
     def pixels_near(self, before: np.ndarray) -> np.ndarray | None:
         """Pixels, bool [H, W], of those that meet places bool [h, w] of the frame before; None without any."""
-        near = cv2.dilate(before.astype(np.uint8), _AROUND) > 0
-        numbers = np.unique(self.parts[near])
+        numbers = np.unique(self.parts[_grow(before)])
         numbers = numbers[numbers > 0]
         return np.isin(self.full, numbers) if len(numbers) else None
 
@@ -82,7 +98,7 @@ def gather(
         number: k + 1 for k, number in enumerate(_segments_that_move(small, places, settings))
     }  # fmt: skip
     of_segments = np.isin(small, list(moving)) & (small > 0)
-    left = _large(blobs & ~(cv2.dilate(of_segments.astype(np.uint8), _AROUND) > 0), settings.min_pixels)
+    left = _large(blobs & ~_grow(of_segments), settings.min_pixels)
     left &= small == 0
     return _as_things(_blobs_that_move(_large(left, settings.min_pixels), places, settings), places, segments, moving)
 
@@ -119,6 +135,11 @@ def _spread(labels: np.ndarray, places: Gathering) -> np.ndarray:
         joins = (grown == 0) & (beside > 0) & ~places.world & (np.abs(z - depth) < SAME_THING * depth)
         grown[joins] = beside[joins]
     return grown
+
+
+def _grow(mask: np.ndarray) -> np.ndarray:
+    """A mask bool [h, w] and its neighbours."""
+    return cv2.dilate(mask.astype(np.uint8), _AROUND) > 0
 
 
 def _large(mask: np.ndarray, least: int) -> np.ndarray:

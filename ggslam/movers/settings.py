@@ -10,8 +10,8 @@ from ggslam.system.settings import setting, settings_class
 class MoverSettings:
     """Things that move while a recording is made."""
 
-    enabled: bool = setting(False, basic=True)
-    """Whether they are looked for, and kept out of tracking and map."""
+    enabled: bool = setting(True, basic=True)
+    """Whether they are looked for, and kept out of tracking and map; not with a rig of cameras."""
     columns: int = setting(107, 16, 10**4, "px")
     """Width of the images that are compared, about."""
     margin_m: float = setting(0.004, 0, 10, "m")

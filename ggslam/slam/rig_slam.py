@@ -231,14 +231,14 @@ def _settings_for(rig: Rig, config: Config) -> Config:
     refusals = {
         "realtime_fps": config.realtime_fps > 0, "memory_limit_mb": config.memory_limit_mb > 0,
         "device": config.device == "cuda", "tracker": config.tracker != "gicp",
-        "movers.enabled": config.movers.enabled,
     }  # fmt: skip
     refused = [name for name, is_refused in refusals.items() if is_refused]
     if refused:
-        value = config.movers.enabled if refused[0] == "movers.enabled" else getattr(config, refused[0])
+        value = getattr(config, refused[0])
         raise ConfigError(f"{refused[0]}: a rig of cameras does not go with {value}; runs of a rig are synchronous, on "
-                          "the CPU, tracked by G-ICP, with all of the map in memory, without movers")  # fmt: skip
-    return replace(config, device="cpu", loops=_loops_for(len(rig), config.loops))
+                          "the CPU, tracked by G-ICP, with all of the map in memory")  # fmt: skip
+    movers = replace(config.movers, enabled=False)  # frames of different cameras follow one another
+    return replace(config, device="cpu", loops=_loops_for(len(rig), config.loops), movers=movers)
 
 
 def _loops_for(cameras: int, loops: LoopSettings) -> LoopSettings:

@@ -17,6 +17,8 @@ from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
+SURE = (TrackingStatus.FIRST, TrackingStatus.OK, TrackingStatus.DEGENERATE)
+"""How frames are tracked in which something may be found that did not move before."""
 DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 """Where frames are that nothing is said of: their poses may be wrong."""
 
@@ -56,7 +58,7 @@ class RunMovers:
         self._margin = _margin(self.detector.settings, noise)
         known = result.status not in DOUBTFUL
         shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
-        self.detector.look(shown, result.T_world_camera if known else None, self._margin)
+        self.detector.look(shown, result.T_world_camera if known else None, self._margin, result.status in SURE)
         mask = self.detector.mask
         return result if mask is None else replace(result, points=_without(result.points, mask))
 

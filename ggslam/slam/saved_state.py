@@ -204,6 +204,7 @@ RULES: Rules = {
     RunObjects: _but("_masks"),
     RunMovers: _but("_reads_masks", "_margin"),
     MoverDetector: _but("settings"),
+    CoarseView: Rule(fixed=_names("depth", "near", "far")),
     ObjectMasks: _but("settings", "_segment"),
     # tracking
     GicpTracker: _but("_given_engine", "_features"),
@@ -238,7 +239,7 @@ RULES: Rules = {
     NeighbourIndex: Rule(save=_save_index, take=_take_index),
     # plain values
     **dict.fromkeys(
-        (Camera, CameraFixtures, CoarseView, Trail, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind,
+        (Camera, CameraFixtures, Trail, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind,
          FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes,
          KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
