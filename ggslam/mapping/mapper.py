@@ -36,6 +36,11 @@ FINAL_DECAY = 0.2
 FINAL_STEPS_A_VIEW = 4
 """Of the last identity steps so many follow each other on one rendering, which takes as long as a step."""
 
+_FALLING = ("means", "quaternions", "sh_dc")
+"""Groups whose rates fall with the root of a Gaussian's updates."""
+_YOUNG = ("log_scales", "opacity_logits", "sh_rest")
+"""Groups whose first steps are longer."""
+
 
 @dataclass
 class MapperTimes:
@@ -369,10 +374,10 @@ class Mapper(ABC):
         r = self.settings.rates
         young = r.young_factor
         decay = (1 / young) ** (1 / max(1, r.young_updates)) if young > 1 else 1.0
-        rates = {name: young * rate_factor * getattr(r, name) for name in ADAM_GROUPS}
+        rates = {name: rate_factor * getattr(r, name) * (young if name in _YOUNG else 1) for name in ADAM_GROUPS}
         if self.identity is not None:
             rates["features"] = self.identity.settings.rate
         return AdamSettings(
             learning_rates=rates, beta1=r.beta1, beta2=r.beta2, epsilon=r.epsilon, decay=decay, decay_floor=1 / young,
-            decayed_groups=tuple(name for name in ADAM_GROUPS if name != "features"),
+            decayed_groups=_YOUNG, falling_groups=_FALLING, fall_updates=r.fall_updates,
         )  # fmt: skip

@@ -41,18 +41,26 @@ class InsertionSettings:
 
 @settings_class(frozen=True)
 class LearningRates:
-    """Adam step sizes of each group of parameters."""
+    """Adam step sizes of each group of parameters.
 
-    means: float = setting(6e-4, 0, 10, "m")
-    """Of the means."""
-    quaternions: float = setting(4e-3, 0, 10)
-    """Of the quaternions."""
+    Those of means, quaternions and colours fall with the root of a Gaussian's steps (`fall_updates`): what was just
+    born finds its place fast, what is old averages over many views. Standard deviations and opacities keep theirs
+    after a few longer steps (`young_updates`): falling or longer steps of these lose depth.
+    """
+
+    means: float = setting(1.8e-3, 0, 10, "m")
+    """Of the means, at a Gaussian's first step."""
+    quaternions: float = setting(1.2e-2, 0, 10)
+    """Of the quaternions, at a Gaussian's first step."""
     log_scales: float = setting(5e-2, 0, 10)
     """Of the logarithms of the standard deviations."""
     opacity_logits: float = setting(5e-2, 0, 10)
     """Of the logits of the opacities."""
-    sh_dc: float = setting(1.8e-2, 0, 10)
-    """Of the colours' coefficient of degree 0."""
+    sh_dc: float = setting(0.108, 0, 10)
+    """Of the colours' coefficient of degree 0, at a Gaussian's first step."""
+    fall_updates: float = setting(32.0, 0.1, 10**4)
+    """Steps of means, quaternions and `sh_dc` at a Gaussian's u-th update are shorter than its first by the root of
+    1 + (u - 1) / this, at most by 20."""
     sh_rest: float = setting(5e-4, 0, 10)
     """Of the colours' other coefficients."""
     features: float = setting(1e-2, 0, 10)
@@ -64,7 +72,8 @@ class LearningRates:
     epsilon: float = setting(1e-15, 1e-30, 1)
     """Added to the root of the second moment."""
     young_factor: float = setting(3.0, 1, 100)
-    """A Gaussian's first step is this much longer; see `young_updates`."""
+    """A Gaussian's first step of standard deviations, opacity and `sh_rest` is this much longer; see
+    `young_updates`."""
     young_updates: int = setting(8, 1, 10**4)
     """Over this many steps of a Gaussian `young_factor` falls to 1."""
 

@@ -213,7 +213,13 @@ def test_steps_are_those_of_the_cpu(cuda_library: CudaLibrary, degree: int, feat
 
 
 @pytest.mark.skipif("GGSLAM_SANITIZER" in os.environ, reason="a sanitizer's compiler changes the order of sums")
-@pytest.mark.parametrize("settings", [ADAM, AdamSettings(decay=0.999, decay_floor=0.1), AdamSettings(beta1=0.0)])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ADAM, AdamSettings(decay=0.999, decay_floor=0.1), AdamSettings(beta1=0.0),
+        AdamSettings(decayed_groups=("log_scales",), decay=0.9, falling_groups=("means", "quaternions", "sh_dc")),
+    ],
+)  # fmt: skip
 def test_steps_of_gaussians_of_every_age(cuda_library: CudaLibrary, settings: AdamSettings) -> None:
     gaussians = make_map(1, 2)
     gaussians.updates.copy_(torch.logspace(0, 4.5, len(gaussians)).to(torch.int32) - 1)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from rendering_scenes import CAMERA, POSE, make_image_gradients, make_scene
@@ -19,8 +21,9 @@ RATES = {
     "sh_dc": 5e-3, "sh_rest": 6e-3, "features": 7e-3,
 }  # fmt: skip
 SETTINGS = AdamSettings(
-    RATES, beta1=0.8, beta2=0.95, epsilon=1e-8, decay=0.7, decay_floor=0.2, decayed_groups=("means",)
-)
+    RATES, beta1=0.8, beta2=0.95, epsilon=1e-8, decay=0.7, decay_floor=0.2, decayed_groups=("means",),
+    falling_groups=("quaternions", "sh_dc"), fall_updates=1.5, fall_floor=0.6,
+)  # fmt: skip
 
 
 def make_map(degree: int, features: int) -> GaussianMap:
@@ -48,8 +51,12 @@ class PlainAdam:
         s, shape = self.settings, (-1, *[1] * (self.values[name].ndim - 1))
 
         def group(key: str) -> torch.Tensor:
-            decay = (s.decay ** (counts - 1.0)).clamp_min(s.decay_floor) if key in s.decayed_groups else 1.0
-            return (s.learning_rates.get(key, 0.0) * torch.ones(len(counts), dtype=torch.float64) * decay).view(shape)
+            factor = torch.ones(len(counts), dtype=torch.float64)
+            if key in s.decayed_groups:
+                factor = (s.decay ** (counts - 1.0)).clamp_min(s.decay_floor)
+            if key in s.falling_groups:
+                factor = (1 / (1 + (counts - 1.0) / s.fall_updates).sqrt()).clamp_min(s.fall_floor)
+            return (s.learning_rates.get(key, 0.0) * factor).view(shape)
 
         if name != "sh":
             return group(name)
@@ -125,9 +132,21 @@ def test_schedule_settles_and_is_clamped() -> None:
     update = torch.arange(1, len(schedule) + 1, dtype=torch.float64)
     means = 1e-3 * (0.7 ** (update - 1)).clamp_min(0.2) / (1 - 0.8**update)
     assert torch.allclose(schedule[:, 0], means, rtol=1e-6)
+    quaternions = 2e-3 * (1 / (1 + (update - 1) / 1.5).sqrt()).clamp_min(0.6) / (1 - 0.8**update)
+    assert torch.allclose(schedule[:, 1], quaternions, rtol=1e-6)
     assert torch.allclose(schedule[:, 7], 1 / torch.sqrt(1 - 0.95**update), rtol=1e-6)
-    assert abs(float(schedule[-1, 7]) - 1) < 1e-6 and abs(float(schedule[-1, 1]) - 2e-3) < 1e-8
+    assert abs(float(schedule[-1, 7]) - 1) < 1e-6 and abs(float(schedule[-1, 1]) - 1.2e-3) < 1e-8
+    assert abs(float(schedule[-1, 2]) - 3e-3) < 1e-8
     assert SETTINGS.schedule() is SETTINGS.schedule()
+
+
+def test_a_schedule_is_long_enough_for_the_fall() -> None:
+    settings = AdamSettings(decayed_groups=(), falling_groups=("means",), fall_updates=4.0, fall_floor=0.05)
+    schedule = settings.schedule().double()
+    assert len(schedule) >= 4 * (400 - 1) and float(schedule[-1, 0] / 1e-4) == pytest.approx(0.05, rel=1e-6)
+    half = dataclasses.replace(settings, learning_rates={"means": 5e-5})
+    assert torch.allclose(half.schedule()[:, 0].double(), schedule[:, 0] / 2, rtol=1e-6)
+    assert torch.equal(half.schedule()[:, 7].double(), schedule[:, 7])
 
 
 def test_wrong_steps_are_refused() -> None:
@@ -143,6 +162,9 @@ def test_wrong_steps_are_refused() -> None:
     rasterizer.forward(plain, CAMERA, POSE)
     with pytest.raises(RenderError, match="without moments"):
         rasterizer.backward_step(plain, gradient, optimizer=SETTINGS)
-    for wrong in ({"learning_rates": {"colour": 1.0}}, {"beta1": 1.0}, {"decay": 0.0}):
+    for wrong in (
+        {"learning_rates": {"colour": 1.0}}, {"beta1": 1.0}, {"decay": 0.0}, {"falling_groups": ("means",)},
+        {"decayed_groups": (), "falling_groups": ("colour",)}, {"fall_updates": 0.0}, {"fall_floor": 0.0},
+    ):  # fmt: skip
         with pytest.raises(RenderError):
             AdamSettings(**wrong)  # type: ignore[arg-type]

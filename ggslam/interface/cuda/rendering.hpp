@@ -39,7 +39,9 @@ struct AdamStep {
   std::int32_t* updates;  // [N], of each Gaussian so far
   float rates[kAdamGroups];
   std::int32_t decayed_groups;  // bit g: the rate of group g decays
+  std::int32_t falling_groups;  // bit g: it falls instead
   float log_decay, decay_floor; // rate * max(decay_floor, decay^(u - 1)) at the u-th update
+  float fall_rate, fall_floor;  // rate * max(fall_floor, 1 / sqrt(1 + (u - 1) fall_rate))
   float beta1, beta2, log_beta1, log_beta2, epsilon;
 };
 

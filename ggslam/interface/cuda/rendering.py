@@ -20,7 +20,7 @@ from ggslam.interface.core.rendering import (
 )
 
 HEADER = "cuda/rendering.hpp"
-HEADER_SHA256 = "601a32a656567aac5647adabff360d54cb0a21b218a7b3c4ef2881577a686cea"
+HEADER_SHA256 = "2abc6d2a93da3acb821a95b3dd8d6a2a4da1cba4caf957a0e4d0f969fb8219cd"
 
 
 class AdamGroup(IntEnum):
@@ -62,8 +62,9 @@ class AdamStep(Structure):
     _fields_ = [
         ("means", AdamArrays), ("quaternions", AdamArrays), ("log_scales", AdamArrays), ("opacity_logits", AdamArrays),
         ("sh", AdamArrays), ("features", AdamArrays), ("updates", c_void_p), ("rates", c_float * 7),
-        ("decayed_groups", c_int32), ("log_decay", c_float), ("decay_floor", c_float), ("beta1", c_float),
-        ("beta2", c_float), ("log_beta1", c_float), ("log_beta2", c_float), ("epsilon", c_float),
+        ("decayed_groups", c_int32), ("falling_groups", c_int32), ("log_decay", c_float), ("decay_floor", c_float),
+        ("fall_rate", c_float), ("fall_floor", c_float), ("beta1", c_float), ("beta2", c_float), ("log_beta1", c_float),
+        ("log_beta2", c_float), ("epsilon", c_float),
     ]
 
 

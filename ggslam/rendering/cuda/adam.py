@@ -55,8 +55,12 @@ def _set_numbers(step: AdamStep, optimizer: AdamSettings) -> None:
     def logarithm(factor: float) -> float:
         return math.log(factor) if factor > 0 else -math.inf
 
+    def bits(groups: tuple[str, ...]) -> int:
+        return sum(1 << bit for bit, name in enumerate(ADAM_GROUPS) if name in groups)
+
     step.rates[:] = [float(optimizer.learning_rates.get(name, 0.0)) for name in ADAM_GROUPS]
-    step.decayed_groups = sum(1 << bit for bit, name in enumerate(ADAM_GROUPS) if name in optimizer.decayed_groups)
+    step.decayed_groups, step.falling_groups = bits(optimizer.decayed_groups), bits(optimizer.falling_groups)
+    step.fall_rate, step.fall_floor = 1 / optimizer.fall_updates, optimizer.fall_floor
     step.log_decay, step.decay_floor = logarithm(optimizer.decay), optimizer.decay_floor
     step.beta1, step.log_beta1 = optimizer.beta1, logarithm(optimizer.beta1)
     step.beta2, step.log_beta2 = optimizer.beta2, logarithm(optimizer.beta2)

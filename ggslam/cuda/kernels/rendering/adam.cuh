@@ -11,6 +11,7 @@ namespace ggslam::cuda {
 // What all parameters of a Gaussian share at its u-th update.
 struct AdamFactors {
   float decay;       // of the rates of decayed groups
+  float fall;        // of those of falling groups
   float rate;        // 1 / (1 - beta1^u)
   float correction;  // 1 / sqrt(1 - beta2^u)
 };
@@ -18,13 +19,15 @@ struct AdamFactors {
 __device__ inline AdamFactors adam_factors(const AdamStep& adam, std::int32_t update) {
   const float u = static_cast<float>(update);
   // 1 - beta^u as it stands would lose half its digits at the first updates.
-  return {fmaxf(adam.decay_floor, expf((u - 1.0f) * adam.log_decay)), 1.0f / -expm1f(u * adam.log_beta1),
-          1.0f / sqrtf(-expm1f(u * adam.log_beta2))};
+  return {fmaxf(adam.decay_floor, expf((u - 1.0f) * adam.log_decay)),
+          fmaxf(adam.fall_floor, 1.0f / sqrtf(1.0f + (u - 1.0f) * adam.fall_rate)),
+          1.0f / -expm1f(u * adam.log_beta1), 1.0f / sqrtf(-expm1f(u * adam.log_beta2))};
 }
 
 __device__ inline float step_size(const AdamStep& adam, const AdamFactors& factors, AdamGroup group) {
   const float decay = ((adam.decayed_groups >> group) & 1) != 0 ? factors.decay : 1.0f;
-  return adam.rates[group] * decay * factors.rate;
+  const float fall = ((adam.falling_groups >> group) & 1) != 0 ? factors.fall : 1.0f;
+  return adam.rates[group] * decay * fall * factors.rate;
 }
 
 // One parameter.
