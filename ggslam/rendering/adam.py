@@ -74,7 +74,7 @@ class AdamSettings:
         """float32 [rows, 8]: row u - 1 serves the u-th update, the last row all later ones. Columns: step size
         rate / (1 - beta1^u) of each group of `ADAM_GROUPS`, then 1 / sqrt(1 - beta2^u)."""
         rates = tuple(float(self.learning_rates.get(name, 0.0)) for name in ADAM_GROUPS)
-        return _scaled(_Shape.of(self), rates)
+        return _schedule(_Shape.of(self), rates)
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def _rows_until(factor: float, limit: float) -> int:
 
 
 @lru_cache(maxsize=16)
-def _scaled(shape: _Shape, rates: tuple[float, ...]) -> torch.Tensor:
+def _schedule(shape: _Shape, rates: tuple[float, ...]) -> torch.Tensor:
     return (_unit_schedule(shape) * torch.tensor([*rates, 1.0], dtype=torch.float64)).float().contiguous()
 
 
