@@ -86,7 +86,7 @@ class MoverDetector:
         before, moved, self.found, self.small = self.found, self.small, None, None
         if novel.sum() < min(s.min_pixels, 3):
             return
-        places = Gathering(novel, fresh, view.depth, same > passed, factor, frame.depth.shape)
+        places = Gathering(novel, passed > 0, fresh, view.depth, same > passed, factor, frame.depth.shape)
         found = gather(places, frame.load_mask, s)
         if found is None or found.small.sum() > s.max_share * ((passed > 0) | (same > 0)).sum():
             return

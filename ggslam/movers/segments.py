@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ggslam.geometry.fixed_to_camera import parts_with_seeds
 from ggslam.movers.evidence import thin_out
 from ggslam.movers.settings import MoverSettings
 
@@ -28,6 +29,7 @@ class Gathering:
 
     Attributes:
         novel: something has come there.
+        perhaps: the same by less evidence, where it hangs on places that are `novel`.
         rests: it is where all the latest frames saw it.
         depth: float32, metres.
         world: frames before saw the same there.
@@ -36,6 +38,7 @@ class Gathering:
     """
 
     novel: np.ndarray
+    perhaps: np.ndarray
     rests: np.ndarray
     depth: np.ndarray
     world: np.ndarray
@@ -89,7 +92,7 @@ def gather(
             may move.
         settings: how much of a thing has to have come.
     """
-    blobs = _large(places.novel, settings.min_pixels)
+    blobs = parts_with_seeds(_large(places.novel, settings.min_pixels), places.novel | places.perhaps, 0)
     segments = load_segments()
     if segments is None:
         return _as_things(_blobs_that_move(blobs, places, settings), places, None, {})

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ggslam.geometry.fixed_to_camera import parts_with_seeds
 from ggslam.geometry.voxels import neighbour_step, voxel_keys
 from ggslam.movers.evidence import CoarseView, Margin, compare
 from ggslam.movers.segments import Gathering, gather
@@ -15,6 +16,8 @@ from ggslam.scene.poses import transform_points
 
 VOXEL = 0.05
 """Metres."""
+SEED_SHARE = 0.1
+"""Of what has gone in one piece so much lies in the trail at least."""
 _STEPS = [neighbour_step(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
 
 
@@ -69,12 +72,13 @@ def gone_since(
     if near.sum() < settings.min_pixels / 4:
         return None
     evidence = compare(earlier, newest, margin)
-    passed = evidence.passed & near
+    # Movers are found by the side that goes ahead: the rest of what has gone hangs on what lies in their trail.
+    passed = parts_with_seeds(evidence.passed & near, evidence.passed, SEED_SHARE)
     if passed.sum() < settings.min_pixels / 4:
         return None
     factor = shape[1] // earlier.camera.width
-    rests, world = np.zeros(passed.shape, bool), evidence.same | ~near
-    found = gather(Gathering(passed, rests, earlier.depth, world, factor, shape), lambda: segments, settings)
+    rests, world = np.zeros(passed.shape, bool), evidence.same
+    found = gather(Gathering(passed, rests, rests, earlier.depth, world, factor, shape), lambda: segments, settings)
     return None if found is None else found.full > 0
 
 

@@ -46,7 +46,7 @@ from ggslam.runs.records.mark import FileRecord, RunRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points_of_map
-from ggslam.runs.writing import RUN_FILES, TRUTH_FILE
+from ggslam.runs.writing import MOVERS_FILE, RUN_FILES, TRUTH_FILE
 from ggslam.scene.arrays import arrays_of, arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
@@ -60,7 +60,7 @@ _CLASSIFIER, _TABLE = "classifier.npz", "objects.json"
 _NEEDED = (
     RunRecord.FILE, KeyframesRecord.FILE, "trajectory.txt", "config.yaml", SequenceRecord.FILE, TimingRecord.FILE,
 )  # fmt: skip
-_PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, _TABLE, _CLASSIFIER)
+_PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, MOVERS_FILE, _TABLE, _CLASSIFIER)
 _MEMBERS = frozenset((_HEAD, _MAP, PLACES_FILE, *_NEEDED, *_PERHAPS))
 _MOST_KEYFRAMES = (1 << 16) - 2
 

@@ -10,12 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import RunFolderError, SequenceError
+from ggslam.errors import FormatError, RunFolderError, SequenceError
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.sequence import OpenRecord, PartRecord, SequenceRecord
+from ggslam.runs.writing import MOVERS_FILE
+from ggslam.scene.arrays import read_all_arrays
 from ggslam.sequences import Sequence, open_sequence
 from ggslam.sequences.joined import JoinedPart, JoinedSequence
 from ggslam.sequences.live import LiveSequence, is_live, open_live
+from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.sequences.rig import RigSequence
 from ggslam.system.json_files import json_ready
 
@@ -144,7 +147,8 @@ def request_in(record: OpenRecord, path: Path | None = None, masks: Path | None 
 def open_recording_of(
     folder: RunFolder, path: Path | None = None, masks: Path | None = None, scale: float | None = None
 ) -> Sequence:
-    """Opens the recording of a run again, as the run did; of a merged run all its recordings as one.
+    """Opens the recording of a run again, as the run did; of a merged run all its recordings as one. Frames come
+    without what the run found to move.
 
     Args:
         folder: of the run.
@@ -159,10 +163,33 @@ def open_recording_of(
     return open_recorded(folder.sequence(), str(folder.path), path, masks, scale)
 
 
+def read_moving(folder: Path) -> MovingPixels | None:
+    """What a run found to move in its frames; None: nothing.
+
+    Raises:
+        RunFolderError: the file is damaged.
+    """
+    path = folder / MOVERS_FILE
+    if not path.is_file():
+        return None
+    try:
+        return MovingPixels.from_arrays(read_all_arrays(path, "what moves in a recording"))
+    except FormatError as error:
+        raise RunFolderError(f"{path}: cannot be read: {str(error).removeprefix(f'{path}: ')}") from None
+
+
 def open_recorded(
     record: SequenceRecord, run: str, path: Path | None = None, masks: Path | None = None, scale: float | None = None
 ) -> Sequence:
-    """The same by the record alone; `run` names whose it is."""
+    """The same by the record alone; `run` is the folder whose it is."""
+    sequence = _open_again(record, run, path, masks, scale)
+    sequence.moving = read_moving(Path(run))
+    return sequence
+
+
+def _open_again(
+    record: SequenceRecord, run: str, path: Path | None, masks: Path | None, scale: float | None
+) -> Sequence:
     if record.parts is None:
         return _open_as(run, record, path, masks, scale)
     if len({part.open.path for part in record.parts}) > 1 and (path is not None or masks is not None):

@@ -23,6 +23,7 @@ from ggslam.runs.records.mark import RunRecord, VerdictRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_map_in_parts, save_points
+from ggslam.scene.arrays import arrays_to_bytes
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.config import Config, save_config
 from ggslam.slam.result import SlamResult
@@ -38,12 +39,14 @@ REPORT_FILE = "report.html"
 CHANGES_FOLDER = "changes"
 """Of a run that was brought up to date: what changed, as `ggslam changes --out` writes it."""
 POINTS = ("points.ply", "points_grid.ply")
+MOVERS_FILE = "movers.npz"
+"""What moves in the recording's frames, see `sequences/moving_pixels.py`; of runs in which something was found."""
 TRAJECTORIES = "trajectories"
 """Folder with a trajectory of each camera of a rig; trajectory.txt is that of the rig."""
 RUN_FILES = (
     *OBJECT_FILES, "map.ply", MAP_INDEX, "trajectory.txt", KeyframesRecord.FILE, LoopsRecord.FILE, SequenceRecord.FILE,
     TimingRecord.FILE, "config.yaml", "metrics.json", "frames.csv", *POINTS, PLACES_FILE, STEPS_FILE, TRUTH_FILE,
-    REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES,
+    MOVERS_FILE, REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES,
     CHANGES_FOLDER,
 )  # fmt: skip
 """Files and folders that a run may have besides run.json."""
@@ -100,6 +103,8 @@ class RunToWrite:
 
     def _write_map(self, folder: Path) -> None:
         result = self.result
+        if len(result.moving):
+            write_bytes(folder / MOVERS_FILE, arrays_to_bytes(**result.moving.to_arrays()))
         save_config(self.config, folder / "config.yaml")
         for record in (self.sequence, KeyframesRecord.of_result(result)):
             record.write(folder)

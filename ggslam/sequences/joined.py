@@ -68,7 +68,7 @@ class JoinedSequence(Sequence):
         self.parts = parts
         self._starts = np.cumsum([0, *(len(part.sequence) for part in parts)])
         self._selection = range(int(self._starts[-1]))
-        self._reopen, self.options, self._skipped = None, None, {}
+        self._reopen, self.options, self._skipped, self.moving = None, None, {}, None
         self.timestamps = np.concatenate([part.sequence.timestamps + part.time_shift_s for part in parts])
         known = any(part.sequence.ground_truth is not None for part in parts)
         self.ground_truth = np.concatenate([part.truth() for part in parts]) if known else None
@@ -117,11 +117,12 @@ class JoinedSequence(Sequence):
         part, own = self.part_of(index)
         found = part.sequence.frame(own, masks)
         pose = found.T_world_camera
-        return replace(
+        joined = replace(
             found, index=index, timestamp=float(self.timestamps[index]), mask=part.mask(found.mask),
             T_world_camera=None if pose is None else part.T_joint_truth @ pose,
             mask_loader=None if found.mask_loader is None else partial(_load_mask, part, found),
         )  # fmt: skip
+        return joined if self.moving is None else self.moving.without(joined)
 
     def _attempt(self, index: int, masks: ReadMasks) -> Frame | SkippedFrame:
         part, own = self.part_of(index)

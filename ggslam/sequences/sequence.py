@@ -22,6 +22,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.images import read_color, read_confidence, read_depth
 from ggslam.sequences.masks import MaskReader
+from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.sequences.pixel_grid import ImageGeometry, image_size
 from ggslam.sequences.recording import FrameFiles, Recording
 from ggslam.sequences.stream import ReadAhead
@@ -134,6 +135,8 @@ class Sequence:
         self.native_camera: Camera = self._geometry.native_camera
         self.finer: bool = self._geometry.finer
         self.valid: np.ndarray | None = self._geometry.valid
+        self.moving: MovingPixels | None = None
+        """What a run found to move in the frames: they come without it."""
 
     def _select(self, selection: range) -> int:
         """Takes these frames of the recording; returns how many of them have masks."""
@@ -170,6 +173,8 @@ class Sequence:
             part = object.__new__(Sequence)
             vars(part).update(vars(self), warnings=list(self.warnings))
             part._select(self._selection[index])
+            if self.moving is not None:
+                part.moving = self.moving.select(range(len(self))[index])
             return part
         number = operator.index(index)
         if not -len(self) <= number < len(self):
@@ -251,7 +256,7 @@ class Sequence:
         self._geometry.check(color, depth, files)
         color = self._geometry.steady(color, files, cv2.INTER_LINEAR)
         pose = None if self.ground_truth is None else self.ground_truth[index]
-        return Frame(
+        found = Frame(
             index=index,
             source_index=source,
             timestamp=float(self.timestamps[index]),
@@ -264,6 +269,7 @@ class Sequence:
             depth_delay=0.0 if self._recording.depth_delays is None else float(self._recording.depth_delays[source]),
             mask_loader=partial(self._mask, index) if masks == "lazy" and files.mask is not None else None,
         )
+        return found if self.moving is None else self.moving.without(found)
 
     def stream(self, prefetch: int = 4, masks: ReadMasks = True, begin: int = 0) -> Iterator[Frame]:
         """All frames in order, at most `prefetch` of them read ahead by one background thread (0: no thread).

@@ -17,6 +17,7 @@ from ggslam.objects.lookup import objects_at
 from ggslam.objects.table import ObjectTable, Observation, Supervision
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.slam.config import Config
 from ggslam.slam.loop_closing import LoopEvent
 from ggslam.submaps.gaussian_cells import GaussianCells
@@ -159,6 +160,7 @@ class SlamResult:
         steps: what was noted of every step, content of `steps.csv`.
         device: what it was computed on: "cpu", or the GPU's name.
         config: settings of the run.
+        moving: what was found to move, frame by frame.
     """
 
     gaussians: GaussianMap
@@ -178,6 +180,7 @@ class SlamResult:
     steps: str | None = None
     device: str = "cpu"
     config: Config | None = None
+    moving: MovingPixels = field(default_factory=MovingPixels)
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, if anything is; it cannot be read any more."""

@@ -13,10 +13,13 @@ from ggslam.movers.evidence import CoarseView, Margin
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.trail import gone_since
 from ggslam.scene.frame import Frame
+from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
+FILE_HINT = "movers.npz"
+"""What moves where; see `MovingPixels`."""
 SURE = (TrackingStatus.FIRST, TrackingStatus.OK, TrackingStatus.DEGENERATE)
 """How frames are tracked in which something may be found that did not move before."""
 DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
@@ -34,6 +37,8 @@ class RunMovers:
     def __init__(self, settings: MoverSettings, reads_masks: bool) -> None:
         self.detector = MoverDetector(settings)
         self._reads_masks = reads_masks
+        self.pixels = MovingPixels()
+        """What was found in the frames so far."""
         self._margin = _margin(settings, DepthNoise())
 
     @property
@@ -60,7 +65,10 @@ class RunMovers:
         shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
         self.detector.look(shown, result.T_world_camera if known else None, self._margin, result.status in SURE)
         mask = self.detector.mask
-        return result if mask is None else replace(result, points=_without(result.points, mask))
+        if mask is None:
+            return result
+        self.pixels.add(frame.index, mask)
+        return replace(result, points=_without(result.points, mask))
 
     def clean(self, frame: Frame) -> Frame:
         """The frame that `look` saw last without depth where something moves, which `Frame.moving` tells."""
@@ -97,6 +105,11 @@ class RunMovers:
             part = gone_since(old, view, trail, segments, depth.shape, self._margin, settings)
             found.append(None if part is None else grow(part, GROWN))
         return found
+
+    def notes(self, frames: int) -> list[str]:
+        """What the user should know of a run of so many frames."""
+        found = len(self.pixels)
+        return [f"something moves in {found} of {frames} frames: it is not mapped ({FILE_HINT})"] if found else []
 
     def move(self, T_new_old: np.ndarray) -> None:
         """Follows a correction [4, 4] of the world about the camera."""

@@ -44,6 +44,7 @@ from ggslam.objects.table import Observation
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.color_poses import ColorPoses
 from ggslam.slam.config import Config
@@ -204,6 +205,7 @@ RULES: Rules = {
     RunObjects: _but("_masks"),
     RunMovers: _but("_reads_masks", "_margin"),
     MoverDetector: _but("settings"),
+    MovingPixels: Rule(fixed=_names("masks")),
     CoarseView: Rule(fixed=_names("depth", "near", "far")),
     ObjectMasks: _but("settings", "_segment"),
     # tracking

@@ -225,9 +225,10 @@ class Slam:
             gaussians, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
             self.refine_iterations, objects, self.loops.events if self.loops else [],
             self._places(gaussians, cells), cells, None if self.pager is None else self.pager.report(),
-            [*self._notes, *self._fixtures.notes(), *([] if self.pager is None else self.pager.budget.notes)],
+            [*self._notes, *self._fixtures.notes(), *self.movers.notes(len(self.frames)),
+             *([] if self.pager is None else self.pager.budget.notes)],
             None if self.pager is None else self.pager.close, self.steps.to_csv(), device_name(self.map.device),
-            self.config,
+            self.config, self.movers.pixels,
         )  # fmt: skip
 
     def _places(self, gaussians: GaussianMap, cells: GaussianCells | None) -> bytes | None:

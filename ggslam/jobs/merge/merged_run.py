@@ -23,16 +23,17 @@ from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.runs.environment import environment
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import publish_run
-from ggslam.runs.recordings import fingerprint
+from ggslam.runs.recordings import fingerprint, read_moving
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.mark import MergedRecord, RunRecord
 from ggslam.runs.records.sequence import PartRecord, SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points_of_map
-from ggslam.runs.writing import RUN_FILES, TRUTH_FILE, write_objects
+from ggslam.runs.writing import MOVERS_FILE, RUN_FILES, TRUTH_FILE, write_objects
 from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.slam.config import save_config
 from ggslam.slam.saved_places import KEYFRAME_CAMERAS, PLACES_FILE, camera_row
 from ggslam.system.atomic import write_bytes
@@ -96,6 +97,9 @@ class MergedRun:
             self._write_records(staged, seconds)
             self._write_map(staged)
             write_bytes(staged / PLACES_FILE, self._places())
+            moving = MovingPixels.joined((s.first_frame, read_moving(s.folder.path)) for s in self.sources)
+            if len(moving):
+                write_bytes(staged / MOVERS_FILE, arrays_to_bytes(**moving.to_arrays()))
             save_points_of_map(staged, self.gaussians, self.objects.supervision is not None)
             more(staged)
             return self._mark()

@@ -24,7 +24,7 @@ from ggslam.runs.publishing import publish_run
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.saving_parts import save_points_of_map
-from ggslam.runs.writing import RUN_FILES, TRAJECTORIES, TRUTH_FILE, write_objects
+from ggslam.runs.writing import MOVERS_FILE, RUN_FILES, TRAJECTORIES, TRUTH_FILE, write_objects
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
 from ggslam.slam.saved_places import PLACES_FILE
@@ -32,7 +32,8 @@ from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import delay_interrupts
 
-_STAY = ("trajectory.txt", "config.yaml", "sequence.json", "loops.json", STEPS_FILE, TRUTH_FILE, PLACES_FILE)
+_STAY = ("trajectory.txt", "config.yaml", "sequence.json", "loops.json", STEPS_FILE, TRUTH_FILE, PLACES_FILE,
+         MOVERS_FILE)  # fmt: skip
 """Files that are true of the refined run as well; keyframes.json and timing.json with a change."""
 
 

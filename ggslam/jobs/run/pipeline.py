@@ -237,6 +237,8 @@ class _Run:
         """Scores and report."""
         sequence, error = self.sequence, outcome.error
         kept = sequence if isinstance(sequence, Sequence) else None if error else _kept_recording(self.folder, sequence)
+        if kept is not None and len(outcome.result.moving):
+            kept.moving = outcome.result.moving
         if self.request.evaluate and error is None:
             if kept is None:
                 self.observer.note("not scored: the frames of a live camera are kept with `record` only")

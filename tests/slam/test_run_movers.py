@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A thing that is carried through a room, and one that is carried off, leave no ghosts in the map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ggslam.errors import RunFolderError
+from ggslam.runs.recordings import read_moving
+from ggslam.runs.saving import save_run
+from ggslam.runs.writing import MOVERS_FILE
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.slam.config import load_config
+from ggslam.slam.saved_state import describe_state, restore_state
+from ggslam.slam.slam import Slam
+
+CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+FRAMES, BEGINS, SPEED = 36, 12, 0.04
+QUICK = [
+    "mapping.iterations_per_frame=2", "mapping.first_frame_iterations=20", "refine_iterations=0",
+    "masks.source=none", "keyframes.max_gap=5", "tracking.noise={constant: 0.001, square: 0.0}",
+]  # fmt: skip
+RED = np.array([220, 20, 20], np.uint8)
+
+
+def pose(n: int) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = 0.004 * n
+    return T
+
+
+def box_at(n: int) -> float:
+    """World x of the middle of the box at frame n: it rests, and is carried to the right out of sight."""
+    return -0.5 + SPEED * max(0, n - BEGINS)
+
+
+def frame(n: int) -> Frame:
+    """A corner of two walls and a floor with a texture, before it a red box."""
+    rays, origin = CAMERA.rays().reshape(-1, 3).astype(float), pose(n)[:3, 3]
+    best, color = np.full(len(rays), np.inf), np.zeros((len(rays), 3))
+    for normal, distance, tint in (((0, 0, 1), 3.0, 1.0), ((0, 1, 0), 0.8, 0.8), ((0.8, 0, 0.6), 2.6, 0.6)):
+        n_hat = np.array(normal, float)
+        t = (distance - origin @ n_hat) / np.where(np.abs(rays @ n_hat) > 1e-9, rays @ n_hat, 1e-9)
+        hit = (t > 0) & (t < best)
+        at = origin + t[:, None] * rays
+        shade = 0.5 + 0.2 * np.sin(9 * at[:, 0]) + 0.15 * np.cos(13 * at[:, 1]) + 0.15 * np.sin(11 * at[:, 2])
+        best = np.where(hit, t, best)
+        color = np.where(hit[:, None], tint * 255 * shade[:, None] * [0.7, 0.9, 1.0], color)
+    t = 1.5 - origin[2]
+    at = origin + t * rays
+    box = (np.abs(at[:, 0] - box_at(n)) < 0.2) & (np.abs(at[:, 1]) < 0.2) & (t < best)
+    best, color = np.where(box, t, best), np.where(box[:, None], RED, color)
+    shape = (CAMERA.height, CAMERA.width)
+    return Frame(
+        n, n, n / 30, color.clip(0, 255).astype(np.uint8).reshape(*shape, 3),
+        best.astype(np.float32).reshape(shape), CAMERA, T_world_camera=pose(n),
+    )  # fmt: skip
+
+
+def red_share(slam: Slam, n: int) -> float:
+    """Share of the rendered image at frame n that is red."""
+    view = slam.mapper.render_view(CAMERA, np.linalg.inv(slam.pose_of(slam.frames[n])))
+    image = view.image.numpy()
+    return float(((image[0] > 0.6) & (image[1] < 0.3)).mean())
+
+
+def run(enabled: bool, frames: int = FRAMES) -> Slam:
+    slam = Slam(CAMERA, load_config(None, [f"movers.enabled={enabled}".lower(), *QUICK]))
+    for n in range(frames):
+        slam.step(frame(n))
+    return slam
+
+
+@pytest.fixture(scope="module")
+def with_search() -> Slam:
+    return run(True)
+
+
+@pytest.mark.long("three short runs")
+def test_a_thing_that_is_carried_off_leaves_nothing(with_search: Slam) -> None:
+    without = run(False)
+    assert red_share(without, 0) > 0.03
+    assert red_share(with_search, 0) < red_share(without, 0) / 10
+    found = with_search.movers.pixels
+    assert found.frames and min(found.frames) > BEGINS
+    assert any(keyframe.moving is not None for keyframe in with_search.mapper.keyframes[:2])
+    mask = found.mask(BEGINS + 12, (CAMERA.height, CAMERA.width))
+    red = (frame(BEGINS + 12).color == RED).all(2)
+    assert mask is not None and (mask & red).sum() > 0.95 * red.sum()
+    assert "something moves in" in " ".join(with_search.result().notes)
+
+
+def test_a_run_goes_on_bit_for_bit_while_something_moves() -> None:
+    half = BEGINS + 10
+    first, again = run(True, half), Slam(CAMERA, load_config(None, ["movers.enabled=true", *QUICK]))
+    tree, arrays = describe_state(first)
+    restore_state(again, tree, [array.copy() for array in arrays])
+    for n in range(half, half + 4):
+        first.step(frame(n))
+        again.step(frame(n))
+    assert first.movers.pixels.frames == again.movers.pixels.frames
+    assert len(first.movers.pixels) > 0
+    assert np.array_equal(first.map.means.numpy(), again.map.means.numpy())
+
+
+def test_frames_without_movers_are_passed_on_as_they_are() -> None:
+    slam = run(True, 3)
+    given = frame(3)
+    slam.track(given)
+    assert slam.without_movers(given) is given
+
+
+def test_masks_are_kept_with_the_run(with_search: Slam, tmp_path: Path) -> None:
+    folder = save_run(with_search.result(), tmp_path / "run")
+    moving = read_moving(folder.path)
+    assert moving is not None and moving.frames == with_search.movers.pixels.frames
+    (folder.path / MOVERS_FILE).write_bytes(b"PK")
+    with pytest.raises(RunFolderError, match=r"movers.npz: cannot be read"):
+        read_moving(folder.path)
