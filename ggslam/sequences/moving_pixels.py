@@ -71,7 +71,7 @@ class MovingPixels:
         )  # fmt: skip
 
     @staticmethod
-    def joined(parts: Iterable[tuple[int, MovingPixels | None]]) -> MovingPixels:
+    def concatenate(parts: Iterable[tuple[int, MovingPixels | None]]) -> MovingPixels:
         """Of several runs as one, each with the number that its first frame has there. Masks of another size than the
         first ones are left out."""
         found = MovingPixels()

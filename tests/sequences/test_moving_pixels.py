@@ -48,7 +48,7 @@ def test_selected_and_joined(moving: MovingPixels, masks: dict[int, np.ndarray])
     assert chosen.frames == [1, 2, 4] and np.array_equal(chosen.mask(1, (121, 161)), masks[3])
     other = MovingPixels()
     other.add(0, np.ones((10, 10), bool))
-    both = MovingPixels.joined([(0, moving), (20, None), (30, moving), (60, other)])
+    both = MovingPixels.concatenate([(0, moving), (20, None), (30, moving), (60, other)])
     assert both.frames == [3, 5, 9, 33, 35, 39] and np.array_equal(both.mask(33, (121, 161)), masks[3])
 
 

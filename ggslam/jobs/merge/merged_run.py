@@ -97,7 +97,7 @@ class MergedRun:
             self._write_records(staged, seconds)
             self._write_map(staged)
             write_bytes(staged / PLACES_FILE, self._places())
-            moving = MovingPixels.joined((s.first_frame, read_moving(s.folder.path)) for s in self.sources)
+            moving = MovingPixels.concatenate((s.first_frame, read_moving(s.folder.path)) for s in self.sources)
             if len(moving):
                 write_bytes(staged / MOVERS_FILE, arrays_to_bytes(**moving.to_arrays()))
             save_points_of_map(staged, self.gaussians, self.objects.supervision is not None)
