@@ -82,11 +82,13 @@ class RigFile:
 def find_rig_file(path: Path) -> Path | None:
     """The file of the rig at a path: itself, or that in the folder; None if there is none.
 
-    A YAML file is one of a rig if it has an entry `cameras`.
+    A YAML file is one of a rig if it has an entry `cameras`, or is named itself and called rig.yaml.
     """
     file = path / FILE if os.path.isdir(path) else path  # noqa: PTH112 (Path's raises for impossible names)
     if file.suffix.lower() not in (".yaml", ".yml") or not os.path.isfile(file):  # noqa: PTH113
         return None
+    if file is path and file.name == FILE:
+        return file
     try:
         return file if re.search(r"^cameras\s*:", read_text(file), re.MULTILINE) else None
     except SequenceError:

@@ -25,6 +25,7 @@ from ggslam.synthetic.scene import Scene
 from ggslam.synthetic.scenes import SCENES, SceneKind
 from ggslam.synthetic.sensor import disparity_distortion, noisy_color, noisy_depth
 from ggslam.synthetic.trajectory import camera_path
+from ggslam.system.atomic import write_failure
 
 DEPTH_SCALE = 5000.0
 LARGEST_DISTORTION = 10.0
@@ -183,7 +184,7 @@ def new_folder(target: Path) -> Iterator[Path]:
         work.chmod(0o755)  # mkdtemp makes it private
         _put_in_place(work, target)
     except OSError as error:
-        raise SequenceError(f"{target}: cannot be written: {error}") from None
+        raise _failure(target, error) from None
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -197,13 +198,20 @@ def _check_numbers(width: int, height: int, frame_rate: float, distortion: float
         )
 
 
+def _failure(target: Path, error: OSError) -> SequenceError:
+    """The error to raise when the operating system would not write; a full disk is not the user's fault."""
+    failure = SequenceError(f"{target}: cannot be written: {error.strerror or error}")
+    failure.exit_code = write_failure(target, error).exit_code
+    return failure
+
+
 def _folder_beside(target: Path) -> Path:
     """A new hidden folder on the same file system."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         return Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     except OSError as error:
-        raise SequenceError(f"{target}: cannot be written: {error.strerror}") from None
+        raise _failure(target, error) from None
 
 
 def _kind_of(scene: Scene | str) -> SceneKind:

@@ -128,6 +128,12 @@ def test_damaged_images_and_masks_are_told_by_the_rigs_numbers(two: Path) -> Non
         list(open_rig(path))
 
 
+def test_a_file_without_cameras_says_so(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text("camera: []\n")
+    with pytest.raises(SequenceError, match=r"rig.yaml: expected an entry 'cameras'"):
+        open_sequence(tmp_path / "rig.yaml")
+
+
 def test_a_camera_has_its_own_scale_and_intrinsics(two: Path) -> None:
     more = {"scale": 0.5, "intrinsics": [30, 30, 15.5, 11.5]}
     rig = open_rig(write_rig(two, entry("a", "folder", np.eye(4)), entry("b", "folder", **more)))

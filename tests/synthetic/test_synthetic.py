@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -256,4 +257,11 @@ def test_refusals(tmp_path: Path, recording: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         write(tmp_path / "broken", frames=3, progress=stop)
+
+    def fill(done: int, count: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(SequenceError, match="broken: cannot be written: No space left on device") as failure:
+        write(tmp_path / "broken", frames=3, progress=fill)
+    assert failure.value.exit_code == 1
     assert sorted(p.name for p in tmp_path.iterdir()) == ["full", "small"]  # nothing half-written
