@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,8 @@ EPILOG = """
 
   ggslam synth demo/monday --changes 5
   ggslam synth demo/tuesday --changes 5 --visit 2
+
+  ggslam synth demo/busy --movers walker,mug,door
 """
 
 
@@ -47,7 +50,8 @@ def synth(
         ),
     ] = SceneName.room,
     frames: Annotated[
-        int | None, typer.Option(help="Number of frames; default: room 60, loop 480, corridor 720.", min=2)
+        int | None,
+        typer.Option(help="Number of frames; default: room 60, with movers 120, loop 480, corridor 720.", min=2),
     ] = None,
     width: Annotated[int, typer.Option(help="Image width.", min=16)] = 320,
     height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
@@ -73,18 +77,22 @@ def synth(
         typer.Option(help="Things of the room that differ between two visits; the second one's are in changes.json."),
     ] = None,
     visit: Annotated[int, typer.Option(help="Which of the two visits to record.", min=1, max=2)] = 1,
+    movers: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="What moves while the room is recorded: some of walker,mug,door; movers.json tells where it is "
+            "in each frame. The same seed and frames without it: the same, with nothing that moves.",
+        ),
+    ] = None,
 ) -> None:
     """Generate a recording: textured, furnished rooms with exact poses and instance masks."""
-    from ggslam.synthetic import SCENES, write_synthetic_rig, write_synthetic_sequence
+    from ggslam.synthetic import FRAMES_WITH_MOVERS, SCENES
 
-    frames = SCENES[scene.value].frames if frames is None else frames
-    if changes is None and visit > 1:
-        raise SequenceError("--visit: only with --changes there are two visits")
-    if changes is not None and rig is not None:
-        raise SequenceError("--changes: not with --rig")
-    write, cameras = partial(write_synthetic_sequence, changes=changes, visit=visit), ""
-    if rig is not None:
-        write, cameras = partial(write_synthetic_rig, cameras=rig.split(","), delay=rig_delay), f" by each of {rig}"
+    if frames is None:
+        frames = FRAMES_WITH_MOVERS if movers is not None else SCENES[scene.value].frames
+    write = _writer(rig, rig_delay, changes, visit, movers)
+    cameras = f" by each of {rig}" if rig is not None else ""
     with progress_bar() as bar:
         task = bar.add_task("render", total=frames, info="")
         write(
@@ -93,3 +101,18 @@ def synth(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
     console.print(f"wrote {folder}: {frames} frames of {width}x{height}{cameras}", highlight=False, markup=False)
+
+
+def _writer(rig: str | None, delay: float, changes: int | None, visit: int, movers: str | None) -> Callable[..., Path]:
+    """What writes the recording, with the options that the others do not have."""
+    from ggslam.synthetic import write_synthetic_rig, write_synthetic_sequence
+
+    if changes is None and visit > 1:
+        raise SequenceError("--visit: only with --changes there are two visits")
+    if rig is None:
+        moving = [] if movers is None else movers.split(",")
+        return partial(write_synthetic_sequence, changes=changes, visit=visit, movers=moving)
+    for option, value in (("--changes", changes), ("--movers", movers)):
+        if value is not None:
+            raise SequenceError(f"{option}: not with --rig")
+    return partial(write_synthetic_rig, cameras=rig.split(","), delay=delay)

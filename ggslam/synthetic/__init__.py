@@ -5,6 +5,7 @@ scanner."""
 
 from ggslam.synthetic.corridor import furnished_corridor
 from ggslam.synthetic.house import ring_of_rooms
+from ggslam.synthetic.movers import MOVERS
 from ggslam.synthetic.raycast import RayCaster, RayImages
 from ggslam.synthetic.rig import write_synthetic_rig
 from ggslam.synthetic.room import furnished_room
@@ -16,9 +17,11 @@ from ggslam.synthetic.world_cloud import cloud_tiles, world_cloud
 from ggslam.synthetic.world_plan import make_world
 from ggslam.synthetic.world_scanner import Scan, Scanner
 from ggslam.synthetic.world_walk import walk
-from ggslam.synthetic.writer import write_synthetic_sequence
+from ggslam.synthetic.writer import FRAMES_WITH_MOVERS, write_synthetic_sequence
 
 __all__ = [
+    "FRAMES_WITH_MOVERS",
+    "MOVERS",
     "SCENES",
     "TRAJECTORIES",
     "RayCaster",

@@ -74,13 +74,13 @@ def room_at_two_visits(seed: int, count: int) -> tuple[Scene, Scene, list[MadeCh
     for instance in rng.permutation(candidates).tolist():
         if len(made) == count:
             break
-        middle = np.concatenate([_outline(shape) for shape in first.shapes if shape.instance == instance]).mean(0)
+        middle = np.concatenate([outline(shape) for shape in first.shapes if shape.instance == instance]).mean(0)
         if len(made) % 3 == 2:
             kind: Literal["removed", "added"] = "removed" if len(made) % 2 else "added"
             _move(second if kind == "removed" else first, instance, _shift(_AWAY))
             made.append(MadeChange(kind, instance, names[instance], middle))
             continue
-        T = _free_motion(second, instance, rng)
+        T = free_motion(second, instance, rng)
         if T is not None:
             _move(second, instance, T)
             made.append(MadeChange("moved", instance, names[instance], middle, T))
@@ -89,11 +89,11 @@ def room_at_two_visits(seed: int, count: int) -> tuple[Scene, Scene, list[MadeCh
     return first, second, made
 
 
-def _free_motion(scene: Scene, instance: int, rng: np.random.Generator) -> np.ndarray | None:
+def free_motion(scene: Scene, instance: int, rng: np.random.Generator) -> np.ndarray | None:
     """A motion [4, 4] along what the instance stands on, to where nothing else is; None: none was found."""
     own = [shape for shape in scene.shapes if shape.instance == instance]
     others = [shape for shape in scene.shapes if shape.instance != instance]
-    points = np.concatenate([_outline(shape) for shape in own])
+    points = np.concatenate([outline(shape) for shape in own])
     middle, bottom = points.mean(0), float(points[:, 2].min())
     supports = [s for s in others if _is_flat(s) and abs(_top(s) - bottom) < _TOUCHING and _carries(s, points, bottom)]
     for _ in range(_TRIES if supports else 0):
@@ -103,7 +103,7 @@ def _free_motion(scene: Scene, instance: int, rng: np.random.Generator) -> np.nd
         moved = points @ T[:3, :3].T + T[:3, 3]
         if not any(_carries(support, moved, bottom) for support in supports):
             continue
-        raised = np.concatenate([moved, _fill(moved)])
+        raised = np.concatenate([moved, fill(moved)])
         raised[:, 2] = np.maximum(raised[:, 2], bottom + _TOUCHING + _GAP)
         if all((shape.distance(raised) > _GAP).all() for shape in others):
             return T
@@ -117,13 +117,13 @@ def _move(scene: Scene, instance: int, T: np.ndarray) -> None:
     ]
 
 
-def _outline(shape: Shape) -> np.ndarray:
+def outline(shape: Shape) -> np.ndarray:
     """Corners [8, 3] of a shape's bounding box, world."""
     corners = np.array(list(product((-1, 1), repeat=3))) * shape.bounds()
     return corners @ shape.T_world_shape[:3, :3].T + shape.T_world_shape[:3, 3]
 
 
-def _fill(points: np.ndarray) -> np.ndarray:
+def fill(points: np.ndarray) -> np.ndarray:
     """Points [n, 3] all over the box around some, which lie no farther from each other than what may stand between."""
     low, high = points.min(0), points.max(0)
     axes = [np.linspace(a, b, max(2, int((b - a) / 0.04) + 1)) for a, b in zip(low, high, strict=True)]

@@ -9,7 +9,7 @@ shadows are smooth rather than noisy.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -47,9 +47,19 @@ class LightMaps:
 
 def bake(scene: Scene) -> LightMaps:
     """Computes the light maps of every face of every shape, in the order of shapes and their faces."""
+    return _bake(scene, 0)
+
+
+def bake_further(scene: Scene, maps: LightMaps, further: Sequence[Shape]) -> LightMaps:
+    """The light maps of a scene and, after them, those of further shapes in it."""
+    return _join(maps, _bake(replace(scene, shapes=[*scene.shapes, *further]), len(scene.shapes)))
+
+
+def _bake(scene: Scene, first: int) -> LightMaps:
+    """Of every shape from a number on; those before it only cast shadows."""
     sizes: list[tuple[int, int]] = []
     points, normals, owners = [], [], []
-    for index, shape in enumerate(scene.shapes):
+    for index, shape in enumerate(scene.shapes[first:], first):
         R, t = shape.T_world_shape[:3, :3], shape.T_world_shape[:3, 3]
         for face, extent in enumerate(face_sizes(shape)):
             columns, rows = _patches(extent[0]), _patches(extent[1])
@@ -74,6 +84,13 @@ def bake(scene: Scene) -> LightMaps:
         shapes = [shape if _reaches_into(shape, low, high) else None for shape in scene.shapes]
         light[seen[inside]] += _direct(shapes, source, patches.of(inside))
     return _pack(light, sizes)
+
+
+def _join(first: LightMaps, second: LightMaps) -> LightMaps:
+    """Both, the second one's faces after the first one's, which stay where they are in the atlas."""
+    corner = second.corner + np.array([0, len(first.atlas)])
+    atlas, size = np.concatenate([first.atlas, second.atlas]), np.concatenate([first.size, second.size])
+    return LightMaps(atlas, np.concatenate([first.corner, corner]), size)
 
 
 class _Patches:

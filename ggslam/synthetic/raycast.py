@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,9 +12,9 @@ import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
-from ggslam.synthetic.lighting import LightMaps, bake
+from ggslam.synthetic.lighting import LightMaps, bake, bake_further
 from ggslam.synthetic.materials import Material
-from ggslam.synthetic.scene import FACES, Kind, Scene
+from ggslam.synthetic.scene import FACES, Kind, Scene, Shape
 from ggslam.synthetic.surfaces import face_sizes, intersect, locate
 
 _NEAR = 0.02
@@ -34,24 +35,33 @@ class RayImages:
 
 
 class RayCaster:
-    """Renders views of one scene. Texture pyramids are prepared once, light maps when colour is first needed."""
+    """Renders views of one scene. Texture pyramids are prepared once, light maps when colour is first needed.
 
-    def __init__(self, scene: Scene, seed: int = 0) -> None:
+    Further shapes are lit by the scene but cast no shadows on it; these and the scene's own can be placed elsewhere.
+    They take their light with them.
+    """
+
+    def __init__(self, scene: Scene, seed: int = 0, further: Sequence[Shape] = ()) -> None:
         self._scene = scene
-        self._shapes = scene.shapes
-        self._kinds = np.array([int(shape.kind) for shape in scene.shapes])
-        self._half = np.array([shape.half for shape in scene.shapes], np.float32)
-        self._top = np.array([shape.top for shape in scene.shapes], np.float32)
-        self._bounds = np.array([shape.bounds() for shape in scene.shapes])
-        self._T_shape_world = inverse(np.array([shape.T_world_shape for shape in scene.shapes]))
-        self._instances = np.array([0] + [shape.instance for shape in scene.shapes], np.uint16)
+        self._shapes = [*scene.shapes, *further]
+        self._kinds = np.array([int(shape.kind) for shape in self._shapes])
+        self._half = np.array([shape.half for shape in self._shapes], np.float32)
+        self._top = np.array([shape.top for shape in self._shapes], np.float32)
+        self._bounds = np.array([shape.bounds() for shape in self._shapes])
+        self._T_shape_world = inverse(np.array([shape.T_world_shape for shape in self._shapes]))
+        self._instances = np.array([0] + [shape.instance for shape in self._shapes], np.uint16)
         self._materials: list[Material] = []
         self._pyramids: list[list[np.ndarray]] = []
         self._prepare_faces(np.random.default_rng(seed))
 
     @cached_property
     def _lights(self) -> LightMaps:
-        return bake(self._scene)
+        maps, further = bake(self._scene), self._shapes[len(self._scene.shapes) :]
+        return bake_further(self._scene, maps, further) if further else maps
+
+    def place(self, numbers: Sequence[int], T_world_shapes: np.ndarray) -> None:
+        """Puts shapes elsewhere: their numbers, the scene's before the further ones, and poses [n, 4, 4]."""
+        self._T_shape_world[list(numbers)] = inverse(T_world_shapes)
 
     def _prepare_faces(self, rng: np.random.Generator) -> None:
         """Per face: material, texture coordinates as an affine map of (u, v), and metres per texel."""

@@ -6,9 +6,9 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -20,7 +20,7 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
 from ggslam.synthetic.changes import MadeChange, room_at_two_visits
-from ggslam.synthetic.raycast import RayCaster
+from ggslam.synthetic.movers import MovingScene, find_movers, movers_of
 from ggslam.synthetic.scene import Scene
 from ggslam.synthetic.scenes import SCENES, SceneKind
 from ggslam.synthetic.sensor import disparity_distortion, noisy_color, noisy_depth
@@ -30,6 +30,8 @@ from ggslam.system.atomic import write_failure
 DEPTH_SCALE = 5000.0
 LARGEST_DISTORTION = 10.0
 CHANGES_FILE = "changes.json"
+MOVERS_FILE = "movers.json"
+FRAMES_WITH_MOVERS = 120
 FOCAL_LENGTH = 0.75
 """As a share of the image width: 67 degrees of view."""
 
@@ -48,16 +50,19 @@ def write_synthetic_sequence(
     depth_distortion: float | None = None,
     changes: int | None = None,
     visit: int = 1,
+    movers: Sequence[str] = (),
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Ray-casts a recording of a room, a house or a corridor: rgb/, depth/, masks/, camera.yaml and poses.txt.
+    """Ray-casts a recording of a room, a house or a corridor: rgb/, depth/, masks/, camera.yaml and poses.txt; with
+    movers also movers.json.
 
     The same arguments give the same recording. The folder appears only when it is complete.
 
     Args:
         folder: to be made; must not exist or be empty, unless `overwrite`.
-        frames: how many; None: 60 of the room, 480 of the house, 720 of the corridor, whose length follows.
+        frames: how many; None: 60 of the room, 120 if something moves in it, 480 of the house, 720 of the corridor,
+            whose length follows.
         width, height: size of the images.
         seed: of textures, the unrest of the hand, and noise.
         noise: depth and colour noise of a sensor; otherwise depth is exact to 0.1 mm.
@@ -70,6 +75,8 @@ def write_synthetic_sequence(
         changes: things of the room that differ between its two visits (see `room_at_two_visits`); the second one's
             folder has them in changes.json. The camera goes all around ("round") if no trajectory is given.
         visit: which of the two, 1 or 2; the second goes the other way round.
+        movers: what moves while the room is recorded, of `MOVERS`: each rests, moves and rests again. Without them the
+            same frames and seed give the same recording with nothing that moves.
         overwrite: replaces a recording of this generator that is already there.
         progress: called with (frames done, frames).
 
@@ -80,6 +87,10 @@ def write_synthetic_sequence(
         SequenceError: impossible arguments, or the folder cannot be written.
     """
     target, made = Path(folder), list[MadeChange]()
+    if wanted := movers_of(movers):
+        if scene != "room" or changes is not None:
+            raise SequenceError("movers: only the room has things that move, and not at two visits")
+        frames = FRAMES_WITH_MOVERS if frames is None else frames
     if changes is not None:
         scene, made = _scene_of_visit(scene, seed, changes, visit)
         trajectory = trajectory or "round"
@@ -88,8 +99,13 @@ def write_synthetic_sequence(
     if visit > 1:  # another hand, and the way back
         poses = np.ascontiguousarray(camera_path(plan.scene, len(poses), plan.trajectory, seed + 1)[::-1])
     check_target(target, "camera.yaml", overwrite)
+    moving = find_movers(plan.scene, plan.camera, poses, seed, wanted)
+    plan = replace(plan, scene=moving.scene)
     with new_folder(target) as work:
-        write_recording(work, plan, poses, plan.times, number=visit - 1, progress=progress)
+        write_recording(work, plan, poses, plan.times, number=visit - 1, progress=progress, moving=moving)
+        if wanted:
+            truth = {"recording": target.resolve().name, **moving.truth()}
+            (work / MOVERS_FILE).write_text(json.dumps(truth) + "\n", encoding="utf-8")
         if visit > 1:
             text = json.dumps({"changes": [change.to_dict() for change in made]}, indent=1)
             (work / CHANGES_FILE).write_text(text + "\n", encoding="utf-8")
@@ -154,7 +170,7 @@ def plan_recording(
 
 def write_recording(
     folder: Path, plan: RecordingPlan, poses: np.ndarray, times: np.ndarray, number: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None, moving: MovingScene | None = None,
 ) -> None:  # fmt: skip
     """Ray-casts a recording into a folder that is there.
 
@@ -164,8 +180,9 @@ def write_recording(
         poses: T_world_camera, float64 [n, 4, 4], and `times`, seconds, of its frames.
         number: of the camera, if several record the same: the sensor of each has its own noise.
         progress: called with (frames done, frames).
+        moving: the scene, if something moves in it.
     """
-    _write_images(folder, plan, poses, number, progress)
+    _write_images(folder, plan, poses, number, progress, moving or MovingScene(plan.scene, plan.seed))
     _write_description(folder, plan, poses, times)
     if (times != plan.times).any():  # else they follow from the frame rate
         (folder / "timestamps.txt").write_text("".join(f"{time:.6f}\n" for time in times.tolist()), encoding="utf-8")
@@ -253,14 +270,14 @@ def check_target(target: Path, file: str, overwrite: bool) -> None:
 
 
 def _write_images(
-    folder: Path, plan: RecordingPlan, poses: np.ndarray, number: int, progress: Callable[[int, int], None] | None
-) -> None:
+    folder: Path, plan: RecordingPlan, poses: np.ndarray, number: int, progress: Callable[[int, int], None] | None,
+    moving: MovingScene,
+) -> None:  # fmt: skip
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir()
-    caster = RayCaster(plan.scene, plan.seed)
     offset = disparity_distortion(plan.camera, plan.distortion, plan.seed + number) if plan.distortion else 0.0
     for i, pose in enumerate(poses):
-        images = caster.render(plan.camera, pose)
+        images = moving.render(i, plan.camera, pose)
         color, depth = images.color, images.depth
         if plan.noise:
             rng = np.random.default_rng([plan.seed, 4, i, *([number] if number else [])])

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A person of boxes and cylinders who walks through the view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.synthetic.materials import MaterialMaker
+from ggslam.synthetic.motion import Mover, Setting, progress_between, translation, turn
+from ggslam.synthetic.scene import Scene, SceneBuilder, Shape
+
+RADIUS, HEIGHT = 0.26, 1.78
+"""Metres of free floor around the middle of a person, and how tall they are."""
+FROM_CAMERA = 0.6
+"""Metres between the person's middle and the camera, at least."""
+_STEP = 0.05
+"""Metres between frames, at most on the average."""
+_LEAST_WAY, _MOST_WAY = 1.3, 3.6
+_STRIDE, _SWING = 1.4, np.radians(27)
+"""Metres of two steps; how far legs swing."""
+_CELL, _TRIES = 0.08, 4000
+_ENOUGH = 0.6
+"""Of the time walked in view: a way with it is taken."""
+_JOINTS = {"torso": (0.0, 0.0, 0.88), "left leg": (0.0, 0.1, 0.88), "right leg": (0.0, -0.1, 0.88),
+           "left arm": (0.0, 0.26, 1.4), "right arm": (0.0, -0.26, 1.4)}  # fmt: skip
+_SWINGS = {"torso": 0.0, "left leg": 1.0, "right leg": -1.0, "left arm": -0.8, "right arm": 0.8}
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Positions [frames, 2], headings [frames] and metres walked [frames]."""
+
+    at: np.ndarray
+    heading: np.ndarray
+    walked: np.ndarray
+
+
+def walker(setting: Setting) -> Mover:
+    """A person whose arms and legs swing.
+
+    Raises:
+        SequenceError: nowhere can anybody walk in view of the camera.
+    """
+    rng = np.random.default_rng([setting.seed, 11, 0])
+    way = _find_way(setting, rng)
+    number = setting.new_instance("person")
+    root = translation(np.column_stack([way.at, np.zeros(setting.frames)])) @ turn(way.heading, 2)
+    gentle = np.clip(np.minimum(way.walked, way.walked[-1] - way.walked) / (_STRIDE / 4), 0, 1)
+    swing = _SWING * gentle * np.sin(2 * np.pi * way.walked / _STRIDE)
+    figure = _figure(number, rng)
+    parts, shapes, tracks = {}, [], []
+    for name, joint in _JOINTS.items():
+        parts[name] = root @ translation(np.array(joint)) @ turn(_SWINGS[name] * swing, 1)
+        for shape in figure[name]:
+            local = translation(-np.array(joint)) @ shape.T_world_shape
+            tracks.append(parts[name] @ local)
+            shapes.append(replace(shape, T_world_shape=tracks[-1][setting.frames // 2]))
+    numbers = setting.add_shapes(shapes)
+    what = f"a walking person of boxes and cylinders, {HEIGHT:g} m"
+    return Mover("person", what, number, False, root, numbers, np.stack(tracks, 1), {"root": root, **parts})
+
+
+def _figure(number: int, rng: np.random.Generator) -> dict[str, list[Shape]]:
+    """Shapes of each part of a person who stands at the origin and looks along x."""
+    make = MaterialMaker(rng)
+    skin, hair = make.plain((0.80, 0.60, 0.48), 0.05), make.plain((0.22, 0.15, 0.10), 0.12)
+    hue = rng.uniform(0.15, 0.75, 3)
+    shirt = make.checker((hue[0], hue[1], hue[2]), (0.9 - hue[0], 0.9 - hue[1], 0.9 - hue[2]), 6)
+    sleeve, trousers = make.fabric((hue[0], hue[1], hue[2])), make.fabric((0.20, 0.24, 0.34))
+    shoe = make.plain((0.16, 0.12, 0.10), 0.1)
+
+    made: dict[str, list[Shape]] = {}
+    for name, (_, y, _) in _JOINTS.items():
+        builder = SceneBuilder()
+        part = builder.instance("person")
+        if name == "torso":
+            part.box((0, 0, 1.16), (0.22, 0.42, 0.58), shirt)
+            part.cylinder((0, 0, 1.48), 0.055, 0.12, skin)
+            part.ellipsoid((0, 0, 1.63), (0.10, 0.085, 0.125), skin)
+            part.ellipsoid((-0.018, 0, 1.66), (0.10, 0.09, 0.12), hair)
+        elif name.endswith("leg"):
+            part.cylinder((0, y, 0.47), 0.07, 0.82, trousers, top=1.2)
+            part.box((0.05, y, 0.04), (0.26, 0.09, 0.08), shoe)
+        else:
+            part.cylinder((0, y, 1.13), 0.045, 0.56, sleeve, top=1.2)
+            part.ellipsoid((0, y, 0.82), (0.045, 0.035, 0.07), skin)
+        made[name] = [replace(shape, instance=number, casts_shadow=False) for shape in builder.scene.shapes]
+    return made
+
+
+def _find_way(setting: Setting, rng: np.random.Generator) -> _Way:
+    free, corner = _free_floor(setting)
+    places = np.argwhere(free) * _CELL + corner
+    if not len(places):
+        raise SequenceError("movers: nowhere is there room for a person")
+    times, best, most = setting.views.frames, None, 0.0
+    for _ in range(_TRIES):
+        first = rng.uniform(0.12, 0.45)
+        last = min(0.9, first + rng.uniform(0.4, 0.65))
+        longest = np.clip(_STEP * (last - first) * setting.frames, _LEAST_WAY, _MOST_WAY)
+        a, b, c = places[rng.integers(len(places), size=3)]
+        if not 0.7 * longest < np.linalg.norm(c - a) < longest:
+            continue
+        progress = progress_between(setting.frames, first, last)
+        way = _bend(a, (a + b + c) / 3, c, progress)
+        cells = np.rint((way.at - corner) / _CELL).astype(int)
+        if not free[cells[:, 0], cells[:, 1]].all():
+            continue
+        if np.linalg.norm(way.at - setting.views.poses[:, :2, 3], axis=1).min() < FROM_CAMERA:
+            continue
+        seen, under_way = _shares_seen(setting, way), (progress[times] > 0) & (progress[times] < 1)
+        score = float(seen[under_way].mean()) - 0.15 * float(seen[0] + seen[-1])
+        if score > most:
+            best, most = way, score
+        if most >= _ENOUGH:
+            break
+    if best is None:
+        raise SequenceError("movers: nobody can walk through what the camera sees")
+    return best
+
+
+def _bend(a: np.ndarray, b: np.ndarray, c: np.ndarray, progress: np.ndarray) -> _Way:
+    """From a to c, bent towards b, at an even pace but for start and stop."""
+    t = np.linspace(0, 1, 200)[:, None]
+    curve = (1 - t) ** 2 * a + 2 * t * (1 - t) * b + t**2 * c
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    walked = progress * length[-1]
+    u = np.interp(walked, length, t[:, 0])[:, None]
+    at = (1 - u) ** 2 * a + 2 * u * (1 - u) * b + u**2 * c
+    ahead = (1 - u) * (b - a) + u * (c - b)
+    return _Way(at, np.arctan2(ahead[:, 1], ahead[:, 0]), walked)
+
+
+def _shares_seen(setting: Setting, way: _Way) -> np.ndarray:
+    """Of a person on a way, the share that is seen in each of the views."""
+    heights = np.array([0.3, 0.7, 1.1, 1.5])
+    shares = []
+    for i, frame in enumerate(setting.views.frames):
+        points = np.column_stack([np.tile(way.at[frame], (len(heights), 1)), heights])
+        shares.append(setting.views.sees(points, i).mean())
+    return np.array(shares)
+
+
+def _free_floor(setting: Setting) -> tuple[np.ndarray, np.ndarray]:
+    """Where a person can stand, bool [x, y], and the middle of its first cell."""
+    scene: Scene = setting.scene
+    low, high = np.array(scene.bounds)
+    x, y = (np.arange(low[k] + RADIUS + 0.05, high[k] - RADIUS - 0.05, _CELL) for k in (0, 1))
+    grid = np.stack(np.meshgrid(x, y, np.arange(0.1, HEIGHT, 0.2), indexing="ij"), -1).reshape(-1, 3)
+    obstacles = [shape for shape in scene.shapes if _is_in_the_way(shape)]
+    for mover in setting.movers:
+        known = [*scene.shapes, *setting.shapes]
+        for number, track in zip(mover.numbers, mover.tracks.swapaxes(0, 1), strict=True):
+            steps = np.unique(track.reshape(-1, 16), axis=0).reshape(-1, 4, 4)[::4]
+            obstacles.extend(replace(known[number], T_world_shape=T) for T in steps)
+    nearest = np.full(len(grid), np.inf)
+    for shape in obstacles:
+        np.minimum(nearest, shape.distance(grid), out=nearest)
+    free = nearest.reshape(len(x), len(y), -1).min(2) > RADIUS
+    return free, np.array([x[0], y[0]])
+
+
+def _is_in_the_way(shape: Shape) -> bool:
+    """Whether anybody runs into it: rugs and lamps at the ceiling they do not."""
+    reach = np.abs(shape.T_world_shape[2, :3]) @ shape.bounds()
+    middle = shape.T_world_shape[2, 3]
+    return bool(middle + reach > 0.05 and middle - reach < HEIGHT)
