@@ -4,11 +4,13 @@
     python scripts/bench_movers.py ../shared/data                     # all of it
     python scripts/bench_movers.py ../shared/data --only movers       # one part: movers, still
     python scripts/bench_movers.py ../shared/data --masks none
+    python scripts/bench_movers.py --synth 3                          # generated rooms instead
 
 movers: `livingroom_movers`, with the search and without, beside its twin in which nothing moves: error of the
 trajectory, held-out PSNR over pixels that no mover covers, and behind the movers, where the twin tells what is
 there (places where a thing rests before it moves, or afterwards, are left out of both: no one map is right there);
 overlap of the masks that were found with the true ones, and when each mover was found first.
+--synth N: N generated rooms with a walker, a mug and a drawer (320x240), as in movers.
 still: recordings in which nothing moves, with the search and without: frames in which something was found.
 """
 
@@ -17,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,9 +29,10 @@ import numpy as np
 
 from ggslam.evaluation.trajectory import align_points
 from ggslam.scene.poses import inverse, transform_points
-from ggslam.sequences import open_sequence
+from ggslam.sequences import Sequence, open_sequence
 from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam
+from ggslam.synthetic import FRAMES_WITH_MOVERS, MOVERS, write_synthetic_sequence
 
 FEWEST_PIXELS = 30
 """Of a mover at half size: fewer are not asked for."""
@@ -46,9 +50,15 @@ class Run:
     masks: dict[int, np.ndarray] = field(default_factory=dict)
 
 
+def open_recording(path: Path, stop: int | None) -> Sequence:
+    """At half size, but small ones as they are."""
+    sequence = open_sequence(path, stop=stop)
+    return open_sequence(path, scale=0.5, stop=stop) if sequence.camera.width > 400 else sequence
+
+
 def run(path: Path, settings: list[str], stop: int | None) -> Run:
-    """A run of a recording at half size."""
-    sequence = open_sequence(path, scale=0.5, stop=stop)
+    """A run of a recording."""
+    sequence = open_recording(path, stop)
     slam, masks, seconds = Slam(sequence.camera, load_config(None, settings)), {}, 0.0
     for frame in sequence:
         start = time.process_time()
@@ -62,7 +72,7 @@ def run(path: Path, settings: list[str], stop: int | None) -> Run:
 
 def ate_cm(done: Run, path: Path, stop: int | None) -> float:
     """Root mean square error of the trajectory."""
-    sequence = open_sequence(path, scale=0.5, stop=stop)
+    sequence = open_recording(path, stop)
     found, true = [], []
     for tracked, frame in zip(done.slam.frames, sequence, strict=True):
         if tracked.status != "lost" and frame.T_world_camera is not None:
@@ -80,14 +90,16 @@ def psnr(error: list[np.ndarray]) -> float:
 
 def places_of_rest(path: Path, twin: Path, numbers: list[int], stop: int | None) -> list[np.ndarray]:
     """Of each frame the pixels, bool [H, W], where a thing is before it moves, or after it came to rest."""
-    last = None
-    for frame in open_sequence(path, scale=0.5, stop=stop):
-        last = frame
-    assert last is not None and last.T_world_camera is not None
-    own = np.isin(last.load_mask(), numbers) & (last.depth > 0)
-    points = transform_points(last.camera.back_project(last.depth)[own], last.T_world_camera)
+    frames = list(open_recording(path, stop))
+    seen_at_rest = []
+    for frame in (frames[0], frames[-1]):
+        mask = frame.load_mask()
+        assert mask is not None and frame.T_world_camera is not None
+        own = np.isin(mask, numbers) & (frame.depth > 0)
+        seen_at_rest.append(transform_points(frame.camera.back_project(frame.depth)[own], frame.T_world_camera))
+    points = np.concatenate(seen_at_rest)
     found = []
-    for frame in open_sequence(twin, scale=0.5, stop=stop):
+    for frame in open_recording(twin, stop):
         assert frame.T_world_camera is not None
         seen, camera = transform_points(points, inverse(frame.T_world_camera)), frame.camera
         image = np.isin(frame.load_mask(), numbers).astype(np.uint8)
@@ -113,7 +125,7 @@ def scores(
         stop: frames.
     """
     free, behind = [], []
-    sequence = open_sequence(twin, scale=0.5, stop=stop)
+    sequence = open_recording(twin, stop)
     for tracked, frame, covered, left_out in zip(done.slam.frames, sequence, movers, rests, strict=True):
         held_out = done.slam.config.evaluation.is_held_out(frame.index)
         if tracked.status == "lost" or not (held_out or covered.any()):
@@ -126,12 +138,11 @@ def scores(
     return psnr(free), psnr(behind)
 
 
-def bench_movers(data: Path, more: list[str], stop: int | None) -> None:
-    """The recording with movers against its twin."""
-    path, twin = data / "livingroom_movers", data / "livingroom_movers_static"
+def bench_movers(path: Path, twin: Path, more: list[str], stop: int | None) -> None:
+    """A recording with movers against its twin."""
     told = json.loads((path / "movers.json").read_text())
     truth, movers = told["frames"], told["movers"]
-    sequence = open_sequence(path, scale=0.5, stop=stop)
+    sequence = open_recording(path, stop)
     ids, numbers = [], {m["instance_id"] for m in movers}
     for frame in sequence:
         mask = frame.load_mask()
@@ -190,17 +201,33 @@ def bench_still(data: Path, more: list[str], stop: int | None) -> None:
         print(f"| {name} | {len(on.masks)} | {most:.2%} | {ates} | {on.seconds:.1f}, {off.seconds:.1f} |", flush=True)
 
 
+def bench_generated(count: int, more: list[str], stop: int | None) -> None:
+    """Generated rooms against their twins."""
+    for seed in range(count):
+        with tempfile.TemporaryDirectory() as folder:
+            path, twin = Path(folder) / "busy", Path(folder) / "still"
+            write_synthetic_sequence(path, seed=seed, movers=MOVERS)
+            write_synthetic_sequence(twin, seed=seed, frames=FRAMES_WITH_MOVERS)
+            print(f"\nroom {seed}")
+            bench_movers(path, twin, more, stop)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, help="folder of the recordings")
+    parser.add_argument("data", type=Path, nargs="?", help="folder of the recordings")
+    parser.add_argument("--synth", type=int, default=0, metavar="N", help="generated rooms instead")
     parser.add_argument("--only", choices=["movers", "still"])
     parser.add_argument("--masks", choices=["recording", "none", "geometry", "auto"], default="auto")
     parser.add_argument("--stop", type=int, help="frames of each recording")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting")
     given = parser.parse_args()
     more = [f"masks.source={given.masks}", *given.set]
+    if given.synth:
+        return bench_generated(given.synth, more, given.stop)
+    if given.data is None:
+        parser.error("expected the folder of the recordings, or --synth")
     if given.only != "still":
-        bench_movers(given.data, more, given.stop)
+        bench_movers(given.data / "livingroom_movers", given.data / "livingroom_movers_static", more, given.stop)
     if given.only != "movers":
         bench_still(given.data, more, given.stop)
 
