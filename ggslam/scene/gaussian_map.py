@@ -168,6 +168,10 @@ class GaussianMap:
         """[N, 3] view-independent part of the colour, unclamped."""
         return sh_to_rgb(self.sh[:, 0])
 
+    def bound_colors(self) -> None:
+        """Brings colours of degree 0 between black and white."""
+        self.sh[:, 0].clamp_(-0.5 / SH_C0, 0.5 / SH_C0)
+
     # --- whole rows --------------------------------------------------------------------------------------------------
 
     def _arrays(self, count: int) -> dict[str, torch.Tensor]:

@@ -45,6 +45,21 @@ def test_a_keyframe_is_learned() -> None:
     assert torch.isfinite(mapper.map.means).all() and mapper.map.updates.max() == 65
 
 
+@pytest.mark.parametrize("degree", [0, 1])
+def test_colours_stay_between_black_and_white(degree: int) -> None:
+    """As far as they are alone: with a direction's part the sum counts."""
+    mapper = CpuMapper(GaussianMap(degree), MapperSettings(), NativeContext(2))
+    frame = wall()
+    checks = np.indices(frame.depth.shape).sum(0) // 3 % 2
+    frame = dataclasses.replace(frame, color=np.repeat(255 * checks[..., None], 3, 2).astype(np.uint8))
+    mapper.add_keyframe(frame, np.eye(4))
+    mapper.run(8)
+    mapper.refine(7)
+    rgb = mapper.map.rgb
+    bounded = bool((rgb >= -1e-6).all() and (rgb <= 1 + 1e-6).all())
+    assert bounded == (degree == 0)
+
+
 def test_what_is_explained_is_not_inserted_again() -> None:
     mapper = make_mapper()
     mapper.add_keyframe(wall(), np.eye(4))
