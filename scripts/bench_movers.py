@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
@@ -28,6 +27,7 @@ import cv2
 import numpy as np
 
 from ggslam.evaluation.trajectory import align_points
+from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sequences import Sequence, open_sequence
 from ggslam.slam.config import load_config
@@ -100,9 +100,10 @@ def places_of_rest(path: Path, twin: Path, numbers: list[int], stop: int | None)
     points = np.concatenate(seen_at_rest)
     found = []
     for frame in open_recording(twin, stop):
-        assert frame.T_world_camera is not None
+        mask = frame.load_mask()
+        assert mask is not None and frame.T_world_camera is not None
         seen, camera = transform_points(points, inverse(frame.T_world_camera)), frame.camera
-        image = np.isin(frame.load_mask(), numbers).astype(np.uint8)
+        image = np.isin(mask, numbers).astype(np.uint8)
         ahead = seen[seen[:, 2] > 0]
         u = np.rint(camera.fx * ahead[:, 0] / ahead[:, 2] + camera.cx).astype(int)
         v = np.rint(camera.fy * ahead[:, 1] / ahead[:, 2] + camera.cy).astype(int)
@@ -124,13 +125,14 @@ def scores(
         rests: bool [H, W] of each frame, where nothing is compared.
         stop: frames.
     """
-    free, behind = [], []
+    free, behind, mapper = [], [], done.slam.mapper
+    assert isinstance(mapper, CpuMapper)
     sequence = open_recording(twin, stop)
     for tracked, frame, covered, left_out in zip(done.slam.frames, sequence, movers, rests, strict=True):
         held_out = done.slam.config.evaluation.is_held_out(frame.index)
         if tracked.status == "lost" or not (held_out or covered.any()):
             continue
-        view = done.slam.mapper.render_view(frame.camera, inverse(done.slam.pose_of(tracked)))
+        view = mapper.render_view(frame.camera, inverse(done.slam.pose_of(tracked)))
         wrong = (view.image.numpy().transpose(1, 2, 0).clip(0, 1) - frame.color / np.float32(255)) ** 2
         if held_out:
             free.append(wrong[~covered & ~left_out].reshape(-1))
@@ -168,7 +170,8 @@ def bench_movers(path: Path, twin: Path, more: list[str], stop: int | None) -> N
 
 def print_masks(done: Run, ids: list[np.ndarray], truth: list[dict]) -> None:
     """How the masks that were found compare with the true ones."""
-    overlaps, onsets, invented = [], {}, []
+    overlaps, invented = [], []
+    onsets: dict[int, list[int | None]] = {}
     for index, mask in enumerate(ids):
         found = done.masks.get(index, np.zeros(mask.shape, bool))
         wanted = np.zeros(mask.shape, bool)
@@ -233,4 +236,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
