@@ -97,13 +97,10 @@ def gather(
     if segments is None:
         return _as_things(_blobs_that_move(blobs, places, settings), places, None, {})
     small = thin_out(segments, places.factor)
-    moving = {
-        number: k + 1 for k, number in enumerate(_segments_that_move(small, places, settings))
-    }  # fmt: skip
+    moving = {number: k for k, number in enumerate(_segments_that_move(small, places, settings), start=1)}
     of_segments = np.isin(small, list(moving)) & (small > 0)
-    left = _large(blobs & ~_grow(of_segments), settings.min_pixels)
-    left &= small == 0
-    return _as_things(_blobs_that_move(_large(left, settings.min_pixels), places, settings), places, segments, moving)
+    left = _large(blobs & ~_grow(of_segments) & (small == 0), settings.min_pixels)
+    return _as_things(_blobs_that_move(left, places, settings), places, segments, moving)
 
 
 def _segments_that_move(small: np.ndarray, places: Gathering, s: MoverSettings) -> list[int]:

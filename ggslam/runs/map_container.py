@@ -46,10 +46,11 @@ from ggslam.runs.records.mark import FileRecord, RunRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points_of_map
-from ggslam.runs.writing import MOVERS_FILE, RUN_FILES, TRUTH_FILE
+from ggslam.runs.writing import RUN_FILES, TRUTH_FILE
 from ggslam.scene.arrays import arrays_of, arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.system.atomic import atomic_write, make_folder, write_bytes
 from ggslam.system.foreign import open_foreign

@@ -13,12 +13,11 @@ import numpy as np
 from ggslam.errors import FormatError, RunFolderError, SequenceError
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.sequence import OpenRecord, PartRecord, SequenceRecord
-from ggslam.runs.writing import MOVERS_FILE
 from ggslam.scene.arrays import read_all_arrays
 from ggslam.sequences import Sequence, open_sequence
 from ggslam.sequences.joined import JoinedPart, JoinedSequence
 from ggslam.sequences.live import LiveSequence, is_live, open_live
-from ggslam.sequences.moving_pixels import MovingPixels
+from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.sequences.rig import RigSequence
 from ggslam.system.json_files import json_ready
 

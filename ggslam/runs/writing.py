@@ -24,6 +24,7 @@ from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_map_in_parts, save_points
 from ggslam.scene.arrays import arrays_to_bytes
+from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.config import Config, save_config
 from ggslam.slam.result import SlamResult
@@ -39,8 +40,6 @@ REPORT_FILE = "report.html"
 CHANGES_FOLDER = "changes"
 """Of a run that was brought up to date: what changed, as `ggslam changes --out` writes it."""
 POINTS = ("points.ply", "points_grid.ply")
-MOVERS_FILE = "movers.npz"
-"""What moves in the recording's frames, see `sequences/moving_pixels.py`; of runs in which something was found."""
 TRAJECTORIES = "trajectories"
 """Folder with a trajectory of each camera of a rig; trajectory.txt is that of the rig."""
 RUN_FILES = (

@@ -20,6 +20,8 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.scene.frame import Frame
 
+MOVERS_FILE = "movers.npz"
+"""Of runs in which something was found to move."""
 LARGEST_SIDE = 1 << 15
 """Pixels of an image."""
 

@@ -13,13 +13,11 @@ from ggslam.movers.evidence import CoarseView, Margin
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.trail import gone_since
 from ggslam.scene.frame import Frame
-from ggslam.sequences.moving_pixels import MovingPixels
+from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
-FILE_HINT = "movers.npz"
-"""What moves where; see `MovingPixels`."""
 SURE = (TrackingStatus.FIRST, TrackingStatus.OK, TrackingStatus.DEGENERATE)
 """How frames are tracked in which something may be found that did not move before."""
 DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
@@ -109,7 +107,7 @@ class RunMovers:
     def notes(self, frames: int) -> list[str]:
         """What the user should know of a run of so many frames."""
         found = len(self.pixels)
-        return [f"something moves in {found} of {frames} frames: it is not mapped ({FILE_HINT})"] if found else []
+        return [f"something moves in {found} of {frames} frames: it is not mapped ({MOVERS_FILE})"] if found else []
 
     def move(self, T_new_old: np.ndarray) -> None:
         """Follows a correction [4, 4] of the world about the camera."""

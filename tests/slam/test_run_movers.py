@@ -11,9 +11,9 @@ import pytest
 from ggslam.errors import RunFolderError
 from ggslam.runs.recordings import read_moving
 from ggslam.runs.saving import save_run
-from ggslam.runs.writing import MOVERS_FILE
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
+from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.slam.config import load_config
 from ggslam.slam.saved_state import describe_state, restore_state
 from ggslam.slam.slam import Slam

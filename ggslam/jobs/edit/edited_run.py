@@ -18,7 +18,8 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.publishing import publish_run
 from ggslam.runs.records.mark import RunRecord
-from ggslam.runs.writing import MOVERS_FILE, OBJECT_FILES, POINTS, REPORT_FILE, TRAJECTORIES, TRUTH_FILE, write_objects
+from ggslam.runs.writing import OBJECT_FILES, POINTS, REPORT_FILE, TRAJECTORIES, TRUTH_FILE, write_objects
+from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.atomic import make_folder

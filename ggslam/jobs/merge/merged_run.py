@@ -30,10 +30,10 @@ from ggslam.runs.records.mark import MergedRecord, RunRecord
 from ggslam.runs.records.sequence import PartRecord, SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points_of_map
-from ggslam.runs.writing import MOVERS_FILE, RUN_FILES, TRUTH_FILE, write_objects
+from ggslam.runs.writing import RUN_FILES, TRUTH_FILE, write_objects
 from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.sequences.moving_pixels import MovingPixels
+from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.slam.config import save_config
 from ggslam.slam.saved_places import KEYFRAME_CAMERAS, PLACES_FILE, camera_row
 from ggslam.system.atomic import write_bytes

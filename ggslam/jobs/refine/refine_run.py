@@ -24,9 +24,10 @@ from ggslam.runs.publishing import publish_run
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.saving_parts import save_points_of_map
-from ggslam.runs.writing import MOVERS_FILE, RUN_FILES, TRAJECTORIES, TRUTH_FILE, write_objects
+from ggslam.runs.writing import RUN_FILES, TRAJECTORIES, TRUTH_FILE, write_objects
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
+from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.folder_lock import folder_lock
