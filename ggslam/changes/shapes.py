@@ -14,6 +14,7 @@ from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Evidence, Sightings, Tolerance
 from ggslam.changes.things import color_apart
 from ggslam.geometry.normals import estimate_normals
+from ggslam.geometry.plane_steps import plane_step
 from ggslam.scene.poses import fit_similarity, inverse, orthonormalize, se3_exp, transform_points, turning_angle
 
 COLOR_SCALE_M = 0.08
@@ -187,29 +188,11 @@ class _Target:
             if pairs.sum() < _FEWEST:
                 return T
             partners = nearest[pairs]
-            step = self._step(moved[pairs], self.shape.points[partners], self._normals[partners], reach)
+            step = plane_step(moved[pairs], self.shape.points[partners], self._normals[partners], reach, _TANGENT)
             T = orthonormalize(step @ T)
             if np.abs(step - np.eye(4)).max() < _SMALL_STEP:
                 break
         return T
-
-    @staticmethod
-    def _step(p: np.ndarray, q: np.ndarray, n: np.ndarray, reach: float) -> np.ndarray:
-        """The motion [4, 4] that brings points p [n, 3] nearer to q, whose normals are n."""
-        middle, off = p.mean(0), p - q
-        plane = (off * n).sum(1)
-        weight = 1 / (1 + (plane / (0.25 * reach)) ** 2)
-        arm = p - middle
-        J = np.concatenate([n, np.cross(arm, n)], 1)
-        H, g = J.T @ (weight[:, None] * J), J.T @ (weight * plane)
-        for axis in np.eye(3):
-            J = np.concatenate([np.broadcast_to(axis, p.shape), np.cross(arm, axis)], 1)
-            H += _TANGENT * J.T @ (weight[:, None] * J)
-            g += _TANGENT * J.T @ (weight * (off @ axis))
-        twist = -np.linalg.solve(H, g)
-        there = np.eye(4)
-        there[:3, 3] = middle
-        return there @ se3_exp(twist) @ inverse(there)
 
 
 @cache

@@ -39,6 +39,7 @@ class MoverDetector:
         trail: where movers have been.
         found: small mask of what moves, or may, in the latest frame...
         small: ...and of what does, as `mask`.
+        things: int32 [H, W], number of the moving thing at each pixel, 0 without one, not grown; None: nothing.
     """
 
     settings: MoverSettings
@@ -46,6 +47,7 @@ class MoverDetector:
     views: list[CoarseView] = field(default_factory=list)
     found: np.ndarray | None = None
     small: np.ndarray | None = None
+    things: np.ndarray | None = None
     trail: Trail = field(default_factory=Trail)
 
     def expect(self, frame: Frame) -> Frame:
@@ -64,7 +66,7 @@ class MoverDetector:
             margin: see there.
             sure: whether the pose is; if it is not, nothing begins to move.
         """
-        self.mask = None
+        self.mask = self.things = None
         if T_world_camera is None:
             self.views, self.found, self.small = [], None, None
             return
@@ -98,6 +100,7 @@ class MoverDetector:
             seen_twice = found.pixels_near(before)
             if seen_twice is not None:
                 self.mask = grow(seen_twice, GROWN)
+                self.things = np.where(seen_twice, found.full, 0)
                 self.small = thin_out(seen_twice, factor)
                 self.trail.add(view, self.small)
 

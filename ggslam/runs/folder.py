@@ -28,9 +28,10 @@ from pathlib import Path
 import numpy as np
 
 from ggslam import __version__
-from ggslam.errors import RunFolderError
+from ggslam.errors import FormatError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
+from ggslam.movers.point_files import POINTS_FILE, points_from_arrays
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.checkpoints import has_checkpoints
@@ -41,9 +42,11 @@ from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.movers import MoversRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.writing import RUN_FILES, RunToWrite
+from ggslam.scene.arrays import read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config, config_from_dict
@@ -235,6 +238,22 @@ class RunFolder:
     def loops(self) -> LoopsRecord | None:
         """loops.json; None if an older run has none."""
         return LoopsRecord.read_if_there(self.path)
+
+    def movers(self) -> MoversRecord:
+        """What moved while the recording was made; nothing of a run that did not look for it."""
+        return MoversRecord.read_if_there(self.path) or MoversRecord()
+
+    def mover_points(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """Points float32 [n, 3] of each mover in its own frame, and their colours uint8 [n, 3].
+
+        Raises:
+            RunFolderError: the file is missing or damaged.
+        """
+        path = self.path / POINTS_FILE
+        try:
+            return points_from_arrays(read_all_arrays(path, "points of movers"))
+        except FormatError as error:
+            raise RunFolderError(f"{path}: cannot be read: {str(error).removeprefix(f'{path}: ')}") from None
 
     def metrics(self) -> MetricsRecord | None:
         """metrics.json: the scores; None if the run was not scored."""

@@ -36,6 +36,7 @@ from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.merging.moving import with_channels
+from ggslam.movers.point_files import POINTS_FILE
 from ggslam.objects.encoding import code_of
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import publish_run
@@ -43,6 +44,7 @@ from ggslam.runs.records.container import CONTAINER_FORMAT, CONTAINER_VERSION, C
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.mark import FileRecord, RunRecord
+from ggslam.runs.records.movers import MoversRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points_of_map
@@ -61,7 +63,7 @@ _CLASSIFIER, _TABLE = "classifier.npz", "objects.json"
 _NEEDED = (
     RunRecord.FILE, KeyframesRecord.FILE, "trajectory.txt", "config.yaml", SequenceRecord.FILE, TimingRecord.FILE,
 )  # fmt: skip
-_PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, MOVERS_FILE, _TABLE, _CLASSIFIER)
+_PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, MOVERS_FILE, MoversRecord.FILE, POINTS_FILE, _TABLE, _CLASSIFIER)
 _MEMBERS = frozenset((_HEAD, _MAP, PLACES_FILE, *_NEEDED, *_PERHAPS))
 _MOST_KEYFRAMES = (1 << 16) - 2
 

@@ -13,6 +13,7 @@ from ggslam import __version__
 from ggslam.errors import GgslamError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.trajectory import write_tum
+from ggslam.movers.point_files import POINTS_FILE, points_to_arrays
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.environment import environment
@@ -20,6 +21,7 @@ from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.mark import RunRecord, VerdictRecord
+from ggslam.runs.records.movers import MoversRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_map_in_parts, save_points
@@ -45,7 +47,7 @@ TRAJECTORIES = "trajectories"
 RUN_FILES = (
     *OBJECT_FILES, "map.ply", MAP_INDEX, "trajectory.txt", KeyframesRecord.FILE, LoopsRecord.FILE, SequenceRecord.FILE,
     TimingRecord.FILE, "config.yaml", "metrics.json", "frames.csv", *POINTS, PLACES_FILE, STEPS_FILE, TRUTH_FILE,
-    MOVERS_FILE, REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES,
+    MOVERS_FILE, MoversRecord.FILE, POINTS_FILE, REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES,
     CHANGES_FOLDER,
 )  # fmt: skip
 """Files and folders that a run may have besides run.json."""
@@ -104,6 +106,8 @@ class RunToWrite:
         result = self.result
         if len(result.moving):
             write_bytes(folder / MOVERS_FILE, arrays_to_bytes(**result.moving.to_arrays()))
+            MoversRecord.of_result(result, self.names).write(folder)
+            write_bytes(folder / POINTS_FILE, arrays_to_bytes(**points_to_arrays(result.movers)))
         save_config(self.config, folder / "config.yaml")
         for record in (self.sequence, KeyframesRecord.of_result(result)):
             record.write(folder)

@@ -13,6 +13,7 @@ import numpy as np
 from ggslam.errors import ConfigError
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import MapperTimes
+from ggslam.movers.found import FoundMover
 from ggslam.objects.lookup import objects_at
 from ggslam.objects.table import ObjectTable, Observation, Supervision
 from ggslam.scene.gaussian_map import GaussianMap
@@ -160,7 +161,8 @@ class SlamResult:
         steps: what was noted of every step, content of `steps.csv`.
         device: what it was computed on: "cpu", or the GPU's name.
         config: settings of the run.
-        moving: what was found to move, frame by frame.
+        moving: what was found to move, frame by frame...
+        movers: ...and mover by mover.
     """
 
     gaussians: GaussianMap
@@ -181,6 +183,7 @@ class SlamResult:
     device: str = "cpu"
     config: Config | None = None
     moving: MovingPixels = field(default_factory=MovingPixels)
+    movers: list[FoundMover] = field(default_factory=list)
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, if anything is; it cannot be read any more."""

@@ -10,7 +10,9 @@ import numpy as np
 
 from ggslam.movers.detector import GROWN, MoverDetector, coarse_factor, grow
 from ggslam.movers.evidence import CoarseView, Margin
+from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
+from ggslam.movers.tracks import MoverTracks
 from ggslam.movers.trail import gone_since
 from ggslam.scene.frame import Frame
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
@@ -37,6 +39,8 @@ class RunMovers:
         self._reads_masks = reads_masks
         self.pixels = MovingPixels()
         """What was found in the frames so far."""
+        self.tracks = MoverTracks()
+        """The movers one by one."""
         self._margin = _margin(settings, DepthNoise())
 
     @property
@@ -62,6 +66,10 @@ class RunMovers:
         known = result.status not in DOUBTFUL
         shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
         self.detector.look(shown, result.T_world_camera if known else None, self._margin, result.status in SURE)
+        if known:
+            self.tracks.look(RecentFrame.of(shown, result.T_world_camera, self._margin), self.detector.things)
+        else:
+            self.tracks.clear()
         mask = self.detector.mask
         if mask is None:
             return result
@@ -112,6 +120,7 @@ class RunMovers:
     def move(self, T_new_old: np.ndarray) -> None:
         """Follows a correction [4, 4] of the world about the camera."""
         self.detector.move(T_new_old)
+        self.tracks.move(T_new_old)
 
 
 def _margin(settings: MoverSettings, noise: DepthNoise) -> Margin:

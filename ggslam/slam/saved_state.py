@@ -35,6 +35,11 @@ from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.sampling import KeyframeSampler
 from ggslam.movers.detector import MoverDetector
 from ggslam.movers.evidence import CoarseView
+from ggslam.movers.found import MoverSight
+from ggslam.movers.patches import Patch
+from ggslam.movers.rigid import RigidTracker
+from ggslam.movers.surface import MoverSurface
+from ggslam.movers.tracks import MoverTracks, Track
 from ggslam.movers.trail import Trail
 from ggslam.objects.association import Associator
 from ggslam.objects.consistency import ConsistencyJudge
@@ -205,6 +210,8 @@ RULES: Rules = {
     RunObjects: _but("_masks"),
     RunMovers: _but("_reads_masks", "_margin"),
     MoverDetector: _but("settings"),
+    MoverTracks: _but("recent"),
+    MoverSurface: _but("_tree"),
     MovingPixels: Rule(fixed=_names("masks")),
     CoarseView: Rule(fixed=_names("depth", "near", "far")),
     ObjectMasks: _but("settings", "_segment"),
@@ -241,7 +248,8 @@ RULES: Rules = {
     NeighbourIndex: Rule(save=_save_index, take=_take_index),
     # plain values
     **dict.fromkeys(
-        (Camera, CameraFixtures, Trail, DepthEdges, DepthNoise, ResidualNoise, KeyframeKind,
+        (Camera, CameraFixtures, Trail, Track, MoverSight, Patch, RigidTracker, DepthEdges, DepthNoise,
+         ResidualNoise, KeyframeKind,
          FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes,
          KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,

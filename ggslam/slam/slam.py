@@ -228,7 +228,7 @@ class Slam:
             [*self._notes, *self._fixtures.notes(), *self.movers.notes(len(self.frames)),
              *([] if self.pager is None else self.pager.budget.notes)],
             None if self.pager is None else self.pager.close, self.steps.to_csv(), device_name(self.map.device),
-            self.config, self.movers.pixels,
+            self.config, self.movers.pixels, self.movers.tracks.describe(),
         )  # fmt: skip
 
     def _places(self, gaussians: GaussianMap, cells: GaussianCells | None) -> bytes | None:

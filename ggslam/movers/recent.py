@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The latest located frames, to look back at when something turns out to have begun to move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.movers.patches import Patch, patch_of
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+
+
+@dataclass
+class RecentFrame:
+    """A located frame as the movers saw it.
+
+    Attributes:
+        index: `Frame.index`.
+        depth, color, camera, load_mask: of the frame.
+        T_world_camera: float64 [4, 4].
+        margin: metres by which depths of one surface differ there, by depth.
+    """
+
+    index: int
+    depth: np.ndarray
+    color: np.ndarray
+    camera: Camera
+    load_mask: Callable[[], np.ndarray | None]
+    T_world_camera: np.ndarray
+    margin: Callable[[np.ndarray], np.ndarray]
+    _segments: np.ndarray | None = None
+
+    @staticmethod
+    def of(frame: Frame, T_world_camera: np.ndarray, margin: Callable[[np.ndarray], np.ndarray]) -> RecentFrame:
+        """Holds what the frame holds, and copies nothing."""
+        return RecentFrame(frame.index, frame.depth, frame.color, frame.camera, frame.load_mask, T_world_camera, margin)
+
+    def segments(self) -> np.ndarray | None:
+        """The recording's masks, uint16 [H, W], read once."""
+        if self._segments is None:
+            self._segments = self.load_mask()
+        return self._segments
+
+    def show(self, mask: np.ndarray) -> Sight | None:
+        """What is on a mask bool [H, W]; None: too little."""
+        patch = patch_of(mask, self.depth, self.color, self.camera)
+        if patch is None:
+            return None
+        z = float(np.median(patch.points[:, 2]))
+        area = float(mask.sum()) * z * z / (self.camera.fx * self.camera.fy)
+        margin = float(self.margin(np.float32(z)))
+        return Sight(patch.move(self.T_world_camera), area, margin, float(mask.mean()))
+
+    def show_surface(self, points: np.ndarray) -> np.ndarray:
+        """Where points of a surface [n, 3], world, would be seen and something is that far: bool [H, W]."""
+        camera, found = self.camera, np.zeros(self.depth.shape, bool)
+        R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        seen = (points - t) @ R
+        z = np.maximum(seen[:, 2], 1e-3)
+        u = np.rint(camera.fx * seen[:, 0] / z + camera.cx)
+        v = np.rint(camera.fy * seen[:, 1] / z + camera.cy)
+        inside = (seen[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        rows, columns, z = v[inside].astype(int), u[inside].astype(int), z[inside]
+        there = np.abs(self.depth[rows, columns] - z) < 2 * self.margin(z.astype(np.float32)) + 0.005
+        found[rows[there], columns[there]] = True
+        return found
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a frame shows of a mover.
+
+    Attributes:
+        patch: world.
+        area: square metres facing the camera, about.
+        margin: metres up to which points lie on a surface.
+        share: of the image.
+    """
+
+    patch: Patch
+    area: float
+    margin: float
+    share: float

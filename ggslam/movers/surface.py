@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The surface of a rigid mover as it was seen so far, which grows, and which new frames are brought upon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ggslam.geometry.plane_steps import plane_step
+from ggslam.geometry.voxels import voxel_keys
+from ggslam.movers.patches import Patch
+from ggslam.scene.poses import inverse, orthonormalize, transform_points
+
+VOXEL = 0.008
+"""Metres, of points that are kept."""
+MOST_POINTS = 4000
+"""A larger surface grows no more."""
+COLOR_M, NORMAL_M = 0.08, 0.015
+"""Metres that the distance from black to full in one channel, and of unit normals, counts as where partners are looked
+for: the inside of a thin wall is no partner of its outside."""
+REACH_M = 0.03
+"""Partners are looked for up to three times as far."""
+_TANGENT, _HELD = 0.1, 1.5
+"""Weight of the distance along the surface, and voxels up to which it counts: what lies beyond the edge of what was
+seen so far would pull."""
+_STEER, _PAIRED, _INNER = 200, 5, 2
+"""Points that steer, searches for partners, and steps after each."""
+_SMALL = 1e-4
+_MOST_SEEN = 50.0
+
+
+@dataclass(frozen=True)
+class PatchFit:
+    """A patch brought upon a surface.
+
+    Attributes:
+        T_patch_surface: float64 [4, 4].
+        share: of the patch that lies on the surface.
+        rms_m: distance off the surface, root mean square; what is farther than 2 cm counts so.
+        apart_m: mean distance of partners in places, colours and normals.
+    """
+
+    T_patch_surface: np.ndarray
+    share: float
+    rms_m: float
+    apart_m: float
+
+
+@dataclass
+class MoverSurface:
+    """Points in the mover's own frame, a few millimetres apart.
+
+    Attributes:
+        points, colors, normals: float64 [n, 3] each, as of a `Patch`.
+        seen: float64 [n], how often each was seen.
+    """
+
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    colors: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    normals: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    seen: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    _tree: cKDTree | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def add(self, patch: Patch) -> None:
+        """Takes in a patch in the mover's frame: means of what falls into one voxel and faces one way."""
+        if len(self) > MOST_POINTS:
+            return
+        points = np.concatenate([self.points, patch.points])
+        normals = np.concatenate([self.normals, patch.normals])
+        axis = np.abs(normals).argmax(1)
+        side = 2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] > 0)
+        _, place = np.unique(8 * (voxel_keys(points, VOXEL) % (1 << 60)) + side, return_inverse=True)
+        weight = np.concatenate([self.seen, np.ones(len(patch))])
+        total = np.bincount(place, weight)
+        values = np.concatenate([points, np.concatenate([self.colors, patch.colors]), normals], 1)
+        mean = np.stack([np.bincount(place, weight * column) for column in values.T], 1) / total[:, None]
+        self.points, self.colors, normals = mean[:, :3], mean[:, 3:6], mean[:, 6:]
+        self.normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        self.seen, self._tree = np.minimum(total, _MOST_SEEN), None
+
+    def fit(self, patch: Patch, T_patch_surface: np.ndarray, margin: float, rounds: int = _PAIRED) -> PatchFit:
+        """Brings the patch upon the surface.
+
+        Args:
+            patch: in any frame.
+            T_patch_surface: [4, 4] to begin with.
+            margin: metres up to which a point lies on the surface.
+            rounds: searches for partners; none: it is judged where it is.
+        """
+        some, T = patch.some(_STEER), inverse(T_patch_surface)
+        for _ in range(rounds):
+            moved = some.move(T)
+            apart, partners = self._partners(moved, 3 * REACH_M)
+            pairs = np.isfinite(apart)
+            if pairs.sum() < 12:
+                break
+            p, q, n = moved.points[pairs], self.points[partners[pairs]], self.normals[partners[pairs]]
+            total = np.eye(4)
+            for _ in range(_INNER):
+                off = p - q
+                along = off - (off * n).sum(1, keepdims=True) * n
+                step = plane_step(p, q, n, REACH_M, _TANGENT, (along**2).sum(1) < (_HELD * VOXEL) ** 2)
+                total, p = step @ total, transform_points(p, step)
+            T = orthonormalize(total @ T)
+            if np.abs(total - np.eye(4)).max() < _SMALL:
+                break
+        moved = some.move(T)
+        apart, partners = self._partners(moved, np.inf)
+        plane = np.abs(((moved.points - self.points[partners]) * self.normals[partners]).sum(1))
+        rms = float(np.sqrt((np.minimum(plane, 0.02) ** 2).mean()))
+        return PatchFit(inverse(T), float((plane < margin).mean()), rms, float(np.minimum(apart, 3 * REACH_M).mean()))
+
+    def _partners(self, patch: Patch, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        if self._tree is None:
+            self._tree = cKDTree(_joint(self.points, self.colors, self.normals), balanced_tree=False)
+        apart, rows = self._tree.query(_joint(patch.points, patch.colors, patch.normals), distance_upper_bound=reach)
+        return apart, rows
+
+
+def _joint(points: np.ndarray, colors: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    return np.concatenate([points, COLOR_M * colors, NORMAL_M * normals], 1)
