@@ -160,7 +160,7 @@ class MoverTracks:
             if track.instance is not None and segments is not None:
                 mask = segments == track.instance
             elif mask is None:
-                mask = self._expected(track, view)
+                mask = self._place_of(track, view)
             sight = view.show(mask)
             if sight is not None:
                 track.follow(sight, view, detected is not None)
@@ -211,7 +211,7 @@ class MoverTracks:
                 track.follow(sight, earlier, False)
 
     @staticmethod
-    def _expected(track: Track, view: RecentFrame) -> np.ndarray:
+    def _place_of(track: Track, view: RecentFrame) -> np.ndarray:
         """Where a mover without a segment is seen that was not found to move."""
         points = transform_points(track.tracker.surface.points, track.tracker.predict(view.index))
         return view.show_surface(points)
