@@ -29,6 +29,8 @@ EPILOG = """
 
   ggslam export runs/kitchen --objects mug,7 --out objects/
 
+  ggslam export runs/kitchen --movers --out movers/
+
   ggslam export runs/kitchen --format segmented --out kitchen_objects.ply
 
   ggslam export runs/kitchen --format points --voxel 0.005 --out clouds/
@@ -67,6 +69,11 @@ Objects = Annotated[
     typer.Option(help="Objects by name or id (mug,7), or all. ply: a file for each (of one, --out may be the "
                  "file); segmented, mesh, sog, streamed-sog, gltf, usd: only these."),
 ]  # fmt: skip
+Movers = Annotated[
+    bool,
+    typer.Option("--movers", help="Write the points of each thing that moved, in its own frame, as a PLY of its own "
+                 "into the folder --out, and movers.json, which tells where it was."),
+]  # fmt: skip
 Plain = Annotated[bool, typer.Option("--plain", help="Write only the fields of 3DGS: no object ids, no identities.")]
 Keyframes = Annotated[
     bool, typer.Option("--keyframes", help="colmap, nerfstudio: write only keyframes and held-out frames.")
@@ -98,6 +105,7 @@ def export(
     voxel: Voxel = None,
     min_opacity: MinOpacity = 0.0,
     objects: Objects = None,
+    movers: Movers = False,
     plain: Plain = False,
     keyframes: Keyframes = False,
     sequence: options.MovedSequence = None,
@@ -110,7 +118,8 @@ def export(
 
     with progress_bar() as bar:
         message = export_run(
-            run, out, asked, voxel=voxel, objects=objects, min_opacity=min_opacity, plain=plain, keyframes=keyframes,
+            run, out, asked, voxel=voxel, objects=objects, movers=movers, min_opacity=min_opacity, plain=plain,
+            keyframes=keyframes,
             recording=sequence, rendered=rendered, zoom=zoom, observer=ProgressObserver(bar),
         )  # fmt: skip
     console.print(message, highlight=False, markup=False)

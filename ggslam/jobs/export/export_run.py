@@ -15,6 +15,7 @@ from ggslam.jobs.export.map_files import (
     export_trajectory,
 )
 from ggslam.jobs.export.meshes import MeshRequest, export_mesh
+from ggslam.jobs.export.movers import export_movers
 from ggslam.jobs.export.scenes import export_scene
 from ggslam.jobs.export.splats import export_packed, export_pcd
 from ggslam.jobs.export.streams import stream_run, stream_store
@@ -39,6 +40,7 @@ def export_run(
     *,
     voxel: float | None = None,
     objects: str | None = None,
+    movers: bool = False,
     min_opacity: float = 0.0,
     plain: bool = False,
     keyframes: bool = False,
@@ -60,6 +62,7 @@ def export_run(
         voxel: metres: distance of points (default 0.01), or the edge of a mesh's voxels (default: as the run's
             settings say).
         objects: names or ids, "mug,7", or "all", for ply, segmented, mesh, sog, streamed-sog, gltf, usd: only these.
+        movers: instead of the map, the points of each thing that moved, as a PLY file for each in the folder `out`.
         min_opacity: leave out fainter Gaussians (not of trajectory, mesh, colmap, nerfstudio).
         plain: ply, segmented, sog, streamed-sog, gltf, usd: only the fields of 3DGS.
         keyframes: colmap, nerfstudio: only keyframes and held-out frames.
@@ -77,6 +80,9 @@ def export_run(
         SequenceError: the recording cannot be read.
     """
     place = Path(out)
+    if movers:
+        _refuse_beside_movers(place, format, voxel, objects, plain, keyframes, recording, rendered, zoom, min_opacity)
+        return export_movers(run if isinstance(run, RunFolder) else RunFolder.open(Path(run)), place)
     kind = choose_format(None if format is None else _format_named(format), place, objects)
     _refuse_ignored(kind, objects, keyframes, recording, rendered, zoom)
     if not isinstance(run, RunFolder) and is_store(Path(run)):
@@ -135,6 +141,14 @@ def _format_named(name: str) -> ExportFormat:
     except ValueError:
         known = ", ".join(kind.value for kind in ExportFormat)
         raise ConfigError(f"`format`: expected one of {known}, found {name!r}") from None
+
+
+def _refuse_beside_movers(place: Path, *others: object) -> None:
+    """Raises ConfigError for what says something of the map."""
+    if any(value not in (None, False, 0.0, 1.0) for value in others):
+        raise ConfigError("`movers` writes points of movers as they were seen: of other arguments it takes only `out`")
+    if place.suffix:
+        raise ConfigError(f"`out` {place}: `movers` writes a folder, with a file for each")
 
 
 def _refuse_ignored(
