@@ -99,7 +99,8 @@ def read_rig_file(path: Path) -> RigFile:
     """Reads the file of a rig.
 
     Raises:
-        SequenceError: it is no YAML, or an entry is missing, unknown, there twice or impossible.
+        SequenceError: it is no YAML, or an entry is missing, unknown, there twice or impossible, or two cameras
+            have one recording.
     """
     try:
         content, repeated = parse_yaml(text := read_text(path)), repeated_key(text)
@@ -119,10 +120,21 @@ def read_rig_file(path: Path) -> RigFile:
         camera = _camera(path, number, entry)
         if camera.name in [other.name for other in cameras]:
             raise SequenceError(f"{path}: camera '{camera.name}' is there twice")
+        twin = next((other for other in cameras if _takes_the_same(other, camera)), None)
+        if twin is not None:
+            names = f"cameras '{twin.name}' and '{camera.name}'"
+            raise SequenceError(f"{path}: {names} have one recording: {entry['recording']}")
         cameras.append(camera)
     if len(cameras) < 2:
         raise SequenceError(f"{path}: a rig has two cameras or more, found '{cameras[0].name}' alone")
     return RigFile(path, tuple(cameras), tolerance)
+
+
+def _takes_the_same(a: RigCamera, b: RigCamera) -> bool:
+    """Whether two cameras are given the same images; a bag has those of several."""
+    return os.path.realpath(a.recording) == os.path.realpath(b.recording) and (
+        a.options.get("topics") == b.options.get("topics")
+    )
 
 
 def _camera(path: Path, number: int, entry: Any) -> RigCamera:

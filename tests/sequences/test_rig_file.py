@@ -35,10 +35,11 @@ def entry(name: str, recording: str, T: np.ndarray = SIDE, **more: Any) -> dict[
 
 @pytest.fixture
 def two(tmp_path: Path) -> Path:
-    """A folder with two recordings of five frames, of different formats: TUM and the plain layout."""
+    """A folder with two recordings of five frames, of different formats: TUM and the plain layout; the latter twice."""
     for name in ("tum", "folder"):
         (tmp_path / name).mkdir()
         MAKERS[name](tmp_path / name)
+    shutil.copytree(tmp_path / "folder", tmp_path / "again")
     return tmp_path
 
 
@@ -84,7 +85,7 @@ def test_frames_come_instant_by_instant(two: Path) -> None:
 
 
 def test_instants_are_chosen_as_frames_are(two: Path) -> None:
-    path = write_rig(two, entry("a", "folder", np.eye(4)), entry("b", "folder"))
+    path = write_rig(two, entry("a", "folder", np.eye(4)), entry("b", "again"))
     rig = open_rig(path, start=1, stop=5, stride=2)
     assert [f.source_index for f in rig] == [1, 1, 3, 3]
     assert rig.selection == range(1, 5, 2)
@@ -94,7 +95,7 @@ def test_instants_are_chosen_as_frames_are(two: Path) -> None:
 
 def test_true_poses_of_another_world_give_way(two: Path) -> None:
     """The second recording's poses are as if its camera lay in the first one: those of the first hold for both."""
-    rig = open_rig(write_rig(two, entry("a", "folder", np.eye(4)), entry("b", "folder", SIDE)))
+    rig = open_rig(write_rig(two, entry("a", "folder", np.eye(4)), entry("b", "again", SIDE)))
     assert rig.ground_truth is not None
     np.testing.assert_allclose(rig.ground_truth[0], pose(0), atol=1e-6)
     np.testing.assert_allclose(rig.ground_truth[1], pose(0) @ SIDE, atol=1e-6)
@@ -105,7 +106,7 @@ def test_true_poses_of_another_world_give_way(two: Path) -> None:
 
 
 def test_other_processes_read_it_too(two: Path) -> None:
-    rig = open_rig(write_rig(two, entry("a", "folder", np.eye(4)), entry("b", "folder")))
+    rig = open_rig(write_rig(two, entry("a", "folder", np.eye(4)), entry("b", "again")))
     again = pickle.loads(pickle.dumps(rig))
     assert len(again) == len(rig) == 10
     for k in (0, 7):
@@ -136,7 +137,7 @@ def test_a_file_without_cameras_says_so(tmp_path: Path) -> None:
 
 def test_a_camera_has_its_own_scale_and_intrinsics(two: Path) -> None:
     more = {"scale": 0.5, "intrinsics": [30, 30, 15.5, 11.5]}
-    rig = open_rig(write_rig(two, entry("a", "folder", np.eye(4)), entry("b", "folder", **more)))
+    rig = open_rig(write_rig(two, entry("a", "folder", np.eye(4)), entry("b", "again", **more)))
     sizes = [(camera.width, camera.height) for camera in rig.rig.cameras]
     assert sizes == [(32, 24), (16, 12)]
     assert rig.rig.cameras[1].fx == 15
@@ -145,6 +146,7 @@ def test_a_camera_has_its_own_scale_and_intrinsics(two: Path) -> None:
 
 BAD: dict[str, tuple[list[dict[str, Any]], dict[str, Any], str]] = {
     "one camera": ([entry("a", TUM)], {}, "two cameras or more, found 'a' alone"),
+    "one recording": ([entry("a", TUM), entry("b", TUM)], {}, "cameras 'a' and 'b' have one recording"),
     "twice": ([entry("a", TUM), entry("a", "folder")], {}, "camera 'a' is there twice"),
     "no recording": ([entry("a", TUM), entry("b", "nowhere")], {}, "camera 'b': .*nowhere: no such folder or file"),
     "long name": ([entry("a", TUM), entry("b", "x" * 300)], {}, "no such folder or file"),
@@ -188,7 +190,7 @@ def test_a_rig_of_rigs_is_refused(two: Path) -> None:
 
 
 def test_what_holds_for_one_camera_is_said_in_the_file(two: Path) -> None:
-    path = write_rig(two, entry("a", "folder"), entry("b", "folder"))
+    path = write_rig(two, entry("a", "folder"), entry("b", "again"))
     with pytest.raises(SequenceError, match="`depth_scale` is of one camera; say it in the rig's file"):
         open_sequence(path, depth_scale=1000)
     with pytest.raises(SequenceError, match="expected rig.yaml"):
