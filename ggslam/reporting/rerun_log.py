@@ -11,6 +11,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError, MissingDependency, RunFolderError
 from ggslam.scene.camera import Camera
+from ggslam.scene.poses import matrix_to_quaternion
 
 VIEWER = "rerun"
 _ENDING = ".rrd"
@@ -34,7 +35,7 @@ def check_target(target: str) -> None:
 
 class RerunLog:
     """A stream to rerun. Entities: `world/camera` and below it `image` and `depth`, `world/map`, `world/path`,
-    `plots/NAME`; timelines `frame` and `time` (seconds since the first frame).
+    `world/movers/NUMBER`, `plots/NAME`; timelines `frame` and `time` (seconds since the first frame).
 
     Args:
         target: "rerun" or a file, see `check_target`.
@@ -98,6 +99,19 @@ class RerunLog:
     def path(self, positions: np.ndarray) -> None:
         """The camera's positions so far [N, 3]."""
         self._stream.log("world/path", self._rr.LineStrips3D([positions]))
+
+    def box(self, number: int, T_world_box: np.ndarray, size: np.ndarray) -> None:
+        """The box about a mover: its pose [4, 4], the origin in its middle, and its size [3], metres."""
+        w, x, y, z = matrix_to_quaternion(T_world_box[:3, :3]).tolist()
+        box = self._rr.Boxes3D(
+            centers=[T_world_box[:3, 3]], half_sizes=[size / 2], quaternions=[self._rr.Quaternion(xyzw=[x, y, z, w])],
+            labels=[f"mover {number}"],
+        )  # fmt: skip
+        self._stream.log(f"world/movers/{number}", box)
+
+    def drop_box(self, number: int) -> None:
+        """The mover moves no more."""
+        self._stream.log(f"world/movers/{number}", self._rr.Clear(recursive=False))
 
     def scalars(self, values: dict[str, float]) -> None:
         """Numbers that become curves; those that are not finite are left out."""

@@ -48,6 +48,21 @@ class ListedObject:
         return f"{self.id} · {self.name}" if self.name else f"{self.id} · object"
 
 
+@dataclass(frozen=True)
+class ShownMover:
+    """Something that moved while the map was recorded.
+
+    Attributes:
+        way: its middles, [n, 3], world.
+        boxes: its box in each frame in which it moves: center [3], axes (rows of [3, 3]) and size [3].
+        color: RGB.
+    """
+
+    way: np.ndarray
+    boxes: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
+    color: tuple[int, int, int]
+
+
 class ViewedMap(Protocol):
     """A map with its recording. Methods may be called from any thread."""
 
@@ -83,6 +98,9 @@ class ViewedMap(Protocol):
 
     def objects(self) -> list[ListedObject]:
         """By rising id."""
+
+    def movers(self) -> list[ShownMover]:
+        """What moved while it was recorded."""
 
     def frame_picture(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Recorded and rendered images of a frame side by side, and what the frame's camera recorded (or, without

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
 from ggslam.viewer.cameras import box_lines, frustum_lines, vertical_fov
+from ggslam.viewer.model import ShownMover
 from ggslam.viewer.splats import Splats
 
 if TYPE_CHECKING:
@@ -87,6 +88,16 @@ class SceneNodes:
         """Pyramids at the keyframes, [K, 4, 4]."""
         self._lines("/camera/keyframes", frustum_lines(T_world_camera, camera, depth), _KEYFRAMES, 1.0)
 
+    def set_movers(self, movers: Sequence[ShownMover], frame: int) -> None:
+        """The ways of what moved, and the boxes of what moves in a frame."""
+        lines, colors = [np.zeros((0, 2, 3), np.float32)], [np.zeros((0, 2, 3), np.uint8)]
+        for mover in movers:
+            own = [np.stack([mover.way[:-1], mover.way[1:]], axis=1)]
+            own += [box_lines(*mover.boxes[frame])] if frame in mover.boxes else []
+            lines += own
+            colors += [np.broadcast_to(np.array(mover.color, np.uint8), part.shape) for part in own]
+        self._lines("/camera/movers", np.concatenate(lines), np.concatenate(colors), 2.5)
+
     def set_box(self, center: np.ndarray, axes: np.ndarray, size: np.ndarray, up: np.ndarray, text: str) -> None:
         """Frames the selected object and writes a label above it."""
         self._lines("/selected/box", box_lines(center, axes, size), _SELECTED, 2.0)
@@ -114,13 +125,13 @@ class SceneNodes:
         )  # fmt: skip
 
     def show_lines(self, name: str, visible: bool) -> None:
-        """Shows or hides "path", "keyframes" or "now", also those that come later."""
+        """Shows or hides "path", "keyframes", "now" or "movers", also those that come later."""
         node = f"/camera/{name}"
         (self._hidden.discard if visible else self._hidden.add)(node)
         if node in self._marks:
             self._marks[node].visible = visible
 
-    def _lines(self, name: str, segments: np.ndarray, color: tuple[int, int, int], width: float) -> None:
+    def _lines(self, name: str, segments: np.ndarray, color: tuple[int, int, int] | np.ndarray, width: float) -> None:
         self._drop(name)
         if len(segments):
             self._marks[name] = self._server.scene.add_line_segments(

@@ -45,7 +45,7 @@ class Stage:
         self.frame = next(iter(model.frame_poses))
         self.edited: Callable[[], None] = lambda: None
         self._drawing = threading.RLock()
-        self.centers = np.zeros((0, 3), np.float32)
+        self.centers, self.movers = np.zeros((0, 3), np.float32), model.movers()
         self.draw_map()
         self._draw_camera()
         self.summary = server.gui.add_markdown("")
@@ -66,6 +66,7 @@ class Stage:
         self.depth = float(np.clip(0.01 * np.linalg.norm(extent), 0.02, 0.06))
         self.nodes.set_path(self.model.walks)
         self.nodes.set_keyframes(self.model.keyframe_poses, self.model.camera, self.depth)
+        self.nodes.set_movers(self.movers, self.frame)
 
     def describe(self) -> None:
         """Says what is shown."""

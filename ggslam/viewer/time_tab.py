@@ -68,6 +68,8 @@ class TimeTab:
         self._image.image = picture
         stage = self._stage
         stage.nodes.set_frame(stage.model.frame_poses[frame], stage.model.camera, 2 * stage.depth, recorded)
+        if stage.movers:
+            stage.nodes.set_movers(stage.movers, frame)
 
     def _look(self) -> None:
         if self._follow.value:

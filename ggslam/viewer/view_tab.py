@@ -31,6 +31,8 @@ class ViewTab:
         with gui.add_folder("Show"):
             for name, label in _LINES.items():
                 self._line_box(name, label)
+            if stage.movers:
+                self._line_box("movers", "What moved")
         save = gui.add_button("Save picture", icon="camera", hint=f"Rendered by ggslam, {PICTURE_SIZE} pixels wide")
 
         @coloring.on_update

@@ -11,6 +11,7 @@ import numpy as np
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points, associate
 from ggslam.formats.trajectory import read_tum, write_tum
+from ggslam.jobs.report.mover_pictures import mover_views
 from ggslam.jobs.report.run_data import FrameView, LevelAxes, Path3D, RunData
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
@@ -52,13 +53,14 @@ def _load(folder: RunFolder, sequence: Sequence | None, views: list[FrameView]) 
     lacking = [name for name in mark.missing if name != REPORT_FILE]  # which is about to be written
     mark = mark.model_copy(update={"missing": lacking}) if mark.missing else mark
     timing, recording = TimingRecord.read_if_there(folder.path), SequenceRecord.read_if_there(folder.path)
-    path = folder.path.absolute()
+    path, movers = folder.path.absolute(), folder.movers().movers
     return RunData(
         name=path.name, path=str(path), camera_path=path_of_run(folder, record, sequence), tracked=_columns(record),
         keyframes=np.array([k.frame for k in record.keyframes], int),
         steps=_table(folder, STEPS_FILE), scores=_table(folder, "frames.csv"), metrics=metrics, timing=timing,
         settings=_settings(folder), defaults=flat(config_to_dict(Config())), recording=recording, mark=mark,
         warnings=run_warnings(mark, recording, timing, loops, record, metrics), views=views,
+        movers=movers, mover_views=mover_views(sequence, movers, record.poses()),
     )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.movers import MoverRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 
@@ -88,6 +89,8 @@ class RunData:
         mark: what it was made with.
         warnings: what a user should know.
         views: pictures.
+        movers: what moved while it was recorded.
+        mover_views: pictures of them.
     """
 
     name: str
@@ -105,6 +108,8 @@ class RunData:
     mark: RunRecord = field(default_factory=RunRecord)
     warnings: list[str] = field(default_factory=list)
     views: list[FrameView] = field(default_factory=list)
+    movers: list[MoverRecord] = field(default_factory=list)
+    mover_views: list[FrameView] = field(default_factory=list)
 
     def recording_name(self) -> str:
         """Where its recording is."""

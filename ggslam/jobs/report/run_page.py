@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from ggslam.jobs.report.metric_words import MEANINGS, METRICS, TILES
+from ggslam.jobs.report.mover_section import movers_part
 from ggslam.jobs.report.run_data import RunData, stage_seconds
 from ggslam.jobs.report.run_plots import (
     error_plot,
@@ -29,6 +30,7 @@ def run_page(run: RunData) -> str:
     """The whole page as text."""
     parts = [
         ("scores", "Scores", _scores(run)), ("views", "Views", _views(run)), ("trajectory", "Trajectory", _path(run)),
+        *([("movers", "What moved", movers_part(run))] if run.movers else []),
         ("quality", "Image quality", _quality(run)), ("tracking", "Tracking", _tracking_part(run)),
         ("time", "Time", _time(run)), ("map", "Map and memory", _map(run)), ("losses", "Losses", _losses(run)),
         ("meaning", "What the numbers mean", p.definitions(MEANINGS)), ("settings", "Settings", _settings(run)),

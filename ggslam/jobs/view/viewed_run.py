@@ -23,12 +23,13 @@ from ggslam.objects.table import ObjectRecord
 from ggslam.reporting.pictures import color_of_depth, depth_range
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.movers import MoverFrameRecord, mover_colors
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
 from ggslam.system.foreign import is_plain_name
-from ggslam.viewer.model import Coloring, ListedObject
+from ggslam.viewer.model import Coloring, ListedObject, ShownMover
 from ggslam.viewer.splats import Splats, most_visible, splats_of
 from ggslam.viewer.static_page import static_page
 from ggslam.volumes.map_upright import upright_of
@@ -164,6 +165,12 @@ class ViewedRun:
         with self._lock:
             return [] if self._segmented is None else [_list_object(record) for record in self._segmented.table.objects]
 
+    def movers(self) -> list[ShownMover]:
+        """See `ViewedMap`."""
+        movers = self.folder.movers().movers
+        colors = mover_colors(movers)
+        return [ShownMover(m.way(), {f.frame: _box_of(f) for f in m.frames}, colors[m.id]) for m in movers]
+
     def frame_picture(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """See `ViewedMap`."""
         with self._lock:
@@ -284,6 +291,10 @@ def _list_object(record: ObjectRecord) -> ListedObject:
         record.id, record.name, record.color, record.gaussians, np.array(box.center), np.array(box.axes),
         np.array(box.size), np.array(record.centroid),
     )  # fmt: skip
+
+
+def _box_of(frame: MoverFrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return frame.corners().mean(0), frame.T_world_mover[:3, :3].T, frame.box_max - frame.box_min
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -30,6 +30,7 @@ class LiveLog:
         self._log = log
         self._keyframes = 0
         self._positions: list[np.ndarray] = []
+        self._moving: set[int] = set()
 
     def __call__(self, slam: Slam, frame: Frame, report: StepReport) -> None:
         """Sends what a step brought."""
@@ -45,6 +46,7 @@ class LiveLog:
             pose = slam.pose_of(report.frame)
             self._positions.append(pose[:3, 3])
             self._log.pose(pose)
+            self._send_movers(slam, frame.index, pose)
         if report.is_keyframe:
             self._log.depth(frame.depth)
             self._send_path()
@@ -67,6 +69,18 @@ class LiveLog:
     def close(self) -> None:
         """Nothing more comes."""
         self._log.close()
+
+    def _send_movers(self, slam: Slam, frame: int, T_world_camera: np.ndarray) -> None:
+        """Boxes of what moves in the frame; of what does no longer none."""
+        seen = {track.number: track.sights[-1] for track in slam.movers.tracks.tracks if track.sights}
+        moving = {number: sight for number, sight in seen.items() if sight.frame == frame}
+        for number, sight in moving.items():
+            T_mover_box = np.eye(4)
+            T_mover_box[:3, 3] = (sight.low + sight.high) / 2
+            self._log.box(number, T_world_camera @ sight.T_camera_mover @ T_mover_box, sight.high - sight.low)
+        for number in self._moving - set(moving):
+            self._log.drop_box(number)
+        self._moving = set(moving)
 
     def _send_path(self) -> None:
         stride = max(1, len(self._positions) // _MOST_POSITIONS)

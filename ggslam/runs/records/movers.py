@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pydantic
 
 from ggslam.movers.found import FoundMover, MoverSight
+from ggslam.objects.colors import id_palette
 from ggslam.runs.records.record import Array, Number, Record, RecordFile
 from ggslam.scene.poses import inverse, separation
 from ggslam.slam.result import SlamResult
@@ -135,6 +136,12 @@ class MoversRecord(RecordFile):
         poses = {frame.frame_index: T for frame, T in known if np.isfinite(T).all()}
         found = [_record(mover, poses, names) for mover in result.movers]
         return MoversRecord.of({"movers": [record for record in found if record is not None]})
+
+
+def mover_colors(movers: Sequence[MoverRecord]) -> dict[int, tuple[int, int, int]]:
+    """RGB of each."""
+    palette = id_palette()
+    return {mover.id: tuple(palette[mover.id].tolist()) for mover in movers}
 
 
 def _record(mover: FoundMover, poses: Mapping[int, np.ndarray], names: Mapping[int, str]) -> dict[str, Any] | None:
