@@ -17,8 +17,9 @@ _CHUNK = 1 << 17
 
 
 def estimate_normals(
-    points: np.ndarray, rows: np.ndarray | None = None, neighbours: int = NEIGHBOURS, tree: cKDTree | None = None
-) -> np.ndarray:
+    points: np.ndarray, rows: np.ndarray | None = None, neighbours: int = NEIGHBOURS, tree: cKDTree | None = None,
+    workers: int = -1,
+) -> np.ndarray:  # fmt: skip
     """Unit normals float64 [n, 3] of points [N, 3], the direction of least variance among each point's nearest
     neighbours; their sign is arbitrary.
 
@@ -27,6 +28,7 @@ def estimate_normals(
         rows: int [n], the points whose normals are wanted; None: all.
         neighbours: points in a plane, the point itself included.
         tree: of the points; None: one is built.
+        workers: threads that search; one is faster for a few hundred points.
     """
     points = np.asarray(points, np.float64)
     tree = cKDTree(points) if tree is None else tree
@@ -34,7 +36,7 @@ def estimate_normals(
     normals = np.empty((len(rows), 3))
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
-        near = points[tree.query(points[rows[part]], count, workers=-1)[1].reshape(-1, count)]
+        near = points[tree.query(points[rows[part]], count, workers=workers)[1].reshape(-1, count)]
         offsets = near - near.mean(1, keepdims=True)
         normals[part] = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
     return normals

@@ -63,6 +63,6 @@ def patch_of(mask: np.ndarray, depth: np.ndarray, color: np.ndarray, camera: Cam
     if kept.sum() < _FEWEST:
         return None
     points = points[kept]
-    normals = estimate_normals(points, neighbours=_NEIGHBOURS)
+    normals = estimate_normals(points, neighbours=_NEIGHBOURS, workers=1)
     normals *= -np.sign((normals * points).sum(1))[:, None]
     return Patch(points, color[v, u][kept] / 255.0, normals)

@@ -13,6 +13,7 @@ import pytest
 
 from ggslam.errors import ConfigError, MissingDependency
 from ggslam.jobs.watch.rerun_follower import MAP_EVERY, LiveLog
+from ggslam.movers.found import MoverSight
 from ggslam.reporting.rerun_log import RerunLog
 from ggslam.scene.camera import Camera
 from ggslam.slam.result import StepReport, TrackedFrame
@@ -63,7 +64,8 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
     module: Any = ModuleType("rerun")
     module.RecordingStream = Stream
     module.ViewCoordinates = SimpleNamespace(RIGHT_HAND_Y_DOWN="y down")
-    for kind in ("Pinhole", "Transform3D", "EncodedImage", "DepthImage", "Points3D", "LineStrips3D", "Scalars"):
+    for kind in ("Pinhole", "Transform3D", "EncodedImage", "DepthImage", "Points3D", "LineStrips3D", "Scalars",
+                 "Boxes3D", "Quaternion", "Clear"):  # fmt: skip
         setattr(module, kind, lambda *values, _kind=kind, **named: Archetype(_kind, *values, **named))
     monkeypatch.setitem(sys.modules, "rerun", module)
 
@@ -72,8 +74,12 @@ def follow(log: RerunLog, frames: int) -> LiveLog:
     """A run of `frames` frames, every second one a keyframe, the third one lost; the camera moves along x."""
     live = LiveLog(log)
     gaussians = SimpleNamespace(count=2, means=_tensor(2, 3), rgb=_tensor(2, 3), scales=_tensor(2, 3))
-    slam: Any = SimpleNamespace(camera=CAMERA, map=gaussians, pose_of=lambda f: _moved(f.frame_index))
+    sights = [MoverSight(k, _moved(1.0), np.full(3, -0.5), np.array([0.5, 0.5, 1.5]), 0.1) for k in (4, 5)]
+    track = SimpleNamespace(number=7, sights=[])
+    movers = SimpleNamespace(tracks=SimpleNamespace(tracks=[track]))
+    slam: Any = SimpleNamespace(movers=movers, camera=CAMERA, map=gaussians, pose_of=lambda f: _moved(f.frame_index))
     for k in range(frames):
+        track.sights = [sight for sight in sights if sight.frame <= k]
         status = "lost" if k == 3 else "ok"
         tracked = TrackedFrame(k, k, 100 + k / 10, 0, np.eye(4), 0.9, 0.01, status)
         frame: Any = SimpleNamespace(
@@ -111,6 +117,10 @@ def test_poses_images_map_and_numbers_are_sent() -> None:
     assert (stream.entities("world/camera/depth")[0].values[0] == 1000).all()
     assert len(stream.entities("plots/loss")) == 19 and len(stream.entities("plots/overlap")) == 20
     assert stream.times == {"frame": 19, "time": pytest.approx(1.9)}
+    boxes = [(a, f) for e, a, f in stream.logged if e == "world/movers/7"]
+    assert [(a.kind, f) for a, f in boxes] == [("Boxes3D", 4), ("Boxes3D", 5), ("Clear", 6)]
+    np.testing.assert_allclose(boxes[1][0].centers, [[6, 0, 0.5]])  # camera at 5, mover 1 from it, its middle ahead
+    np.testing.assert_allclose(boxes[1][0].half_sizes, [[0.5, 0.5, 1]])
     refined: Any = SimpleNamespace(
         trajectory=lambda: np.stack([_moved(1), np.full((4, 4), np.nan), _moved(2)]), gaussians=[]
     )
