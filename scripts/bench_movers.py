@@ -9,7 +9,8 @@
 movers: `livingroom_movers`, with the search and without, beside its twin in which nothing moves: error of the
 trajectory, held-out PSNR over pixels that no mover covers, and behind the movers, where the twin tells what is
 there (places where a thing rests before it moves, or afterwards, are left out of both: no one map is right there);
-overlap of the masks that were found with the true ones, and when each mover was found first.
+overlap of the masks that were found with the true ones, and when each mover was found first; of each mover since when
+it moves by movers.json, and its displacement, against the truth.
 --synth N: N generated rooms with a walker, a mug and a drawer (320x240), as in movers.
 still: recordings in which nothing moves, with the search and without: frames in which something was found.
 """
@@ -28,9 +29,11 @@ import numpy as np
 
 from ggslam.evaluation.trajectory import align_points
 from ggslam.mapping.cpu.mapper import CpuMapper
-from ggslam.scene.poses import inverse, transform_points
+from ggslam.runs.records.movers import MoversRecord
+from ggslam.scene.poses import inverse, separation, transform_points
 from ggslam.sequences import Sequence, open_sequence
 from ggslam.slam.config import load_config
+from ggslam.slam.result import SlamResult
 from ggslam.slam.slam import Slam
 from ggslam.synthetic import FRAMES_WITH_MOVERS, MOVERS, write_synthetic_sequence
 
@@ -46,6 +49,7 @@ class Run:
     """What a run gives that is scored."""
 
     slam: Slam
+    result: SlamResult
     seconds: float
     masks: dict[int, np.ndarray] = field(default_factory=dict)
 
@@ -66,8 +70,7 @@ def run(path: Path, settings: list[str], stop: int | None) -> Run:
         seconds += time.process_time() - start
         if slam.movers.mask is not None:
             masks[frame.index] = slam.movers.mask
-    slam.finish()
-    return Run(slam, seconds, masks)
+    return Run(slam, slam.finish(), seconds, masks)
 
 
 def ate_cm(done: Run, path: Path, stop: int | None) -> float:
@@ -166,6 +169,7 @@ def bench_movers(path: Path, twin: Path, more: list[str], stop: int | None) -> N
         if name == "movers":
             found = done
     print_masks(found, ids, truth)
+    print_tracks(found, path, truth, {m["instance_id"]: m["rigid"] for m in movers}, stop)
 
 
 def print_masks(done: Run, ids: list[np.ndarray], truth: list[dict]) -> None:
@@ -191,6 +195,39 @@ def print_masks(done: Run, ids: list[np.ndarray], truth: list[dict]) -> None:
     print(f"\nIoU {np.mean(overlaps):.3f} over {len(overlaps)} frames; frames with a mover where none is: {invented}")
     for number, (first, seen) in onsets.items():
         print(f"mover {number}: moves from frame {first}, found in frame {seen}")
+
+
+def print_tracks(done: Run, path: Path, truth: list[dict], rigid: dict[int, bool], stop: int | None) -> None:
+    """Each mover of movers.json against the truth: since when it moves, its kind, and its displacement, measured at its
+    place before. Of runs without instance masks: the masks do not tell which is which."""
+    true_poses = {f.index: f.T_world_camera for f in open_recording(path, stop)}
+    found = MoversRecord.of_result(done.result, {}).movers
+    print("\n| mover | kind (true) | moves from (true) | found | moved (true) cm | turn (true) deg | error cm, deg |")
+    print("|---|---|---|---|---|---|---|")
+    for mover in found:
+        told = [{m["instance_id"]: m for m in frame["movers"]}.get(mover.instance) for frame in truth]
+        if mover.instance not in rigid:
+            print(f"| {mover.id}, none of the true ones | {mover.kind} | {mover.moves[0][0]} | {mover.found} | | | |")
+            continue
+        begun = next((k for k, m in enumerate(told) if m and m["moving"] and m["visible_px"] > 0), -1)
+        kind = "rigid" if rigid[mover.instance] else "not rigid"
+        words = f"| {mover.title} | {mover.kind} ({kind}) | {mover.moves[0][0]} ({begun}) | {mover.found} |"
+        if mover.displacement is None or mover.before is None or mover.after is None:
+            print(f"{words} | | | |")
+            continue
+        own, first = mover.displacement, true_poses[0]
+        old, new = told[mover.before.frame], told[mover.after.frame]
+        assert old is not None and new is not None and first is not None
+        T_run_world = inverse(first)  # a run's world is its first camera
+        T_world_new, T_world_old = (np.array(m["T_world"], float) for m in (new, old))
+        T_true = T_run_world @ T_world_new @ inverse(T_world_old) @ inverse(T_run_world)
+        at = mover.before.T_world_mover[:3, 3][None]
+        go, turn = separation(np.eye(4), T_true)
+        go = float(np.linalg.norm(transform_points(at, T_true) - at))
+        off = 100 * float(np.linalg.norm(transform_points(at, T_true) - transform_points(at, own.T_new_old)))
+        degrees = separation(T_true, own.T_new_old)[1]
+        print(f"{words} {100 * own.distance_m:.1f} ({100 * go:.1f}) | {own.turn_deg:.1f} ({turn:.1f}) | "
+              f"{off:.2f}, {degrees:.2f} |")  # fmt: skip
 
 
 def bench_still(data: Path, more: list[str], stop: int | None) -> None:

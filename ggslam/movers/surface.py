@@ -13,11 +13,11 @@ from ggslam.geometry.voxels import voxel_keys
 from ggslam.movers.patches import Patch
 from ggslam.scene.poses import inverse, orthonormalize, transform_points
 
-VOXEL = 0.008
+VOXEL = 0.006
 """Metres, of points that are kept."""
-MOST_POINTS = 4000
+MOST_POINTS = 6000
 """A larger surface grows no more."""
-COLOR_M, NORMAL_M = 0.08, 0.015
+COLOR_M, NORMAL_M = 0.08, 0.025
 """Metres that the distance from black to full in one channel, and of unit normals, counts as where partners are looked
 for: the inside of a thin wall is no partner of its outside."""
 REACH_M = 0.03
