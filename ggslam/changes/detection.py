@@ -147,6 +147,7 @@ class ChangeDetector:
     def _compare(self, found: Detection) -> None:
         gone, come = ([t for t in things if self._is_changed(t, found.ids_believed)] for things in self.things)
         if found.ids_believed:
+            self._drop_hardly_seen(gone, come)
             self._pair_by_id(found, gone, come)
             self._find_replaced(gone, come)
         else:
@@ -202,7 +203,9 @@ class ChangeDetector:
             shifted = label not in changed and self._has_shifted(old, new)
             if label not in changed and not shifted:
                 continue
-            unseen = min(old.seen, new.seen) < s.min_seen  # of what one visit hardly saw nothing is said
+            # What one visit saw go or come as a whole is elsewhere, also where the other place was hidden from a visit.
+            sure = any(t.seen >= s.min_seen and t.changed >= s.whole for t in (old, new))
+            unseen = min(old.seen, new.seen) < s.min_seen and not sure  # of what hardly was seen nothing is said
             for things, thing in ((gone, old), (come, new)):
                 if thing in things:
                     things.remove(thing)
@@ -210,13 +213,21 @@ class ChangeDetector:
             if shifted and fit is not None and fit.share >= s.min_fit and fit.color_apart <= s.max_color:
                 found.changes += filter(None, [self._motion_change(old, new, fit)])
                 continue
+            if fit is None:
+                continue
+            fits = fit.share >= s.min_fit
             # Where surfaces do not fit, as of a cloth, both places have to have changed as a whole.
-            if fit is not None and min(old.changed, new.changed) >= (
-                s.min_changed if fit.share >= s.min_fit else s.whole
-            ):
+            if (fits and sure) or min(old.changed, new.changed) >= (s.min_changed if fits else s.whole):
                 change = self._motion_change(old, new, fit)
                 if change is not None:
                     found.changes.append(change)
+
+    def _drop_hardly_seen(self, gone: list[Thing], come: list[Thing]) -> None:
+        """What a visit has too little of to be a thing did not come or go."""
+        for number, things in enumerate((gone, come)):
+            known = set(np.unique(self.visits[1 - number].gaussians.object_id.numpy()).tolist())
+            known -= {t.label for t in self.things[1 - number]}
+            things[:] = [t for t in things if t.label not in known]
 
     def _find_replaced(self, gone: list[Thing], come: list[Thing]) -> None:
         """What stands where something else of another id stood: that was removed, and this was added."""

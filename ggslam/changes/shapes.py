@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import permutations, product
 
@@ -26,6 +26,22 @@ _REFINED = 1500
 """Points that a motion is refined by."""
 _AS_GOOD = 0.02
 """Difference in quality that says nothing."""
+_APART_M = 0.05
+"""Metres that surfaces lie apart which count as much as all that fits."""
+_OVERLAP, _JUDGED = 0.6, 3000
+"""Share of the points, the nearest, that tell how far surfaces lie apart, and points that motions are judged by."""
+_STANDS, _LEVEL = np.radians(20), np.radians(0.5)
+"""What tilts a thing less may be noise; what tilts it less than the other keeps it upright."""
+_STANDING_COSTS = 0.05
+"""Worse quality that a motion may have which keeps the thing upright."""
+_PROBED = (15, -15, 30, -30, *range(45, 181, 15), *range(-165, -44, 15))
+"""Degrees that a thing is turned by to see whether it would fit as well."""
+_TURN_TELLS = 0.05
+"""Worse quality of further turns by which a turn is known."""
+_BESIDE_M, _LAST_STEPS = (0.04, 0.015), 100
+"""How far beside a motion others start, metres, and steps of the last refinement."""
+_SHIFTS = np.eye(6)[:, :3]
+"""Twists that turn nothing."""
 _TANGENT = 0.1
 """Weight of the distance along the surface, which colours tell, against that off the surface."""
 _FEWEST, _SMALL_STEP = 12, 2e-5
@@ -71,16 +87,26 @@ class Fit:
         share: of the surfaces that fits, of what both visits saw of it; the worse of the two ways.
         seen: share of the surfaces that both visits saw; the worse of the two ways.
         color_apart: how much the colours differ.
+        apart_m: how far the surfaces lie apart, in places and colours, where they fit best; metres.
+        as_good_deg: turned by so many degrees more about the vertical it fits as well: round things and plain ones tell
+            no turn; None: the turn is known.
     """
 
     T_new_old: np.ndarray
     share: float
     seen: float
     color_apart: float
+    apart_m: float = 0.0
+    as_good_deg: float | None = None
 
     def quality(self) -> float:
         """For choosing among fits: more is better."""
-        return self.share - self.color_apart
+        return self.share - self.color_apart - self.apart_m / _APART_M
+
+    @property
+    def turn_known(self) -> bool:
+        """Whether the thing's turn can be told."""
+        return self.as_good_deg is None
 
 
 def fit_shapes(
@@ -96,29 +122,123 @@ def fit_shapes(
     """
     if min(len(old.points), len(new.points)) < settings.min_points:
         return None
+    judge = _Judge(old, new, sights_old, sights_new, settings)
     target, sample = _Target(new), old.sample(_REFINED, np.random.default_rng(0))
-    motions = [target.refine(sample, T, settings.fit_m) for T in _motions(old, new, up)]
-    fits = [_judge(T, old, new, sights_old, sights_new, settings) for T in _unlike(motions, len(motions))]
+    fits = list[Fit]()
+    for T in _motions(old, new, up):
+        ways = [target.refine(sample, T, settings.fit_m)]
+        if _tilt(T, up) < _STANDS:
+            ways.append(target.refine(sample, _without_tilt(T, up, old.points.mean(0)), settings.fit_m, upright(up)))
+        fits += [judge.fit(T) for T in ways]
     best = max(fits, key=Fit.quality)
     # Of motions as good as the best the one that turns least: round things tell no turn.
-    alike = [fit for fit in fits if fit.quality() >= best.quality() - _AS_GOOD]
-    return min(alike, key=lambda fit: turning_angle(fit.T_new_old, np.eye(4)))
+    alike = [fit for fit in _unlike_fits(fits) if fit.quality() >= best.quality() - _AS_GOOD]
+    chosen = min(alike, key=lambda fit: turning_angle(fit.T_new_old, np.eye(4)))
+    settled = _settle(_stand_up(chosen, fits, up), judge, target, sample, up)
+    return _find_turn(settled, judge, target, sample, up)
 
 
-def _judge(
-    T: np.ndarray, old: Shape, new: Shape, sights_old: Sightings, sights_new: Sightings, settings: ChangeSettings
-) -> Fit:
-    within = Tolerance(settings.fit_m, settings.tolerance_relative)
-    shares, seen, apart = [], [], []
-    for shape, other, motion, sights in ((old, new, T, sights_new), (new, old, inverse(T), sights_old)):
-        moved = transform_points(shape.points, motion)
-        found = sights.look_up(moved, within)
-        share, judged = _share_there(found, cKDTree(other.points).query(moved)[0] < 2 * settings.fit_m)
-        shares.append(share)
-        seen.append(judged)
-        apart.append(color_apart(shape.colors, found.color))
-    known = [value for value in apart if np.isfinite(value)]
-    return Fit(T, min(shares), min(seen), max(known) if known else 1.0)
+def _unlike_fits(fits: list[Fit]) -> list[Fit]:
+    """The best fit of each turn."""
+    chosen: list[Fit] = []
+    for fit in sorted(fits, key=lambda fit: -fit.quality()):
+        if all(turning_angle(fit.T_new_old, other.T_new_old) > _ALIKE for other in chosen):
+            chosen.append(fit)
+    return chosen
+
+
+def _stand_up(chosen: Fit, fits: list[Fit], up: np.ndarray) -> Fit:
+    """The fit about as good that keeps the thing upright, if there is one: what tilts it is mostly noise."""
+    upright_ones = [
+        fit for fit in fits
+        if _tilt(fit.T_new_old, up) < _LEVEL and turning_angle(fit.T_new_old, chosen.T_new_old) < _ALIKE
+        and fit.quality() >= chosen.quality() - _STANDING_COSTS
+    ]  # fmt: skip
+    return max(upright_ones, key=Fit.quality, default=chosen)
+
+
+def _settle(fit: Fit, judge: _Judge, target: _Target, sample: Shape, up: np.ndarray) -> Fit:
+    """The motion, refined to the end, also from beside: plain surfaces slide upon each other slowly, as only their
+    edges pull."""
+    level = _tilt(fit.T_new_old, up) < _LEVEL
+    across = np.linalg.svd(up[None])[2][1:]
+    for beside in _BESIDE_M:
+        for step in (np.zeros(3), *(beside * sign * axis for axis in across for sign in (1, -1))):
+            start = fit.T_new_old.copy()
+            start[:3, 3] += step
+            T = target.refine(sample, start, judge.settings.fit_m, upright(up) if level else None, _LAST_STEPS)
+            fit = max(fit, judge.fit(T), key=Fit.quality)
+    return fit
+
+
+def _find_turn(fit: Fit, judge: _Judge, target: _Target, sample: Shape, up: np.ndarray) -> Fit:
+    """Whether the thing turned further about the vertical fits as well."""
+    middle = transform_points(sample.points, fit.T_new_old).mean(0)
+    for angle in _PROBED:
+        further = np.eye(4)
+        further[:3, :3] = _about(up, angle)
+        further[:3, 3] = middle - further[:3, :3] @ middle
+        T = target.refine(sample, further @ fit.T_new_old, judge.settings.fit_m, _SHIFTS)
+        if judge.fit(T).quality() >= fit.quality() - _TURN_TELLS:
+            return replace(fit, as_good_deg=float(angle))
+    return fit
+
+
+def upright(up: np.ndarray) -> np.ndarray:
+    """Twists [6, 4] that keep a thing upright."""
+    basis = np.zeros((6, 4))
+    basis[:3, :3], basis[3:, 3] = np.eye(3), up
+    return basis
+
+
+def _tilt(T: np.ndarray, up: np.ndarray) -> float:
+    """Angle by which a motion tilts what stood upright, radians."""
+    return float(np.arccos(np.clip(up @ T[:3, :3] @ up, -1, 1)))
+
+
+def _without_tilt(T: np.ndarray, up: np.ndarray, about: np.ndarray) -> np.ndarray:
+    """The motion [4, 4] that does the same to a point and turns about the vertical alone."""
+    tilted = T[:3, :3] @ up
+    axis = np.cross(tilted, up)
+    length = float(np.linalg.norm(axis))
+    R = T[:3, :3]
+    if length > 1e-9:
+        R = _about(axis / length, float(np.degrees(_tilt(T, up)))) @ R
+    level = np.eye(4)
+    level[:3, :3] = R
+    level[:3, 3] = transform_points(about[None], T)[0] - R @ about
+    return level
+
+
+class _Judge:
+    """Tells how well motions bring a thing upon what it may be in the other visit."""
+
+    def __init__(
+        self, old: Shape, new: Shape, sights_old: Sightings, sights_new: Sightings, settings: ChangeSettings
+    ) -> None:
+        self.settings = settings
+        self._within = Tolerance(settings.fit_m, settings.tolerance_relative)
+        rng = np.random.default_rng(0)
+        old, new = old.sample(_JUDGED, rng), new.sample(_JUDGED, rng)
+        self._sides = [
+            (shape, sights, cKDTree(other.points), cKDTree(other.joint()))
+            for shape, other, sights in ((old, new, sights_new), (new, old, sights_old))
+        ]
+
+    def fit(self, T: np.ndarray) -> Fit:
+        """A motion T_new_old, judged."""
+        shares, seen, colors, apart = [], [], [], []
+        for (shape, sights, tree, joint), motion in zip(self._sides, (T, inverse(T)), strict=True):
+            moved = transform_points(shape.points, motion)
+            found = sights.look_up(moved, self._within)
+            share, judged = _share_there(found, tree.query(moved)[0] < 2 * self.settings.fit_m)
+            shares.append(share)
+            seen.append(judged)
+            colors.append(color_apart(shape.colors, found.color))
+            off = np.sort(joint.query(Shape(moved, shape.colors).joint(), workers=-1)[0])
+            apart.append(float(off[: max(1, round(_OVERLAP * len(off)))].mean()))
+        known = [value for value in colors if np.isfinite(value)]
+        return Fit(T, min(shares), min(seen), max(known) if known else 1.0, max(apart))
 
 
 def _share_there(found: Evidence, near: np.ndarray) -> tuple[float, float]:
@@ -176,8 +296,12 @@ class _Target:
         self._tree = cKDTree(shape.joint())
         self._normals = estimate_normals(shape.points, neighbours=min(16, len(shape.points)))
 
-    def refine(self, other: Shape, T: np.ndarray, reach: float, steps: int = 25) -> np.ndarray:
-        """Gauss-Newton from a motion [4, 4] that is about right."""
+    def refine(
+        self, other: Shape, T: np.ndarray, reach: float, free: np.ndarray | None = None, steps: int = 25
+    ) -> np.ndarray:
+        """Gauss-Newton from a motion [4, 4] that is about right; `free` [6, k]: twists that it may take, about the
+        middle; None: all."""
+        free = np.eye(6) if free is None else free
         points, joint = other.points, other.joint()
         for _ in range(steps):
             moved = transform_points(points, T)
@@ -188,7 +312,8 @@ class _Target:
             if pairs.sum() < _FEWEST:
                 return T
             partners = nearest[pairs]
-            step = plane_step(moved[pairs], self.shape.points[partners], self._normals[partners], reach, _TANGENT)
+            partner, normal = self.shape.points[partners], self._normals[partners]
+            step = plane_step(moved[pairs], partner, normal, reach, _TANGENT, free=free)
             T = orthonormalize(step @ T)
             if np.abs(step - np.eye(4)).max() < _SMALL_STEP:
                 break

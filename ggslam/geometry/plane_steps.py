@@ -9,8 +9,9 @@ from ggslam.scene.poses import inverse, se3_exp, skew
 
 
 def plane_step(
-    p: np.ndarray, q: np.ndarray, n: np.ndarray, reach: float, tangent: float, held: np.ndarray | None = None
-) -> np.ndarray:
+    p: np.ndarray, q: np.ndarray, n: np.ndarray, reach: float, tangent: float, held: np.ndarray | None = None,
+    free: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """The motion [4, 4] that brings points nearer to their partners.
 
     Args:
@@ -19,6 +20,7 @@ def plane_step(
         reach: metres; pairs a quarter of it apart count half.
         tangent: weight of the distance along the surface against that off it.
         held: bool [n], pairs whose distance along the surface counts; None: all.
+        free: twists [6, k] about the middle that the motion may take; None: all.
     """
     middle, off = p.mean(0), p - q
     plane = (off * n).sum(1)
@@ -34,7 +36,7 @@ def plane_step(
     H[3:, 3:] += tangent * ((weighted * arm).sum() * np.eye(3) - weighted.T @ arm)
     g += tangent * np.concatenate([along @ off, along @ _cross(arm, off)])
     H[np.diag_indices(6)] += 1e-9 * len(p)  # where nothing tells, nothing moves
-    twist = -np.linalg.solve(H, g)
+    twist = -np.linalg.solve(H, g) if free is None else -free @ np.linalg.solve(free.T @ H @ free, free.T @ g)
     there = np.eye(4)
     there[:3, 3] = middle
     return there @ se3_exp(twist) @ inverse(there)

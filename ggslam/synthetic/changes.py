@@ -74,7 +74,7 @@ def room_at_two_visits(seed: int, count: int) -> tuple[Scene, Scene, list[MadeCh
     for instance in rng.permutation(candidates).tolist():
         if len(made) == count:
             break
-        middle = np.concatenate([outline(shape) for shape in first.shapes if shape.instance == instance]).mean(0)
+        middle = _middle([shape for shape in first.shapes if shape.instance == instance])
         if len(made) % 3 == 2:
             kind: Literal["removed", "added"] = "removed" if len(made) % 2 else "added"
             _move(second if kind == "removed" else first, instance, _shift(_AWAY))
@@ -108,6 +108,12 @@ def free_motion(scene: Scene, instance: int, rng: np.random.Generator) -> np.nda
         if all((shape.distance(raised) > _GAP).all() for shape in others):
             return T
     return None
+
+
+def _middle(shapes: list[Shape]) -> np.ndarray:
+    """Of a thing [3], by the volumes of its shapes: a mug's is in the mug, not in its handle."""
+    volumes = [float(np.prod(shape.bounds())) for shape in shapes]
+    return np.average([shape.T_world_shape[:3, 3] for shape in shapes], 0, volumes)
 
 
 def _move(scene: Scene, instance: int, T: np.ndarray) -> None:

@@ -32,6 +32,8 @@ class Box:
     hue: float = 0.0
     cut: int = 0
     """Id of its half with x > 0; 0: it is whole."""
+    plain: bool = False
+    """Whether it is of one colour."""
 
     def surface(self, spacing: float = 0.008) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Points, normals, colours and ids."""
@@ -47,6 +49,8 @@ class Box:
             normals[:, axis] = sign
             shade = 0.5 + 0.45 * np.sin(self.hue + np.array([0.0, 2.1, 4.2]) + 1.3 * (2 * axis + (sign > 0)))
             colors = np.tile(shade, (len(points), 1)) * (0.8 + 0.2 * np.sign(points[:, [u]] * points[:, [v]]))
+            if self.plain:
+                colors[:] = 0.6
             parts.append((points, normals, colors))
         points, normals, colors = (np.concatenate(values) for values in zip(*parts, strict=True))
         ids = np.where(points[:, 0] > 0, self.cut or self.id, self.id)

@@ -9,6 +9,9 @@ from small_visits import Box, SmallVisit, detect
 
 from ggslam.changes.detection import Change, Detection
 from ggslam.changes.found import ChangeTable
+from ggslam.changes.settings import ChangeSettings
+from ggslam.changes.sightings import Picture, Sightings, Tolerance, _Blocks
+from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, transform_points, turning_angle
 
 CUP, CRATE, BRICK = Box(2, (-0.2, 0.1)), Box(3, (0.25, -0.15), (0.12, 0.12, 0.2), 20, 2.0), Box(4, (0.1, 0.3), hue=4.0)
@@ -51,6 +54,7 @@ def test_moved_removed_and_added_things_are_found(ids: bool | None) -> None:
     assert entry["old"]["ids"] == [2] and entry["moved_m"] > 0.3 and 45 < entry["turned_deg"] < 55
 
 
+@pytest.mark.long("shapes are compared from starts all around")
 def test_a_thing_turned_in_place_is_moved() -> None:
     turned = Box(2, CUP.at, turn=60)
     found, _ = detect(SmallVisit([CUP, CRATE]), SmallVisit([turned, CRATE]))
@@ -68,6 +72,7 @@ def test_a_thin_thing_that_was_pushed_along_the_floor_is_moved() -> None:
     check_moved(found.changes[0], before, after)
 
 
+@pytest.mark.long("shapes are compared from starts all around")
 def test_ids_that_were_shuffled_are_not_believed_and_not_needed() -> None:
     moved = Box(4, (-0.05, -0.3), turn=30)
     found, _ = detect(SmallVisit([CUP, CRATE, BRICK]), SmallVisit([moved, Box(2, CRATE.at, CRATE.size, 20, 2.0),
@@ -76,6 +81,7 @@ def test_ids_that_were_shuffled_are_not_believed_and_not_needed() -> None:
     check_moved(found.changes[0], CUP, moved)
 
 
+@pytest.mark.long("shapes are compared from starts all around")
 def test_a_thing_that_one_visit_cut_in_two_is_one() -> None:
     moved = Box(2, (-0.05, -0.3), turn=30, cut=9)
     found, _ = detect(SmallVisit([CUP, CRATE, BRICK]), SmallVisit([moved, CRATE, BRICK]), ids=False)
@@ -101,3 +107,57 @@ def test_of_what_the_second_visit_did_not_look_at_nothing_is_said() -> None:
     found, _ = detect(SmallVisit([CUP, CRATE, BRICK]), corner)
     assert found.changes == []
     assert {change.old.ids for change in found.unseen if change.old is not None} >= {(3,)}
+
+
+@pytest.mark.long("shapes are compared from starts all around")
+def test_a_thing_that_moved_to_where_the_first_visit_saw_nothing_is_moved() -> None:
+    wall = Box(6, (0.0, 0.0), (0.5, 0.06, 0.3), hue=3.0)
+    before, after = Box(2, (-0.1, -0.3)), Box(2, (0.0, 0.3), turn=20)
+    front = SmallVisit([before, wall], around=(-130, -110, -90, -70, -50))
+    found, detector = detect(front, SmallVisit([after, wall]), True)
+    new = next(t for t in detector.things[1] if t.label == 2)
+    assert new.seen < detector.settings.min_seen
+    assert kinds(found) == ["moved"]
+
+
+@pytest.mark.long("shapes are compared from starts all around")
+def test_the_turn_of_a_plain_thing_is_said_not_to_be_known() -> None:
+    plain, painted = Box(2, (-0.2, 0.1), (0.14, 0.14, 0.1), plain=True), Box(3, (0.2, -0.1))
+    moved, turned = Box(2, (-0.15, -0.2), plain.size, turn=90, plain=True), Box(3, (0.2, 0.15), turn=60)
+    found, detector = detect(SmallVisit([plain, painted]), SmallVisit([moved, turned]))
+    by_id = {change.old.ids[0]: change for change in found.changes if change.old is not None}
+    assert kinds(found) == ["moved", "moved"]
+    assert by_id[2].fit is not None and not by_id[2].fit.turn_known
+    assert by_id[3].fit is not None and by_id[3].fit.turn_known
+    check_moved(by_id[3], painted, turned)
+    assert by_id[2].T_new_old is not None  # its place is known all the same
+    place = transform_points(np.array([[*plain.at, 0.05]]), by_id[2].T_new_old)[0]
+    assert np.allclose(place, [*moved.at, 0.05], atol=0.01)
+    entries = ChangeTable(found, detector.judged, ({}, {})).to_dict()["changes"]
+    said = {entry["old"]["ids"][0]: (entry["turn_known"], "turn_reason" in entry) for entry in entries}
+    assert said == {2: (False, True), 3: (True, False)}
+
+
+def test_what_the_first_visit_hardly_saw_was_not_added() -> None:
+    speck = Box(2, (-0.3, 0.3), (0.004, 0.004, 0.004))
+    found, detector = detect(SmallVisit([speck, CRATE, BRICK]), SmallVisit([CUP, CRATE, BRICK]), True)
+    assert all(t.label != 2 for t in detector.things[0])
+    assert found.changes == []
+
+
+def test_points_that_no_picture_shows_are_passed_by_and_all_others_looked_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    sights = Sightings(SmallVisit([CUP], around=(0, 50), distance=0.4).build(), ChangeSettings(), NativeContext(2))
+    points, passed = np.random.default_rng(0).uniform(-1.5, 1.5, (4000, 3)), list[int]()
+    before = _Blocks.before
+
+    def noted(self: _Blocks, picture: Picture) -> np.ndarray:
+        rows = before(self, picture)
+        passed.append(len(points) - len(rows))
+        return rows
+
+    monkeypatch.setattr(_Blocks, "before", noted)
+    found = sights.look_up(points, Tolerance(0.02, 0.01))
+    monkeypatch.setattr(_Blocks, "before", lambda self, p: np.arange(len(self.points)))
+    for name, values in vars(sights.look_up(points, Tolerance(0.02, 0.01))).items():
+        np.testing.assert_array_equal(getattr(found, name), values)
+    assert found.hidden.any() and found.through.any() and max(passed) > 1000

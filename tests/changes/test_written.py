@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from small_visits import Box, SmallVisit
 
 from ggslam.changes.detection import ChangeDetector
@@ -18,6 +19,7 @@ from ggslam.jobs.changes.pictures import NEW_COLOR, OLD_COLOR
 from ggslam.native.loader import NativeContext
 
 
+@pytest.mark.long("shapes are compared from starts all around")
 def test_every_change_has_numbers_and_a_picture(tmp_path: Path) -> None:
     old, new = SmallVisit([Box(2, (-0.2, 0.1))]), SmallVisit([Box(2, (0.2, -0.1)), Box(3, (-0.2, 0.15), hue=2)])
     visits, context = (old.build(), new.build()), NativeContext(2)
