@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds what moves, frame after frame.
 
-A place of a frame is evidence if several frames before it looked past it at something farther: something has come
-there. Such places are gathered into whole things, by segments where there are any, else by what is connected; what is
-seen once, or is too small, is noise.
+A place of a frame is evidence if several frames before it, or one without doubt, looked past it at something farther:
+something has come there. Such places are gathered into whole things, by segments where there are any, else by what is
+connected; what is seen once, or is too small, is noise.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from ggslam.movers.evidence import CoarseView, Margin, compare, thin_out
-from ggslam.movers.segments import Gathering, gather
+from ggslam.movers.segments import Gathering, gather, grow_places
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.trail import Trail
 from ggslam.scene.camera import Camera
@@ -22,10 +22,10 @@ from ggslam.scene.frame import Frame
 
 AGES = (1, 2, 4, 8, 16, 32, 48)
 """Each frame is compared with those so many frames before it."""
-GROWN = 2
+GROWN = 1
 """Pixels of a 320 pixel wide image by which masks of movers are larger than what was found: outlines are blurred."""
-PREDICTED = 3
-"""Times as many pixels are expected to move in the next frame."""
+PREDICTED = 6
+"""...and the larger of what is expected to move in the next frame."""
 
 
 @dataclass
@@ -40,6 +40,7 @@ class MoverDetector:
         found: small mask of what moves, or may, in the latest frame...
         small: ...and of what does, as `mask`.
         things: int32 [H, W], number of the moving thing at each pixel, 0 without one, not grown; None: nothing.
+        expected: bool [H, W], what the next frame is located without: all of `found`.
     """
 
     settings: MoverSettings
@@ -48,14 +49,14 @@ class MoverDetector:
     found: np.ndarray | None = None
     small: np.ndarray | None = None
     things: np.ndarray | None = None
+    expected: np.ndarray | None = None
     trail: Trail = field(default_factory=Trail)
 
     def expect(self, frame: Frame) -> Frame:
         """The frame to locate: without depth where something is expected to move."""
-        if self.mask is None or self.mask.shape != frame.depth.shape:
+        if self.expected is None or self.expected.shape != frame.depth.shape:
             return frame
-        moves = grow(self.mask, PREDICTED * GROWN)
-        return replace(frame, depth=np.where(moves, np.float32(0), frame.depth))
+        return replace(frame, depth=np.where(self.expected, np.float32(0), frame.depth))
 
     def look(self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin, sure: bool = True) -> None:
         """Finds what moves in a frame: `mask`.
@@ -68,34 +69,42 @@ class MoverDetector:
         """
         self.mask = self.things = None
         if T_world_camera is None:
-            self.views, self.found, self.small = [], None, None
+            self.views, self.found, self.small, self.expected = [], None, None, None
             return
         s, factor = self.settings, coarse_factor(frame.camera, self.settings)
-        view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera)
+        view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera, margin)
         earlier, self.views = self.views, [*self.views[-AGES[-1] :], view]
         passed, clearly, same = np.zeros((3, *view.depth.shape), np.int8)
-        fresh = view.depth > 0
+        known, stayed, left = np.zeros((3, *view.depth.shape), bool)
         for age in AGES:
             if age > len(earlier):
                 continue
-            evidence = compare(view, earlier[-age], margin)
+            evidence = compare(view, earlier[-age], margin, self.small)
             passed += evidence.passed
             clearly += evidence.clearly
             same += evidence.same
+            known |= evidence.same | evidence.otherwise
             if age <= s.rest_frames:
-                fresh &= evidence.same
-        novel = passed >= s.min_passed
-        before, moved, self.found, self.small = self.found, self.small, None, None
+                left |= evidence.otherwise
+                if 2 * age >= s.rest_frames:
+                    stayed |= evidence.same
+        before, moved = self.found, self.small
+        self.found = self.small = self.expected = None
+        novel = passed + clearly >= s.min_passed
+        if moved is not None:
+            novel |= (passed > 0) & grow_places(moved)
         if novel.sum() < min(s.min_pixels, 3):
             return
-        places = Gathering(novel, passed > 0, fresh, view.depth, same > passed, factor, frame.depth.shape)
+        rests, judged, shape = stayed & ~left, stayed | left, frame.depth.shape
+        places = Gathering(novel, passed > 0, known, rests, judged, view.depth, same > passed, factor, shape)
         found = gather(places, frame.load_mask, s)
-        if found is None or found.small.sum() > s.max_share * ((passed > 0) | (same > 0)).sum():
+        most = known if moved is None else view.depth > 0  # what moves may hide most of what was seen before
+        if found is None or found.small.sum() > s.max_share * most.sum():
             return
-        found = found.keep_credible(novel, (clearly >= s.min_passed) & sure, moved)
+        found = found.keep_credible(novel, (2 * clearly >= s.min_passed) & sure, moved)
         if found is None:
             return
-        self.found = found.small
+        self.found, self.expected = found.small, grow(found.full > 0, PREDICTED)
         if before is not None:
             seen_twice = found.pixels_near(before)
             if seen_twice is not None:

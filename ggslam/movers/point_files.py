@@ -41,6 +41,5 @@ def points_from_arrays(arrays: Mapping[str, np.ndarray]) -> dict[int, tuple[np.n
     if not fits or offsets[0] != 0 or offsets[-1] != len(points) or not np.isfinite(points).all():
         raise FormatError("points of movers that do not fit together")
     return {
-        int(number): (points[a:b], colors[a:b])
-        for number, a, b in zip(ids, offsets[:-1], offsets[1:], strict=True)
+        int(number): (points[a:b], colors[a:b]) for number, a, b in zip(ids, offsets[:-1], offsets[1:], strict=True)
     }

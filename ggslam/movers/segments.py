@@ -18,6 +18,8 @@ SAME_THING = 0.03
 CLEAR = 0.5
 """Where a thing begins to move, this share of its evidence has to be clear: what differs by little more than noise
 would may be a pose's or a camera's error."""
+JUDGED = 0.25
+"""Share of a thing's places that earlier frames must have looked at to say that it rests."""
 REACH = 2
 """Places by which a thing is larger than its evidence, at most."""
 _AROUND = np.ones((3, 3), np.uint8)
@@ -30,7 +32,9 @@ class Gathering:
     Attributes:
         novel: something has come there.
         perhaps: the same by less evidence, where it hangs on places that are `novel`.
-        rests: it is where all the latest frames saw it.
+        known: earlier frames looked there.
+        rests: it is where all the latest frames saw it that looked there...
+        judged: ...of places at which enough of them did.
         depth: float32, metres.
         world: frames before saw the same there.
         factor: how many times the image is smaller.
@@ -39,7 +43,9 @@ class Gathering:
 
     novel: np.ndarray
     perhaps: np.ndarray
+    known: np.ndarray
     rests: np.ndarray
+    judged: np.ndarray
     depth: np.ndarray
     world: np.ndarray
     factor: int
@@ -66,7 +72,7 @@ class MovingThings:
         numbers = []
         for number in np.unique(self.parts[self.small]):
             own = self.parts == number
-            known = before is not None and bool((own & _grow(before)).any())
+            known = before is not None and bool((own & grow_places(before)).any())
             if known or (own & clear).sum() > CLEAR * (own & novel).sum():
                 numbers.append(number)
         if not numbers:
@@ -76,7 +82,7 @@ class MovingThings:
 
     def pixels_near(self, before: np.ndarray) -> np.ndarray | None:
         """Pixels, bool [H, W], of those that meet places bool [h, w] of the frame before; None without any."""
-        numbers = np.unique(self.parts[_grow(before)])
+        numbers = np.unique(self.parts[grow_places(before)])
         numbers = numbers[numbers > 0]
         return np.isin(self.full, numbers) if len(numbers) else None
 
@@ -99,19 +105,18 @@ def gather(
     small = thin_out(segments, places.factor)
     moving = {number: k for k, number in enumerate(_segments_that_move(small, places, settings), start=1)}
     of_segments = np.isin(small, list(moving)) & (small > 0)
-    left = _large(blobs & ~_grow(of_segments) & (small == 0), settings.min_pixels)
+    left = _large(blobs & ~grow_places(of_segments) & (small == 0), settings.min_pixels)
     return _as_things(_blobs_that_move(left, places, settings), places, segments, moving)
 
 
 def _segments_that_move(small: np.ndarray, places: Gathering, s: MoverSettings) -> list[int]:
     """Ids of segments of which enough has come and that do not rest."""
-    known = places.depth > 0
-    counted = (known, known & places.novel, known & places.rests)
-    count, novel, rest = (np.bincount(small[mask], minlength=int(small.max()) + 1) for mask in counted)
+    counted = (places.known, places.novel, places.rests, places.judged)
+    count, novel, rest, judged = (np.bincount(small[mask], minlength=int(small.max()) + 1) for mask in counted)
     found = []
     for number in np.flatnonzero(novel):
         enough = max(s.min_pixels / 4, s.min_share * count[number])
-        if number and novel[number] >= enough and rest[number] < s.at_rest * count[number]:
+        if number and novel[number] >= enough and not _at_rest(rest[number], judged[number], count[number], s):
             found.append(int(number))
     return found
 
@@ -120,11 +125,17 @@ def _blobs_that_move(blobs: np.ndarray, places: Gathering, s: MoverSettings) -> 
     """Numbers int32 [h, w] of connected places that do not rest, each with what is connected to it."""
     count, labels = cv2.connectedComponents(blobs.astype(np.uint8), connectivity=8)
     for number in range(1, count):
-        if places.rests[labels == number].mean() >= s.at_rest:
-            labels[labels == number] = 0
+        own = labels == number
+        if _at_rest(places.rests[own].sum(), places.judged[own].sum(), own.sum(), s):
+            labels[own] = 0
     for _ in range(REACH):
         labels = _spread(labels, places)
     return labels
+
+
+def _at_rest(rest: int, judged: int, count: int, s: MoverSettings) -> bool:
+    """Whether a thing of so many places stays where it is."""
+    return judged >= JUDGED * count and rest >= s.at_rest * judged
 
 
 def _spread(labels: np.ndarray, places: Gathering) -> np.ndarray:
@@ -137,7 +148,7 @@ def _spread(labels: np.ndarray, places: Gathering) -> np.ndarray:
     return grown
 
 
-def _grow(mask: np.ndarray) -> np.ndarray:
+def grow_places(mask: np.ndarray) -> np.ndarray:
     """A mask bool [h, w] and its neighbours."""
     return cv2.dilate(mask.astype(np.uint8), _AROUND) > 0
 

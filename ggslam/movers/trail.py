@@ -78,7 +78,11 @@ def gone_since(
         return None
     factor = shape[1] // earlier.camera.width
     rests, world = np.zeros(passed.shape, bool), evidence.same
-    found = gather(Gathering(passed, rests, rests, earlier.depth, world, factor, shape), lambda: segments, settings)
+    found = gather(
+        Gathering(passed, rests, earlier.depth > 0, rests, rests, earlier.depth, world, factor, shape),
+        lambda: segments,
+        settings,
+    )
     return None if found is None else found.full > 0
 
 

@@ -101,13 +101,13 @@ class RunMovers:
         """
         settings, camera, trail = self.detector.settings, newest.camera, self.detector.trail
         factor = coarse_factor(camera, settings)
-        view = CoarseView.of(newest.depth, camera, factor, T_world_newest)
+        view = CoarseView.of(newest.depth, camera, factor, T_world_newest, self._margin)
         found: list[np.ndarray | None] = []
         for depth, T_world_camera, segments in earlier:
             if depth.shape != newest.depth.shape:
                 found.append(None)
                 continue
-            old = CoarseView.of(depth, camera, factor, T_world_camera)
+            old = CoarseView.of(depth, camera, factor, T_world_camera, self._margin)
             part = gone_since(old, view, trail, segments, depth.shape, self._margin, settings)
             found.append(None if part is None else grow(part, GROWN))
         return found
@@ -125,9 +125,7 @@ class RunMovers:
 
 def _margin(settings: MoverSettings, noise: DepthNoise) -> Margin:
     """What depths of one surface may differ by."""
-    constant = np.float32(settings.margin_m + settings.margin_sigmas * noise.constant)
-    square = np.float32(settings.margin_sigmas * noise.square)
-    return lambda z: constant + square * z * z
+    return Margin(settings.margin_m, noise, settings.margin_sigmas)
 
 
 def _without(points: PointSource, mask: np.ndarray) -> DeferredPoints:

@@ -213,7 +213,7 @@ RULES: Rules = {
     MoverTracks: _but("recent"),
     MoverSurface: _but("_tree"),
     MovingPixels: Rule(fixed=_names("masks")),
-    CoarseView: Rule(fixed=_names("depth", "near", "far")),
+    CoarseView: Rule(fixed=_names("depth", "near", "far", "whole", "smooth")),
     ObjectMasks: _but("settings", "_segment"),
     # tracking
     GicpTracker: _but("_given_engine", "_features"),

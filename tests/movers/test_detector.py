@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from ggslam.movers.detector import MoverDetector
-from ggslam.movers.evidence import CoarseView, compare
+from ggslam.movers.evidence import CoarseView, Margin, compare
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.trail import Trail, gone_since
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
+from ggslam.tracking.settings import DepthNoise
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 WALL, BOX = 3.0, 1.5
@@ -41,8 +42,7 @@ def frame(n: int, box_at: float | None, seed: int | None = None, ids: bool = Fal
     return Frame(n, n, n / 30, color, depth, CAMERA, mask if ids else None)
 
 
-def margin(z: np.ndarray) -> np.ndarray:
-    return np.full_like(z, 0.004 + 5 * NOISE)
+margin = Margin(0.004, DepthNoise(NOISE, 0.0), 5.0)
 
 
 def look_at(boxes: list[float | None], seed: int | None = 0, ids: bool = False) -> list[np.ndarray | None]:
@@ -121,7 +121,7 @@ def test_a_wrong_pose_is_no_mover_as_large_as_the_image() -> None:
 
 def test_evidence_says_what_was_passed_and_what_was_there() -> None:
     before, now = frame(0, None), frame(1, 0.0)
-    views = [CoarseView.of(f.depth, CAMERA, 3, pose(f.index)) for f in (before, now)]
+    views = [CoarseView.of(f.depth, CAMERA, 3, pose(f.index), margin) for f in (before, now)]
     found, box = compare(views[1], views[0], margin), views[1].depth < 2
     assert found.passed[box].all() and not found.passed[~box].any()
     assert not found.same[box].any() and found.same[~box].mean() > 0.9
@@ -130,8 +130,8 @@ def test_evidence_says_what_was_passed_and_what_was_there() -> None:
 def test_depth_next_to_holes_says_nothing() -> None:
     before, now = frame(0, None), frame(1, 0.0)
     depth = before.depth.copy()
-    depth[::6, ::6] = 0
-    views = [CoarseView.of(depth, CAMERA, 3, pose(0)), CoarseView.of(now.depth, CAMERA, 3, pose(1))]
+    depth[::2, ::2] = 0
+    views = [CoarseView.of(depth, CAMERA, 3, pose(0), margin), CoarseView.of(now.depth, CAMERA, 3, pose(1), margin)]
     assert not compare(views[1], views[0], margin).passed.any()
 
 
@@ -139,11 +139,72 @@ def test_depth_next_to_holes_says_nothing() -> None:
 def test_what_an_earlier_view_shows_at_the_trail_is_gone(ids: bool) -> None:
     settings, trail = MoverSettings(enabled=True), Trail()
     before, now = frame(0, 0.0, ids=ids), frame(20, None)
-    old, new = (CoarseView.of(f.depth, CAMERA, 3, pose(f.index)) for f in (before, now))
+    old, new = (CoarseView.of(f.depth, CAMERA, 3, pose(f.index), margin) for f in (before, now))
     assert gone_since(old, new, trail, before.mask, (240, 320), margin, settings) is None  # nothing has moved
     trail.add(old, (old.depth < 2))
     gone = gone_since(old, new, trail, before.mask, (240, 320), margin, settings)
     assert overlap(gone, before.depth < 2) > 0.8
     still = replace(now, depth=frame(20, 0.0).depth)
-    there = CoarseView.of(still.depth, CAMERA, 3, pose(20))
+    there = CoarseView.of(still.depth, CAMERA, 3, pose(20), margin)
     assert gone_since(old, there, trail, before.mask, (240, 320), margin, settings) is None
+
+
+KINECT = Margin(0.004, DepthNoise(0.008, 0.0), 5.0)
+
+
+def noisy(n: int, step: float, shared: bool) -> Frame:
+    """A wall in 8 mm of noise, a board on it that has come nearer by `step`; noise of pixels, or of 12 x 12 each."""
+    clean = np.full((240, 320), 2.0, np.float32)
+    columns = np.abs((np.arange(320) - CAMERA.cx) / CAMERA.fx * 2 + 0.01 * n) < 0.2
+    clean[80:160, columns] -= step
+    rng = np.random.default_rng(n)
+    spread = (
+        np.kron(rng.normal(0, 0.008, (20, 27)), np.ones((12, 12)))[:, :320]
+        if shared
+        else rng.normal(0, 0.008, (240, 320))
+    )
+    mask = np.where(clean < 2.0 if step else False, 7, 1).astype(np.uint16)
+    return Frame(n, n, n / 30, np.zeros((240, 320, 3), np.uint8), clean + spread.astype(np.float32), CAMERA, mask)
+
+
+def look_in_noise(steps: list[float], shared: bool = False) -> list[np.ndarray | None]:
+    detector, found = MoverDetector(MoverSettings()), []
+    for n, step in enumerate(steps):
+        detector.look(noisy(n, step, shared), pose(n), KINECT)
+        found.append(detector.mask)
+    return found
+
+
+def test_a_few_centimetres_are_found_in_a_kinects_noise() -> None:
+    found = look_in_noise([0.0] * 8 + [0.003 * n for n in range(1, 13)])
+    assert all(mask is None for mask in found[:9])
+    first = next(n for n, mask in enumerate(found) if mask is not None)
+    assert 0.003 * (first - 7) <= 0.03
+    board = noisy(19, 0.036, False).mask
+    assert board is not None and overlap(found[19], board == 7) > 0.8
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_noise_is_no_mover_whether_pixels_share_it_or_not(shared: bool) -> None:
+    assert all(mask is None for mask in look_in_noise([0.0] * 40, shared))
+    assert all(mask is None for mask in look_in_noise([0.05] * 40, shared))
+
+
+def test_a_person_entering_is_left_out_of_tracking_before_they_are_believed() -> None:
+    detector = MoverDetector(MoverSettings())
+    for n, at in enumerate([None] * 6 + [-0.3]):
+        detector.look(frame(n, at), pose(n), margin)
+    following = frame(7, -0.29)
+    assert detector.mask is None and not detector.expect(following).depth[following.depth < 2].any()
+
+
+def test_what_one_clear_look_passed_is_found_though_the_rest_was_not_seen_before() -> None:
+    """The camera turns: of a tall thing at the side most lies where no frame before it looked."""
+    detector = MoverDetector(MoverSettings())
+    for n in range(7):
+        seen = frame(n, 0.0 if n > 5 else None, ids=True)
+        depth = seen.depth.copy()
+        if n <= 5:
+            depth[93:] = 0
+        detector.look(replace(seen, depth=depth), pose(n), margin)
+    assert detector.found is not None and detector.found[40:50, 45:60].all()
