@@ -74,7 +74,7 @@ class MoverDetector:
         s, factor = self.settings, coarse_factor(frame.camera, self.settings)
         view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera, margin)
         earlier, self.views = self.views, [*self.views[-AGES[-1] :], view]
-        passed, clearly, same = np.zeros((3, *view.depth.shape), np.int8)
+        passed, clearly, surely, same = np.zeros((4, *view.depth.shape), np.int8)
         known, stayed, left = np.zeros((3, *view.depth.shape), bool)
         for age in AGES:
             if age > len(earlier):
@@ -82,6 +82,7 @@ class MoverDetector:
             evidence = compare(view, earlier[-age], margin, self.small)
             passed += evidence.passed
             clearly += evidence.clearly
+            surely += evidence.surely
             same += evidence.same
             known |= evidence.same | evidence.otherwise
             if age <= s.rest_frames:
@@ -90,7 +91,7 @@ class MoverDetector:
                     stayed |= evidence.same
         before, moved = self.found, self.small
         self.found = self.small = self.expected = None
-        novel = passed + clearly >= s.min_passed
+        novel = passed + surely >= s.min_passed
         if moved is not None:
             novel |= (passed > 0) & grow_places(moved)
         if novel.sum() < min(s.min_pixels, 3):
@@ -101,7 +102,7 @@ class MoverDetector:
         most = known if moved is None else view.depth > 0  # what moves may hide most of what was seen before
         if found is None or found.small.sum() > s.max_share * most.sum():
             return
-        found = found.keep_credible(novel, (2 * clearly >= s.min_passed) & sure, moved)
+        found = found.keep_credible(novel, (clearly + surely >= s.min_passed) & sure, moved)
         if found is None:
             return
         self.found, self.expected = found.small, grow(found.full > 0, PREDICTED)

@@ -134,13 +134,15 @@ class PairEvidence:
 
     Attributes:
         passed: the other view looked past it, at something farther...
-        clearly: ...by twice the margin.
+        clearly: ...by twice the margin...
+        surely: ...and both of them saw something smooth.
         same: the other view saw a surface there...
         otherwise: ...or nothing but others.
     """
 
     passed: np.ndarray
     clearly: np.ndarray
+    surely: np.ndarray
     same: np.ndarray
     otherwise: np.ndarray
 
@@ -173,7 +175,9 @@ def compare(view: CoarseView, other: CoarseView, margin: Margin, moved: np.ndarr
     slack = margin(z, np.where(smooth, share, ROUGH).astype(np.float32))
     passed, clearly = known & (near > z + slack), known & (near > z + 2 * slack)
     same = inside & (near < z + slack) & (far > z - slack)
-    return PairEvidence(*(found.reshape(view.depth.shape) for found in (passed, clearly, same, known & ~same)))
+    return PairEvidence(
+        *(found.reshape(view.depth.shape) for found in (passed, clearly, clearly & smooth, same, known & ~same))
+    )
 
 
 def _measured_share(other: CoarseView, margin: Margin, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> float:
