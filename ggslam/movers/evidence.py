@@ -17,7 +17,6 @@ import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
-from ggslam.tracking.settings import DepthNoise
 
 _NO_DEPTH = np.float32(np.inf)
 SMOOTH = 2.5
@@ -44,13 +43,14 @@ class Margin:
 
     Attributes:
         least: metres, whatever the noise: poses are no better.
-        noise: of the depth camera.
-        sigmas: standard deviations.
+        sigmas: standard deviations of the depth camera's noise...
+        constant, square: ...which is constant + square z^2, metres.
     """
 
     least: float
-    noise: DepthNoise
     sigmas: float
+    constant: float
+    square: float = 0.0
 
     def __call__(self, z: np.ndarray, share: np.ndarray | float = 1.0) -> np.ndarray:
         """At depths in metres; `share`: of a pixel's noise that is left where a mean is compared."""
@@ -58,7 +58,7 @@ class Margin:
 
     def sigma(self, z: np.ndarray) -> np.ndarray:
         """Standard deviation of a pixel's depth, metres."""
-        return np.float32(self.noise.constant) + np.float32(self.noise.square) * z * z
+        return np.float32(self.constant) + np.float32(self.square) * z * z
 
 
 @dataclass(frozen=True)

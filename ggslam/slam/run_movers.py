@@ -125,7 +125,7 @@ class RunMovers:
 
 def _margin(settings: MoverSettings, noise: DepthNoise) -> Margin:
     """What depths of one surface may differ by."""
-    return Margin(settings.margin_m, noise, settings.margin_sigmas)
+    return Margin(settings.margin_m, settings.margin_sigmas, noise.constant, noise.square)
 
 
 def _without(points: PointSource, mask: np.ndarray) -> DeferredPoints:

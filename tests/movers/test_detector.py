@@ -14,7 +14,6 @@ from ggslam.movers.settings import MoverSettings
 from ggslam.movers.trail import Trail, gone_since
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.tracking.settings import DepthNoise
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 WALL, BOX = 3.0, 1.5
@@ -42,7 +41,7 @@ def frame(n: int, box_at: float | None, seed: int | None = None, ids: bool = Fal
     return Frame(n, n, n / 30, color, depth, CAMERA, mask if ids else None)
 
 
-margin = Margin(0.004, DepthNoise(NOISE, 0.0), 5.0)
+margin = Margin(0.004, 5.0, NOISE)
 
 
 def look_at(boxes: list[float | None], seed: int | None = 0, ids: bool = False) -> list[np.ndarray | None]:
@@ -149,7 +148,7 @@ def test_what_an_earlier_view_shows_at_the_trail_is_gone(ids: bool) -> None:
     assert gone_since(old, there, trail, before.mask, (240, 320), margin, settings) is None
 
 
-KINECT = Margin(0.004, DepthNoise(0.008, 0.0), 5.0)
+KINECT = Margin(0.004, 5.0, 0.008)
 
 
 def noisy(n: int, step: float, shared: bool) -> Frame:
