@@ -19,7 +19,8 @@ class MoverSettings:
     margin_sigmas: float = setting(5.0, 0, 100)
     """See `margin_m`."""
     min_passed: int = setting(2, 1, 100)
-    """So many frames have to have looked past a place at something farther."""
+    """So many frames have to have looked past a place at something farther; one that did so clearly, where both saw
+    something smooth, counts twice."""
     min_pixels: int = setting(8, 1, 10**6)
     """Connected places of the small image that are something that moves; of a segment a quarter of them."""
     min_share: float = setting(0.12, 0, 1)
