@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import ggslam
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.ply import read_ply
@@ -20,7 +21,6 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.movers import MoversRecord
 from ggslam.scene.arrays import arrays_to_bytes
 from ggslam.scene.camera import Camera
-from tests.command_line import ggslam
 
 
 def pose(x: float) -> list[list[float]]:

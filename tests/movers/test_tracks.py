@@ -7,11 +7,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+from box_scene import box_pose, camera_pose, error, render, view_of
 
 from ggslam.movers.found import FoundMover, MoverSight
 from ggslam.movers.tracks import MoverTracks
 from ggslam.scene.poses import inverse
-from tests.movers.box_scene import box_pose, camera_pose, error, render, view_of
 
 BEGINS, FOUND, ENDS, LAST = 12, 16, 32, 44
 
