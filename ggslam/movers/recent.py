@@ -56,17 +56,22 @@ class RecentFrame:
 
     def show_surface(self, points: np.ndarray) -> np.ndarray:
         """Where points of a surface [n, 3], world, would be seen and something is that far: bool [H, W]."""
-        camera, found = self.camera, np.zeros(self.depth.shape, bool)
+        found = np.zeros(self.depth.shape, bool)
+        rows, columns, z = self.project(points)
+        there = np.abs(self.depth[rows, columns] - z) < 2 * self.margin(z.astype(np.float32)) + 0.005
+        found[rows[there], columns[there]] = True
+        return found
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows, columns and depths of those of some points [n, 3], world, that fall into the image."""
+        camera = self.camera
         R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         seen = (points - t) @ R
         z = np.maximum(seen[:, 2], 1e-3)
         u = np.rint(camera.fx * seen[:, 0] / z + camera.cx)
         v = np.rint(camera.fy * seen[:, 1] / z + camera.cy)
         inside = (seen[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        rows, columns, z = v[inside].astype(int), u[inside].astype(int), z[inside]
-        there = np.abs(self.depth[rows, columns] - z) < 2 * self.margin(z.astype(np.float32)) + 0.005
-        found[rows[there], columns[there]] = True
-        return found
+        return v[inside].astype(int), u[inside].astype(int), z[inside]
 
 
 @dataclass(frozen=True)

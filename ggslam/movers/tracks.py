@@ -240,13 +240,8 @@ def view_share(view: RecentFrame, track: Track, mask: np.ndarray) -> float:
     """Share of a mover's surface, where it is expected in a view, that is on a mask bool [H, W]."""
     assert track.latest is not None
     points = transform_points(track.latest.points, track.tracker.predict(view.index))
-    camera, T = view.camera, inverse(view.T_world_camera)
-    seen = transform_points(points, T)
-    z = np.maximum(seen[:, 2], 1e-3)
-    u = np.rint(camera.fx * seen[:, 0] / z + camera.cx).astype(int)
-    v = np.rint(camera.fy * seen[:, 1] / z + camera.cy).astype(int)
-    inside = (seen[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    return float(mask[v[inside], u[inside]].sum()) / max(1, len(points))
+    rows, columns, _ = view.project(points)
+    return float(mask[rows, columns].sum()) / max(1, len(points))
 
 
 def _segment_of(ids: np.ndarray) -> int | None:

@@ -36,7 +36,6 @@ from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.merging.moving import with_channels
-from ggslam.movers.point_files import POINTS_FILE
 from ggslam.objects.encoding import code_of
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import publish_run
@@ -44,7 +43,7 @@ from ggslam.runs.records.container import CONTAINER_FORMAT, CONTAINER_VERSION, C
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.mark import FileRecord, RunRecord
-from ggslam.runs.records.movers import MoversRecord
+from ggslam.runs.records.movers import MOVER_FILES
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points_of_map
@@ -52,7 +51,6 @@ from ggslam.runs.writing import RUN_FILES, TRUTH_FILE
 from ggslam.scene.arrays import arrays_of, arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
-from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.system.atomic import atomic_write, make_folder, write_bytes
 from ggslam.system.foreign import open_foreign
@@ -63,7 +61,7 @@ _CLASSIFIER, _TABLE = "classifier.npz", "objects.json"
 _NEEDED = (
     RunRecord.FILE, KeyframesRecord.FILE, "trajectory.txt", "config.yaml", SequenceRecord.FILE, TimingRecord.FILE,
 )  # fmt: skip
-_PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, MOVERS_FILE, MoversRecord.FILE, POINTS_FILE, _TABLE, _CLASSIFIER)
+_PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, *MOVER_FILES, _TABLE, _CLASSIFIER)
 _MEMBERS = frozenset((_HEAD, _MAP, PLACES_FILE, *_NEEDED, *_PERHAPS))
 _MOST_KEYFRAMES = (1 << 16) - 2
 

@@ -21,7 +21,7 @@ from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.mark import RunRecord, VerdictRecord
-from ggslam.runs.records.movers import MoversRecord
+from ggslam.runs.records.movers import MOVER_FILES, MoversRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_map_in_parts, save_points
@@ -47,7 +47,7 @@ TRAJECTORIES = "trajectories"
 RUN_FILES = (
     *OBJECT_FILES, "map.ply", MAP_INDEX, "trajectory.txt", KeyframesRecord.FILE, LoopsRecord.FILE, SequenceRecord.FILE,
     TimingRecord.FILE, "config.yaml", "metrics.json", "frames.csv", *POINTS, PLACES_FILE, STEPS_FILE, TRUTH_FILE,
-    MOVERS_FILE, MoversRecord.FILE, POINTS_FILE, REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES,
+    *MOVER_FILES, REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES,
     CHANGES_FOLDER,
 )  # fmt: skip
 """Files and folders that a run may have besides run.json."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from ggslam.formats.point_ply import write_points_in_parts
 from ggslam.formats.point_sampling import MapPart, sample_parts
-from ggslam.movers.point_files import POINTS_FILE
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
@@ -19,14 +18,13 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.publishing import publish_run
 from ggslam.runs.records.mark import RunRecord
-from ggslam.runs.records.movers import MoversRecord
+from ggslam.runs.records.movers import MOVER_FILES
 from ggslam.runs.writing import OBJECT_FILES, POINTS, REPORT_FILE, TRAJECTORIES, TRUTH_FILE, write_objects
-from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.atomic import make_folder
 
-RECORDS = (STEPS_FILE, TRUTH_FILE, MOVERS_FILE, MoversRecord.FILE, POINTS_FILE)
+RECORDS = (STEPS_FILE, TRUTH_FILE, *MOVER_FILES)
 """Files that stay true, too, but older runs have none."""
 COPIED = ("trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "loops.json", *RECORDS)
 """Files that stay true of an edited run."""

@@ -17,26 +17,24 @@ from ggslam.jobs.refine.cell_mapper import StillMapper
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.visit_records import exposure_of
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
-from ggslam.movers.point_files import POINTS_FILE
 from ggslam.native.loader import NativeContext
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import publish_run
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.mark import RunRecord
-from ggslam.runs.records.movers import MoversRecord
+from ggslam.runs.records.movers import MOVER_FILES
 from ggslam.runs.saving_parts import save_points_of_map
 from ggslam.runs.writing import RUN_FILES, TRAJECTORIES, TRUTH_FILE, write_objects
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
-from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import delay_interrupts
 
 _STAY = ("trajectory.txt", "config.yaml", "sequence.json", "loops.json", STEPS_FILE, TRUTH_FILE, PLACES_FILE,
-         MOVERS_FILE, MoversRecord.FILE, POINTS_FILE)  # fmt: skip
+         *MOVER_FILES)  # fmt: skip
 """Files that are true of the refined run as well; keyframes.json and timing.json with a change."""
 
 

@@ -10,10 +10,15 @@ import numpy as np
 import pydantic
 
 from ggslam.movers.found import FoundMover, MoverSight
+from ggslam.movers.point_files import POINTS_FILE
 from ggslam.objects.colors import id_palette
 from ggslam.runs.records.record import Array, Number, Record, RecordFile
 from ggslam.scene.poses import inverse, separation
+from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.slam.result import SlamResult
+
+MOVER_FILES = (MOVERS_FILE, "movers.json", POINTS_FILE)
+"""All that a run has of its movers; stays true whatever is done to its map."""
 
 
 def _pose(value: np.ndarray) -> np.ndarray:
@@ -126,7 +131,7 @@ class MoverRecord(Record):
 class MoversRecord(RecordFile):
     """All movers."""
 
-    FILE: ClassVar[str] = "movers.json"
+    FILE: ClassVar[str] = MOVER_FILES[1]
     movers: list[MoverRecord] = []
 
     @staticmethod
