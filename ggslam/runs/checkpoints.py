@@ -138,13 +138,15 @@ class Checkpoints:
             self._kept = KeptArrays(self.folder)
             raise
 
-    def remove(self) -> None:
-        """Removes all of it: the run is complete."""
-        if self._finishing is not None:
-            self._finishing.cancel()
-            self._finishing.exception()
+    def close(self) -> None:
+        """Ends the other thread, after what it was given: nothing is written or removed afterwards."""
         if self._helper is not None:
             self._helper.shutdown()
+            self._helper = None
+
+    def remove(self) -> None:
+        """Removes all of it: the run is complete."""
+        self.close()
         if self.folder.is_symlink():
             raise RunFolderError(f"{self.folder}: is a symbolic link; a folder of ggslam's own is expected there")
         shutil.rmtree(self.folder, ignore_errors=True)

@@ -26,7 +26,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.verification import verify_run
 from ggslam.slam.result import StepReport
-from ggslam.system.atomic import write_failure
+from ggslam.system.atomic import sync_folder, write_failure
 from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import Interrupted
 
@@ -126,8 +126,12 @@ def test_a_run_killed_at_any_moment_goes_on(room: Path, whole: Path, tmp_path: P
 
 
 @pytest.mark.long("killed and resumed three times")
-def test_killed_again_and_again(room: Path, whole: Path, tmp_path: Path) -> None:
+def test_killed_again_and_again(
+    room: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "run"
+    # On a slow disk: nothing may be at work in the folder still when it is looked at, or gone on with.
+    monkeypatch.setattr(checkpoints, "sync_folder", lambda folder: (time.sleep(0.3), sync_folder(folder)))
     with pytest.raises(Killed):
         execute(request(room, out, every=1), KillAt(frame=3))
     for frame in (5, 6, 12):

@@ -169,6 +169,9 @@ class _Run:
                 checkpoints.remove()
                 folder.discard()
             raise
+        finally:
+            # However it ends: whoever has the folder next finds nobody at work in it.
+            checkpoints.close()
         if not result.keyframes:
             checkpoints.remove()
             folder.discard()
