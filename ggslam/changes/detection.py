@@ -124,7 +124,7 @@ class ChangeDetector:
         points, ids = surface.points[kept], surface.labels[kept].astype(np.int64)
         other = self.sights[1 - number].look_up(points, tolerance)
         distance = cKDTree(self.visits[number].T_world_camera[:, :3, 3]).query(points)[0]
-        return JudgedSurface(points, surface.colors[kept], ids, other, tolerance.at(distance))
+        return JudgedSurface(points, surface.colors[kept], surface.toward[kept], ids, other, tolerance.at(distance))
 
     def _ids_agree(self) -> bool:
         """Whether things that stayed have the same ids in both visits."""
@@ -171,7 +171,7 @@ class ChangeDetector:
 
     def _shape(self, number: int, thing: Thing) -> Shape:
         judged = self.judged[number]
-        return Shape(judged.points[thing.rows], judged.colors[thing.rows])
+        return Shape.from_views(*(values[thing.rows] for values in (judged.points, judged.colors, judged.toward)))
 
     def _fit(self, old: Thing, new: Thing) -> Fit | None:
         before, after = self._shape(0, old), self._shape(1, new)

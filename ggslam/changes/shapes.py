@@ -19,6 +19,11 @@ from ggslam.scene.poses import fit_similarity, inverse, orthonormalize, se3_exp,
 
 COLOR_SCALE_M = 0.08
 """Metres that the distance from black to full in one channel counts as where partners are looked for."""
+NORMAL_SCALE_M = 0.06
+"""Metres that a radian between normals counts as there."""
+_NEIGHBOURS, _SIDE_M = 16, 0.02
+"""Points that a normal is estimated from, and metres that a radian between the directions they were seen from counts
+as."""
 _COARSE, _COARSE_STEPS, _GOOD = 150, 10, 16
 _FINE, _FINE_STEPS, _BEST = 400, 15, 8
 """Points, steps of each stage, and motions that are kept after it."""
@@ -58,19 +63,36 @@ class Shape:
     Attributes:
         points: float64 [n, 3], world.
         colors: float32 [n, 3] in [0, 1].
+        normals: float64 [n, 3], unit vectors to the side that was seen.
     """
 
     points: np.ndarray
     colors: np.ndarray
+    normals: np.ndarray
+
+    @staticmethod
+    def from_views(points: np.ndarray, colors: np.ndarray, toward: np.ndarray) -> Shape:
+        """A surface, with directions [n, 3] to the cameras that saw it: both faces of a thin thing are told apart."""
+        count = min(_NEIGHBOURS, len(points))
+        normals = estimate_normals(points, neighbours=count, beside=_SIDE_M * toward) if count else np.zeros((0, 3))
+        return Shape(points, colors, np.where((normals * toward).sum(1, keepdims=True) < 0, -normals, normals))
+
+    def move(self, T: np.ndarray) -> Shape:
+        """The same moved by [4, 4]."""
+        return Shape(transform_points(self.points, T), self.colors, self.normals @ T[:3, :3].T)
 
     def sample(self, count: int, rng: np.random.Generator) -> Shape:
         """Some of its points."""
         rows = rng.permutation(len(self.points))[:count]
-        return Shape(self.points[rows], self.colors[rows])
+        return Shape(self.points[rows], self.colors[rows], self.normals[rows])
 
     def joint(self) -> np.ndarray:
         """Places and colours, [n, 6] metres."""
         return np.concatenate([self.points, COLOR_SCALE_M * self.colors], 1)
+
+    def joint_with_sides(self) -> np.ndarray:
+        """Places, colours and normals, [n, 9] metres."""
+        return np.concatenate([self.joint(), NORMAL_SCALE_M * self.normals], 1)
 
     def extent(self) -> float:
         """Its size: the diagonal of the box that holds the middle nine tenths of it, metres."""
@@ -134,8 +156,10 @@ def fit_shapes(
     # Of motions as good as the best the one that turns least: round things tell no turn.
     alike = [fit for fit in _unlike_fits(fits) if fit.quality() >= best.quality() - _AS_GOOD]
     chosen = min(alike, key=lambda fit: turning_angle(fit.T_new_old, np.eye(4)))
-    settled = _settle(_stand_up(chosen, fits, up), judge, target, sample, up)
-    return _find_turn(settled, judge, target, sample, up)
+    # Which way round a thing is, shows what it covers, whichever faces were seen; where exactly, face upon face.
+    faces = _Target(new, faces=True)
+    settled = _settle(_stand_up(chosen, fits, up), judge, faces, sample, up)
+    return _find_turn(settled, judge, (faces, target), sample, up)
 
 
 def _unlike_fits(fits: list[Fit]) -> list[Fit]:
@@ -161,6 +185,10 @@ def _settle(fit: Fit, judge: _Judge, target: _Target, sample: Shape, up: np.ndar
     """The motion, refined to the end, also from beside: plain surfaces slide upon each other slowly, as only their
     edges pull."""
     level = _tilt(fit.T_new_old, up) < _LEVEL
+    T = target.refine(sample, fit.T_new_old, judge.settings.fit_m, upright(up) if level else None, _LAST_STEPS)
+    on_faces = judge.fit(T)
+    if on_faces.quality() >= fit.quality() - _TURN_TELLS:
+        fit = on_faces
     across = np.linalg.svd(up[None])[2][1:]
     for beside in _BESIDE_M:
         for step in (np.zeros(3), *(beside * sign * axis for axis in across for sign in (1, -1))):
@@ -171,16 +199,17 @@ def _settle(fit: Fit, judge: _Judge, target: _Target, sample: Shape, up: np.ndar
     return fit
 
 
-def _find_turn(fit: Fit, judge: _Judge, target: _Target, sample: Shape, up: np.ndarray) -> Fit:
+def _find_turn(fit: Fit, judge: _Judge, targets: tuple[_Target, ...], sample: Shape, up: np.ndarray) -> Fit:
     """Whether the thing turned further about the vertical fits as well."""
     middle = transform_points(sample.points, fit.T_new_old).mean(0)
     for angle in _PROBED:
         further = np.eye(4)
         further[:3, :3] = _about(up, angle)
         further[:3, 3] = middle - further[:3, :3] @ middle
-        T = target.refine(sample, further @ fit.T_new_old, judge.settings.fit_m, _SHIFTS)
-        if judge.fit(T).quality() >= fit.quality() - _TURN_TELLS:
-            return replace(fit, as_good_deg=float(angle))
+        for target in targets:
+            T = target.refine(sample, further @ fit.T_new_old, judge.settings.fit_m, _SHIFTS)
+            if judge.fit(T).quality() >= fit.quality() - _TURN_TELLS:
+                return replace(fit, as_good_deg=float(angle))
     return fit
 
 
@@ -229,13 +258,13 @@ class _Judge:
         """A motion T_new_old, judged."""
         shares, seen, colors, apart = [], [], [], []
         for (shape, sights, tree, joint), motion in zip(self._sides, (T, inverse(T)), strict=True):
-            moved = transform_points(shape.points, motion)
-            found = sights.look_up(moved, self._within)
-            share, judged = _share_there(found, tree.query(moved)[0] < 2 * self.settings.fit_m)
+            moved = shape.move(motion)
+            found = sights.look_up(moved.points, self._within)
+            share, judged = _share_there(found, tree.query(moved.points)[0] < 2 * self.settings.fit_m)
             shares.append(share)
             seen.append(judged)
             colors.append(color_apart(shape.colors, found.color))
-            off = np.sort(joint.query(Shape(moved, shape.colors).joint(), workers=-1)[0])
+            off = np.sort(joint.query(moved.joint(), workers=-1)[0])
             apart.append(float(off[: max(1, round(_OVERLAP * len(off)))].mean()))
         known = [value for value in colors if np.isfinite(value)]
         return Fit(T, min(shares), min(seen), max(known) if known else 1.0, max(apart))
@@ -289,12 +318,17 @@ def _step(a: Shape, b: Shape, tree: cKDTree, motions: np.ndarray) -> tuple[np.nd
 
 
 class _Target:
-    """A surface that others are brought upon: point-to-plane, and along the surface by colours."""
+    """A surface that others are brought upon: point-to-plane, and along the surface by colours.
 
-    def __init__(self, shape: Shape) -> None:
+    Args:
+        shape: the surface.
+        faces: only what faces the same way may be the same: the other face of something thin is not.
+    """
+
+    def __init__(self, shape: Shape, faces: bool = False) -> None:
         self.shape = shape
-        self._tree = cKDTree(shape.joint())
-        self._normals = estimate_normals(shape.points, neighbours=min(16, len(shape.points)))
+        self._places = Shape.joint_with_sides if faces else Shape.joint
+        self._tree = cKDTree(self._places(shape))
 
     def refine(
         self, other: Shape, T: np.ndarray, reach: float, free: np.ndarray | None = None, steps: int = 25
@@ -302,17 +336,15 @@ class _Target:
         """Gauss-Newton from a motion [4, 4] that is about right; `free` [6, k]: twists that it may take, about the
         middle; None: all."""
         free = np.eye(6) if free is None else free
-        points, joint = other.points, other.joint()
         for _ in range(steps):
-            moved = transform_points(points, T)
-            apart, nearest = self._tree.query(
-                np.concatenate([moved, joint[:, 3:]], 1), distance_upper_bound=3 * reach, workers=-1
-            )
+            placed = other.move(T)
+            moved = placed.points
+            apart, nearest = self._tree.query(self._places(placed), distance_upper_bound=3 * reach, workers=-1)
             pairs = np.isfinite(apart)
             if pairs.sum() < _FEWEST:
                 return T
             partners = nearest[pairs]
-            partner, normal = self.shape.points[partners], self._normals[partners]
+            partner, normal = self.shape.points[partners], self.shape.normals[partners]
             step = plane_step(moved[pairs], partner, normal, reach, _TANGENT, free=free)
             T = orthonormalize(step @ T)
             if np.abs(step - np.eye(4)).max() < _SMALL_STEP:

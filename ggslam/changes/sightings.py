@@ -111,19 +111,22 @@ class Surface:
     Attributes:
         points: float64 [n, 3], world.
         colors: float32 [n, 3] in [0, 1].
+        toward: float32 [n, 3], mean of the unit vectors to the cameras that saw it.
         labels: uint16 [n].
         counts: int32 [n], measurements that each was made of.
     """
 
     points: np.ndarray
     colors: np.ndarray
+    toward: np.ndarray
     labels: np.ndarray
     counts: np.ndarray
 
     @staticmethod
     def empty() -> Surface:
         """Of nothing."""
-        return Surface(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0, np.uint16), np.zeros(0, np.int32))
+        none = np.zeros((0, 3), np.float32)
+        return Surface(np.zeros((0, 3)), none, none, np.zeros(0, np.uint16), np.zeros(0, np.int32))
 
     @staticmethod
     def join(parts: Sequence[Surface]) -> Surface:
@@ -141,11 +144,13 @@ class Surface:
         first = np.flatnonzero(np.append(True, (np.diff(keys) != 0) | (np.diff(labels) != 0)))
         weights = self.counts[order].astype(np.float64)
         counts = np.add.reduceat(weights, first)
-        points, colors = (
+        points, colors, toward = (
             np.add.reduceat(values[order] * weights[:, None], first) / counts[:, None]
-            for values in (self.points, self.colors)
+            for values in (self.points, self.colors, self.toward)
         )
-        return Surface(points, colors.astype(np.float32), labels[first], counts.astype(np.int32))
+        return Surface(
+            points, colors.astype(np.float32), toward.astype(np.float32), labels[first], counts.astype(np.int32)
+        )
 
 
 @dataclass(frozen=True)
@@ -250,7 +255,11 @@ class Sightings:
             nearest, farthest = picture.nearest(), picture.farthest()
             shown = (nearest > 0) & (farthest - nearest < OUTLINE * farthest)
             points, counts = _back_project(picture, shown), np.ones(int(shown.sum()), np.int32)
-            waiting.append(Surface(points, picture.color[shown] * BYTE, picture.labels[shown], counts))
+            toward = inverse(picture.T_camera_world)[:3, 3] - points
+            toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+            waiting.append(
+                Surface(points, picture.color[shown] * BYTE, toward.astype(np.float32), picture.labels[shown], counts)
+            )
             if len(waiting) == _THINNED_EVERY or number + 1 == len(self.pictures):
                 gathered, waiting = Surface.join([gathered, *waiting]).thin(spacing), []
         return gathered

@@ -49,6 +49,7 @@ class JudgedSurface:
     Attributes:
         points: float64 [n, 3], world.
         colors: float32 [n, 3] in [0, 1].
+        toward: float32 [n, 3], to the cameras that saw it.
         ids: int64 [n], objects; 0 = none.
         other: what the other visit saw there.
         within: float64 [n], how near surfaces have to be there to be one, metres.
@@ -56,6 +57,7 @@ class JudgedSurface:
 
     points: np.ndarray
     colors: np.ndarray
+    toward: np.ndarray
     ids: np.ndarray
     other: Evidence
     within: np.ndarray

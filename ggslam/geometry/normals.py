@@ -18,7 +18,7 @@ _CHUNK = 1 << 17
 
 def estimate_normals(
     points: np.ndarray, rows: np.ndarray | None = None, neighbours: int = NEIGHBOURS, tree: cKDTree | None = None,
-    workers: int = -1,
+    workers: int = -1, beside: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Unit normals float64 [n, 3] of points [N, 3], the direction of least variance among each point's nearest
     neighbours; their sign is arbitrary.
@@ -28,15 +28,17 @@ def estimate_normals(
         rows: int [n], the points whose normals are wanted; None: all.
         neighbours: points in a plane, the point itself included.
         tree: of the points; None: one is built.
+        beside: [N, k], further coordinates in which neighbours lie near; the tree then is of all.
         workers: threads that search; one is faster for a few hundred points.
     """
     points = np.asarray(points, np.float64)
-    tree = cKDTree(points) if tree is None else tree
+    places = points if beside is None else np.concatenate([points, beside], 1)
+    tree = cKDTree(places) if tree is None else tree
     rows, count = np.arange(len(points)) if rows is None else rows, min(neighbours, len(points))
     normals = np.empty((len(rows), 3))
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
-        near = points[tree.query(points[rows[part]], count, workers=workers)[1].reshape(-1, count)]
+        near = points[tree.query(places[rows[part]], count, workers=workers)[1].reshape(-1, count)]
         offsets = near - near.mean(1, keepdims=True)
         normals[part] = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
     return normals

@@ -62,6 +62,7 @@ def test_a_thing_turned_in_place_is_moved() -> None:
     check_moved(found.changes[0], CUP, turned)
 
 
+@pytest.mark.long("shapes are compared from starts all around")
 def test_a_thin_thing_that_was_pushed_along_the_floor_is_moved() -> None:
     size = (0.3, 0.12, 0.006)
     before, after = Box(5, (-0.1, -0.3), size), Box(5, (-0.02, -0.26), size, turn=30)
