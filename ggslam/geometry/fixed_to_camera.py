@@ -82,8 +82,5 @@ def parts_with_seeds(seeds: np.ndarray, candidates: np.ndarray, least_share: flo
 
 def is_in_image_part(points: np.ndarray, part: np.ndarray, camera: Camera) -> np.ndarray:
     """Which points [n, 3] in the camera's frame fall on a part of its image, bool [H, W]; bool [n]."""
-    z = np.maximum(points[:, 2], 1e-6)
-    u = np.rint(camera.fx * points[:, 0] / z + camera.cx).clip(-1, camera.width).astype(int)
-    v = np.rint(camera.fy * points[:, 1] / z + camera.cy).clip(-1, camera.height).astype(int)
-    inside = (points[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return inside & part[np.where(inside, v, 0), np.where(inside, u, 0)]
+    rows, columns, inside = camera.project(points)
+    return inside & part[rows, columns]

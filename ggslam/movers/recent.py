@@ -64,14 +64,10 @@ class RecentFrame:
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rows, columns and depths of those of some points [n, 3], world, that fall into the image."""
-        camera = self.camera
         R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         seen = (points - t) @ R
-        z = np.maximum(seen[:, 2], 1e-3)
-        u = np.rint(camera.fx * seen[:, 0] / z + camera.cx)
-        v = np.rint(camera.fy * seen[:, 1] / z + camera.cy)
-        inside = (seen[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        return v[inside].astype(int), u[inside].astype(int), z[inside]
+        rows, columns, inside = self.camera.project(seen, nearest=0.05)
+        return rows[inside], columns[inside], seen[inside, 2]
 
 
 @dataclass(frozen=True)

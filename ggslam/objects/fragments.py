@@ -139,14 +139,11 @@ class FragmentMemory:
             return
         R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
         points = (np.stack([f.centre for f in absent]) - t) @ R
-        z = np.maximum(points[:, 2], 1e-6)
-        u = np.rint(camera.fx * points[:, 0] / z + camera.cx)
-        v = np.rint(camera.fy * points[:, 1] / z + camera.cy)
-        inside = (points[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        rows, columns, inside = camera.project(points)
         for k in np.flatnonzero(inside):
-            y, x = int(v[k]), int(u[k])
+            y, x = int(rows[k]), int(columns[k])
             segment, fragment = int(overlap.row[y, x]), absent[k]
-            if segment < 0 or segment in minor or abs(depth[y, x] - z[k]) > 2 * fragment.radius:
+            if segment < 0 or segment in minor or abs(depth[y, x] - points[k, 2]) > 2 * fragment.radius:
                 continue
             if best[segment] >= 0 and overlap.objects[best[segment]] == fragment.parent:
                 fragment.together += 1

@@ -47,11 +47,8 @@ class CameraView:
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pixel index [M] (row-major, int64), depth [M] and whether it falls into the image, of world points [M, 3]."""
         local = points @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
-        z, c = local[:, 2], self.camera
-        safe = np.maximum(z, 1e-6)
-        column, row = np.rint(c.fx * local[:, 0] / safe + c.cx), np.rint(c.fy * local[:, 1] / safe + c.cy)
-        inside = (z > 0.05) & (column >= 0) & (row >= 0) & (column < c.width) & (row < c.height)
-        return np.where(inside, row * c.width + column, 0).astype(np.int64), z, inside
+        rows, columns, inside = self.camera.project(local, nearest=0.05)
+        return rows * self.camera.width + columns, local[:, 2], inside
 
 
 @dataclass(frozen=True)

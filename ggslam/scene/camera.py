@@ -62,6 +62,14 @@ class Camera:
         """Points in the camera frame, float32 [H, W, 3], of a depth image [H, W] in metres (0 stays the origin)."""
         return self.rays() * depth[..., None].astype(np.float32)
 
+    def project(self, points: np.ndarray, nearest: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The pixels that points [n, 3] in the camera frame fall on: rows and columns, int64 [n], 0 outside, and
+        whether they fall into the image, farther away than `nearest` metres, bool [n]."""
+        z = np.maximum(points[:, 2], 1e-6)
+        column, row = np.rint(self.fx * points[:, 0] / z + self.cx), np.rint(self.fy * points[:, 1] / z + self.cy)
+        inside = (points[:, 2] > nearest) & (row >= 0) & (column >= 0) & (row < self.height) & (column < self.width)
+        return np.where(inside, row, 0).astype(np.int64), np.where(inside, column, 0).astype(np.int64), inside
+
 
 @lru_cache(maxsize=4)
 def _rays(camera: Camera) -> np.ndarray:

@@ -116,10 +116,6 @@ def _differences(frame: Frame, other: Frame, convention: PoseConvention, ratio: 
     points = points[points[:, 2] > 0]
     T_world_frame, T_world_other = map(convention.convert, (frame.T_world_camera, other.T_world_camera))
     points = transform_points(points, inverse(T_world_other) @ T_world_frame)
-    points = points[points[:, 2] > 0.02 * ratio]
-    c = other.camera
-    u = np.rint(c.fx * points[:, 0] / points[:, 2] + c.cx).astype(int)
-    v = np.rint(c.fy * points[:, 1] / points[:, 2] + c.cy).astype(int)
-    inside = (u >= 0) & (u < c.width) & (v >= 0) & (v < c.height)
-    predicted, seen = points[inside, 2], other.depth[v[inside], u[inside]] * np.float32(ratio)
+    rows, columns, inside = other.camera.project(points, nearest=0.02 * ratio)
+    predicted, seen = points[inside, 2], other.depth[rows[inside], columns[inside]] * np.float32(ratio)
     return np.abs(seen - predicted)[seen > 0] / predicted[seen > 0]

@@ -48,13 +48,11 @@ def count_chances(
     for keyframe in keyframes:
         if keyframe.mask is None or keyframe.frame_index == ELSEWHERE or not len(world):
             continue
-        camera, T = keyframe.camera, keyframe.T_camera_world
+        T = keyframe.T_camera_world
         p = world @ T[:3, :3].T + T[:3, 3]
-        z = np.maximum(p[:, 2], 1e-6)
-        u, v = np.rint(camera.fx * p[:, 0] / z + camera.cx), np.rint(camera.fy * p[:, 1] / z + camera.cy)
-        shown = (p[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        rows, columns, shown = keyframe.camera.project(p)
         inside = np.flatnonzero(shown & (keyframe.frame_index >= begin))
-        depth = keyframe.depth_m()[v[inside].astype(int), u[inside].astype(int)]
-        near = np.abs(depth - z[inside]) < np.maximum(_NEAR_M, _NEAR_RELATIVE * z[inside])
+        z = p[inside, 2]
+        near = np.abs(keyframe.depth_m()[rows[inside], columns[inside]] - z) < np.maximum(_NEAR_M, _NEAR_RELATIVE * z)
         seen[inside[near]] += 1
     return dict(zip(points, seen.tolist(), strict=True))

@@ -84,14 +84,10 @@ class Views:
             points: world.
             frame: position in `frames`.
         """
-        T, camera = self.poses[self.frames[frame]], self.camera
+        T = self.poses[self.frames[frame]]
         own = (points - T[:3, 3]) @ T[:3, :3]
-        z = np.maximum(own[:, 2], 0.05)
-        u = np.rint(camera.fx * own[:, 0] / z + camera.cx).astype(int)
-        v = np.rint(camera.fy * own[:, 1] / z + camera.cy).astype(int)
-        inside = (own[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        u, v = u.clip(0, camera.width - 1), v.clip(0, camera.height - 1)
-        return inside & (own[:, 2] < self.depths[frame][v, u] + 0.03)
+        rows, columns, inside = self.camera.project(own, nearest=0.1)
+        return inside & (own[:, 2] < self.depths[frame][rows, columns] + 0.03)
 
     def share_seen(self, points: np.ndarray, progress: np.ndarray) -> float:
         """Of what is under way, the share that is seen.

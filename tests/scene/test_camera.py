@@ -44,3 +44,16 @@ def test_back_projected_points_project_to_their_pixels() -> None:
 def test_impossible_cameras_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="impossible camera"):
         Camera(**{"width": 4, "height": 3, "fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, **change})  # type: ignore[arg-type]
+
+
+def test_projection_tells_pixels_and_what_is_outside() -> None:
+    camera = CAMERA.scale(0.1)
+    depth = np.random.default_rng(0).uniform(1, 5, (camera.height, camera.width)).astype(np.float32)
+    rows, columns, inside = camera.project(camera.back_project(depth).reshape(-1, 3))
+    assert inside.all() and rows.dtype == columns.dtype == np.int64
+    assert (rows * camera.width + columns == np.arange(depth.size)).all()
+    behind, beside, near, there = [0, 0, -1], [9, 0, 1], [0, 0, 0.05], [0, 0, 0.2]
+    rows, columns, inside = camera.project(np.array([behind, beside, near, there], float), nearest=0.1)
+    assert inside.tolist() == [False, False, False, True]
+    assert (rows[:3] == 0).all() and (columns[:3] == 0).all()
+    assert (rows[3], columns[3]) == (round(camera.cy), round(camera.cx))
