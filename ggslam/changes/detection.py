@@ -174,21 +174,21 @@ class ChangeDetector:
         return Shape.from_views(*(values[thing.rows] for values in (judged.points, judged.colors, judged.toward)))
 
     def _fit(self, old: Thing, new: Thing) -> Fit | None:
-        before, after = self._shape(0, old), self._shape(1, new)
-        if min(len(before.points), len(after.points)) < self.settings.min_points:
+        if min(len(old), len(new)) < self.settings.min_points:
             return None
-        small, large = sorted((before.extent(), after.extent()))
+        small, large = sorted((self.judged[0].extent(old), self.judged[1].extent(new)))
         if large > self.settings.max_size_ratio * small:
             return None
+        before, after = self._shape(0, old), self._shape(1, new)
         return fit_shapes(before, after, self.sights[0], self.sights[1], self._up, self.settings)
 
     def _motion_change(self, old: Thing, new: Thing, fit: Fit) -> Change | None:
         """The change that a fit tells; None: it did not move by more than the maps err."""
-        s, shape = self.settings, self._shape(0, old)
-        middle, error = shape.points.mean(0), 0.5 * float(self.judged[0].within[old.rows].mean())
+        s, judged = self.settings, self.judged[0]
+        middle, error = judged.points[old.rows].mean(0), 0.5 * float(judged.within[old.rows].mean())
         shift = float(np.linalg.norm(transform_points(middle[None], fit.T_new_old)[0] - middle))
         turn = float(np.degrees(turning_angle(fit.T_new_old, np.eye(4))))
-        least_turn = max(s.least_turn_deg, float(np.degrees(error / (0.5 * shape.extent()))))
+        least_turn = max(s.least_turn_deg, float(np.degrees(error / (0.5 * judged.extent(old)))))
         if shift < max(s.least_motion_m, error) and turn < least_turn:
             return None
         confidence = fit.share * min(1.0, max(0.0, 1 - fit.color_apart))

@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Evidence, Sightings, Tolerance
 from ggslam.changes.things import color_apart
-from ggslam.geometry.normals import estimate_normals
+from ggslam.geometry.colored_surface import ColoredSurface
+from ggslam.geometry.normals import estimate_normals, turn_toward
 from ggslam.geometry.plane_steps import plane_step
 from ggslam.scene.poses import fit_similarity, inverse, orthonormalize, se3_exp, transform_points, turning_angle
 
@@ -21,9 +22,8 @@ COLOR_SCALE_M = 0.08
 """Metres that the distance from black to full in one channel counts as where partners are looked for."""
 NORMAL_SCALE_M = 0.06
 """Metres that a radian between normals counts as there."""
-_NEIGHBOURS, _SIDE_M = 16, 0.02
-"""Points that a normal is estimated from, and metres that a radian between the directions they were seen from counts
-as."""
+_SIDE_M = 0.02
+"""Metres that a radian between the directions that points were seen from counts as where neighbours are looked for."""
 _COARSE, _COARSE_STEPS, _GOOD = 150, 10, 16
 _FINE, _FINE_STEPS, _BEST = 400, 15, 8
 """Points, steps of each stage, and motions that are kept after it."""
@@ -39,6 +39,8 @@ _STANDS, _LEVEL = np.radians(20), np.radians(0.5)
 """What tilts a thing less may be noise; what tilts it less than the other keeps it upright."""
 _STANDING_COSTS = 0.05
 """Worse quality that a motion may have which keeps the thing upright."""
+_FACES_COST = 0.05
+"""Worse quality that a motion may have which lays faces upon faces."""
 _PROBED = (15, -15, 30, -30, *range(45, 181, 15), *range(-165, -44, 15))
 """Degrees that a thing is turned by to see whether it would fit as well."""
 _TURN_TELLS = 0.05
@@ -57,34 +59,17 @@ _TRIMMED = 0.8
 
 
 @dataclass(frozen=True)
-class Shape:
-    """The surface of a thing.
-
-    Attributes:
-        points: float64 [n, 3], world.
-        colors: float32 [n, 3] in [0, 1].
-        normals: float64 [n, 3], unit vectors to the side that was seen.
-    """
-
-    points: np.ndarray
-    colors: np.ndarray
-    normals: np.ndarray
+class Shape(ColoredSurface):
+    """The surface of a thing, in the world."""
 
     @staticmethod
     def from_views(points: np.ndarray, colors: np.ndarray, toward: np.ndarray) -> Shape:
         """A surface, with directions [n, 3] to the cameras that saw it: both faces of a thin thing are told apart."""
-        count = min(_NEIGHBOURS, len(points))
-        normals = estimate_normals(points, neighbours=count, beside=_SIDE_M * toward) if count else np.zeros((0, 3))
-        return Shape(points, colors, np.where((normals * toward).sum(1, keepdims=True) < 0, -normals, normals))
-
-    def move(self, T: np.ndarray) -> Shape:
-        """The same moved by [4, 4]."""
-        return Shape(transform_points(self.points, T), self.colors, self.normals @ T[:3, :3].T)
+        return Shape(points, colors, turn_toward(estimate_normals(points, beside=_SIDE_M * toward), toward))
 
     def sample(self, count: int, rng: np.random.Generator) -> Shape:
         """Some of its points."""
-        rows = rng.permutation(len(self.points))[:count]
-        return Shape(self.points[rows], self.colors[rows], self.normals[rows])
+        return self.at(rng.permutation(len(self))[:count])
 
     def joint(self) -> np.ndarray:
         """Places and colours, [n, 6] metres."""
@@ -93,11 +78,6 @@ class Shape:
     def joint_with_sides(self) -> np.ndarray:
         """Places, colours and normals, [n, 9] metres."""
         return np.concatenate([self.joint(), NORMAL_SCALE_M * self.normals], 1)
-
-    def extent(self) -> float:
-        """Its size: the diagonal of the box that holds the middle nine tenths of it, metres."""
-        low, high = np.percentile(self.points, [5, 95], axis=0)
-        return float(np.linalg.norm(high - low))
 
 
 @dataclass(frozen=True)
@@ -142,7 +122,7 @@ def fit_shapes(
         sights_old, sights_new: what the visits saw.
         up: [3], unit vector: most things turn about it.
     """
-    if min(len(old.points), len(new.points)) < settings.min_points:
+    if min(len(old), len(new)) < settings.min_points:
         return None
     judge = _Judge(old, new, sights_old, sights_new, settings)
     target, sample = _Target(new), old.sample(_REFINED, np.random.default_rng(0))
@@ -156,7 +136,7 @@ def fit_shapes(
     # Of motions as good as the best the one that turns least: round things tell no turn.
     alike = [fit for fit in _unlike_fits(fits) if fit.quality() >= best.quality() - _AS_GOOD]
     chosen = min(alike, key=lambda fit: turning_angle(fit.T_new_old, np.eye(4)))
-    # Which way round a thing is, shows what it covers, whichever faces were seen; where exactly, face upon face.
+    # The space that a thing fills tells which way round it is, whichever faces were seen; its faces, where exactly.
     faces = _Target(new, faces=True)
     settled = _settle(_stand_up(chosen, fits, up), judge, faces, sample, up)
     return _find_turn(settled, judge, (faces, target), sample, up)
@@ -184,18 +164,20 @@ def _stand_up(chosen: Fit, fits: list[Fit], up: np.ndarray) -> Fit:
 def _settle(fit: Fit, judge: _Judge, target: _Target, sample: Shape, up: np.ndarray) -> Fit:
     """The motion, refined to the end, also from beside: plain surfaces slide upon each other slowly, as only their
     edges pull."""
-    level = _tilt(fit.T_new_old, up) < _LEVEL
-    T = target.refine(sample, fit.T_new_old, judge.settings.fit_m, upright(up) if level else None, _LAST_STEPS)
-    on_faces = judge.fit(T)
-    if on_faces.quality() >= fit.quality() - _TURN_TELLS:
+    free = upright(up) if _tilt(fit.T_new_old, up) < _LEVEL else None
+
+    def refine(T: np.ndarray) -> Fit:
+        return judge.fit(target.refine(sample, T, judge.settings.fit_m, free, _LAST_STEPS))
+
+    on_faces = refine(fit.T_new_old)
+    if on_faces.quality() >= fit.quality() - _FACES_COST:
         fit = on_faces
     across = np.linalg.svd(up[None])[2][1:]
     for beside in _BESIDE_M:
         for step in (np.zeros(3), *(beside * sign * axis for axis in across for sign in (1, -1))):
             start = fit.T_new_old.copy()
             start[:3, 3] += step
-            T = target.refine(sample, start, judge.settings.fit_m, upright(up) if level else None, _LAST_STEPS)
-            fit = max(fit, judge.fit(T), key=Fit.quality)
+            fit = max(fit, refine(start), key=Fit.quality)
     return fit
 
 

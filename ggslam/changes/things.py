@@ -49,7 +49,7 @@ class JudgedSurface:
     Attributes:
         points: float64 [n, 3], world.
         colors: float32 [n, 3] in [0, 1].
-        toward: float32 [n, 3], to the cameras that saw it.
+        toward: float32 [n, 3], mean of the unit vectors to the cameras that saw it.
         ids: int64 [n], objects; 0 = none.
         other: what the other visit saw there.
         within: float64 [n], how near surfaces have to be there to be one, metres.
@@ -69,6 +69,11 @@ class JudgedSurface:
         judged = int(gone.sum() + there.sum())
         apart = color_apart(self.colors[rows[there]], other.color[there])
         return Thing(label, ids, rows, judged / max(1, len(rows)), int(gone.sum()) / max(1, judged), apart)
+
+    def extent(self, thing: Thing) -> float:
+        """A thing's size: the diagonal of the box that holds the middle nine tenths of it, metres."""
+        low, high = np.percentile(self.points[thing.rows], [5, 95], axis=0)
+        return float(np.linalg.norm(high - low))
 
 
 def things_by_id(judged: JudgedSurface, settings: ChangeSettings) -> list[Thing]:

@@ -42,3 +42,8 @@ def estimate_normals(
         offsets = near - near.mean(1, keepdims=True)
         normals[part] = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
     return normals
+
+
+def turn_toward(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Normals [n, 3], each turned to the side that its direction [n, 3] points to."""
+    return np.where((normals * directions).sum(1, keepdims=True) < 0, -normals, normals)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.geometry.normals import estimate_normals
+from ggslam.geometry.colored_surface import ColoredSurface
+from ggslam.geometry.normals import estimate_normals, turn_toward
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import transform_points
 
 MOST = 500
 """Points: of more they are taken at regular distances."""
@@ -19,32 +19,14 @@ _OUTLYING = 3.0
 
 
 @dataclass(frozen=True)
-class Patch:
-    """Surface seen in one frame.
-
-    Attributes:
-        points: float64 [n, 3], metres.
-        colors: float64 [n, 3] in [0, 1].
-        normals: float64 [n, 3], unit vectors to the side that was seen.
-    """
-
-    points: np.ndarray
-    colors: np.ndarray
-    normals: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def move(self, T: np.ndarray) -> Patch:
-        """The same moved by [4, 4]."""
-        return Patch(transform_points(self.points, T), self.colors, self.normals @ T[:3, :3].T)
+class Patch(ColoredSurface):
+    """Surface seen in one frame."""
 
     def some(self, most: int) -> Patch:
         """So many of its points at most, drawn alike every time."""
         if len(self) <= most:
             return self
-        rows = np.random.default_rng(0).permutation(len(self))[:most]
-        return Patch(self.points[rows], self.colors[rows], self.normals[rows])
+        return self.at(np.random.default_rng(0).permutation(len(self))[:most])
 
 
 def patch_of(mask: np.ndarray, depth: np.ndarray, color: np.ndarray, camera: Camera) -> Patch | None:
@@ -63,6 +45,5 @@ def patch_of(mask: np.ndarray, depth: np.ndarray, color: np.ndarray, camera: Cam
     if kept.sum() < _FEWEST:
         return None
     points = points[kept]
-    normals = estimate_normals(points, neighbours=_NEIGHBOURS, workers=1)
-    normals *= -np.sign((normals * points).sum(1))[:, None]
+    normals = turn_toward(estimate_normals(points, neighbours=_NEIGHBOURS, workers=1), -points)
     return Patch(points, color[v, u][kept] / 255.0, normals)

@@ -126,9 +126,7 @@ def test_a_run_killed_at_any_moment_goes_on(room: Path, whole: Path, tmp_path: P
 
 
 @pytest.mark.long("killed and resumed three times")
-def test_killed_again_and_again(
-    room: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_again_and_again(room: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "run"
     # On a slow disk: nothing may be at work in the folder still when it is looked at, or gone on with.
     monkeypatch.setattr(checkpoints, "sync_folder", lambda folder: (time.sleep(0.3), sync_folder(folder)))

@@ -17,9 +17,6 @@ from ggslam.scene.poses import inverse, separation
 from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.slam.result import SlamResult
 
-MOVER_FILES = (MOVERS_FILE, "movers.json", POINTS_FILE)
-"""All that a run has of its movers; stays true whatever is done to its map."""
-
 
 def _pose(value: np.ndarray) -> np.ndarray:
     if value.shape != (4, 4) or not np.isfinite(value).all():
@@ -131,7 +128,7 @@ class MoverRecord(Record):
 class MoversRecord(RecordFile):
     """All movers."""
 
-    FILE: ClassVar[str] = MOVER_FILES[1]
+    FILE: ClassVar[str] = "movers.json"
     movers: list[MoverRecord] = []
 
     @staticmethod
@@ -185,3 +182,7 @@ def _stretches(frames: list[int]) -> list[list[int]]:
         else:
             found.append([frame, frame])
     return found
+
+
+MOVER_FILES = (MOVERS_FILE, MoversRecord.FILE, POINTS_FILE)
+"""All that a run has of its movers; stays true whatever is done to its map."""
