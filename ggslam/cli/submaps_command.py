@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,9 +13,11 @@ import typer
 from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
+from ggslam.system.json_files import json_ready
 
 if TYPE_CHECKING:
     from ggslam.jobs.submaps.fill import StoreListing
+    from ggslam.submaps.store_objects import ObjectEvent
 
 EPILOG = """
 [bold]Examples[/]
@@ -27,6 +31,12 @@ EPILOG = """
 
 _PROBLEMS = 5
 """Damaged files that are named."""
+
+_OBJECTS = 40
+"""Objects that are listed."""
+_CELLS = 4
+"""Cells of an object that are named."""
+_WORDS = {"look": "changed look"}
 
 SourcePath = Annotated[
     Path,
@@ -71,8 +81,10 @@ def submaps(
     camera: options.OwnCamera = None,
     intrinsics: options.Intrinsics = None,
     columns: options.Columns = 4,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what is in the store as JSON.")] = False,
 ) -> None:  # fmt: skip
-    """Make a grid store, add a visit to one, or list its cells, parts, visits and changes."""
+    """Make a grid store, add a visit to one, or list its cells, parts, visits, objects and what changed."""
+    from ggslam.jobs.changes.store_visits import add_run
     from ggslam.jobs.submaps.fill import SubmapsRequest, list_store, make_store
     from ggslam.runs.recordings import SequenceRequest
 
@@ -87,8 +99,13 @@ def submaps(
             ), columns,
         )  # fmt: skip
         with progress_bar() as bar:
-            make_store(request, ProgressObserver(bar))
-    _print(list_store(source if out is None else out, since))
+            observer = ProgressObserver(bar)
+            make_store(request, observer, partial(add_run, observer=observer))
+    listing = list_store(source if out is None else out, since)
+    if as_json:
+        typer.echo(json.dumps(json_ready(listing.to_dict()), indent=1))
+    else:
+        _print(listing)
 
 
 def _print(listing: StoreListing) -> None:
@@ -109,7 +126,37 @@ def _print(listing: StoreListing) -> None:
             for c in listing.changes
         ]
         console.print(table(f"{len(rows)} cells since {listing.since}", ["cell", "new", "changed"], rows))
+    _print_objects(listing)
     for problem in listing.problems[:_PROBLEMS]:
         console.print(problem, highlight=False, markup=False, soft_wrap=True)
     if len(listing.problems) > _PROBLEMS:
         console.print(f"and {len(listing.problems) - _PROBLEMS} more files like these", highlight=False)
+
+
+def _print_objects(listing: StoreListing) -> None:
+    if listing.events is not None:
+        title = f"{len(listing.events)} objects since {listing.since}"
+        rows = [_event_row(event) for event in listing.events]
+        console.print(table(title, ["", "object", "moved", "turned", "cells"], rows))
+    elif listing.objects is not None:
+        present = listing.objects.present()
+        title = f"{len(present)} objects, {len(listing.objects.objects) - len(present)} gone"
+        rows = [
+            [o.label(), str(o.gaussians), str(len(o.cells)), o.first_seen, o.last_seen] for o in present[:_OBJECTS]
+        ]
+        console.print(table(title, ["object", "Gaussians", "cells", "first seen", "last seen"], rows))
+        if len(present) > _OBJECTS:
+            console.print(f"and {len(present) - _OBJECTS} more objects", highlight=False)
+    if listing.unknown:
+        names = ", ".join(listing.unknown)
+        text = f"no record of objects: {names}" if listing.objects is not None else "no record of objects"
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def _event_row(event: ObjectEvent) -> list[str]:
+    motion, cells = event.motion(), " ".join(str(key) for key in event.cells[:_CELLS])
+    if len(event.cells) > _CELLS:
+        cells += f" and {len(event.cells) - _CELLS} more"
+    moved = "" if motion is None else f"{100 * motion[0]:.1f} cm"
+    turned = "" if motion is None else "unknown" if event.turn_known is False else f"{motion[1]:.1f} deg"
+    return [_WORDS.get(event.kind, event.kind), event.label(), moved, turned, cells]

@@ -6,6 +6,7 @@
         lock                          held by the one writer
         cells/3_0_-2/17/points.pcd    cell (3, 0, -2), a part written with version 17 (cell_files.py)
         visits/                       what is remembered of visits (visit_files.py)
+        objects.json                  the objects that visits found (store_objects.py)
 
 Units: metres in world coordinates, seconds on the clock of the recordings, sizes in bytes.
 
@@ -282,6 +283,13 @@ class GridStore:
         self._check_writable()
         with self._writing:
             self._index.remove(key)
+            self._sweep(key)
+
+    def remove_part(self, key: CellKey, part: str) -> None:
+        """Removes a part of a cell; no error if there is none."""
+        self._check_writable()
+        with self._writing:
+            self._index.remove_part(key, part)
             self._sweep(key)
 
     def changed_since(self, visit: str) -> list[CellChange]:

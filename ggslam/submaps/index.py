@@ -201,6 +201,11 @@ class CellIndex:
             for table in ("cells", "parts", "changes"):
                 connection.execute(f"DELETE FROM {table} WHERE x = ? AND y = ? AND z = ?", key)
 
+    def remove_part(self, key: CellKey, name: str) -> None:
+        """Forgets a part of a cell."""
+        with self._transaction() as connection:
+            connection.execute("DELETE FROM parts WHERE x = ? AND y = ? AND z = ? AND name = ?", (*key, name))
+
     def _rows(self, query: str, values: Sequence[Any] = ()) -> list[tuple]:
         with self._lock, _explain_errors(self.path):
             return self._connection.execute(query, values).fetchall()

@@ -13,6 +13,7 @@ from ggslam.errors import FormatError, RunFolderError
 from ggslam.submaps.cell_files import CellFiles, wait_for_disk
 from ggslam.submaps.grid import CELLS, INDEX, GridStore
 from ggslam.submaps.index import CellIndex
+from ggslam.submaps.store_objects import OBJECTS_FILE
 from ggslam.submaps.visit_files import VISITS
 from ggslam.system.atomic import make_folder, write_failure
 
@@ -75,6 +76,10 @@ def _copy_to(store: GridStore, folder: Path, last: bool) -> bool:
             raise FormatError(f"{store.path / VISITS}: is a link; a store holds none")
         shutil.copytree(store.path / VISITS, folder / VISITS, symlinks=True)
         written += (folder / VISITS).iterdir()
+    known = store.path / OBJECTS_FILE
+    if known.is_file():
+        shutil.copyfile(known, folder / OBJECTS_FILE, follow_symlinks=False)  # a store with links was not opened
+        written.append(folder / OBJECTS_FILE)
     folders = {path.parent for path in written} | {path.parent.parent for path in written[1:]}
     with ThreadPoolExecutor(_WAITING_THREADS) as pool:
         list(pool.map(wait_for_disk, [*written, *folders]))

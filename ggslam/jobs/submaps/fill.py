@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,10 @@ from ggslam.sequences.rig import one_camera
 from ggslam.submaps.cell_records import CellChange
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.submaps.store_objects import ObjectEvent, StoreObjects, read_objects
 
+AddRun = Callable[[Path, GridStore, "str | None", "float | None"], object]
+"""Writes a run (its folder) into a store that is open for writing, as a visit of a name at a time."""
 _NEAR_IN_TIME = 0.02
 """Seconds by which a pose of another file may differ from a frame."""
 
@@ -86,10 +89,29 @@ class StoreListing:
     changes: Sequence[CellChange] | None
     problems: Sequence[str] = ()
     """What is wrong with files of it; the rest can be used."""
+    objects: StoreObjects | None = None
+    """None: nothing is known of objects, or the file that tells is damaged (see `problems`)."""
+    events: Sequence[ObjectEvent] | None = None
+    """What happened to objects since the visit asked for; None: no visit was, or nothing is known of objects."""
+    unknown: Sequence[str] = ()
+    """Visits, of those asked for, that nothing is known of as far as objects go."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; how far things moved is in it, too."""
+        values = asdict(self)
+        for event, entry in zip(self.events or [], values["events"] or [], strict=True):
+            motion = event.motion()
+            entry["moved_m"], entry["turned_deg"] = (None, None) if motion is None else motion
+        return values
 
 
-def make_store(request: SubmapsRequest, observer: Observer) -> None:
+def make_store(request: SubmapsRequest, observer: Observer, add_run: AddRun = store_of_run) -> None:
     """Makes a store, or adds a visit to one.
+
+    Args:
+        request: what is asked for.
+        observer: receives progress updates.
+        add_run: writes a run into a store as a visit.
 
     Raises:
         GgslamError: the source or the store cannot be read, or the recording has no poses.
@@ -110,7 +132,7 @@ def make_store(request: SubmapsRequest, observer: Observer) -> None:
         elif is_cloud(source):
             store_of_cloud(source, store, request.visit, request.at)
         else:
-            store_of_run(source, store, request.visit, request.at)
+            add_run(source, store, request.visit, request.at)
 
 
 def list_store(path: Path, since: str | None = None) -> StoreListing:
@@ -132,9 +154,18 @@ def list_store(path: Path, since: str | None = None) -> StoreListing:
         visits = [_visit_total(store, name, following) for name, following in _with_next(store.visits())]
         changes = None if since is None else store.changed_since(since)
         size = sum(record.bytes for record in records)
+        problems, objects = list(store.problems()), None
+        try:
+            objects = read_objects(store)
+        except FormatError as error:  # the cells are as good as before
+            problems.append(str(error))
+        names = store.visits()
+        asked = names if since is None else names[names.index(since) :]
+        known = set() if objects is None else {entry.visit for entry in objects.visits if entry.compared is not None}
         return StoreListing(
             Path(path), store.settings, len(records), size, dict(sorted(parts.items())), visits, since, changes,
-            list(store.problems()),
+            problems, objects, None if objects is None or since is None else objects.events_since(asked),
+            [name for name in asked if name not in known],
         )  # fmt: skip
 
 

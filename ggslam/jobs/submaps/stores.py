@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,8 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
 from ggslam.slam.saved_places import PLACES_FILE
-from ggslam.submaps.cell_keys import partition
+from ggslam.submaps.cell_keys import CellKey, partition
+from ggslam.submaps.cell_points import POINTS
 from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
@@ -57,17 +58,20 @@ def open_or_create(path: Path, settings: SubmapSettings) -> GridStore:
     return GridStore.open(path, write=True, settings=settings) if is_store(path) else GridStore.create(path, settings)
 
 
-def store_of_run(run: Path, store: GridStore, visit: str | None = None, at: float | None = None) -> None:
+def store_of_run(
+    run: Path, store: GridStore, visit: str | None = None, at: float | None = None, replaced: Collection[str] = (),
+) -> None:  # fmt: skip
     """Writes what a run knows into the cells of a store: the surface that its keyframes measured (or, of a run without
     places, the cloud sampled from its map), its Gaussians, and its places.
 
-    Cells that were recorded less than T before are left alone.
+    Cells that were recorded less than T before are left alone, unless the run takes the place of earlier visits.
 
     Args:
         run: folder of the run; the store's world is the run's.
         store: open for writing.
         visit: name of the visit; None: a name made of the run's content.
         at: time of the visit in seconds; None: that of the run's last frame.
+        replaced: visits whose latest state the run shows: what they wrote goes, whenever it was.
 
     Raises:
         RunFolderError: no run, or files of it are damaged.
@@ -87,12 +91,22 @@ def store_of_run(run: Path, store: GridStore, visit: str | None = None, at: floa
     others = list(_gaussian_parts(store, folder.gaussians()))
     if camera is not None:
         others += _place_parts(store, views, camera)
-    due = _Due(store, time)
+    due = _Due(store, np.inf if replaced else time)
+    earlier = [key for key in store.cells() if store.cell(key).visit in replaced] if replaced else []
     others, kept = [write for write in others if due[write.key]], due.of(points)
     # The points come last: they make a cell new, and one that was cut off before is written again by the next attempt.
     for begin in range(0, len(others), _CELLS_AT_ONCE):
         _put(store, others[begin : begin + _CELLS_AT_ONCE])
     store_cloud(store, points[kept], {name: values[kept] for name, values in attributes.items()}, time)
+    held = {GAUSSIANS: {w.key for w in others if GAUSSIANS in w.parts}, POINTS: _cells(store, points)}
+    for key in earlier:
+        for part in [name for name, cells in held.items() if name in store.cell(key).parts and key not in cells]:
+            store.remove_part(key, part)
+
+
+def _cells(store: GridStore, points: np.ndarray) -> set[CellKey]:
+    finite = points[np.isfinite(points).all(1)]
+    return {(x, y, z) for x, y, z in np.unique(store.grid.keys_of(finite), axis=0).tolist()}
 
 
 def visit_of(folder: RunFolder) -> str:

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run becomes a visit of a grid store: its cells, its objects, and what happened to those that were there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.jobs.changes.changes import CHANGES_FILE, ChangesOutcome, find_changes
+from ggslam.jobs.changes.store_events import (
+    add_evidence,
+    events_of_changes,
+    events_of_history,
+    first_events,
+    with_cells,
+)
+from ggslam.jobs.progress import Observer
+from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, cell_arrays, gaussians_to_bytes
+from ggslam.jobs.submaps.stores import store_of_run, visit_of
+from ggslam.objects.table import ObjectTable
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import fingerprint
+from ggslam.runs.writing import CHANGES_FOLDER
+from ggslam.scene.poses import inverse, turning_angle
+from ggslam.submaps.cell_keys import CellKey
+from ggslam.submaps.grid import GridStore
+from ggslam.submaps.store_objects import (
+    Box,
+    StoredObject,
+    StoreObjects,
+    VisitObjects,
+    read_objects,
+    write_objects,
+)
+from ggslam.system.json_files import read_json
+
+_OFF_METRES, _OFF_DEGREES = 0.2, 5.0
+"""How far the world of a run may lie from the store's."""
+_MANY_OFF = 3
+"""Keyframes at least, to tell that."""
+
+
+@dataclass
+class _Comparison:
+    """What is known of a visit's objects before its cells are written."""
+
+    entry: VisitObjects
+    known: dict[int, StoredObject]
+    seen: set[int]
+    replaced: list[str] = field(default_factory=list)
+    """Visits that the run shows the latest state of."""
+    against: str | None = None
+    """The visit that the maps were compared with."""
+
+
+def add_run(
+    run: Path, store: GridStore, visit: str | None = None, at: float | None = None, observer: Observer | None = None
+) -> VisitObjects | None:
+    """Writes a run into a store as a visit, like `store_of_run`, and what it tells of objects.
+
+    - The first run with objects: all of them came.
+    - An updated run takes the place of the visits that it continues, in all their cells and whenever they were; what
+      happened to objects is its history.
+    - Another run is compared with the run of the visit before, if that is still there and the two have common ground.
+      Its cells are written as they are due; where ids are the same in both runs, what was removed leaves the cells that
+      were not, and so does what moved and is in those that were.
+
+    Returns:
+        What was found of objects; None: the run has none.
+
+    Raises:
+        ConfigError: the store holds a later state of the run, or the run's world is not the store's.
+        GgslamError: as of `store_of_run`.
+    """
+    folder = RunFolder.open(run)
+    name = visit or visit_of(folder)
+    objects = read_objects(store) or StoreObjects()
+    if not folder.has_objects():
+        store_of_run(run, store, visit, at)
+        if observer is not None and objects.visits:
+            observer.note("the run has no objects: nothing is said of those of the store")
+        return None
+    table = folder.object_table()
+    states = _states(folder, table)
+    earlier = [entry for entry in objects.visits if entry.visit != name]
+    for entry in earlier:
+        if set(states) < set(entry.states):
+            raise ConfigError(f"{store.path}: holds a later state of {run} already, from visit {entry.visit!r}")
+    found = _compare(folder, table, VisitObjects(name, str(folder.path.absolute()), states, None), earlier, objects,
+                     observer)  # fmt: skip
+    found.replaced += [v for v in store.visits() if v != name and v in {f"run {state[:16]}" for state in states}]
+    store_of_run(run, store, visit, at, found.replaced)
+    if found.against is not None and not found.entry.own_ids:
+        found.entry.notes.extend(_drop_ghosts(store, found))
+    after = _objects_after(store, table, found, {e.visit for e in earlier if e.own_ids})
+    cells = {known.id: known.cells for known in after}
+    entry = replace(found.entry, events=with_cells(found.entry.events, cells))
+    write_objects(store, StoreObjects(visits=[*earlier, entry], objects=after))
+    if observer is not None:
+        for note in entry.notes:
+            observer.note(note)
+    return entry
+
+
+def _states(folder: RunFolder, table: ObjectTable) -> list[str]:
+    return [fingerprint(folder)] if table.history is None else [visit.fingerprint for visit in table.history.visits]
+
+
+# --- what happened ---------------------------------------------------------------------------------------------------
+
+
+def _compare(
+    folder: RunFolder, table: ObjectTable, entry: VisitObjects, earlier: list[VisitObjects], objects: StoreObjects,
+    observer: Observer | None,
+) -> _Comparison:  # fmt: skip
+    known = {own.id: own for own in objects.objects}
+    history, last = table.history, len(entry.states) - 1
+    seen = set(table.ids())
+    if history is not None:
+        seen &= {past.id for past in history.objects if past.last_seen == last}
+    if not earlier:
+        return _Comparison(replace(entry, compared="first", events=first_events(table)), {}, seen)
+    continued = [other for other in earlier if set(other.states) <= set(entry.states) and not other.own_ids]
+    if continued and history is not None:
+        past = len(continued[-1].states)
+        events = events_of_history(history, known, past)
+        if past == last:
+            events = add_evidence(events, _told_changes(folder), known)
+        else:
+            entry.notes.append(f"{last + 1 - past} visits at once: changed looks are not told")
+        done = replace(entry, compared="history", events=events)
+        return _Comparison(done, known, seen, [other.visit for other in continued])
+    if continued:  # the same run again
+        done = replace(entry, compared="history")
+        return _Comparison(done, known, seen, [other.visit for other in continued])
+    return _compare_maps(folder, entry, earlier[-1], known, seen, observer)
+
+
+def _told_changes(folder: RunFolder) -> Mapping[str, Any]:
+    path = folder.path / CHANGES_FOLDER / CHANGES_FILE
+    return read_json(path) if path.is_file() else {"changes": [], "unseen": []}
+
+
+def _compare_maps(
+    folder: RunFolder, entry: VisitObjects, before: VisitObjects, known: dict[int, StoredObject], seen: set[int],
+    observer: Observer | None,
+) -> _Comparison:  # fmt: skip
+    try:
+        old = RunFolder.open(Path(before.run))
+        if _states(old, old.object_table()) != before.states:
+            raise RunFolderError(f"{before.run}: holds another run now")
+        outcome = find_changes(old.path, folder.path, observer=observer)
+    except GgslamError as error:
+        entry.notes.append(f"not compared with visit {before.visit!r}, its objects are not listed: {error}")
+        return _Comparison(replace(entry, own_ids=True), known, seen)
+    _check_world(folder, outcome, before.visit)
+    own_ids = not outcome.table.found.ids_believed
+    events = events_of_changes(outcome.table.to_dict(), known, own_ids)
+    if own_ids:
+        entry.notes.append("object ids are others than the store's: its objects are not listed, only what changed; "
+                           "a run that `ggslam update` makes keeps ids")  # fmt: skip
+    done = replace(entry, compared="runs", own_ids=own_ids, events=events)
+    return _Comparison(done, known, set() if own_ids else seen, against=before.visit)
+
+
+def _check_world(folder: RunFolder, outcome: ChangesOutcome, visit: str) -> None:
+    own, placed = folder.keyframes().keyframes, outcome.visits[1].T_world_camera
+    if len(own) != len(placed) or len(own) < _MANY_OFF:
+        return
+    pairs = [(record.T_world_camera, T) for record, T in zip(own, placed, strict=True)]
+    metres = float(np.median([np.linalg.norm(T[:3, 3] - mine[:3, 3]) for mine, T in pairs]))
+    degrees = float(np.degrees(np.median([turning_angle(T @ inverse(mine), np.eye(4)) for mine, T in pairs])))
+    if metres > _OFF_METRES or degrees > _OFF_DEGREES:
+        raise ConfigError(
+            f"{folder.path}: lies {metres:.2f} m and {degrees:.0f} degrees from where visit {visit!r} has it; "
+            "add the run that `ggslam update` makes of the two, or start this one in the earlier run's map"
+        )
+
+
+# --- the cells -------------------------------------------------------------------------------------------------------
+
+
+def _drop_ghosts(store: GridStore, found: _Comparison) -> list[str]:
+    """Takes what is gone, and what moved and is in new cells, out of the cells of earlier visits; returns notes."""
+    old_cells, own_ids = {}, set[int]()
+    for key in _cells_with_gaussians(store):
+        arrays, visit = cell_arrays(store, key)
+        if visit == store.visit:
+            own_ids |= set(np.unique(arrays["object_id"]).tolist())
+        else:
+            old_cells[key] = visit
+    gone = {event.id for event in found.entry.events if event.kind == "removed" and event.id is not None}
+    moved = {event.id for event in found.entry.events if event.kind == "moved" and event.id is not None}
+    for key, visit in old_cells.items():
+        arrays, _ = cell_arrays(store, key)
+        keep = ~np.isin(arrays["object_id"], sorted(gone | (moved & own_ids)))
+        if not keep.any():
+            store.remove_part(key, GAUSSIANS)
+        elif not keep.all():
+            data = gaussians_to_bytes({name: values[keep] for name, values in arrays.items()}, visit)
+            store.put(key, {GAUSSIANS: data}, counts={GAUSSIANS: int(keep.sum())})
+    left = sorted(moved - own_ids)
+    if not left:
+        return []
+    return [f"moved, and still at the old place, for no cell of the new one was due: objects {left}"]
+
+
+def _cells_with_gaussians(store: GridStore) -> list[CellKey]:
+    return [key for key in store.cells() if GAUSSIANS in store.cell(key).parts]
+
+
+# --- the objects -----------------------------------------------------------------------------------------------------
+
+
+def _objects_after(
+    store: GridStore, table: ObjectTable, found: _Comparison, foreign: set[str]
+) -> list[StoredObject]:
+    """The store's objects after a visit, counted in its cells; `foreign`: earlier visits with ids of their own."""
+    visit = found.entry.visit
+    others = foreign | ({visit} if found.entry.own_ids else set())
+    count: dict[int, int] = {}
+    cells: dict[int, list[CellKey]] = {}
+    for key in _cells_with_gaussians(store):
+        arrays, filled_by = cell_arrays(store, key)
+        if filled_by in others:
+            continue
+        for i, n in zip(*(a.tolist() for a in np.unique(arrays["object_id"], return_counts=True)), strict=True):
+            count[i] = count.get(i, 0) + n
+            cells.setdefault(i, []).append(key)
+    after = dict(found.known)
+    for record in [] if found.entry.own_ids else table.objects:
+        before = after.get(record.id)
+        first = visit if before is None else before.first_seen
+        last = visit if before is None or record.id in found.seen else before.last_seen
+        after[record.id] = StoredObject(record.id, record.name, Box(**asdict(record.box)), 0, [], first, last)
+    for event in found.entry.events:
+        if event.kind == "removed" and event.id in after:
+            after[event.id] = replace(after[event.id], gone_since=visit)
+    return [
+        replace(after[i], gaussians=count.get(i, 0), cells=sorted(cells.get(i, []))) for i in sorted(after)
+    ]
