@@ -27,13 +27,13 @@ def events_of_history(history: History, known: Known, past: int) -> list[ObjectE
     """What happened to objects in the visits of an updated run after the first `past` ones, by rising id."""
     events = []
     for own in history.objects:
-        kind, T = _happened(own, known.get(own.id), past)
+        kind, T = _verdict(own, known.get(own.id), past)
         if kind is not None:
             events.append(_event(kind, own.id, own.name, known, T))
     return events
 
 
-def _happened(own: ObjectPast, before: StoredObject | None, past: int) -> tuple[Kind | None, np.ndarray | None]:
+def _verdict(own: ObjectPast, before: StoredObject | None, past: int) -> tuple[Kind | None, np.ndarray | None]:
     was_there = own.first_seen < past and (before is None or before.gone_since is None)
     if own.gone_since is not None:
         return ("removed" if was_there and own.gone_since >= past else None), None

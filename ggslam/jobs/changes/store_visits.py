@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
-from ggslam.jobs.changes.changes import CHANGES_FILE, ChangesOutcome, find_changes
+from ggslam.jobs.changes.changes import ChangesOutcome, find_changes
 from ggslam.jobs.changes.store_events import (
     add_evidence,
     events_of_changes,
@@ -25,6 +25,7 @@ from ggslam.jobs.submaps.stores import store_of_run, visit_of
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import fingerprint
+from ggslam.runs.records.changes import ChangesRecord
 from ggslam.runs.writing import CHANGES_FOLDER
 from ggslam.scene.poses import inverse, turning_angle
 from ggslam.submaps.cell_keys import CellKey
@@ -37,7 +38,6 @@ from ggslam.submaps.store_objects import (
     read_objects,
     write_objects,
 )
-from ggslam.system.json_files import read_json
 
 _OFF_METRES, _OFF_DEGREES = 0.2, 5.0
 """How far the world of a run may lie from the store's."""
@@ -142,8 +142,8 @@ def _compare(
 
 
 def _told_changes(folder: RunFolder) -> Mapping[str, Any]:
-    path = folder.path / CHANGES_FOLDER / CHANGES_FILE
-    return read_json(path) if path.is_file() else {"changes": [], "unseen": []}
+    record = ChangesRecord.read_if_there(folder.path / CHANGES_FOLDER)
+    return {"changes": [], "unseen": []} if record is None else {"changes": [], "unseen": [], **record.values()}
 
 
 def _compare_maps(
