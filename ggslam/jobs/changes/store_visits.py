@@ -118,7 +118,10 @@ def _compare(
     folder: RunFolder, table: ObjectTable, entry: VisitObjects, earlier: list[VisitObjects], objects: StoreObjects,
     observer: Observer | None,
 ) -> _Comparison:  # fmt: skip
-    known = {own.id: own for own in objects.objects}
+    known = {  # without what the visit itself told, if it is written again
+        own.id: replace(own, gone_since=None) if own.gone_since == entry.visit else own
+        for own in objects.objects if own.first_seen != entry.visit
+    }  # fmt: skip
     history, last = table.history, len(entry.states) - 1
     seen = set(table.ids())
     if history is not None:
