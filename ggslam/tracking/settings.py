@@ -48,6 +48,9 @@ class PointSettings:
     """Lower bound of the smallest regularised eigenvalue (equation 1 of GS-ICP): a plane's thickness."""
     max_elongation: float = setting(4.0, 1, 1e4)
     """Upper bound of the largest regularised eigenvalue."""
+    near_weight: float = setting(1.5, 1, 1e9)
+    """Near points, whose noise is less, weigh at most so many times what one at the frame's median depth does: what is
+    near may move."""
 
     def __post_init__(self) -> None:
         if self.min_depth >= self.max_depth:

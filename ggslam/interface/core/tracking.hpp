@@ -15,6 +15,7 @@ struct DepthPointsSettings {
   float min_depth, max_depth;          // metres
   float min_thickness, max_elongation;  // of the regularised covariance, see regularized_axes()
   float min_neighbours;                // share of the window that must lie on the same surface
+  float max_weight;                    // of a point
   int32_t width, height;
   int32_t stride;       // pixels between points
   int32_t window;       // the window has (2 window + 1)^2 samples
@@ -27,7 +28,7 @@ struct DepthPointsOutput {
   float* normals;      // [n, 3] unit, towards the camera
   float* covariances;  // [n, 6] xx xy xz yy yz zz, median eigenvalue 1
   int32_t* pixels;     // [n, 2] u, v
-  float* weights;      // [n] (sigma(1 m) / sigma(z))^2
+  float* weights;      // [n] (sigma(1 m) / sigma(z))^2, at most max_weight
 };
 
 // Gaussians of a map.

@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/tracking.hpp"
-HEADER_SHA256 = "c64a52dc3b49e0a2105185bd3f4e069626c4fe64ef8c871ac9ca225630f0ca5c"
+HEADER_SHA256 = "96fb5d1f871f370458b09b6b21258e663cd89b5d585ac4d415a888796fc0e0d6"
 
 
 class DepthPointsSettings(Structure):
@@ -17,8 +17,8 @@ class DepthPointsSettings(Structure):
     _fields_ = [
         ("fx", c_float), ("fy", c_float), ("cx", c_float), ("cy", c_float), ("noise_constant", c_float),
         ("noise_square", c_float), ("min_depth", c_float), ("max_depth", c_float), ("min_thickness", c_float),
-        ("max_elongation", c_float), ("min_neighbours", c_float), ("width", c_int32), ("height", c_int32),
-        ("stride", c_int32), ("window", c_int32), ("window_step", c_int32),
+        ("max_elongation", c_float), ("min_neighbours", c_float), ("max_weight", c_float), ("width", c_int32),
+        ("height", c_int32), ("stride", c_int32), ("window", c_int32), ("window_step", c_int32),
     ]
 
 

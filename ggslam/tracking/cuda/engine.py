@@ -73,7 +73,7 @@ class CudaTrackingEngine:
         np.copyto(staged, depth)
         self._depth_upload.send(self._depth)
         stride = grid_stride(int(np.count_nonzero(staged > 0)), settings.count)
-        arguments = native_points_settings(self.camera, settings, noise, stride)
+        arguments = native_points_settings(self.camera, settings, noise, stride, depth)
         border = arguments.window * arguments.window_step
         columns, rows = (
             max(0, math.ceil((size - 2 * border - stride // 2) / stride)) for size in (depth.shape[1], depth.shape[0])

@@ -105,7 +105,7 @@ __device__ inline void write_point(const DepthPointsJob& job, const GridPoint& a
   compose_symmetric3(shape, axes, out.covariances + 6 * n);
   out.pixels[2 * n] = at.u, out.pixels[2 * n + 1] = at.v;
   const float ratio = (s.noise_constant + s.noise_square) / sigma;
-  out.weights[n] = ratio * ratio;
+  out.weights[n] = fminf(ratio * ratio, s.max_weight);
 }
 
 // Writes the good points, each behind those before it.

@@ -61,7 +61,7 @@ int depth_points_row(const float* depth, const DepthPointsSettings& s, int v, co
     regularized_axes(values, s.min_thickness, 1.0f, s.max_elongation, shape);
     compose_symmetric3(shape, axes, out.covariances + 6 * n);
     out.pixels[2 * n] = u, out.pixels[2 * n + 1] = v;
-    out.weights[n] = (reference / sigma) * (reference / sigma);
+    out.weights[n] = std::min((reference / sigma) * (reference / sigma), s.max_weight);
     ++n;
   }
   return n;

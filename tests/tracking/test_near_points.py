@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Something near that moves does not take the camera along, though its points are the most accurate ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ggslam.native.loader import NativeContext
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse, separation
+from ggslam.tracking.gicp import align
+from ggslam.tracking.points import extract_points, largest_weight
+from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings, TargetSettings
+from ggslam.tracking.surface import MeasuredSurface
+
+NOISE = DepthNoise(constant=0.0005, square=0.0019)
+UNBOUNDED = replace(PointSettings(), near_weight=1e9)
+
+
+def with_passer_by(frame: Frame, first_column: int, share: int = 8) -> np.ndarray:
+    """The frame's depth, float32 [H, W], where something round as wide as one in `share` stands before the camera."""
+    depth = frame.depth.copy()
+    width = depth.shape[1] // share
+    across = np.linspace(-1, 1, width)
+    folds = 0.05 * np.sin(np.arange(depth.shape[0]) / 9)[:, None]
+    depth[:, first_column : first_column + width] = 0.6 - 0.1 * np.sqrt(1 - 0.9 * across**2) + folds
+    return depth
+
+
+def error_m(frames: list[Frame], settings: PointSettings, share: int) -> float:
+    """How far off the camera is found after what is near went on by 8 pixels."""
+    before, after = frames[0], frames[1]
+    assert before.T_world_camera is not None and after.T_world_camera is not None
+    context, camera = NativeContext(2), before.camera
+    surface = MeasuredSurface(TargetSettings(), context)
+    points = extract_points(with_passer_by(before, 40, share), camera, settings, NOISE, context)
+    target = surface.add(points, before.T_world_camera)
+    points = extract_points(with_passer_by(after, 48, share), camera, settings, NOISE, context)
+    found = align(points, target, after.T_world_camera, AlignSettings(), NOISE, context)
+    return separation(inverse(found.T_world_camera), inverse(after.T_world_camera))[0]
+
+
+@pytest.mark.parametrize("share", [6, 8, 12])
+def test_something_near_that_moves_does_not_take_the_camera_along(frames: list[Frame], share: int) -> None:
+    bounded, unbounded = error_m(frames, PointSettings(), share), error_m(frames, UNBOUNDED, share)
+    assert bounded < 0.007
+    assert unbounded > 4 * bounded
+
+
+def test_near_points_weigh_little_more_than_those_at_the_median_depth(frames: list[Frame]) -> None:
+    frame = frames[0]
+    depth = with_passer_by(frame, 40)
+    context = NativeContext(1)
+    free = extract_points(depth, frame.camera, UNBOUNDED, NOISE, context)
+    bound = extract_points(depth, frame.camera, PointSettings(), NOISE, context)
+    limit = largest_weight(depth, PointSettings(), NOISE, 4)
+    assert free.weights.max() > 10 * limit
+    assert bound.weights.max() == pytest.approx(limit, rel=0.02)  # the median of another grid
+    far = free.weights < 0.9 * limit
+    assert far.any() and np.array_equal(bound.weights[far], free.weights[far])
+
+
+def test_a_frame_without_depth_has_a_bound_all_the_same() -> None:
+    assert largest_weight(np.zeros((8, 8), np.float32), PointSettings(), NOISE, 2) == PointSettings().near_weight
