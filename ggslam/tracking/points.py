@@ -143,7 +143,8 @@ def native_points_settings(
     return structures.DepthPointsSettings(
         camera.fx, camera.fy, camera.cx, camera.cy, noise.constant, noise.square, settings.min_depth,
         settings.max_depth, settings.min_thickness, settings.max_elongation, settings.min_neighbours,
-        largest_weight(depth, settings, noise, stride), camera.width, camera.height, stride, settings.window, max(1, round(camera.width / 320)),
+        largest_weight(depth, settings, noise, stride), camera.width, camera.height, stride, settings.window,
+        max(1, round(camera.width / 320)),
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
 from ggslam.tracking.gicp import align
-from ggslam.tracking.points import extract_points, largest_weight
+from ggslam.tracking.points import extract_points, grid_stride, largest_weight
 from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings, TargetSettings
 from ggslam.tracking.surface import MeasuredSurface
 
@@ -56,9 +56,10 @@ def test_near_points_weigh_little_more_than_those_at_the_median_depth(frames: li
     context = NativeContext(1)
     free = extract_points(depth, frame.camera, UNBOUNDED, NOISE, context)
     bound = extract_points(depth, frame.camera, PointSettings(), NOISE, context)
-    limit = largest_weight(depth, PointSettings(), NOISE, 4)
+    stride = grid_stride(int(np.count_nonzero(depth > 0)), PointSettings().count)
+    limit = largest_weight(depth, PointSettings(), NOISE, stride)
     assert free.weights.max() > 10 * limit
-    assert bound.weights.max() == pytest.approx(limit, rel=0.02)  # the median of another grid
+    assert bound.weights.max() == pytest.approx(limit)
     far = free.weights < 0.9 * limit
     assert far.any() and np.array_equal(bound.weights[far], free.weights[far])
 
