@@ -53,6 +53,11 @@ class RunMovers:
         """What moves in the frame tracked last, bool [H, W]; None: nothing, as far as is known."""
         return self.detector.mask
 
+    @property
+    def may_move(self) -> bool:
+        """Whether something in the frame tracked last moves, or may."""
+        return self.detector.found is not None
+
     def expect(self, frame: Frame) -> Frame:
         """The frame to locate: without depth where something is expected to move."""
         return self.detector.expect(frame) if self.active else frame

@@ -278,6 +278,8 @@ class Slam:
         self._fixtures.follow(self.camera, located)
         self._tell_noise(result.median_depth_m)
         result = self.movers.look(frame, result, self.tracker.noise)
+        if self.movers.may_move:
+            self.tracker.be_wary()
         self.times.tracking_by_frame.append(time.perf_counter() - start)
         self.times.tracking += self.times.tracking_by_frame[-1]
         return result

@@ -73,13 +73,18 @@ class GicpTracker(Tracker):
         if self.noise is None:
             self.noise = estimate_noise(frame.depth, self.camera)
         noise = self.noise or DepthNoise()
-        points = self.engine.points(frame.depth, self.settings.points, noise)
+        points = self._points(frame.depth, noise)
+        motion.wary = max(0, motion.wary - 1)
         view = FeatureView(frame.color, frame.depth, motion.T_world_camera)
         if target is None:
             return self._begin(view, points)
         self.noise = noise  # what could not be measured before the first keyframe is taken as usual
         self._features = None
         found, reason = self._locate(view, points, target)
+        if not motion.wary and found.photometric_share > 0 and motion.is_sudden(found.photometric_residual):
+            motion.wary = self.settings.recovery.wary_frames
+            points = self._points(frame.depth, noise)
+            found, reason = self._locate(view, points, target)
         if not self._is_acceptable(found):
             return self._give_up(points, found)
         T = orthonormalize(found.T_world_camera)
@@ -87,6 +92,8 @@ class GicpTracker(Tracker):
         doubt = self._features.contradict(T, JUMP_SLACK) if self._features is not None else ""
         self._features = None
         motion.follow(view, T)
+        if found.photometric_share > 0:
+            motion.note_greys(found.photometric_residual)
         motion.remember(view, points, self.settings)
         status = TrackingStatus.DEGENERATE if found.degenerate else TrackingStatus.OK
         status = TrackingStatus.RECOVERED if reason else status
@@ -95,6 +102,13 @@ class GicpTracker(Tracker):
         return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, found)
 
     # --- parts -------------------------------------------------------------------------------------------------------
+
+    def _points(self, depth: np.ndarray, noise: DepthNoise) -> PointSource:
+        settings = self.settings.points
+        if self.state.motion.wary:
+            near = min(settings.near_weight, self.settings.recovery.near_weight)
+            settings = dataclasses.replace(settings, near_weight=near)
+        return self.engine.points(depth, settings, noise)
 
     def _look_at_residuals(self, points: PointSource, found: AlignmentResult) -> None:
         """Noise that was measured on the first frame is taken to be larger where frames do not lie on one another."""

@@ -13,6 +13,13 @@ from ggslam.tracking.photometric import PhotometricReference
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import PhotometricSettings, TrackerSettings
 
+GREYS = 6
+"""Frames whose grey values tell what is usual."""
+SUDDEN = 2.0
+"""Images that agree so many times less than usual make a pose doubtful..."""
+SUDDEN_FLOOR = 0.015
+"""...if they differ by this much, in [0, 1]."""
+
 
 @dataclass
 class CameraMotion:
@@ -25,6 +32,8 @@ class CameraMotion:
         views: the last located frames, the newest first.
         reference_view: an earlier one, not too far away, whose grey values frames are compared with.
         reference: the same, prepared; None: not yet.
+        greys: how much grey values of the last located frames differed from the reference, the newest first.
+        wary: so many more frames are located as if something near moved.
     """
 
     T_world_camera: np.ndarray
@@ -33,10 +42,23 @@ class CameraMotion:
     views: list[FeatureView] = field(default_factory=list)
     reference_view: FeatureView | None = None
     reference: PhotometricReference | None = None
+    greys: list[float] = field(default_factory=list)
+    wary: int = 0
 
     def predict(self) -> np.ndarray:
         """The next pose [4, 4] at constant velocity."""
         return self.T_world_camera @ self.velocity
+
+    def is_sudden(self, residual: float) -> bool:
+        """Whether images that differ by `residual` agree far less than those of the frames before did: something near
+        that moves may have taken the pose along."""
+        if len(self.greys) < GREYS:
+            return False
+        return residual > max(SUDDEN * float(np.median(self.greys)), SUDDEN_FLOOR)
+
+    def note_greys(self, residual: float) -> None:
+        """The grey values of a located frame differ by so much from the reference."""
+        self.greys = [residual, *self.greys[: GREYS - 1]]
 
     def follow(self, view: FeatureView, T_world_camera: np.ndarray) -> None:
         """A frame was located at `T_world_camera` [4, 4], which becomes its view's pose."""
@@ -52,7 +74,7 @@ class CameraMotion:
         """The camera was found at `T_world_camera` [4, 4] by other means; the frames remembered are of elsewhere."""
         self.velocity, self.lost = np.eye(4), False
         self.T_world_camera = view.T_world_camera = T_world_camera
-        self.views, self.reference_view, self.reference = [], None, None
+        self.views, self.reference_view, self.reference, self.greys = [], None, None, []
 
     def move(self, T_new_old: np.ndarray) -> None:
         """The world about the camera was moved by a correction [4, 4]."""

@@ -48,9 +48,8 @@ class PointSettings:
     """Lower bound of the smallest regularised eigenvalue (equation 1 of GS-ICP): a plane's thickness."""
     max_elongation: float = setting(4.0, 1, 1e4)
     """Upper bound of the largest regularised eigenvalue."""
-    near_weight: float = setting(1.5, 1, 1e9)
-    """Near points, whose noise is less, weigh at most so many times what one at the frame's median depth does: what is
-    near may move."""
+    near_weight: float = setting(1e9, 1, 1e9)
+    """Near points, whose noise is less, weigh at most so many times what one at the frame's median depth does."""
 
     def __post_init__(self) -> None:
         if self.min_depth >= self.max_depth:
@@ -160,6 +159,10 @@ class RecoverySettings:
     """Under this overlap from every start the frame is lost."""
     min_share: float = setting(0.2, 0, 1)
     """A pose short of the convincing overlap is believed only if this share of the textured points was compared."""
+    near_weight: float = setting(1.5, 1, 1e9)
+    """`points.near_weight` while something may move: what is near may take the pose along."""
+    wary_frames: int = setting(16, 0, 1000)
+    """Frames for which that holds, after images suddenly agreed less or something was found that may move."""
     views: int = setting(2, 1, 100)
     """Located frames whose features are matched, the latest first."""
     features: FeatureSettings = field(default_factory=FeatureSettings)

@@ -162,6 +162,10 @@ class Tracker(ABC):
         """Frames are aligned to `target` from the next one on."""
         self.state.target = target
 
+    def be_wary(self) -> None:
+        """Something may move: near points are trusted less for a while, whoever they belong to."""
+        self.state.motion.wary = self.settings.recovery.wary_frames
+
     def start_lost(self, target: GicpTarget) -> None:
         """Nothing is known of the camera's pose but that it is somewhere at `target`; see `relocate`."""
         self.state.target, self.state.motion.lost = target, True
