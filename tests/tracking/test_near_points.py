@@ -12,10 +12,17 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
 from ggslam.tracking.gicp import align
-from ggslam.tracking.points import extract_points, grid_stride, largest_weight
-from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings, RecoverySettings, TargetSettings, TrackerSettings
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.motion import GREYS, CameraMotion
+from ggslam.tracking.points import extract_points, grid_stride, largest_weight
+from ggslam.tracking.settings import (
+    AlignSettings,
+    DepthNoise,
+    PointSettings,
+    RecoverySettings,
+    TargetSettings,
+    TrackerSettings,
+)
 from ggslam.tracking.surface import MeasuredSurface
 
 NOISE = DepthNoise(constant=0.0005, square=0.0019)
