@@ -37,6 +37,7 @@ class MoverDetector:
         mask: bool [H, W], what moves in the latest frame; None: nothing.
         views: coarse depth of the latest frames, the newest last.
         trail: where movers have been.
+        segments: ids of the recording's segments that move in the latest frame.
         found: small mask of what moves, or may, in the latest frame...
         small: ...and of what does, as `mask`.
         things: int32 [H, W], number of the moving thing at each pixel, 0 without one, not grown; None: nothing.
@@ -50,6 +51,7 @@ class MoverDetector:
     small: np.ndarray | None = None
     things: np.ndarray | None = None
     expected: np.ndarray | None = None
+    segments: frozenset[int] = frozenset()
     trail: Trail = field(default_factory=Trail)
 
     def expect(self, frame: Frame) -> Frame:
@@ -69,7 +71,7 @@ class MoverDetector:
         """
         self.mask = self.things = None
         if T_world_camera is None:
-            self.views, self.found, self.small, self.expected = [], None, None, None
+            self.views, self.found, self.small, self.expected, self.segments = [], None, None, None, frozenset()
             return
         s, factor = self.settings, coarse_factor(frame.camera, self.settings)
         view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera, margin)
@@ -89,16 +91,17 @@ class MoverDetector:
                 left |= evidence.otherwise
                 if 2 * age >= s.rest_frames:
                     stayed |= evidence.same
-        before, moved = self.found, self.small
+        before, moved, moving = self.found, self.small, self.segments
+        self.segments = frozenset()
         self.found = self.small = self.expected = None
         novel = passed + surely >= s.min_passed
         if moved is not None:
             novel |= (passed > 0) & grow_places(moved)
-        if novel.sum() < min(s.min_pixels, 3):
+        if novel.sum() < min(s.min_pixels, 3) and not moving:
             return
         rests, judged, shape = stayed & ~left, stayed | left, frame.depth.shape
         places = Gathering(novel, passed > 0, known, rests, judged, view.depth, same > passed, factor, shape)
-        found = gather(places, frame.load_mask, s)
+        found = gather(places, frame.load_mask, s, moving)
         most = known if moved is None else view.depth > 0  # what moves may hide most of what was seen before
         if found is None or found.small.sum() > s.max_share * most.sum():
             return
@@ -112,6 +115,7 @@ class MoverDetector:
                 self.mask = grow(seen_twice, GROWN)
                 self.things = np.where(seen_twice, found.full, 0)
                 self.small = thin_out(seen_twice, factor)
+                self.segments = found.segments_on(seen_twice)
                 self.trail.add(view, self.small)
 
     def clean(self, frame: Frame) -> Frame:

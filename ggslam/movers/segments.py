@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -20,6 +20,9 @@ CLEAR = 0.5
 would may be a pose's or a camera's error."""
 JUDGED = 0.25
 """Share of a thing's places that earlier frames must have looked at to say that it rests."""
+STILL_MOVES = 0.5
+"""A segment that moved in the frame before goes on, though frames before saw it all about, while no more than this share
+of what can be judged of it rests."""
 REACH = 2
 """Places by which a thing is larger than its evidence, at most."""
 _AROUND = np.ones((3, 3), np.uint8)
@@ -60,11 +63,18 @@ class MovingThings:
         small: bool [h, w], the places of all of them.
         parts: int32 [h, w], number of the thing at each place, 0 without one.
         full: int32 [H, W], the same for each pixel.
+        segments: id of the segment that a thing is, by the thing's number.
     """
 
     small: np.ndarray
     parts: np.ndarray
     full: np.ndarray
+    segments: dict[int, int] = field(default_factory=dict)
+
+    def segments_on(self, mask: np.ndarray) -> frozenset[int]:
+        """Ids of the segments that have pixels on a mask bool [H, W]."""
+        numbers = np.unique(self.full[mask])
+        return frozenset(self.segments[int(n)] for n in numbers if int(n) in self.segments)
 
     def keep_credible(self, novel: np.ndarray, clear: np.ndarray, before: np.ndarray | None) -> MovingThings | None:
         """Those whose places bool [h, w] of evidence are clear to more than a half, and those that meet what moved in
@@ -78,7 +88,7 @@ class MovingThings:
         if not numbers:
             return None
         small, pixels = np.isin(self.parts, numbers), np.isin(self.full, numbers)
-        return MovingThings(small, np.where(small, self.parts, 0), np.where(pixels, self.full, 0))
+        return MovingThings(small, np.where(small, self.parts, 0), np.where(pixels, self.full, 0), self.segments)
 
     def pixels_near(self, before: np.ndarray) -> np.ndarray | None:
         """Pixels, bool [H, W], of those that meet places bool [h, w] of the frame before; None without any."""
@@ -88,8 +98,9 @@ class MovingThings:
 
 
 def gather(
-    places: Gathering, load_segments: Callable[[], np.ndarray | None], settings: MoverSettings
-) -> MovingThings | None:
+    places: Gathering, load_segments: Callable[[], np.ndarray | None], settings: MoverSettings,
+    moved: frozenset[int] = frozenset(),
+) -> MovingThings | None:  # fmt: skip
     """The things that move, None without any.
 
     Args:
@@ -97,27 +108,32 @@ def gather(
         load_segments: gives ids uint16 [H, W] of the frame's segments, 0 = none, or None. Asked only where something
             may move.
         settings: how much of a thing has to have come.
+        moved: ids of the segments that moved in the frame before.
     """
     blobs = parts_with_seeds(_large(places.novel, settings.min_pixels), places.novel | places.perhaps, 0)
     segments = load_segments()
     if segments is None:
         return _as_things(_blobs_that_move(blobs, places, settings), places, None, {})
     small = thin_out(segments, places.factor)
-    moving = {number: k for k, number in enumerate(_segments_that_move(small, places, settings), start=1)}
+    moving = {number: k for k, number in enumerate(_segments_that_move(small, places, settings, moved), start=1)}
     of_segments = np.isin(small, list(moving)) & (small > 0)
     left = _large(blobs & ~grow_places(of_segments) & (small == 0), settings.min_pixels)
     return _as_things(_blobs_that_move(left, places, settings), places, segments, moving)
 
 
-def _segments_that_move(small: np.ndarray, places: Gathering, s: MoverSettings) -> list[int]:
+def _segments_that_move(
+    small: np.ndarray, places: Gathering, s: MoverSettings, moved: frozenset[int]
+) -> list[int]:
     """Ids of segments of which enough has come and that do not rest."""
     counted = (places.known, places.novel, places.rests, places.judged)
     count, novel, rest, judged = (np.bincount(small[mask], minlength=int(small.max()) + 1) for mask in counted)
     found = []
-    for number in np.flatnonzero(novel):
+    candidates = sorted({*np.flatnonzero(novel).tolist(), *(n for n in moved if n < len(count) and count[n])} - {0})
+    for number in candidates:
         enough = max(s.min_pixels / 4, s.min_share * count[number])
-        if number and novel[number] >= enough and not _at_rest(rest[number], judged[number], count[number], s):
-            found.append(int(number))
+        has_come = novel[number] >= enough and not _at_rest(rest[number], judged[number], count[number], s)
+        if has_come or (number in moved and rest[number] <= STILL_MOVES * judged[number]):
+            found.append(number)
     return found
 
 
@@ -176,4 +192,5 @@ def _as_things(
         for number, k in moving.items():
             full[segments == number] = first + k
             parts[small == number] = first + k
-    return MovingThings(parts > 0, parts, full)
+    first = int(labels.max())
+    return MovingThings(parts > 0, parts, full, {first + k: number for number, k in moving.items()})

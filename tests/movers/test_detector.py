@@ -27,14 +27,17 @@ def pose(n: int) -> np.ndarray:
     return T
 
 
-def frame(n: int, box_at: float | None, seed: int | None = None, ids: bool = False) -> Frame:
-    """A wall, and 1.5 m away the front of a box 0.4 m wide whose middle is at `box_at` (metres, world x)."""
+def frame(
+    n: int, box_at: float | None, seed: int | None = None, ids: bool = False, distance: float = BOX
+) -> Frame:  # fmt: skip
+    """A wall, and 1.5 m away (`distance`) the front of a box 0.4 m wide whose middle is at `box_at` (metres, world x)."""
     depth = np.full((240, 320), WALL, np.float32)
     mask = np.ones((240, 320), np.uint16)
     if box_at is not None:
-        x = (np.arange(320) - CAMERA.cx) / CAMERA.fx * BOX + 0.01 * n
-        columns = np.abs(x - box_at) < 0.2
-        depth[80:160, columns], mask[80:160, columns] = BOX, 7
+        x = (np.arange(320) - CAMERA.cx) / CAMERA.fx * distance + 0.01 * n
+        columns, half = np.abs(x - box_at) < 0.2, round(40 * BOX / distance)
+        rows = slice(120 - half, 120 + half)
+        depth[rows, columns], mask[rows, columns] = distance, 7
     if seed is not None:
         depth += np.random.default_rng(1000 * seed + n).normal(0, NOISE, depth.shape).astype(np.float32)
     color = np.zeros((240, 320, 3), np.uint8)
@@ -86,6 +89,22 @@ def test_what_has_come_to_rest_is_no_mover_any_more() -> None:
     found = look_at(boxes)
     assert found[15] is not None
     assert all(mask is None for mask in found[-4:])
+
+
+def test_a_mover_goes_on_though_frames_before_saw_it_all_about() -> None:
+    """It goes to and fro, then straight away from the camera: where it is then, nobody ever looked past."""
+    detector, found = MoverDetector(MoverSettings(enabled=True)), []
+    to_and_fro = [0.0] * 50 + [0.03 * min(n, 12 - n) for n in range(13)]
+    places = [(at, BOX) for at in to_and_fro] + [(0.0, BOX + 0.02 * n) for n in range(1, 30)]
+    for n, (at, distance) in enumerate(places):
+        detector.look(frame(n, at, 0, True, distance), pose(n), margin)
+        found.append(detector.mask)
+    assert all(mask is None for mask in found[:51])
+    assert all(mask is not None for mask in found[58:])
+    for _ in range(10):
+        n += 1
+        detector.look(frame(n, at, 0, True, distance), pose(n), margin)
+    assert detector.mask is None  # at rest
 
 
 def test_a_lost_frame_breaks_the_row() -> None:
