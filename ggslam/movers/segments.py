@@ -21,8 +21,8 @@ would may be a pose's or a camera's error."""
 JUDGED = 0.25
 """Share of a thing's places that earlier frames must have looked at to say that it rests."""
 STILL_MOVES = 0.5
-"""A segment that moved in the frame before goes on, though frames before saw it all about, while no more than this share
-of what can be judged of it rests."""
+"""A segment that moved in the frame before goes on, though frames before saw it all about, while no more than this
+share of what can be judged of it rests."""
 REACH = 2
 """Places by which a thing is larger than its evidence, at most."""
 _AROUND = np.ones((3, 3), np.uint8)
