@@ -30,7 +30,7 @@ def pose(n: int) -> np.ndarray:
 def frame(
     n: int, box_at: float | None, seed: int | None = None, ids: bool = False, distance: float = BOX
 ) -> Frame:  # fmt: skip
-    """A wall, and 1.5 m away (`distance`) the front of a box 0.4 m wide; its middle is at `box_at` (metres, world x)."""
+    """A wall, and 1.5 m away (`distance`) the front of a box 0.4 m wide; its middle is at `box_at` (world x)."""
     depth = np.full((240, 320), WALL, np.float32)
     mask = np.ones((240, 320), np.uint16)
     if box_at is not None:
