@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.jobs.report.change_section import ChangesShown
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.movers import MoverRecord
@@ -91,6 +92,7 @@ class RunData:
         views: pictures.
         movers: what moved while it was recorded.
         mover_views: pictures of them.
+        changes: what changed between the visits that an updated run is of; None: it is no updated run.
     """
 
     name: str
@@ -110,6 +112,7 @@ class RunData:
     views: list[FrameView] = field(default_factory=list)
     movers: list[MoverRecord] = field(default_factory=list)
     mover_views: list[FrameView] = field(default_factory=list)
+    changes: ChangesShown | None = None
 
     def recording_name(self) -> str:
         """Where its recording is."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from ggslam.jobs.report.change_section import changes_part
 from ggslam.jobs.report.metric_words import MEANINGS, METRICS, TILES
 from ggslam.jobs.report.mover_section import movers_part
 from ggslam.jobs.report.run_data import RunData, stage_seconds
@@ -31,6 +32,7 @@ def run_page(run: RunData) -> str:
     parts = [
         ("scores", "Scores", _scores(run)), ("views", "Views", _views(run)), ("trajectory", "Trajectory", _path(run)),
         *([("movers", "What moved", movers_part(run))] if run.movers else []),
+        *([("changes", "What changed", changes_part(run.changes))] if run.changes is not None else []),
         ("quality", "Image quality", _quality(run)), ("tracking", "Tracking", _tracking_part(run)),
         ("time", "Time", _time(run)), ("map", "Map and memory", _map(run)), ("losses", "Losses", _losses(run)),
         ("meaning", "What the numbers mean", p.definitions(MEANINGS)), ("settings", "Settings", _settings(run)),

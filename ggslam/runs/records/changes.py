@@ -9,13 +9,16 @@ from ggslam.runs.records.record import Record, RecordFile
 
 
 class ChangedSide(Record):
-    """A thing as one of the visits has it: ids of the objects that it is."""
+    """A thing as one of the visits has it: ids of the objects that it is, and the share of it that the other visit
+    looked at and did not find."""
 
     ids: list[int]
+    not_there: float | None = None
 
 
 class ChangeRecord(Record):
-    """A change: what happened, to what, how sure; `T_new_old` of what moved."""
+    """A change: what happened, to what, how sure; `T_new_old` of what moved, how far its middle went and how far it
+    turned; the name of its picture."""
 
     kind: str
     name: str
@@ -24,6 +27,9 @@ class ChangeRecord(Record):
     new: ChangedSide | None = None
     T_new_old: Any = None
     turn_known: bool | None = None
+    moved_m: float | None = None
+    turned_deg: float | None = None
+    picture: str = ""
 
 
 class UnseenRecord(Record):
@@ -34,9 +40,11 @@ class UnseenRecord(Record):
 
 
 class ChangesRecord(RecordFile):
-    """The file."""
+    """The file; `old` and `new` are the visits' runs."""
 
     FILE: ClassVar[str] = "changes.json"
+    old: str = ""
+    new: str = ""
 
     changes: list[ChangeRecord] = []
     unseen: list[UnseenRecord] = []
