@@ -207,10 +207,12 @@ def _drop_ghosts(store: GridStore, found: _Comparison) -> list[str]:
         elif not keep.all():
             data = gaussians_to_bytes({name: values[keep] for name, values in arrays.items()}, visit)
             store.put(key, {GAUSSIANS: data}, counts={GAUSSIANS: int(keep.sum())})
-    left = sorted(moved - own_ids)
-    if not left:
-        return []
-    return [f"moved, and still at the old place, for no cell of the new one was due: objects {left}"]
+    added = {event.id for event in found.entry.events if event.kind == "added" and event.id is not None}
+    notes = {
+        "moved, and still at the old place": sorted(moved - own_ids),
+        "added, and not in the store yet": sorted(added - own_ids),
+    }
+    return [f"{what}, for no cell of the new one was due: objects {ids}" for what, ids in notes.items() if ids]
 
 
 def _cells_with_gaussians(store: GridStore) -> list[CellKey]:
