@@ -11,8 +11,10 @@ import numpy as np
 
 from ggslam.changes.detection import Change, Detection
 from ggslam.changes.things import JudgedSurface, Thing
-from ggslam.objects.boxes import OrientedBox, oriented_box
-from ggslam.scene.poses import transform_points, turning_angle
+from ggslam.objects.boxes import oriented_box
+from ggslam.scene.object_names import object_label
+from ggslam.scene.oriented_box import OrientedBox
+from ggslam.scene.poses import motion_of
 
 VERSION = 1
 """Of changes.json."""
@@ -36,8 +38,7 @@ class ChangeTable:
         """For people: the name and id of what changed."""
         for thing, names in zip((change.old, change.new), self._names, strict=True):
             for i in () if thing is None else thing.ids:
-                name = names.get(i)
-                return f"{name} ({i})" if name else f"object {i}"
+                return object_label(i, names.get(i))
         return "something without an id"
 
     def box(self, change: Change, number: int) -> OrientedBox | None:
@@ -53,9 +54,7 @@ class ChangeTable:
     def motion(self, change: Change) -> tuple[float, float]:
         """How far the middle of what moved went, metres, and by how many degrees it turned."""
         assert change.T_new_old is not None
-        middle = self.points(change, 0).mean(0, keepdims=True)
-        shift = float(np.linalg.norm(transform_points(middle, change.T_new_old) - middle))
-        return shift, float(np.degrees(turning_angle(change.T_new_old, np.eye(4))))
+        return motion_of(change.T_new_old, self.points(change, 0).mean(0))
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""

@@ -183,14 +183,13 @@ def _as_things(
     """Connected places and segments with their numbers, as things."""
     if not moving and not labels.any():
         return None
-    (h, w), factor = labels.shape, places.factor
+    (h, w), factor, first = labels.shape, places.factor, int(labels.max())
     parts, full = labels.astype(np.int32), np.zeros(places.shape, np.int32)
     large = cv2.resize(labels.astype(np.uint16), (w * factor, h * factor), interpolation=cv2.INTER_NEAREST)
     full[: h * factor, : w * factor] = large
     if segments is not None:
-        small, first = thin_out(segments, factor), int(labels.max())
+        small = thin_out(segments, factor)
         for number, k in moving.items():
             full[segments == number] = first + k
             parts[small == number] = first + k
-    first = int(labels.max())
     return MovingThings(parts > 0, parts, full, {first + k: number for number, k in moving.items()})

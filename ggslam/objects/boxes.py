@@ -3,32 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
-
 import numpy as np
-import pydantic
 from scipy.linalg import svd
 
-Number = Annotated[float, pydantic.Field(allow_inf_nan=False)]
-Vector = tuple[Number, Number, Number]
+from ggslam.scene.oriented_box import OrientedBox, Vector
+
 TRIMMED = 0.01
 """Share of the points, the farthest from the middle, that a box need not hold: floaters would inflate it."""
-
-
-@dataclass(frozen=True)
-class OrientedBox:
-    """A box in any orientation.
-
-    Attributes:
-        center: metres, world frame.
-        axes: three orthogonal unit vectors (right-handed), the directions of `size`; the longest spread first.
-        size: metres along the axes.
-    """
-
-    center: Vector
-    axes: tuple[Vector, Vector, Vector]
-    size: Vector
 
 
 def middle_of(points: np.ndarray, weights: np.ndarray) -> Vector:

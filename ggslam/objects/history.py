@@ -10,10 +10,10 @@ from typing import Annotated
 import numpy as np
 import pydantic
 
+from ggslam.scene.poses import Matrix, to_matrix
+
 Number = Annotated[int, pydantic.Field(ge=0)]
 """Of a visit in `History.visits`."""
-_Row = tuple[float, float, float, float]
-Matrix = tuple[_Row, _Row, _Row, _Row]
 _UNMOVED: Matrix = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
 
 
@@ -84,13 +84,8 @@ class History:
         for i, name in seen.items():
             own = past.get(i, ObjectPast(i, name, number, number))
             T = np.array(own.T_now_first[own.last_seen]) if own.T_now_first else np.eye(4)
-            now = {**own.T_now_first, number: _matrix(T_new_old[i] @ T if i in T_new_old else T)}
+            now = {**own.T_now_first, number: to_matrix(T_new_old[i] @ T if i in T_new_old else T)}
             past[i] = replace(own, name=own.name or name, last_seen=number, gone_since=None, T_now_first=now)
         for i in set(gone) & set(past):
             past[i] = replace(past[i], gone_since=number)
         return History([*self.visits, visit], [past[i] for i in sorted(past)])
-
-
-def _matrix(T: np.ndarray) -> Matrix:
-    a, b, c, d = ((float(r[0]), float(r[1]), float(r[2]), float(r[3])) for r in T)
-    return a, b, c, d

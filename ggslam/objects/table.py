@@ -16,11 +16,13 @@ import numpy as np
 import pydantic
 
 from ggslam.errors import ConfigError, FormatError, InputError
-from ggslam.objects.boxes import OrientedBox, Vector, middle_of, oriented_box
+from ggslam.objects.boxes import middle_of, oriented_box
 from ggslam.objects.colors import id_palette
 from ggslam.objects.history import History
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.scene.object_names import object_label
+from ggslam.scene.oriented_box import OrientedBox, Vector
 from ggslam.system.atomic import write_text
 from ggslam.system.foreign import read_foreign_text
 
@@ -73,7 +75,7 @@ class ObjectRecord:
 
     def label(self) -> str:
         """For people: the name and id, or the id alone."""
-        return f"{self.name} ({self.id})" if self.name else f"object {self.id}"
+        return object_label(self.id, self.name)
 
 
 @dataclass(frozen=True)

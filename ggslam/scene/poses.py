@@ -7,6 +7,9 @@ import math
 
 import numpy as np
 
+_Row = tuple[float, float, float, float]
+Matrix = tuple[_Row, _Row, _Row, _Row]
+
 
 def skew(w: np.ndarray) -> np.ndarray:
     """Matrix [w]x with [w]x v = w x v, [3, 3]."""
@@ -65,6 +68,18 @@ def turning_angle(T_one: np.ndarray, T_other: np.ndarray) -> float:
 def separation(T_one: np.ndarray, T_other: np.ndarray) -> tuple[float, float]:
     """How far two poses [4, 4] are apart: metres and degrees."""
     return float(np.linalg.norm(T_one[:3, 3] - T_other[:3, 3])), math.degrees(turning_angle(T_one, T_other))
+
+
+def motion_of(T_new_old: np.ndarray, middle: np.ndarray) -> tuple[float, float]:
+    """How far a motion [4, 4] moves a thing with its middle at [3], metres, and turns it, degrees."""
+    shift = transform_points(middle[None], T_new_old)[0] - middle
+    return float(np.linalg.norm(shift)), math.degrees(turning_angle(T_new_old, np.eye(4)))
+
+
+def to_matrix(T: np.ndarray) -> Matrix:
+    """A pose [4, 4] as files have it."""
+    a, b, c, d = ((float(r[0]), float(r[1]), float(r[2]), float(r[3])) for r in T)
+    return a, b, c, d
 
 
 def inverse(T: np.ndarray) -> np.ndarray:

@@ -17,6 +17,9 @@ import pydantic
 from pydantic.dataclasses import dataclass
 
 from ggslam.errors import FormatError
+from ggslam.scene.object_names import object_label
+from ggslam.scene.oriented_box import Number, OrientedBox, Vector
+from ggslam.scene.poses import motion_of, to_matrix
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
 from ggslam.system.atomic import write_bytes
@@ -25,19 +28,8 @@ from ggslam.system.foreign import read_foreign
 OBJECTS_FILE = "objects.json"
 VERSION = 1
 Kind = Literal["added", "removed", "moved", "look", "unseen"]
-Number = Annotated[float, pydantic.Field(allow_inf_nan=False)]
-Vector = tuple[Number, Number, Number]
-Row = tuple[Number, Number, Number, Number]
-Matrix = tuple[Row, Row, Row, Row]
-
-
-@dataclass(frozen=True)
-class Box:
-    """Centre and size in metres, store's world; axes are unit vectors, the directions of `size`."""
-
-    center: Vector
-    axes: tuple[Vector, Vector, Vector]
-    size: Vector
+_Row = tuple[Number, Number, Number, Number]
+FiniteMatrix = tuple[_Row, _Row, _Row, _Row]
 
 
 @dataclass(frozen=True)
@@ -47,7 +39,7 @@ class StoredObject:
     Attributes:
         id: 1 to 65535.
         name: None if nobody named it.
-        box: as the last run that saw it had it.
+        box: as the last run that saw it had it, store's world.
         gaussians: how many of the cells' Gaussians are its.
         cells: those that they lie in, sorted.
         first_seen, last_seen: visits.
@@ -56,7 +48,7 @@ class StoredObject:
 
     id: Annotated[int, pydantic.Field(ge=1, le=65535)]
     name: str | None
-    box: Box
+    box: OrientedBox
     gaussians: Annotated[int, pydantic.Field(ge=0)]
     cells: list[CellKey]
     first_seen: str
@@ -65,7 +57,7 @@ class StoredObject:
 
     def label(self) -> str:
         """For people."""
-        return label_of(self.id, self.name)
+        return object_label(self.id, self.name)
 
 
 @dataclass(frozen=True)
@@ -89,22 +81,22 @@ class ObjectEvent:
     name: str | None
     cells: list[CellKey] = field(default_factory=list)
     middle: Vector | None = None
-    T_new_old: Matrix | None = None
+    T_new_old: FiniteMatrix | None = None
     turn_known: bool | None = None
     confidence: float | None = None
     look: bool = False
 
     def label(self) -> str:
         """For people."""
-        return label_of(self.id, self.name)
+        if self.id is None:
+            return self.name or "something without an id"
+        return object_label(self.id, self.name)
 
     def motion(self) -> tuple[float, float] | None:
         """Metres that its middle went and degrees that it turned; None: it did not move, or its middle is unknown."""
         if self.T_new_old is None or self.middle is None:
             return None
-        T, middle = np.array(self.T_new_old), np.array(self.middle)
-        turn = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
-        return float(np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle)), float(turn)
+        return motion_of(np.array(self.T_new_old), np.array(self.middle))
 
 
 @dataclass(frozen=True)
@@ -157,13 +149,6 @@ class StoreObjects:
         return [event for event in joined if event is not None] + nameless
 
 
-def label_of(id: int | None, name: str | None) -> str:
-    """An object's name and id for people."""
-    if id is None:
-        return name or "something without an id"
-    return f"{name} ({id})" if name else f"object {id}"
-
-
 def join_events(events: list[ObjectEvent]) -> ObjectEvent | None:
     """What several visits, in the order of time, did to one object together; None: it came and went."""
     first, last = events[0], events[-1]
@@ -195,12 +180,6 @@ def join_events(events: list[ObjectEvent]) -> ObjectEvent | None:
 def _least(events: list[ObjectEvent]) -> float | None:
     told = [event.confidence for event in events if event.confidence is not None]
     return min(told) if told else None
-
-
-def to_matrix(T: np.ndarray) -> Matrix:
-    """A pose [4, 4] as the file has it."""
-    a, b, c, d = ((float(r[0]), float(r[1]), float(r[2]), float(r[3])) for r in np.asarray(T))
-    return a, b, c, d
 
 
 def read_objects(store: GridStore) -> StoreObjects | None:

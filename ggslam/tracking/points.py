@@ -14,7 +14,7 @@ from ggslam.interface.arrays import address
 from ggslam.interface.core import tracking as structures
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
-from ggslam.tracking.settings import DepthNoise, PointSettings
+from ggslam.tracking.settings import UNBOUNDED, DepthNoise, PointSettings
 
 
 class PointSource(Protocol):
@@ -130,6 +130,8 @@ def largest_weight(depth: np.ndarray, settings: PointSettings, noise: DepthNoise
         depth: float32 [H, W], metres.
         stride: pixels between the points.
     """
+    if settings.near_weight >= UNBOUNDED:  # the usual: no weight comes near
+        return settings.near_weight
     z = depth[::stride, ::stride]
     z = z[(z >= settings.min_depth) & (z <= settings.max_depth)]
     usual = noise.sigma(1.0) / noise.sigma(float(np.median(z))) if len(z) else 1.0

@@ -11,6 +11,8 @@ from ggslam.features.orb import FeatureSettings
 from ggslam.system.settings import Conflict, setting, settings_class
 
 PhotometricMode = Literal["never", "degenerate", "auto", "always"]
+UNBOUNDED = 1e9
+"""A weight that no point has: the nearest, at 0.1 m, is 10^4 times that at 1 m at most."""
 
 
 @settings_class(frozen=True)
@@ -48,7 +50,7 @@ class PointSettings:
     """Lower bound of the smallest regularised eigenvalue (equation 1 of GS-ICP): a plane's thickness."""
     max_elongation: float = setting(4.0, 1, 1e4)
     """Upper bound of the largest regularised eigenvalue."""
-    near_weight: float = setting(1e9, 1, 1e9)
+    near_weight: float = setting(UNBOUNDED, 1, UNBOUNDED)
     """Near points, whose noise is less, weigh at most so many times what one at the frame's median depth does."""
 
     def __post_init__(self) -> None:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from ggslam.errors import RunFolderError
-from ggslam.jobs.report.change_section import ChangesShown, changes_of, changes_part
+from ggslam.jobs.report.change_section import changes_of, changes_part
+from ggslam.jobs.report.run_data import ChangesShown
 from ggslam.objects.history import History, VisitRecord
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.changes import ChangesRecord

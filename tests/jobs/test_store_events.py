@@ -12,21 +12,21 @@ from ggslam.errors import FormatError
 from ggslam.jobs.changes.store_events import events_of_history
 from ggslam.jobs.submaps.fill import list_store
 from ggslam.objects.history import History, VisitRecord
+from ggslam.scene.oriented_box import OrientedBox
+from ggslam.scene.poses import to_matrix
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.store_copy import copy_store
 from ggslam.submaps.store_objects import (
     OBJECTS_FILE,
-    Box,
     ObjectEvent,
     StoredObject,
     StoreObjects,
     VisitObjects,
     read_objects,
-    to_matrix,
     write_objects,
 )
 
-BOX = Box((1.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.1, 0.1, 0.1))
+BOX = OrientedBox((1.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.1, 0.1, 0.1))
 
 
 def shift(x: float) -> np.ndarray:

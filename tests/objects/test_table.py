@@ -12,11 +12,12 @@ import pytest
 import torch
 
 from ggslam.errors import ConfigError, FormatError
-from ggslam.objects.boxes import OrientedBox, middle_of, oriented_box
+from ggslam.objects.boxes import middle_of, oriented_box
 from ggslam.objects.colors import UNLABELLED, id_palette
 from ggslam.objects.table import ObjectRecord, ObjectTable, Observation
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.oriented_box import OrientedBox
 
 
 def rotation(seed: int) -> np.ndarray:

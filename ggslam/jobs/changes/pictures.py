@@ -12,10 +12,10 @@ from ggslam.changes.detection import Change
 from ggslam.changes.found import ChangeTable
 from ggslam.changes.sightings import Visit
 from ggslam.native.loader import NativeContext
-from ggslam.objects.boxes import OrientedBox
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.reporting.pictures import color_to_uint8, side_by_side
 from ggslam.scene.camera import Camera
+from ggslam.scene.oriented_box import OrientedBox
 from ggslam.scene.poses import inverse, transform_points
 
 NEAR = 0.1

@@ -11,8 +11,8 @@ import numpy as np
 
 from ggslam.objects.history import History, ObjectPast
 from ggslam.objects.table import ObjectTable
-from ggslam.scene.poses import inverse
-from ggslam.submaps.store_objects import Kind, ObjectEvent, StoredObject, to_matrix
+from ggslam.scene.poses import inverse, to_matrix
+from ggslam.submaps.store_objects import Kind, ObjectEvent, StoredObject
 
 Known = Mapping[int, StoredObject]
 """Objects of a store before a visit, by id; also those that are gone."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,11 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import fingerprint
 from ggslam.runs.records.changes import ChangesRecord
 from ggslam.runs.writing import CHANGES_FOLDER
-from ggslam.scene.poses import inverse, turning_angle
+from ggslam.scene.poses import separation
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.store_objects import (
-    Box,
+    Kind,
     StoredObject,
     StoreObjects,
     VisitObjects,
@@ -175,9 +175,8 @@ def _check_world(folder: RunFolder, outcome: ChangesOutcome, visit: str) -> None
     own, placed = folder.keyframes().keyframes, outcome.visits[1].T_world_camera
     if len(own) != len(placed) or len(own) < _MANY_OFF:
         return
-    pairs = [(record.T_world_camera, T) for record, T in zip(own, placed, strict=True)]
-    metres = float(np.median([np.linalg.norm(T[:3, 3] - mine[:3, 3]) for mine, T in pairs]))
-    degrees = float(np.degrees(np.median([turning_angle(T @ inverse(mine), np.eye(4)) for mine, T in pairs])))
+    apart = [separation(record.T_world_camera, T) for record, T in zip(own, placed, strict=True)]
+    metres, degrees = np.median(apart, axis=0)
     if metres > _OFF_METRES or degrees > _OFF_DEGREES:
         raise ConfigError(
             f"{folder.path}: lies {metres:.2f} m and {degrees:.0f} degrees from where visit {visit!r} has it; "
@@ -197,22 +196,25 @@ def _drop_ghosts(store: GridStore, found: _Comparison) -> list[str]:
             own_ids |= set(np.unique(arrays["object_id"]).tolist())
         else:
             old_cells[key] = visit
-    gone = {event.id for event in found.entry.events if event.kind == "removed" and event.id is not None}
-    moved = {event.id for event in found.entry.events if event.kind == "moved" and event.id is not None}
-    for key, visit in old_cells.items():
+    gone, moved, added = (_ids(found.entry, kind) for kind in ("removed", "moved", "added"))
+    leaving = sorted(gone | (moved & own_ids))
+    for key, visit in old_cells.items() if leaving else ():
         arrays, _ = cell_arrays(store, key)
-        keep = ~np.isin(arrays["object_id"], sorted(gone | (moved & own_ids)))
+        keep = ~np.isin(arrays["object_id"], leaving)
         if not keep.any():
             store.remove_part(key, GAUSSIANS)
         elif not keep.all():
             data = gaussians_to_bytes({name: values[keep] for name, values in arrays.items()}, visit)
             store.put(key, {GAUSSIANS: data}, counts={GAUSSIANS: int(keep.sum())})
-    added = {event.id for event in found.entry.events if event.kind == "added" and event.id is not None}
     notes = {
         "moved, and still at the old place": sorted(moved - own_ids),
         "added, and not in the store yet": sorted(added - own_ids),
     }
     return [f"{what}, for no cell of the new one was due: objects {ids}" for what, ids in notes.items() if ids]
+
+
+def _ids(entry: VisitObjects, kind: Kind) -> set[int]:
+    return {event.id for event in entry.events if event.kind == kind and event.id is not None}
 
 
 def _cells_with_gaussians(store: GridStore) -> list[CellKey]:
@@ -242,10 +244,9 @@ def _objects_after(
         before = after.get(record.id)
         first = visit if before is None else before.first_seen
         last = visit if before is None or record.id in found.seen else before.last_seen
-        after[record.id] = StoredObject(record.id, record.name, Box(**asdict(record.box)), 0, [], first, last)
-    for event in found.entry.events:
-        if event.kind == "removed" and event.id in after:
-            after[event.id] = replace(after[event.id], gone_since=visit)
+        after[record.id] = StoredObject(record.id, record.name, record.box, 0, [], first, last)
+    for i in _ids(found.entry, "removed") & set(after):
+        after[i] = replace(after[i], gone_since=visit)
     return [
         replace(after[i], gaussians=count.get(i, 0), cells=sorted(cells.get(i, []))) for i in sorted(after)
     ]

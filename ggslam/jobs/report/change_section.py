@@ -4,18 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from ggslam.jobs.report.run_data import ChangesShown
 from ggslam.objects.history import History, ObjectPast
 from ggslam.reporting import page as p
 from ggslam.reporting.page import Html
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.changes import ChangeRecord, ChangesRecord
 from ggslam.runs.writing import CHANGES_FOLDER
+from ggslam.scene.object_names import object_label
 
 MOST = 12
 """Pictures that are shown."""
@@ -26,21 +27,6 @@ _WORDS = (
     "there: of the surface of the newer visit that the older one did not find."
 )
 _PAST = ("what", "first seen", "last seen", "gone since", "against where it was first seen")
-
-
-@dataclass(frozen=True)
-class ChangesShown:
-    """What a report shows of changes.
-
-    Attributes:
-        record: changes.json.
-        pictures: both visits with boxes, uint8 [H, W, 3], with words.
-        history: of the run's objects; None: it has none.
-    """
-
-    record: ChangesRecord
-    pictures: list[tuple[str, np.ndarray]] = field(default_factory=list)
-    history: History | None = None
 
 
 def changes_of(folder: RunFolder) -> ChangesShown | None:
@@ -118,5 +104,5 @@ def _past(past: ObjectPast) -> list[str]:
         moved = not np.allclose(np.array(T), np.eye(4), atol=1e-6)
         steps.append(f"visit {number + 1}: {'elsewhere' if moved else 'there'}")
     gone = "-" if past.gone_since is None else str(past.gone_since + 1)
-    name = f"{past.name} ({past.id})" if past.name else f"object {past.id}"
+    name = object_label(past.id, past.name)
     return [name, str(past.first_seen + 1), str(past.last_seen + 1), gone, "; ".join(steps) or "-"]

@@ -11,7 +11,6 @@ import numpy as np
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points, associate
 from ggslam.formats.trajectory import read_tum, write_tum
-from ggslam.jobs.report.change_section import changes_of
 from ggslam.jobs.report.mover_pictures import mover_views
 from ggslam.jobs.report.run_data import FrameView, LevelAxes, Path3D, RunData
 from ggslam.runs.folder import RunFolder
@@ -61,7 +60,7 @@ def _load(folder: RunFolder, sequence: Sequence | None, views: list[FrameView]) 
         steps=_table(folder, STEPS_FILE), scores=_table(folder, "frames.csv"), metrics=metrics, timing=timing,
         settings=_settings(folder), defaults=flat(config_to_dict(Config())), recording=recording, mark=mark,
         warnings=run_warnings(mark, recording, timing, loops, record, metrics), views=views,
-        movers=movers, mover_views=mover_views(sequence, movers, record.poses()), changes=changes_of(folder),
+        movers=movers, mover_views=mover_views(sequence, movers, record.poses()),
     )  # fmt: skip
 
 

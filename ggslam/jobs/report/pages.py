@@ -10,6 +10,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points
+from ggslam.jobs.report.change_section import changes_of
 from ggslam.jobs.report.comparison_page import by_recording, comparison_page
 from ggslam.jobs.report.gather import has_limit, load_run, save_truth
 from ggslam.jobs.report.run_data import FrameView, RunData
@@ -50,7 +51,7 @@ def _write_report(folder: RunFolder, sequence: Sequence | None, plots: Path | No
     views = saved_views(folder)
     if not views and not has_limit(folder):  # a view may see far more than a run with a limit holds
         views = rendered_views(folder, recording, pick_frames(folder.keyframes().poses()))
-    run = load_run(folder, recording, views)
+    run = replace(load_run(folder, recording, views), changes=changes_of(folder))
     path = folder.path / REPORT_FILE
     with as_written(folder.path):
         page = run_page(run)

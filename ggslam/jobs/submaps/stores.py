@@ -98,6 +98,8 @@ def store_of_run(
     for begin in range(0, len(others), _CELLS_AT_ONCE):
         _put(store, others[begin : begin + _CELLS_AT_ONCE])
     store_cloud(store, points[kept], {name: values[kept] for name, values in attributes.items()}, time)
+    if not earlier:
+        return
     held = {GAUSSIANS: {w.key for w in others if GAUSSIANS in w.parts}, POINTS: _cells(store, points)}
     for key in earlier:
         for part in [name for name, cells in held.items() if name in store.cell(key).parts and key not in cells]:
