@@ -17,6 +17,7 @@ from ggslam.movers.evidence import CoarseView, Margin, compare, thin_out
 from ggslam.movers.segments import Gathering, gather, grow_places
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.trail import Trail
+from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 
@@ -60,13 +61,16 @@ class MoverDetector:
             return frame
         return replace(frame, depth=np.where(self.expected, np.float32(0), frame.depth))
 
-    def look(self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin, sure: bool = True) -> None:
+    def look(
+        self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin, context: NativeContext, sure: bool = True
+    ) -> None:
         """Finds what moves in a frame: `mask`.
 
         Args:
             frame: as the camera saw it.
             T_world_camera: [4, 4], where it is; None: not known, which breaks the row of frames.
             margin: see there.
+            context: that it is computed in.
             sure: whether the pose is; if it is not, nothing begins to move.
         """
         self.mask = self.things = None
@@ -74,14 +78,13 @@ class MoverDetector:
             self.views, self.found, self.small, self.expected, self.segments = [], None, None, None, frozenset()
             return
         s, factor = self.settings, coarse_factor(frame.camera, self.settings)
-        view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera, margin)
+        view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera, margin, context)
         earlier, self.views = self.views, [*self.views[-AGES[-1] :], view]
         passed, clearly, surely, same = np.zeros((4, *view.depth.shape), np.int8)
         known, stayed, left = np.zeros((3, *view.depth.shape), bool)
-        for age in AGES:
-            if age > len(earlier):
-                continue
-            evidence = compare(view, earlier[-age], margin, self.small)
+        ages = [age for age in AGES if age <= len(earlier)]
+        found_by = compare(view, [earlier[-age] for age in ages], margin, context, self.small)
+        for age, evidence in zip(ages, found_by, strict=True):
             passed += evidence.passed
             clearly += evidence.clearly
             surely += evidence.surely

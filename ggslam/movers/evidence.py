@@ -10,15 +10,19 @@ errors of poses do not average out.
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from ggslam.interface.arrays import address
+from ggslam.interface.core.movers import DepthPlacesJob, OtherPlacesView, PlacesEvidenceJob, PlacesView
+from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import inverse, transform_points
+from ggslam.scene.poses import inverse
 
-_NO_DEPTH = np.float32(np.inf)
 SMOOTH = 2.5
 """Where depth varies by no more standard deviations of the camera than this its mean is compared."""
 KNOWN = 0.9
@@ -84,27 +88,23 @@ class CoarseView:
     smooth: np.ndarray
 
     @staticmethod
-    def of(depth: np.ndarray, camera: Camera, factor: int, T_world_camera: np.ndarray, margin: Margin) -> CoarseView:
+    def of(
+        depth: np.ndarray, camera: Camera, factor: int, T_world_camera: np.ndarray, margin: Margin,
+        context: NativeContext,
+    ) -> CoarseView:  # fmt: skip
         """Of a depth image float32 [H, W]; rows and columns left over are cut."""
         h, w = camera.height // factor, camera.width // factor
         middle = (factor - 1) / 2
         small = Camera(
             w, h, camera.fx / factor, camera.fy / factor, (camera.cx - middle) / factor, (camera.cy - middle) / factor
         )
-        own, around = np.ones((factor, factor), np.uint8), np.ones((3, 3), np.uint8)
-        window = _window(factor)
-        near = thin_out(cv2.erode(np.where(depth > 0, depth, _NO_DEPTH), own), factor)
-        far, least = thin_out(cv2.dilate(depth, own), factor), thin_out(cv2.erode(depth, own), factor)
-        count, total, squares = (
-            thin_out(cv2.boxFilter(image, -1, (window, window), normalize=False), factor)
-            for image in ((depth > 0).astype(np.float32), depth, depth * depth)
-        )
+        around, window = np.ones((3, 3), np.uint8), _window(factor)
+        nearest, farthest, least, count, total, squares = _depth_places(depth, factor, window // 2, context)
         mean = total / np.maximum(count, 1)
         spread = squares / np.maximum(count, 1) - mean * mean
         smooth = (count >= KNOWN * window**2) & (spread < (SMOOTH * margin.sigma(mean)) ** 2)
-        exact = thin_out(depth, factor)
-        value = np.where(smooth, mean, exact)
-        near, far = np.where(smooth, mean, near), np.where(smooth, mean, far)
+        value = np.where(smooth, mean, thin_out(depth, factor))
+        near, far = np.where(smooth, mean, nearest), np.where(smooth, mean, farthest)
         whole = cv2.erode(((least > 0) | smooth).astype(np.uint8), around) > 0
         whole[[0, -1]] = whole[:, [0, -1]] = False  # what is about them is not in the image
         near, far = cv2.erode(near, around), cv2.dilate(far, around)
@@ -147,55 +147,62 @@ class PairEvidence:
     otherwise: np.ndarray
 
 
-def compare(view: CoarseView, other: CoarseView, margin: Margin, moved: np.ndarray | None = None) -> PairEvidence:
-    """What `other` says of what `view` sees.
+def compare(
+    view: CoarseView, others: Sequence[CoarseView], margin: Margin, context: NativeContext,
+    moved: np.ndarray | None = None,
+) -> list[PairEvidence]:  # fmt: skip
+    """What each of `others` says of what `view` sees.
 
     Args:
         view: see there.
-        other: see there.
+        others: see there.
         margin: see there.
+        context: that it is computed in.
         moved: places of `view`, bool [h, w], that say nothing of how much depths of one surface differ.
+
+    Raises:
+        ValueError: an array has another shape than its view's camera.
     """
-    camera = other.camera
-    T_other_view = (inverse(other.T_world_camera) @ view.T_world_camera).astype(np.float32)
-    points = transform_points(view.camera.back_project(view.depth).reshape(-1, 3), T_other_view)
-    z = points[:, 2]
-    ahead = np.maximum(z, np.float32(1e-3))
-    u = np.float32(camera.fx) * points[:, 0] / ahead + np.float32(camera.cx)
-    v = np.float32(camera.fy) * points[:, 1] / ahead + np.float32(camera.cy)
-    inside = (view.depth.reshape(-1) > 0) & (z > 1e-3)
-    inside &= (u >= -0.5) & (v >= -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
-    column, row = (u + np.float32(0.5)).astype(np.int32), (v + np.float32(0.5)).astype(np.int32)
-    where = np.where(inside, row * camera.width + column, 0)
-    near, far = other.near.reshape(-1)[where], other.far.reshape(-1)[where]
-    known = inside & other.whole.reshape(-1)[where]
-    smooth = known & view.smooth.reshape(-1) & other.smooth.reshape(-1)[where]
-    told = np.flatnonzero(smooth if moved is None else smooth & ~moved.reshape(-1))[::EVERY]
-    share = _measured_share(other, margin, u[told], v[told], z[told])
-    slack = margin(z, np.where(smooth, share, ROUGH).astype(np.float32))
-    passed, clearly = known & (near > z + slack), known & (near > z + 2 * slack)
-    same = inside & (near < z + slack) & (far > z - slack)
-    return PairEvidence(
-        *(found.reshape(view.depth.shape) for found in (passed, clearly, clearly & smooth, same, known & ~same))
-    )
+    alive: list[np.ndarray] = []
+    asked = (OtherPlacesView * len(others))()
+    for one, other in zip(asked, others, strict=True):
+        one.places = _places(other, alive)
+        T = (inverse(other.T_world_camera) @ view.T_world_camera)[:3].astype(np.float32)
+        one.T_this_view[:] = T.ravel().tolist()
+    found = np.empty((len(others), 5, *view.depth.shape), bool)
+    job = PlacesEvidenceJob(_places(view, alive), ctypes.addressof(asked), len(others))
+    if moved is not None:
+        job.moved = address(_of_places(moved, np.uint8, view, alive))
+    job.margin_least, job.margin_sigmas = margin.least, margin.sigmas
+    job.noise_constant, job.noise_square = margin.constant, margin.square
+    job.rough, job.least_share, job.nearest, job.every, job.fewest = ROUGH, LEAST_SHARE, NEAREST, EVERY, FEWEST
+    job.found = address(found)
+    load_library().ggslam_places_evidence(context.handle, ctypes.byref(job))
+    return [PairEvidence(*images) for images in found]
 
 
-def _measured_share(other: CoarseView, margin: Margin, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> float:
-    """How large differences between means of depth are, in standard deviations of a pixel, as most of them are.
+def _depth_places(depth: np.ndarray, factor: int, reach: int, context: NativeContext) -> np.ndarray:
+    """What `DepthPlacesJob` finds, float32 [6, h, w]."""
+    depth = np.ascontiguousarray(depth, np.float32)
+    height, width = depth.shape
+    found = np.empty((6, height // factor, width // factor), np.float32)
+    job = DepthPlacesJob(address(depth), height, width, factor, reach, *map(address, found))
+    load_library().ggslam_depth_places(context.handle, ctypes.byref(job))
+    return found
 
-    Args:
-        other: a view.
-        margin: see there.
-        u: float32 [n], columns of points in it...
-        v: ...rows...
-        z: ...and depths.
-    """
-    if len(z) < FEWEST:
-        return ROUGH
-    left = np.clip(u.astype(np.int32), 0, other.camera.width - 2)
-    top = np.clip(v.astype(np.int32), 0, other.camera.height - 2)
-    a, b, depth = u - left, v - top, other.depth
-    upper = (1 - a) * depth[top, left] + a * depth[top, left + 1]
-    lower = (1 - a) * depth[top + 1, left] + a * depth[top + 1, left + 1]
-    off = np.abs((1 - b) * upper + b * lower - z) / margin.sigma(z)
-    return float(np.clip(NEAREST * np.median(off) / 0.6745, LEAST_SHARE, ROUGH))
+
+def _places(view: CoarseView, alive: list[np.ndarray]) -> PlacesView:
+    """A view as the core takes it; `alive` gets arrays that must outlive it."""
+    camera = view.camera
+    images = [_of_places(image, np.float32, view, alive) for image in (view.depth, view.near, view.far)]
+    images += [_of_places(image, np.uint8, view, alive) for image in (view.whole, view.smooth)]
+    return PlacesView(
+        *map(address, images), camera.height, camera.width, camera.fx, camera.fy, camera.cx, camera.cy
+    )  # fmt: skip
+
+
+def _of_places(image: np.ndarray, wanted: type, view: CoarseView, alive: list[np.ndarray]) -> np.ndarray:
+    if image.shape != (view.camera.height, view.camera.width):
+        raise ValueError(f"places: expected {view.camera.height} x {view.camera.width} of them, found {image.shape}")
+    alive.append(np.ascontiguousarray(image, wanted))
+    return alive[-1]

@@ -12,6 +12,7 @@ from ggslam.geometry.voxels import neighbour_step, voxel_keys
 from ggslam.movers.evidence import CoarseView, Margin, compare
 from ggslam.movers.segments import Gathering, gather
 from ggslam.movers.settings import MoverSettings
+from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points
 
 VOXEL = 0.05
@@ -53,6 +54,7 @@ class Trail:
 def gone_since(
     earlier: CoarseView, newest: CoarseView, trail: Trail, segments: np.ndarray | None,
     shape: tuple[int, int], margin: Margin, settings: MoverSettings,
+    context: NativeContext,
 ) -> np.ndarray | None:  # fmt: skip
     """What an earlier view shows where a mover has been since, and the newest view looks through.
 
@@ -64,6 +66,7 @@ def gone_since(
         shape: of its image, (H, W).
         margin: see there.
         settings: how much of a segment has to be gone.
+        context: that it is computed in.
 
     Returns:
         bool [H, W]; None: nothing.
@@ -71,7 +74,7 @@ def gone_since(
     near = trail.contains(earlier)
     if near.sum() < settings.min_pixels / 4:
         return None
-    evidence = compare(earlier, newest, margin)
+    (evidence,) = compare(earlier, [newest], margin, context)
     # Movers are found by the side that goes ahead: the rest of what has gone hangs on what lies in their trail.
     passed = parts_with_seeds(evidence.passed & near, evidence.passed, SEED_SHARE)
     if passed.sum() < settings.min_pixels / 4:

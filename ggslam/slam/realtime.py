@@ -42,7 +42,7 @@ class RealtimeSlam:
         self._beside_mapper = slam.mapper.beside_others()
         # The kernels of one context take turns; the tracker must not wait for the mapper's.
         slam.color_poses.active = False  # the map changes meanwhile
-        slam.tracker.context = NativeContext(slam.context.threads, slam.context.instruction_set)
+        slam.tracker.context = slam.movers.context = NativeContext(slam.context.threads, slam.context.instruction_set)
 
     def run(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
         """Processes all frames; `report` is called for each. Errors of either thread are raised here."""

@@ -14,6 +14,7 @@ from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.tracks import MoverTracks
 from ggslam.movers.trail import gone_since
+from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
@@ -32,11 +33,12 @@ class RunMovers:
     Args:
         settings: see there.
         reads_masks: whether frames' masks may be asked for.
+        context: that evidence is computed in; it may be replaced.
     """
 
-    def __init__(self, settings: MoverSettings, reads_masks: bool) -> None:
+    def __init__(self, settings: MoverSettings, reads_masks: bool, context: NativeContext) -> None:
         self.detector = MoverDetector(settings)
-        self._reads_masks = reads_masks
+        self._reads_masks, self.context = reads_masks, context
         self.pixels = MovingPixels()
         """What was found in the frames so far."""
         self.tracks = MoverTracks()
@@ -70,7 +72,8 @@ class RunMovers:
         self._margin = _margin(self.detector.settings, noise)
         known = result.status not in DOUBTFUL
         shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
-        self.detector.look(shown, result.T_world_camera if known else None, self._margin, result.status in SURE)
+        T_world_camera = result.T_world_camera if known else None
+        self.detector.look(shown, T_world_camera, self._margin, self.context, result.status in SURE)
         if known:
             self.tracks.look(RecentFrame.of(shown, result.T_world_camera, self._margin), self.detector.things)
         else:
@@ -106,14 +109,14 @@ class RunMovers:
         """
         settings, camera, trail = self.detector.settings, newest.camera, self.detector.trail
         factor = coarse_factor(camera, settings)
-        view = CoarseView.of(newest.depth, camera, factor, T_world_newest, self._margin)
+        view = CoarseView.of(newest.depth, camera, factor, T_world_newest, self._margin, self.context)
         found: list[np.ndarray | None] = []
         for depth, T_world_camera, segments in earlier:
             if depth.shape != newest.depth.shape:
                 found.append(None)
                 continue
-            old = CoarseView.of(depth, camera, factor, T_world_camera, self._margin)
-            part = gone_since(old, view, trail, segments, depth.shape, self._margin, settings)
+            old = CoarseView.of(depth, camera, factor, T_world_camera, self._margin, self.context)
+            part = gone_since(old, view, trail, segments, depth.shape, self._margin, settings, self.context)
             found.append(None if part is None else grow(part, GROWN))
         return found
 

@@ -127,6 +127,10 @@ def check_state(slam: Slam) -> None:
         typed = keyframe.color.dtype == np.uint8 and keyframe.depth.dtype == np.uint16
         if not (good and typed and keyframe.index == number and keyframe.T_camera_world.shape == (4, 4)):
             raise FormatError(f"keyframe {number}: not of this recording")
+    for view in slam.movers.detector.views:
+        arrays = (view.depth, view.near, view.far, view.whole, view.smooth)
+        if any(array.shape != (view.camera.height, view.camera.width) for array in arrays):
+            raise FormatError("views of what may move: not of their camera")
     counts = [len(surface), slam.poses.keyframes_made, len(mapper.keyframes)]
     counts += [] if slam.loops is None else [len(slam.loops.poses), len(slam.loops.places)]
     if len(set(counts)) > 1:
@@ -208,7 +212,7 @@ RULES: Rules = {
     FramePoses: Rule(growing=_names("frames")),
     MapCorrections: _but("_surface", "_mapper", "_pager", "_masks", "_publishing"),
     RunObjects: _but("_masks"),
-    RunMovers: _but("_reads_masks", "_margin"),
+    RunMovers: _but("_reads_masks", "_margin", "context"),
     MoverDetector: _but("settings"),
     MoverTracks: _but("recent"),
     MoverSurface: _but("_tree"),

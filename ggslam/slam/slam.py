@@ -101,7 +101,7 @@ class Slam:
         self._objects = RunObjects(self.masks)
         self.color_poses = ColorPoses(self.mapper, self.poses, self.tracker.state)
         self._depth_edges, self._shutters, self._fixtures = DepthEdges(), ShutterTimes(), CameraFixtures()
-        self.movers = RunMovers(self.config.movers, self.config.masks.source in ("auto", "recording"))
+        self.movers = RunMovers(self.config.movers, self.config.masks.source in ("auto", "recording"), self.context)
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
         """Starts in a map made before; `surface` and `loops` hold its keyframes already. The camera counts as lost

@@ -12,11 +12,13 @@ from ggslam.movers.detector import MoverDetector
 from ggslam.movers.evidence import CoarseView, Margin, compare
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.trail import Trail, gone_since
+from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 WALL, BOX = 3.0, 1.5
+CONTEXT = NativeContext(2)
 NOISE = 0.002
 
 
@@ -51,7 +53,7 @@ def look_at(boxes: list[float | None], seed: int | None = 0, ids: bool = False) 
     """The masks of frames in which a box is here and there."""
     detector, found = MoverDetector(MoverSettings(enabled=True)), []
     for n, at in enumerate(boxes):
-        detector.look(frame(n, at, seed, ids), pose(n), margin)
+        detector.look(frame(n, at, seed, ids), pose(n), margin, CONTEXT)
         found.append(detector.mask)
     return found
 
@@ -97,29 +99,29 @@ def test_a_mover_goes_on_though_frames_before_saw_it_all_about() -> None:
     to_and_fro = [0.0] * 50 + [0.03 * min(n, 12 - n) for n in range(13)]
     places = [(at, BOX) for at in to_and_fro] + [(0.0, BOX + 0.02 * n) for n in range(1, 30)]
     for n, (at, distance) in enumerate(places):
-        detector.look(frame(n, at, 0, True, distance), pose(n), margin)
+        detector.look(frame(n, at, 0, True, distance), pose(n), margin, CONTEXT)
         found.append(detector.mask)
     assert all(mask is None for mask in found[:51])
     assert all(mask is not None for mask in found[58:])
     for _ in range(10):
         n += 1
-        detector.look(frame(n, at, 0, True, distance), pose(n), margin)
+        detector.look(frame(n, at, 0, True, distance), pose(n), margin, CONTEXT)
     assert detector.mask is None  # at rest
 
 
 def test_a_lost_frame_breaks_the_row() -> None:
     detector = MoverDetector(MoverSettings(enabled=True))
     for n in range(6):
-        detector.look(frame(n, None), pose(n), margin)
-    detector.look(frame(6, 0.0), None, margin)
-    detector.look(frame(7, 0.0), pose(7), margin)
+        detector.look(frame(n, None), pose(n), margin, CONTEXT)
+    detector.look(frame(6, 0.0), None, margin, CONTEXT)
+    detector.look(frame(7, 0.0), pose(7), margin, CONTEXT)
     assert detector.mask is None and len(detector.views) == 1
 
 
 def test_the_next_frame_is_located_without_the_mover() -> None:
     detector = MoverDetector(MoverSettings(enabled=True))
     for n, at in enumerate([None] * 6 + [-0.3, -0.27, -0.24]):
-        detector.look(frame(n, at), pose(n), margin)
+        detector.look(frame(n, at), pose(n), margin, CONTEXT)
     following = frame(9, -0.21)
     assert not detector.expect(following).depth[following.depth < 2].any()
     now = frame(8, -0.24)
@@ -133,14 +135,14 @@ def test_a_wrong_pose_is_no_mover_as_large_as_the_image() -> None:
     for n in range(8):
         T = pose(n)
         T[2, 3] = -0.5 if n > 5 else 0.0  # the wall seems to have come nearer
-        detector.look(frame(n, None), T, margin)
+        detector.look(frame(n, None), T, margin, CONTEXT)
         assert detector.mask is None
 
 
 def test_evidence_says_what_was_passed_and_what_was_there() -> None:
     before, now = frame(0, None), frame(1, 0.0)
-    views = [CoarseView.of(f.depth, CAMERA, 3, pose(f.index), margin) for f in (before, now)]
-    found, box = compare(views[1], views[0], margin), views[1].depth < 2
+    views = [CoarseView.of(f.depth, CAMERA, 3, pose(f.index), margin, CONTEXT) for f in (before, now)]
+    found, box = compare(views[1], [views[0]], margin, CONTEXT)[0], views[1].depth < 2
     assert found.passed[box].all() and not found.passed[~box].any()
     assert not found.same[box].any() and found.same[~box].mean() > 0.9
 
@@ -149,22 +151,22 @@ def test_depth_next_to_holes_says_nothing() -> None:
     before, now = frame(0, None), frame(1, 0.0)
     depth = before.depth.copy()
     depth[::2, ::2] = 0
-    views = [CoarseView.of(depth, CAMERA, 3, pose(0), margin), CoarseView.of(now.depth, CAMERA, 3, pose(1), margin)]
-    assert not compare(views[1], views[0], margin).passed.any()
+    views = [CoarseView.of(d, CAMERA, 3, pose(i), margin, CONTEXT) for i, d in enumerate((depth, now.depth))]
+    assert not compare(views[1], [views[0]], margin, CONTEXT)[0].passed.any()
 
 
 @pytest.mark.parametrize("ids", [False, True])
 def test_what_an_earlier_view_shows_at_the_trail_is_gone(ids: bool) -> None:
     settings, trail = MoverSettings(enabled=True), Trail()
     before, now = frame(0, 0.0, ids=ids), frame(20, None)
-    old, new = (CoarseView.of(f.depth, CAMERA, 3, pose(f.index), margin) for f in (before, now))
-    assert gone_since(old, new, trail, before.mask, (240, 320), margin, settings) is None  # nothing has moved
+    old, new = (CoarseView.of(f.depth, CAMERA, 3, pose(f.index), margin, CONTEXT) for f in (before, now))
+    assert gone_since(old, new, trail, before.mask, (240, 320), margin, settings, CONTEXT) is None  # nothing has moved
     trail.add(old, (old.depth < 2))
-    gone = gone_since(old, new, trail, before.mask, (240, 320), margin, settings)
+    gone = gone_since(old, new, trail, before.mask, (240, 320), margin, settings, CONTEXT)
     assert overlap(gone, before.depth < 2) > 0.8
     still = replace(now, depth=frame(20, 0.0).depth)
-    there = CoarseView.of(still.depth, CAMERA, 3, pose(20), margin)
-    assert gone_since(old, there, trail, before.mask, (240, 320), margin, settings) is None
+    there = CoarseView.of(still.depth, CAMERA, 3, pose(20), margin, CONTEXT)
+    assert gone_since(old, there, trail, before.mask, (240, 320), margin, settings, CONTEXT) is None
 
 
 KINECT = Margin(0.004, 5.0, 0.008)
@@ -188,7 +190,7 @@ def noisy(n: int, step: float, shared: bool) -> Frame:
 def look_in_noise(steps: list[float], shared: bool = False) -> list[np.ndarray | None]:
     detector, found = MoverDetector(MoverSettings()), []
     for n, step in enumerate(steps):
-        detector.look(noisy(n, step, shared), pose(n), KINECT)
+        detector.look(noisy(n, step, shared), pose(n), KINECT, CONTEXT)
         found.append(detector.mask)
     return found
 
@@ -211,7 +213,7 @@ def test_noise_is_no_mover_whether_pixels_share_it_or_not(shared: bool) -> None:
 def test_a_person_entering_is_left_out_of_tracking_before_they_are_believed() -> None:
     detector = MoverDetector(MoverSettings())
     for n, at in enumerate([None] * 6 + [-0.3]):
-        detector.look(frame(n, at), pose(n), margin)
+        detector.look(frame(n, at), pose(n), margin, CONTEXT)
     following = frame(7, -0.29)
     assert detector.mask is None and not detector.expect(following).depth[following.depth < 2].any()
 
@@ -224,5 +226,5 @@ def test_what_one_clear_look_passed_is_found_though_the_rest_was_not_seen_before
         depth = seen.depth.copy()
         if n <= 5:
             depth[93:] = 0
-        detector.look(replace(seen, depth=depth), pose(n), margin)
+        detector.look(replace(seen, depth=depth), pose(n), margin, CONTEXT)
     assert detector.found is not None and detector.found[40:50, 45:60].all()

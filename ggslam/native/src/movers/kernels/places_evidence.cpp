@@ -1,0 +1,69 @@
+// SPDX-License-Identifier: Apache-2.0
+// Places of one view in another: where they fall, and what that says of them.
+#include "movers/places.hpp"
+
+namespace ggslam::GGSLAM_ISA {
+namespace {
+
+constexpr float kNearest = 1e-3f;  // metres before the camera
+
+}  // namespace
+
+void project_places(const PlacesView& a, const OtherPlacesView& other, const ProjectedPlaces& out) {
+  const PlacesView& b = other.places;
+  const float* T = other.T_this_view;
+  const float right = static_cast<float>(b.width) - 0.5f, low = static_cast<float>(b.height) - 0.5f;
+  for (int y = 0; y < a.height; ++y) {
+    const std::size_t first = static_cast<std::size_t>(y) * a.width;
+    const float* depth = a.depth + first;
+    float* u = out.u + first;
+    float* v = out.v + first;
+    float* z = out.z + first;
+    int* where = out.where + first;
+    const float ray_y = (static_cast<float>(y) - a.cy) / a.fy;
+    for (int x = 0; x < a.width; ++x) {
+      const float d = depth[x], px = (static_cast<float>(x) - a.cx) / a.fx * d, py = ray_y * d;
+      const float qx = T[0] * px + T[1] * py + T[2] * d + T[3], qy = T[4] * px + T[5] * py + T[6] * d + T[7];
+      const float qz = T[8] * px + T[9] * py + T[10] * d + T[11], ahead = qz > kNearest ? qz : kNearest;
+      const float column = b.fx * qx / ahead + b.cx, line = b.fy * qy / ahead + b.cy;
+      const bool inside =
+          (d > 0) & (qz > kNearest) & (column >= -0.5f) & (line >= -0.5f) & (column < right) & (line < low);
+      u[x] = column, v[x] = line, z[x] = qz;
+      // What is outside may be too large for a whole number.
+      const int i = static_cast<int>(inside ? line + 0.5f : 0.f), j = static_cast<int>(inside ? column + 0.5f : 0.f);
+      where[x] = inside ? i * b.width + j : -1;
+    }
+  }
+  const std::size_t count = static_cast<std::size_t>(a.height) * a.width;
+  for (std::size_t i = 0; i < count; ++i) {
+    const int at = out.where[i] < 0 ? 0 : out.where[i];
+    out.near[i] = b.near[at], out.far[i] = b.far[at];
+    out.known[i] = (out.where[i] >= 0) & (b.whole[at] != 0);
+    out.smooth[i] = out.known[i] & (b.smooth[at] != 0) & (a.smooth[i] != 0);
+  }
+}
+
+void judge_places(const PlacesEvidenceJob& job, float share, std::size_t count, const ProjectedPlaces& places,
+                  uint8_t* found) {
+  const float constant = job.noise_constant, square = job.noise_square, least = job.margin_least;
+  const float sigmas = job.margin_sigmas, rough = job.rough;
+  uint8_t* passed = found;
+  uint8_t* clearly = passed + count;
+  uint8_t* surely = clearly + count;
+  uint8_t* same = surely + count;
+  uint8_t* otherwise = same + count;
+  for (std::size_t i = 0; i < count; ++i) {
+    const float z = places.z[i], near = places.near[i], far = places.far[i];
+    const float slack = least + sigmas * (places.smooth[i] ? share : rough) * (constant + square * z * z);
+    const uint8_t known = places.known[i], there = places.where[i] >= 0;
+    const uint8_t beyond = known & (near > z + 2 * slack);
+    const uint8_t surface = there & (near < z + slack) & (far > z - slack);
+    passed[i] = known & (near > z + slack);
+    clearly[i] = beyond;
+    surely[i] = beyond & places.smooth[i];
+    same[i] = surface;
+    otherwise[i] = known & (surface ^ 1);
+  }
+}
+
+}  // namespace ggslam::GGSLAM_ISA

@@ -1,0 +1,48 @@
+// SPDX-License-Identifier: Apache-2.0
+// Rows of what `interface/core/movers.hpp` describes.
+#pragma once
+#include <cstddef>
+
+#include "common/dispatch.hpp"
+#include "interface/core/movers.hpp"
+
+namespace ggslam {
+
+// A row's sums for each column of the image: of a window's rows, and of a place's own.
+struct DepthColumns {
+  double* total;
+  double* squares;
+  float* count;
+  float* nearest;
+  float* farthest;
+  float* least;
+};
+
+// The places of a view in another one; arrays of one element a place.
+struct ProjectedPlaces {
+  float* u;
+  float* v;
+  float* z;
+  float* near;      // what the other view has there...
+  float* far;
+  int* where;       // ...at this place, -1 without one
+  uint8_t* known;   // 1: it knows what is about it
+  uint8_t* smooth;  // 1: and both views are smooth there
+};
+
+// A row of an image as if it were mirrored at its borders, without repeating them.
+inline int mirrored(int i, int count) {
+  if (count == 1) return 0;
+  while (i < 0 || i >= count) i = i < 0 ? -i : 2 * (count - 1) - i;
+  return i;
+}
+
+}  // namespace ggslam
+
+// Places of row `row`; `columns`: scratch, `width` elements each.
+GGSLAM_DECLARE_KERNEL(void depth_places_row(const DepthPlacesJob& job, int row, const DepthColumns& columns))
+GGSLAM_DECLARE_KERNEL(void project_places(const PlacesView& view, const OtherPlacesView& other,
+                                          const ProjectedPlaces& places))
+// The results by one other view, [5, count]; `share`: of a pixel's noise, where both views are smooth.
+GGSLAM_DECLARE_KERNEL(void judge_places(const PlacesEvidenceJob& job, float share, std::size_t count,
+                                        const ProjectedPlaces& places, uint8_t* found))
