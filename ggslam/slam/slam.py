@@ -142,17 +142,16 @@ class Slam:
         is_keyframe = self.wants_keyframe(frame, tracking)
         if is_keyframe:
             self.tracker.target = None  # the surface may be made anew; the next frame gets what it is then
-            if self.loops is not None and self._on_device:
-                self.loops.begin(frame)  # beside what the host waits for
-            self.insert(frame, tracking, self.moves_followed)
+            if self._on_device:
+                self._insert_beside_training(frame, tracking)
+            else:
+                self.insert(frame, tracking, self.moves_followed)
             self.poses.add_keyframe(tracking.T_world_camera)
             if len(self.mapper.keyframes) % TRIM_EVERY == 0:
                 trim()
         self.poses.add(frame, tracking)
-        if self.mapper.keyframes and self.growing:
-            first = is_keyframe and len(self.mapper.keyframes) == 1
-            settings = self.config.mapping
-            self.mapper.run(settings.first_frame_iterations if first else settings.iterations_per_frame)
+        if not (is_keyframe and self._on_device):
+            self._train_step(is_keyframe)
         self.times.stop()
         seconds = time.perf_counter() - start
         return self.note_step(is_keyframe, seconds)
@@ -337,6 +336,21 @@ class Slam:
             return False
         return self.policy.decide(frame.index, tracking)
 
+    def _insert_beside_training(self, frame: Frame, tracking: TrackingResult) -> None:
+        """`insert` and the step's training: the keyframe's place is described while the host hands work to the GPU."""
+        if self.loops is not None:
+            self.loops.begin(frame)
+        tracking = self._corrections.follow(tracking, self.moves_followed)
+        self._add_to_map(frame, tracking)
+        self._train_step(is_keyframe=True)
+        self._look_for_loops(frame, tracking)
+
+    def _train_step(self, is_keyframe: bool) -> None:
+        """The step's iterations, more of them right after the first keyframe."""
+        if self.mapper.keyframes and self.growing:
+            settings, first = self.config.mapping, is_keyframe and len(self.mapper.keyframes) == 1
+            self.mapper.run(settings.first_frame_iterations if first else settings.iterations_per_frame)
+
     def insert(self, frame: Frame, tracking: TrackingResult, moves_followed: int) -> None:
         """A keyframe goes into the map and into what the tracker aligns to; if it closes a loop, the map is corrected.
 
@@ -349,14 +363,21 @@ class Slam:
         if self.pager is not None:
             self.pager.prepare(tracking.T_world_camera, frame.depth)
         before = self.map.count
-        keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
+        keyframe = self._add_to_map(frame, tracking)
         added = self.map.count - before
+        self._look_for_loops(frame, tracking)
+        if self.pager is not None:
+            self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
+
+    def _add_to_map(self, frame: Frame, tracking: TrackingResult) -> Keyframe:
+        keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
         self._corrections.add_points(tracking)
         self._corrections.leave_out(self._fixtures, frame)
         self._corrections.take_out(self.movers, frame)
+        return keyframe
+
+    def _look_for_loops(self, frame: Frame, tracking: TrackingResult) -> None:
         if self.loops is not None:
             correction = self.loops.add(frame, tracking)
             if correction is not None:
                 self._corrections.apply(correction, self.loops)
-        if self.pager is not None:
-            self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
