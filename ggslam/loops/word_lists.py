@@ -4,14 +4,10 @@ what it says."""
 
 from __future__ import annotations
 
-from itertools import chain
-
 import numpy as np
 
 _MERGED_AFTER = 16
-"""Places that are kept in lists of their own, which are quick to add to, before they join the arrays."""
-_LIST_BYTES = 170
-"""Memory of a list with one position, and of its key."""
+"""Places that are kept in a list of their own, which is short and so quick to add to, before they join the others."""
 
 
 class WordLists:
@@ -22,21 +18,24 @@ class WordLists:
     """
 
     def __init__(self, words: int) -> None:
-        self._words = np.empty(0, np.uint32 if words <= 1 << 32 else np.int64)
+        dtype = np.uint32 if words <= 1 << 32 else np.int64
+        self._words = np.empty(0, dtype)
         self._ends = np.zeros(1, np.int64)  # of word i: positions from ends[i] to ends[i + 1]
         self._positions = np.empty(0, np.int32)
-        self._recent: dict[int, list[int]] = {}
+        self._recent_words, self._recent_positions = np.empty(0, dtype), np.empty(0, np.int32)  # by word, then position
         self._waiting = 0
 
     @property
     def held_bytes(self) -> int:
         """Memory that they take, about."""
-        return self._words.nbytes + self._ends.nbytes + self._positions.nbytes + _LIST_BYTES * len(self._recent)
+        recent = self._recent_words.nbytes + self._recent_positions.nbytes
+        return self._words.nbytes + self._ends.nbytes + self._positions.nbytes + recent
 
     def add(self, words: np.ndarray, position: int) -> None:
         """Words [w], sorted, occur at a position greater than all before."""
-        for word in words.tolist():
-            self._recent.setdefault(word, []).append(position)
+        place = np.searchsorted(self._recent_words, words, "right")
+        self._recent_words = np.insert(self._recent_words, place, words)
+        self._recent_positions = np.insert(self._recent_positions, place, position)
         self._waiting += 1
         if self._waiting == _MERGED_AFTER:
             self._merge()
@@ -48,41 +47,43 @@ class WordLists:
         Returns:
             Positions int64 [h], and how often the word of each occurs in all, int64 [h].
         """
+        words = words.astype(self._words.dtype)
         place = np.searchsorted(self._words, words)
         known = place < len(self._words)
         known[known] = self._words[place[known]] == words[known]
         place = np.where(known, place, 0)
         begins = np.where(known, self._ends[place], 0)
         counts = np.where(known, self._ends[np.minimum(place + 1, len(self._ends) - 1)], 0) - begins
-        lists = [self._recent.get(word, ()) for word in words.tolist()]
-        lengths = counts + np.array([len(found) for found in lists], np.int64)
+        recent_begins = np.searchsorted(self._recent_words, words)
+        recent_counts = np.searchsorted(self._recent_words, words, "right") - recent_begins
+        lengths = counts + recent_counts
         order = np.argsort(lengths, kind="stable")
         order = order[lengths[order] > 0]
         order = order[: int(np.searchsorted(np.cumsum(lengths[order]), most, "right"))]
-        merged = np.repeat(begins[order] - np.cumsum(counts[order]) + counts[order], counts[order])
-        of_merged = self._positions[merged + np.arange(len(merged))]
-        recent = [lists[i] for i in order.tolist()]
-        of_recent = np.fromiter(chain.from_iterable(recent), np.int64)
-        recent_counts = np.array([len(found) for found in recent], np.int64)
         # A position's hits are all among the merged or all among the recent: each position has them by rising length.
-        return (
-            np.concatenate([of_merged.astype(np.int64), of_recent]),
-            np.concatenate([np.repeat(lengths[order], counts[order]), np.repeat(lengths[order], recent_counts)]),
-        )
+        merged = self._positions[_ranges(begins[order], counts[order])]
+        recent = self._recent_positions[_ranges(recent_begins[order], recent_counts[order])]
+        times = [np.repeat(lengths[order], each[order]) for each in (counts, recent_counts)]
+        return np.concatenate([merged, recent]).astype(np.int64), np.concatenate(times)
 
     def _merge(self) -> None:
         """The new positions go where the lists of their words end. Nothing else is as long as all lists together, which
         may be most of the memory that a long run has."""
-        recent = np.array(sorted(self._recent), self._words.dtype)
-        counts = np.array([len(self._recent[word]) for word in recent.tolist()], np.int64)
-        new = np.fromiter(chain.from_iterable(self._recent[word] for word in recent.tolist()), np.int32)
-        self._recent, self._waiting = {}, 0
+        recent, counts = np.unique(self._recent_words, return_counts=True)
+        new = self._recent_positions
+        self._recent_words, self._recent_positions = self._recent_words[:0].copy(), new[:0].copy()
+        self._waiting = 0
         place = np.searchsorted(self._words, recent)
         known = place < len(self._words)
         known[known] = self._words[place[known]] == recent[known]
         self._positions = np.insert(self._positions, np.repeat(self._ends[place + known], counts), new)
-        words = np.union1d(self._words, recent)
-        lengths = np.zeros(len(words), np.int64)
-        lengths[np.searchsorted(words, self._words)] = np.diff(self._ends)
-        lengths[np.searchsorted(words, recent)] += counts
-        self._words, self._ends = words, np.concatenate([self._ends[:1], np.cumsum(lengths)])
+        self._words = np.insert(self._words, place[~known], recent[~known])
+        lengths = np.insert(np.diff(self._ends), place[~known], 0)
+        lengths[np.searchsorted(self._words, recent)] += counts
+        self._ends = np.concatenate([self._ends[:1], np.cumsum(lengths)])
+
+
+def _ranges(begins: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Numbers from each of `begins` [n] on, `counts` [n] of them, one range after the other."""
+    before = np.cumsum(counts) - counts
+    return np.repeat(begins - before, counts) + np.arange(int(counts.sum()))
