@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -337,12 +338,18 @@ class Slam:
         return self.policy.decide(frame.index, tracking)
 
     def _insert_beside_training(self, frame: Frame, tracking: TrackingResult) -> None:
-        """`insert` and the step's training: the keyframe's place is described while the host hands work to the GPU."""
+        """`insert` and the step's training: the keyframe's place is described, and its points join the surface, while
+        the host hands work to the GPU."""
         if self.loops is not None:
             self.loops.begin(frame)
         tracking = self._corrections.follow(tracking, self.moves_followed)
-        self._add_to_map(frame, tracking)
-        self._train_step(is_keyframe=True)
+        self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
+        tracking.points.read()  # what waits for the GPU is done in this thread
+        with ThreadPoolExecutor(1, thread_name_prefix="surface") as beside:
+            added = beside.submit(self._corrections.add_points, tracking)
+            self._train_step(is_keyframe=True)
+            added.result()
+        self._clear_map(frame)
         self._look_for_loops(frame, tracking)
 
     def _train_step(self, is_keyframe: bool) -> None:
@@ -363,18 +370,18 @@ class Slam:
         if self.pager is not None:
             self.pager.prepare(tracking.T_world_camera, frame.depth)
         before = self.map.count
-        keyframe = self._add_to_map(frame, tracking)
+        keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
         added = self.map.count - before
+        self._corrections.add_points(tracking)
+        self._clear_map(frame)
         self._look_for_loops(frame, tracking)
         if self.pager is not None:
             self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
 
-    def _add_to_map(self, frame: Frame, tracking: TrackingResult) -> Keyframe:
-        keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
-        self._corrections.add_points(tracking)
-        self._corrections.leave_out(self._fixtures, frame)
-        self._corrections.take_out(self.movers, frame)
-        return keyframe
+    def _clear_map(self, newest: Frame) -> None:
+        """Takes out what does not belong there, as far as the newest keyframe tells."""
+        self._corrections.leave_out(self._fixtures, newest)
+        self._corrections.take_out(self.movers, newest)
 
     def _look_for_loops(self, frame: Frame, tracking: TrackingResult) -> None:
         if self.loops is not None:
