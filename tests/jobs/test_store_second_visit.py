@@ -32,7 +32,11 @@ def test_what_a_second_visit_brought_is_told_and_comes_in_once_its_cells_are_due
     chair = chair_of(store)
     assert chair["gaussians"] > 500 and chair["first_seen"] == "two"
     since = json.loads(succeed("submaps", store, "--since", "two", "--json"))
-    assert [(e["kind"], e["name"]) for e in since["events"] if e["kind"] != "unseen"] == [("added", "chair")]
+    told = [(e["kind"], e["name"]) for e in since["events"] if e["kind"] != "unseen"]
+    assert ("added", "chair") in told and set(told) <= {(change["kind"], change["name"]) for change in truth}
+    # The mug moved, and has 40 pixels at most: if that is not told, nothing is claimed of it.
+    unseen = [e["name"] for e in since["events"] if e["kind"] == "unseen"]
+    assert ("moved", "mug") in told or "mug" in unseen
 
 
 def chair_of(store: Path) -> dict:

@@ -20,6 +20,7 @@ from ggslam.jobs.changes.pictures import picture_of_change
 from ggslam.jobs.merge.placing import find_joint_poses, place_maps
 from ggslam.jobs.merge.sources import MergeSource, read_sources
 from ggslam.jobs.progress import Observer, SilentObserver
+from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.merging.coverage import PlacedRun
 from ggslam.merging.joint_graph import JointPoses
 from ggslam.merging.settings import MergeSettings
@@ -122,9 +123,11 @@ def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str 
 def _visit(source: MergeSource, placed: PlacedRun, T_new_old: np.ndarray) -> Visit:
     known = source.known
     poses = T_new_old @ known.poses
-    points = [transform_points(p.astype(float), T) for p, T in zip(known.points, poses, strict=True)]
-    normals = [n.astype(float) @ T[:3, :3].T for n, T in zip(known.normals, poses, strict=True)]
+    # A run that began in another's map has that one's keyframes, too: they saw what was there before.
+    own = [k for k, record in enumerate(source.record.keyframes) if record.frame != ELSEWHERE] or range(len(poses))
+    points = [transform_points(known.points[k].astype(float), poses[k]) for k in own]
+    normals = [known.normals[k].astype(float) @ poses[k, :3, :3].T for k in own]
     return Visit(
-        placed.gaussians, placed.cameras, placed.T_world_camera, np.concatenate(points), np.concatenate(normals),
-        source.objects is not None,
+        placed.gaussians, [placed.cameras[k] for k in own], placed.T_world_camera[own], np.concatenate(points),
+        np.concatenate(normals), source.objects is not None,
     )  # fmt: skip
