@@ -6,10 +6,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import ggslam
 from kept import session_folder
 from small_runs import run_of
+
+from ggslam.jobs.changes.changes import own_keyframes
+from ggslam.runs.records.keyframes import KeyframesRecord
 
 pytest.importorskip("gtsam")
 
@@ -29,6 +33,12 @@ def test_nothing_is_invented_between_pieces_of_one_recording(visits: tuple[Path,
     written = json.loads((tmp_path / "found" / "changes.json").read_text())
     assert written["changes"] == [] and written["ids_believed"] and written["stayed"] > 5
     assert [path.name for path in (tmp_path / "found").iterdir()] == ["changes.json"]
+
+
+@pytest.mark.parametrize("frames, own", [([-1, -1, 0, 5], [2, 3]), ([0, 4], [0, 1]), ([-1, -1], [0, 1]), ([], [])])
+def test_keyframes_of_an_earlier_map_are_none_of_a_run(frames: list[int], own: list[int]) -> None:
+    keyframes = [{"frame": frame, "T_world_camera": np.eye(4)} for frame in frames]
+    assert list(own_keyframes(KeyframesRecord.of({"keyframes": keyframes, "frames": []}))) == own
 
 
 def test_what_cannot_be_compared_is_refused(visits: tuple[Path, Path], tmp_path: Path) -> None:

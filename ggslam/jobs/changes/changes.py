@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from ggslam.merging.joint_graph import JointPoses
 from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.reporting.pictures import write_picture
+from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.poses import transform_points
 from ggslam.system.atomic import write_text
 from ggslam.system.json_files import json_ready
@@ -84,7 +86,8 @@ def compare_placed(
 ) -> ChangesOutcome:  # fmt: skip
     """Compares two visits whose maps are in one world; arguments as of `find_joint_poses` and `find_changes`."""
     start = time.perf_counter()
-    older, newer = (_visit(s, p, T) for s, p, T in zip(sources, placed, poses.T_new_old, strict=True))
+    counted = (range(len(placed[0].cameras)), own_keyframes(sources[1].record))
+    older, newer = map(_visit, sources, placed, poses.T_new_old, counted)
     observer.begin("comparing surfaces", 1)
     detector = ChangeDetector(older, newer, settings, context, ids)
     found = detector.detect()
@@ -120,14 +123,20 @@ def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str 
     return [*written, out / CHANGES_FILE]
 
 
-def _visit(source: MergeSource, placed: PlacedRun, T_new_old: np.ndarray) -> Visit:
+def own_keyframes(record: KeyframesRecord) -> Sequence[int]:
+    """Numbers of the keyframes of a run's own recording. A run that began in another's map has that one's, too: they
+    saw what was there before. All of them if none is its own."""
+    own = [number for number, keyframe in enumerate(record.keyframes) if keyframe.frame != ELSEWHERE]
+    return own or range(len(record.keyframes))
+
+
+def _visit(source: MergeSource, placed: PlacedRun, T_new_old: np.ndarray, counted: Sequence[int]) -> Visit:
+    """A run as its keyframes with these numbers tell of it."""
     known = source.known
     poses = T_new_old @ known.poses
-    # A run that began in another's map has that one's keyframes, too: they saw what was there before.
-    own = [k for k, record in enumerate(source.record.keyframes) if record.frame != ELSEWHERE] or range(len(poses))
-    points = [transform_points(known.points[k].astype(float), poses[k]) for k in own]
-    normals = [known.normals[k].astype(float) @ poses[k, :3, :3].T for k in own]
+    points = [transform_points(known.points[k].astype(float), poses[k]) for k in counted]
+    normals = [known.normals[k].astype(float) @ poses[k, :3, :3].T for k in counted]
     return Visit(
-        placed.gaussians, [placed.cameras[k] for k in own], placed.T_world_camera[own], np.concatenate(points),
-        np.concatenate(normals), source.objects is not None,
+        placed.gaussians, [placed.cameras[k] for k in counted], placed.T_world_camera[list(counted)],
+        np.concatenate(points), np.concatenate(normals), source.objects is not None,
     )  # fmt: skip

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
-from ggslam.jobs.changes.changes import ChangesOutcome, find_changes
+from ggslam.jobs.changes.changes import ChangesOutcome, find_changes, own_keyframes
 from ggslam.jobs.changes.store_events import (
     add_evidence,
     events_of_changes,
@@ -172,10 +172,11 @@ def _compare_maps(
 
 
 def _check_world(folder: RunFolder, outcome: ChangesOutcome, visit: str) -> None:
-    own, placed = folder.keyframes().keyframes, outcome.visits[1].T_world_camera
+    record, placed = folder.keyframes(), outcome.visits[1].T_world_camera
+    own = own_keyframes(record)
     if len(own) != len(placed) or len(own) < _MANY_OFF:
         return
-    apart = [separation(record.T_world_camera, T) for record, T in zip(own, placed, strict=True)]
+    apart = [separation(record.keyframes[k].T_world_camera, T) for k, T in zip(own, placed, strict=True)]
     metres, degrees = np.median(apart, axis=0)
     if metres > _OFF_METRES or degrees > _OFF_DEGREES:
         raise ConfigError(
