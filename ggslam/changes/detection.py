@@ -265,7 +265,9 @@ class ChangeDetector:
 
     def _has_shifted(self, old: Thing, new: Thing) -> bool:
         """Whether much of where either visit has a thing is something else in the other one: what is thin and was
-        pushed along its support leaves no gap."""
+        pushed along its support leaves no gap. Of a thing that only one visit shows much of, labels end elsewhere."""
+        if max(len(old), len(new)) > self.settings.max_size_ratio * min(len(old), len(new)):
+            return False
         for number, thing in enumerate((old, new)):
             ids = self._ids_at(1 - number, self.judged[number].points[thing.rows])
             if thing.seen < self.settings.min_seen or (ids != thing.label).sum() < self.settings.shifted * len(thing):

@@ -6,11 +6,13 @@ from __future__ import annotations
 import json
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ggslam.cli.console import console, table
+from ggslam.cli.changes_command import print_changes
+from ggslam.cli.console import console, progress_bar, table
+from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -28,6 +30,8 @@ EPILOG = """
   ggslam compare runs/kitchen scan_of_kitchen.ply --align icp
 
   ggslam compare runs/a runs/b --align trajectory --thresholds 0.01,0.03 --out difference.json
+
+  ggslam compare runs/monday runs/tuesday --changes
 """
 
 
@@ -59,17 +63,36 @@ def compare(
     ] = 0.05,
     thresholds: Annotated[str, typer.Option(help="Distances for precision, recall and F1, metres.")] = "0.01,0.02,0.05",
     seed: Annotated[int, typer.Option(help="Seed of the random samples.", min=0)] = 0,
+    changes: Annotated[
+        bool, typer.Option("--changes", help="Of runs: also list what changed from A, the earlier visit, to B.")
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="JSON file to write all numbers to.")] = None,
 ) -> None:  # fmt: skip
     """Compare two maps: how far apart trajectories and surfaces are, and scores side by side. B is the reference."""
     from ggslam.jobs.compare.comparison import compare as compare_sides
+    from ggslam.runs.folder import RunFolder
     from ggslam.system.atomic import write_text
+    from ggslam.system.json_files import json_ready
 
+    for path in (a, b) if changes else ():
+        RunFolder.open(path)  # before anything takes long
     found = compare_sides(a, b, align.value, max_distance, _numbers(thresholds), seed)
     _print(found, max_distance)
+    values = found.to_dict()
+    if changes:
+        values["changes"] = _changes(a, b)
     if out is not None:
-        write_text(out, json.dumps(found.to_dict(), indent=1) + "\n")
+        write_text(out, json.dumps(json_ready(values), indent=1) + "\n")
         console.print(f"wrote {out}", highlight=False, markup=False)
+
+
+def _changes(old: Path, new: Path) -> dict[str, Any]:
+    from ggslam.jobs.changes.changes import find_changes
+
+    with progress_bar() as bar:
+        outcome = find_changes(old, new, observer=ProgressObserver(bar))
+    print_changes(outcome.table)
+    return outcome.table.to_dict()
 
 
 def _numbers(text: str) -> list[float]:

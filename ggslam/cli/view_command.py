@@ -10,6 +10,7 @@ import typer
 
 from ggslam.cli import options
 from ggslam.cli.console import console
+from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
     from ggslam.jobs.view.viewed_run import ViewedRun
@@ -22,6 +23,8 @@ EPILOG = """
   ggslam view runs/kitchen --port 9000
 
   ggslam view runs/kitchen --html kitchen.html
+
+  ggslam view runs/monday --changes changes
 """
 
 
@@ -36,6 +39,10 @@ def view(
         int, typer.Option(help="Show the most visible Gaussians, at most so many.", min=1000)
     ] = 400_000,
     sequence: options.MovedSequence = None,
+    changes: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="What `ggslam changes RUN NEWER --out FOLDER` wrote, to step through."),
+    ] = None,
 ) -> None:
     """Look at a run in the browser: map, camera, frames; select, name, move, delete and export objects."""
     from ggslam.jobs.view.serve import serve_run, wait_for_interrupt, write_page
@@ -44,10 +51,12 @@ def view(
 
     folder = RunFolder.open(run)
     if page is not None:
+        if changes is not None:
+            raise ConfigError("--changes: the page of --html does not show changes; ggslam report does")
         model, size = write_page(folder, page, max_splats, sequence)
         _say(model, f"wrote {page}: {size / 1e6:.1f} MB")
         return
-    server, model = serve_run(folder, host, port, max_splats, sequence)
+    server, model = serve_run(folder, host, port, max_splats, sequence, changes)
     try:
         wait_for_interrupt(lambda: _say(model, f"{address(server)} (Ctrl-C ends)"))
     finally:

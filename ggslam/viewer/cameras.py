@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,3 +130,29 @@ def box_lines(center: np.ndarray, axes: np.ndarray, size: np.ndarray) -> np.ndar
     pairs = [(i, j) for i in range(8) for j in range(i + 1, 8) if np.count_nonzero(signs[i] != signs[j]) == 1]
     corners = center + (signs * size) @ axes
     return corners[np.array(pairs)].astype(np.float32)
+
+
+def best_view(
+    boxes: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], poses: Sequence[np.ndarray], camera: Camera,
+    near: float,
+) -> Viewpoint:  # fmt: skip
+    """From the one of the poses [4, 4] whose image shows most of boxes, as large as can be; looking at their middle.
+
+    Args:
+        boxes: center, axes and size, as of `box_lines`; at least one.
+        poses: T_world_camera; at least one.
+        camera: of all.
+        near: of the view, metres.
+    """
+    corners = np.concatenate([box_lines(*box).reshape(-1, 3) for box in boxes]).astype(float)
+    middle = corners.mean(0)
+
+    def score(T: np.ndarray) -> float:
+        x, y, z = ((corners - T[:3, 3]) @ T[:3, :3]).T
+        ahead = np.where(z > near, z, np.inf)
+        column, row = x / ahead * camera.fx + camera.cx, y / ahead * camera.fy + camera.cy
+        shown = (z > near) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
+        return float(shown.mean() / max(near, np.linalg.norm(middle - T[:3, 3])))
+
+    best = max(poses, key=score)
+    return Viewpoint(best[:3, 3], middle, -best[:3, 1], near)

@@ -20,6 +20,10 @@ COLORINGS: dict[Coloring, str] = {
 }  # fmt: skip
 
 
+Box = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Center [3], axes (rows of [3, 3]) and size [3], metres, world frame."""
+
+
 @dataclass(frozen=True)
 class ListedObject:
     """An object in a list.
@@ -59,8 +63,28 @@ class ShownMover:
     """
 
     way: np.ndarray
-    boxes: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
+    boxes: dict[int, Box]
     color: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class ShownChange:
+    """Something that changed between two visits.
+
+    Attributes:
+        text: a line about it.
+        old, new: its box at the older and at the newer visit; None: it was not there.
+        picture: both visits side by side, uint8 [H, W, 3]; None: there is none.
+    """
+
+    text: str
+    old: Box | None
+    new: Box | None
+    picture: np.ndarray | None
+
+    def boxes(self) -> list[Box]:
+        """Those there are."""
+        return [box for box in (self.old, self.new) if box is not None]
 
 
 class ViewedMap(Protocol):
@@ -101,6 +125,9 @@ class ViewedMap(Protocol):
 
     def movers(self) -> list[ShownMover]:
         """What moved while it was recorded."""
+
+    def changes(self) -> list[ShownChange]:
+        """What changed between two visits."""
 
     def frame_picture(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Recorded and rendered images of a frame side by side, and what the frame's camera recorded (or, without

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ggslam.viewer.cameras import vertical_fov
+from ggslam.viewer.changes_tab import ChangesTab
 from ggslam.viewer.model import EditableMap, ViewedMap
 from ggslam.viewer.objects_tab import ObjectsTab
 from ggslam.viewer.server import keep_fitting
@@ -39,6 +40,10 @@ class Page:
         if editable is not None:
             with tabs.add_tab("Objects"):
                 self.objects = ObjectsTab(self.stage, editable)
+        self.changes: ChangesTab | None = None
+        if self.stage.changes:
+            with tabs.add_tab("Changes"):
+                self.changes = ChangesTab(self.stage)
         self.stage.describe()
         server.scene.set_up_direction(model.up)
         start = self.stage.start_view()

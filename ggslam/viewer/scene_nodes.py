@@ -11,7 +11,7 @@ import numpy as np
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
 from ggslam.viewer.cameras import box_lines, frustum_lines, vertical_fov
-from ggslam.viewer.model import ShownMover
+from ggslam.viewer.model import ShownChange, ShownMover
 from ggslam.viewer.splats import Splats
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ UNIT_M = 0.01
 would round splats of a millimetre to nothing."""
 _LABEL_GAP_M = 0.01
 _PATH, _KEYFRAMES, _SELECTED = (255, 176, 32), (110, 190, 255), (255, 235, 60)
+_WAS, _IS = (220, 30, 30), (20, 160, 60)
+"""As in the pictures of changes."""
 
 
 class SceneNodes:
@@ -97,6 +99,18 @@ class SceneNodes:
             lines += own
             colors += [np.broadcast_to(np.array(mover.color, np.uint8), part.shape) for part in own]
         self._lines("/camera/movers", np.concatenate(lines), np.concatenate(colors), 2.5)
+
+    def set_change(self, change: ShownChange | None) -> None:
+        """Boxes of what changed, and from middle to middle of what moved; None: nothing."""
+        lines, colors = [np.zeros((0, 2, 3), np.float32)], [np.zeros((0, 2, 3), np.uint8)]
+        if change is not None:
+            for box, color in ((change.old, _WAS), (change.new, _IS)):
+                lines += [] if box is None else [box_lines(*box)]
+                colors += [] if box is None else [np.broadcast_to(np.array(color, np.uint8), (12, 2, 3))]
+            if change.old is not None and change.new is not None:
+                lines.append(np.array([[change.old[0], change.new[0]]], np.float32))
+                colors.append(np.array([[_WAS, _IS]], np.uint8))
+        self._lines("/camera/change", np.concatenate(lines), np.concatenate(colors), 3.0)
 
     def set_box(self, center: np.ndarray, axes: np.ndarray, size: np.ndarray, up: np.ndarray, text: str) -> None:
         """Frames the selected object and writes a label above it."""

@@ -6,15 +6,15 @@ from __future__ import annotations
 import functools
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ggslam.errors import GgslamError
-from ggslam.viewer.cameras import Viewpoint, top_view, view_of_pose
-from ggslam.viewer.model import Coloring, ViewedMap
+from ggslam.viewer.cameras import Viewpoint, best_view, top_view, view_of_pose
+from ggslam.viewer.model import Box, Coloring, ViewedMap
 from ggslam.viewer.scene_nodes import SceneNodes
 from ggslam.viewer.words import plain
 
@@ -46,6 +46,7 @@ class Stage:
         self.edited: Callable[[], None] = lambda: None
         self._drawing = threading.RLock()
         self.centers, self.movers = np.zeros((0, 3), np.float32), model.movers()
+        self.changes = model.changes()
         self.draw_map()
         self._draw_camera()
         self.summary = server.gui.add_markdown("")
@@ -86,6 +87,10 @@ class Stage:
     def frame_view(self) -> Viewpoint:
         """What the frame that is looked at saw."""
         return self._view_of(self.model.frame_poses[self.frame])
+
+    def view_of_boxes(self, boxes: Sequence[Box]) -> Viewpoint:
+        """From the frame that shows boxes best, looking at them."""
+        return best_view(boxes, list(self.model.frame_poses.values()), self.model.camera, 2.5 * self.depth)
 
     def _view_of(self, T_world_camera: np.ndarray) -> Viewpoint:
         """From a recorded camera, without the lines and the picture that are drawn right before it."""

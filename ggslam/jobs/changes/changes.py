@@ -18,6 +18,7 @@ from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Visit
 from ggslam.errors import ConfigError
 from ggslam.jobs.changes.pictures import picture_of_change
+from ggslam.jobs.changes.shown import MOST_PICTURES, ChangesShown
 from ggslam.jobs.merge.placing import find_joint_poses, place_maps
 from ggslam.jobs.merge.sources import MergeSource, read_sources
 from ggslam.jobs.progress import Observer, SilentObserver
@@ -27,6 +28,7 @@ from ggslam.merging.joint_graph import JointPoses
 from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.reporting.pictures import write_picture
+from ggslam.runs.records.changes import ChangesRecord
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.poses import transform_points
 from ggslam.system.atomic import write_text
@@ -121,6 +123,17 @@ def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str 
     values = {"old": str(old), "new": str(new), "world": "of the old run", **values}
     write_text(out / CHANGES_FILE, json.dumps(json_ready(values), indent=1) + "\n")
     return [*written, out / CHANGES_FILE]
+
+
+def show_changes(outcome: ChangesOutcome, old: str | Path, new: str | Path, most: int = MOST_PICTURES) -> ChangesShown:
+    """What `find_changes` found, as pages show it, with so many pictures; `old`, `new`: as the runs are named there."""
+    found = outcome.table.found.changes
+    record = ChangesRecord.of({"old": str(old), "new": str(new), **outcome.table.to_dict()})
+    pictures = {
+        number: picture_of_change(change, outcome.table, outcome.visits, outcome.context)
+        for number, change in enumerate(found[:most])
+    }
+    return ChangesShown(record, pictures, left_out=len(found[most:]))
 
 
 def own_keyframes(record: KeyframesRecord) -> Sequence[int]:

@@ -95,9 +95,10 @@ def add_run(
                      observer)  # fmt: skip
     found.replaced += [v for v in store.visits() if v != name and v in {f"run {state[:16]}" for state in states}]
     store_of_run(run, store, visit, at, found.replaced)
+    foreign = {e.visit for e in earlier if e.own_ids}
     if found.against is not None and not found.entry.own_ids:
-        found.entry.notes.extend(_drop_ghosts(store, found))
-    after = _objects_after(store, table, found, {e.visit for e in earlier if e.own_ids})
+        found.entry.notes.extend(_drop_ghosts(store, found, foreign))
+    after = _objects_after(store, table, found, foreign)
     cells = {known.id: known.cells for known in after}
     entry = replace(found.entry, events=with_cells(found.entry.events, cells))
     write_objects(store, StoreObjects(visits=[*earlier, entry], objects=after))
@@ -167,8 +168,9 @@ def _compare_maps(
     if own_ids:
         entry.notes.append("object ids are others than the store's: its objects are not listed, only what changed; "
                            "a run that `ggslam update` makes keeps ids")  # fmt: skip
+    unseen = {i for thing in outcome.table.found.unseen if thing.old is not None for i in thing.old.ids}
     done = replace(entry, compared="runs", own_ids=own_ids, events=events)
-    return _Comparison(done, known, set() if own_ids else seen, against=before.visit)
+    return _Comparison(done, known, set() if own_ids else seen - unseen, against=before.visit)
 
 
 def _check_world(folder: RunFolder, outcome: ChangesOutcome, visit: str) -> None:
@@ -188,14 +190,15 @@ def _check_world(folder: RunFolder, outcome: ChangesOutcome, visit: str) -> None
 # --- the cells -------------------------------------------------------------------------------------------------------
 
 
-def _drop_ghosts(store: GridStore, found: _Comparison) -> list[str]:
-    """Takes what is gone, and what moved and is in new cells, out of the cells of earlier visits; returns notes."""
+def _drop_ghosts(store: GridStore, found: _Comparison, foreign: set[str]) -> list[str]:
+    """Takes what is gone, and what moved and is in new cells, out of the cells of earlier visits; returns notes.
+    `foreign`: visits with ids of their own, which name other things: their cells stay as they are."""
     old_cells, own_ids = {}, set[int]()
     for key in _cells_with_gaussians(store):
         arrays, visit = cell_arrays(store, key)
         if visit == store.visit:
             own_ids |= set(np.unique(arrays["object_id"]).tolist())
-        else:
+        elif visit not in foreign:
             old_cells[key] = visit
     gone, moved, added = (_ids(found.entry, kind) for kind in ("removed", "moved", "added"))
     leaving = sorted(gone | (moved & own_ids))

@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from ggslam.jobs.changes.shown import ChangesShown
+from ggslam.jobs.report.change_section import changes_part
 from ggslam.jobs.report.metric_words import MEANINGS, METRICS, Metric
 from ggslam.jobs.report.run_data import FrameView, RunData
 from ggslam.jobs.report.run_page import FOOTER
@@ -34,7 +36,9 @@ def by_recording(runs: Sequence[RunData]) -> list[list[int]]:
     return list(groups.values())
 
 
-def comparison_page(groups: Sequence[Sequence[RunData]], views: Sequence[Sequence[FrameView]]) -> str:
+def comparison_page(
+    groups: Sequence[Sequence[RunData]], views: Sequence[Sequence[FrameView]], changes: ChangesShown | None = None
+) -> str:
     """The whole page as text.
 
     Args:
@@ -42,9 +46,11 @@ def comparison_page(groups: Sequence[Sequence[RunData]], views: Sequence[Sequenc
             pictures of different recordings are shown one recording after the other: their frames and places have
             nothing to do with each other.
         views: for each recording, frames as each of its runs shows them.
+        changes: what changed between two runs; None: they were not compared by objects.
     """
     runs = [run for group in groups for run in group]
     parts = [
+        *([("changes", "What changed", changes_part(changes))] if changes is not None else []),
         ("scores", "Scores", _scores(runs)), ("settings", "Settings that differ", _settings(runs)),
         ("views", "The same views", _each(groups, [_views(v, len(g)) for g, v in zip(groups, views, strict=True)])),
         ("trajectory", "Trajectory", _curves(groups, lambda group: [*trajectory_plots(group), error_plot(group)])),

@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points
-from ggslam.jobs.report.change_section import changes_of
+from ggslam.jobs.changes.shown import ChangesShown, changes_of
 from ggslam.jobs.report.comparison_page import by_recording, comparison_page
 from ggslam.jobs.report.gather import has_limit, load_run, save_truth
 from ggslam.jobs.report.run_data import FrameView, RunData
@@ -70,13 +70,16 @@ def _recording(folder: RunFolder) -> Sequence | None:
         return None
 
 
-def write_comparison(folders: list[RunFolder], out: Path, plots: Path | None = None) -> Path:
+def write_comparison(
+    folders: list[RunFolder], out: Path, plots: Path | None = None, changes: ChangesShown | None = None
+) -> Path:
     """Writes a page that compares several runs; returns its path.
 
     Args:
         folders: of the runs, at least two.
         out: the page.
         plots: folder to write the plots to as SVG and PNG, too.
+        changes: what changed between two of them.
 
     Raises:
         ConfigError: fewer than two runs.
@@ -94,7 +97,7 @@ def write_comparison(folders: list[RunFolder], out: Path, plots: Path | None = N
         groups.append(_in_one_world(group))
         views.append(_same_views(group, frames))
     with as_written(Path(" or ".join(str(folder.path) for folder in folders))):
-        page = comparison_page(groups, views)
+        page = comparison_page(groups, views, changes)
     make_folder(out.parent)
     write_text(out, page)
     if plots is not None:

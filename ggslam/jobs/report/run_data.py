@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.objects.history import History
-from ggslam.runs.records.changes import ChangesRecord
+from ggslam.jobs.changes.shown import ChangesShown
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.movers import MoverRecord
@@ -69,21 +68,6 @@ class FrameView:
 
     frame: int
     pictures: dict[str, np.ndarray]
-
-
-@dataclass(frozen=True)
-class ChangesShown:
-    """What a report shows of changes.
-
-    Attributes:
-        record: changes.json.
-        pictures: both visits with boxes, uint8 [H, W, 3], with words.
-        history: of the run's objects; None: it has none.
-    """
-
-    record: ChangesRecord
-    pictures: list[tuple[str, np.ndarray]] = field(default_factory=list)
-    history: History | None = None
 
 
 @dataclass(frozen=True)

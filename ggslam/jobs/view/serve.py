@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def serve_run(
     folder: RunFolder, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, max_splats: int = DEFAULT_SPLATS,
-    sequence: Path | None = None,
+    sequence: Path | None = None, changes: Path | None = None,
 ) -> tuple[viser.ViserServer, ViewedRun]:  # fmt: skip
     """Serves a run's page until `close_server`.
 
@@ -31,11 +31,12 @@ def serve_run(
         host, port: see `open_server`.
         max_splats: show no more of the map's Gaussians.
         sequence: where the recording is now, if it was moved.
+        changes: see `ViewedRun`.
 
     Raises:
         GgslamError: as `open_server` and `ViewedRun`.
     """
-    model = ViewedRun(folder, max_splats, sequence)
+    model = ViewedRun(folder, max_splats, sequence, changes)
     server = open_server(host, port)
     try:
         show_run(server, model)

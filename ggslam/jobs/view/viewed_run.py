@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.jobs.changes.shown import ChangesShown, changes_of, read_changes, sentence_of
 from ggslam.jobs.edit.edits import Edit, apply_edit, edit_run
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS, object_file_name
 from ggslam.jobs.view.pictures import ViewPictures
@@ -23,19 +24,22 @@ from ggslam.objects.table import ObjectRecord
 from ggslam.reporting.pictures import color_of_depth, depth_range
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.changes import ChangedSide
 from ggslam.runs.records.movers import MoverFrameRecord, mover_colors
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
 from ggslam.system.foreign import is_plain_name
-from ggslam.viewer.model import Coloring, ListedObject, ShownMover
+from ggslam.viewer.model import Box, Coloring, ListedObject, ShownChange, ShownMover
 from ggslam.viewer.splats import Splats, most_visible, splats_of
 from ggslam.viewer.static_page import static_page
 from ggslam.volumes.map_upright import upright_of
 
 DEFAULT_SPLATS = 400_000
 """As many are shown, at most, unless asked otherwise."""
+_MANY = 1000
+"""Pictures of changes: one is shown at a time."""
 _DIGITS = 4
 """Decimals of a shift in metres and a turn in degrees; what is shown is what is saved."""
 
@@ -48,13 +52,18 @@ class ViewedRun:
         folder: the run.
         max_splats: show no more, the most visible ones.
         sequence: where the recording is now, if it was moved.
+        changes: folder that `ggslam changes` wrote, with this run as the older one; None: what an updated run holds.
 
     Raises:
         RunFolderError, FormatError: the run is damaged, or none of its frames was located.
         SequenceError: the recording is not at `sequence`.
+        ConfigError: `changes` holds none, or those of other runs.
     """
 
-    def __init__(self, folder: RunFolder, max_splats: int = DEFAULT_SPLATS, sequence: Path | None = None) -> None:
+    def __init__(
+        self, folder: RunFolder, max_splats: int = DEFAULT_SPLATS, sequence: Path | None = None,
+        changes: Path | None = None,
+    ) -> None:  # fmt: skip
         self.folder, self._max_splats, self._sequence_path = folder, max_splats, sequence
         self._lock = threading.RLock()
         self._edits: list[Edit] = []
@@ -67,6 +76,7 @@ class ViewedRun:
         if not self.frame_poses:
             raise RunFolderError(f"{folder.path}: no frame of this run was located, so there is nowhere to look from")
         self.notes: list[str] = []
+        self._changes = changes_of(folder, _MANY) if changes is None else self._given_changes(changes)
         self._recording = self._open_recording(sequence)
         self._read_map()
         self.up = upright_of(self._gaussians, np.stack(list(self.frame_poses.values()))).up
@@ -78,6 +88,15 @@ class ViewedRun:
         for frame, pose in self.frame_poses.items():
             found.setdefault(self._record.walk_of(frame), []).append(pose[:3, 3])
         return [np.stack(positions) for positions in found.values()]
+
+    def _given_changes(self, place: Path) -> ChangesShown:
+        shown = read_changes(place, _MANY)
+        own, newer = self.folder.path.resolve(), Path(shown.record.new).resolve()
+        if own == newer:
+            raise ConfigError(f"{place}: lies in the world of the older run; view {shown.record.old} with it")
+        if own != Path(shown.record.old).resolve():
+            self.notes.append(f"{place}: says that it is of {shown.record.old}, not of this run")
+        return shown
 
     def _open_recording(self, path: Path | None) -> Sequence | None:
         try:
@@ -170,6 +189,14 @@ class ViewedRun:
         movers = self.folder.movers().movers
         colors = mover_colors(movers)
         return [ShownMover(m.way(), {f.frame: _box_of(f) for f in m.frames}, colors[m.id]) for m in movers]
+
+    def changes(self) -> list[ShownChange]:
+        """See `ViewedMap`."""
+        shown = self._changes
+        return [] if shown is None else [
+            ShownChange(sentence_of(change), _box_of_side(change.old), _box_of_side(change.new), shown.pictures.get(k))
+            for k, change in enumerate(shown.record.changes)
+        ]  # fmt: skip
 
     def frame_picture(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """See `ViewedMap`."""
@@ -295,6 +322,11 @@ def _list_object(record: ObjectRecord) -> ListedObject:
 
 def _box_of(frame: MoverFrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return frame.corners().mean(0), frame.T_world_mover[:3, :3].T, frame.box_max - frame.box_min
+
+
+def _box_of_side(side: ChangedSide | None) -> Box | None:
+    box = None if side is None else side.box
+    return None if box is None else (np.array(box.center), np.array(box.axes), np.array(box.size))
 
 
 def _numbers(values: np.ndarray) -> str:

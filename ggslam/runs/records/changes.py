@@ -6,14 +6,16 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from ggslam.runs.records.record import Record, RecordFile
+from ggslam.scene.oriented_box import OrientedBox
 
 
 class ChangedSide(Record):
-    """A thing as one of the visits has it: ids of the objects that it is, and the share of it that the other visit
-    looked at and did not find."""
+    """A thing as one of the visits has it: ids of the objects that it is, the share of it that the other visit looked
+    at and did not find, and a box around it, world of the older run."""
 
     ids: list[int]
     not_there: float | None = None
+    box: OrientedBox | None = None
 
 
 class ChangeRecord(Record):
