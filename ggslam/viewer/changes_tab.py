@@ -27,28 +27,30 @@ class ChangesTab:
         @self.choice.on_update
         @stage.guard
         def _on_choice(event: Any) -> None:
-            self._show(event.client)
+            if event.client is not None:
+                self.show(self.number, event.client)
 
         @self._step.on_click
         @stage.guard
         def _on_step(event: Any) -> None:
-            count = len(self._labels)
-            now = self.number
-            if self._step.value == "Next":
-                after = 0 if now is None else (now + 1) % count
-            else:
-                after = count - 1 if now is None else (now - 1) % count
-            self.choice.value = self._labels[after]
-            self._show(event.client)
+            self.step(self._step.value == "Next", event.client)
 
     @property
     def number(self) -> int | None:
         """Of the change that is shown, from 0; None: none is."""
         return None if self.choice.value == NOTHING else self._labels.index(self.choice.value)
 
-    def _show(self, client: Any) -> None:
-        """Draws what is chosen, and takes the page that chose there."""
-        change = None if self.number is None else self._stage.changes[self.number]
+    def step(self, forward: bool, client: Any) -> None:
+        """Shows the next change or the one before; after the last comes the first."""
+        count, now = len(self._labels), self.number
+        if now is None:
+            now = -1 if forward else count
+        self.show((now + (1 if forward else -1)) % count, client)
+
+    def show(self, number: int | None, client: Any) -> None:
+        """Draws a change, or none, and takes the page that asked for it there, if one did."""
+        change = None if number is None else self._stage.changes[number]
+        self.choice.value = NOTHING if number is None else self._labels[number]
         self._stage.nodes.set_change(change)
         self._text.content = "" if change is None else f"**{plain(change.text)}**"
         if self._image is not None:

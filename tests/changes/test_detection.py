@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from small_visits import Box, SmallVisit, detect
 
-from ggslam.changes.detection import Change, Detection
+from ggslam.changes.detection import Change, ChangeDetector, Detection
 from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Picture, Sightings, Tolerance, _Blocks
+from ggslam.changes.things import Thing
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, transform_points, turning_angle
 
@@ -162,3 +165,18 @@ def test_points_that_no_picture_shows_are_passed_by_and_all_others_looked_up(mon
     for name, values in vars(sights.look_up(points, Tolerance(0.02, 0.01))).items():
         np.testing.assert_array_equal(getattr(found, name), values)
     assert found.hidden.any() and found.through.any() and max(passed) > 1000
+
+
+@pytest.mark.parametrize("count, shifted", [(310, True), (742, False)])
+def test_what_only_one_visit_shows_much_of_was_not_pushed(count: int, shifted: bool) -> None:
+    """A strip of a cupboard behind a chair, 259 points of it from one side and 742 from the other, bore other ids at
+    its ends: it was said to have been pushed."""
+
+    def strip(points: int) -> Thing:
+        return Thing(19, (19,), np.arange(points), 1.0, 0.0, 0.05)
+
+    judged = SimpleNamespace(points=np.zeros((1000, 3)))
+    others = SimpleNamespace(
+        settings=ChangeSettings(), judged=[judged, judged], _ids_at=lambda _, points: np.zeros(len(points), int)
+    )
+    assert ChangeDetector._has_shifted(others, strip(259), strip(count)) is shifted  # type: ignore[arg-type]

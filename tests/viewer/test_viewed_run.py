@@ -5,6 +5,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,7 +21,8 @@ from ggslam.rendering.labels import vote_label_image
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.writing import OBJECT_FILES, write_objects
 from ggslam.scene.poses import inverse, quaternion_to_matrix
-from ggslam.viewer.server import close_server
+from ggslam.viewer.page import Page
+from ggslam.viewer.server import close_server, open_server
 
 
 @pytest.fixture
@@ -191,3 +193,64 @@ def test_a_pose_that_is_no_number_is_told(run: RunFolder, tmp_path: Path) -> Non
     path.write_text(json.dumps(record))
     with pytest.raises(RunFolderError, match="keyframes.json: pose of frame 2"):
         ViewedRun(copied)
+
+
+BOX = {"center": [0.5, 0.0, 1.0], "axes": np.eye(3).tolist(), "size": [0.2, 0.2, 0.3]}
+
+
+def written_changes(folder: Path, old: Path, new: Path) -> Path:
+    """As `ggslam changes` writes them: something moved, without a picture, and something was removed, with one."""
+    folder.mkdir()
+    cv2.imwrite(str(folder / "change01_removed.png"), np.full((20, 40, 3), (0, 0, 200), np.uint8))
+    moved = {"kind": "moved", "name": "mug (7)", "confidence": 0.9, "old": {"ids": [7], "box": BOX},
+             "new": {"ids": [7], "box": {**BOX, "center": [0.9, 0.0, 1.0]}}, "moved_m": 0.4, "turned_deg": 3.0,
+             "turn_known": False}  # fmt: skip
+    removed = {"kind": "removed", "name": "milk (2)", "confidence": 0.8, "old": {"ids": [2], "box": BOX}, "new": None,
+               "picture": "change01_removed.png"}  # fmt: skip
+    values = {"old": str(old), "new": str(new), "changes": [moved, removed], "unseen": []}
+    (folder / "changes.json").write_text(json.dumps(values))
+    return folder
+
+
+def test_changes_of_a_later_visit_are_shown_in_the_older_map(run: RunFolder, tmp_path: Path) -> None:
+    place = written_changes(tmp_path / "changes", run.path, tmp_path / "newer")
+    viewed = ViewedRun(run, changes=place)
+    moved, removed = viewed.changes()
+    assert moved.text == "mug (7): moved by 40.0 cm, turn not known" and moved.picture is None
+    assert moved.old is not None and moved.new is not None and np.allclose(moved.new[0] - moved.old[0], [0.4, 0, 0])
+    assert removed.new is None and removed.picture is not None and tuple(removed.picture[0, 0]) == (200, 0, 0)
+    assert not [note for note in viewed.notes if "changes" in note] and not ViewedRun(run).changes()
+
+
+def test_changes_of_other_runs_are_told(run: RunFolder, tmp_path: Path) -> None:
+    other = written_changes(tmp_path / "other", tmp_path / "older", tmp_path / "newer")
+    assert [note for note in ViewedRun(run, changes=other).notes if "not of this run" in note]
+    newer = written_changes(tmp_path / "newer", tmp_path / "older", run.path)
+    with pytest.raises(ConfigError, match="world of the older run"):
+        ViewedRun(run, changes=newer)
+    with pytest.raises(ConfigError, match=r"holds no changes\.json"):
+        ViewedRun(run, changes=tmp_path)
+
+
+def test_changes_are_stepped_through(run: RunFolder, tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    server = open_server(port=0)
+    try:
+        place = written_changes(tmp_path / "changes", run.path, tmp_path / "newer")
+        model = ViewedRun(run, 1000, changes=place)
+        tab = Page(server, model, None, "room").changes
+        assert tab is not None and tab.number is None
+        assert server.scene.get_handle_by_name("/camera/change") is None
+        tab.show(1, None)
+        removed = server.scene.get_handle_by_name("/camera/change")
+        assert tab.number == 1 and removed is not None and removed.points.shape == (12, 2, 3)
+        tab.step(forward=True, client=None)  # after the last the first
+        moved = server.scene.get_handle_by_name("/camera/change")
+        assert tab.number == 0 and moved is not None and moved.points.shape == (25, 2, 3)  # and how it went
+        tab.step(forward=False, client=None)
+        assert tab.number == 1
+        tab.show(None, None)
+        assert server.scene.get_handle_by_name("/camera/change") is None
+        assert Page(server, ViewedRun(run, 1000), None, "room").changes is None
+    finally:
+        close_server(server)
