@@ -35,6 +35,25 @@ def test_nothing_is_invented_between_pieces_of_one_recording(visits: tuple[Path,
     assert [path.name for path in (tmp_path / "found").iterdir()] == ["changes.json"]
 
 
+@pytest.mark.long("two runs are compared by scores, surfaces and objects")
+def test_comparisons_of_runs_tell_changes_if_asked(visits: tuple[Path, Path], tmp_path: Path) -> None:
+    done = ggslam("report", *visits, "--changes", "--out", tmp_path / "page.html")
+    assert done.returncode == 0, done.stderr
+    assert "Nothing was found that changed." in (tmp_path / "page.html").read_text()
+    done = ggslam("compare", *visits, "--changes", "--out", tmp_path / "numbers.json")
+    assert done.returncode == 0 and "nothing changed" in done.stdout, done.stderr
+    told = json.loads((tmp_path / "numbers.json").read_text())["changes"]
+    assert told["changes"] == [] and told["stayed"] > 5
+
+
+def test_changes_are_between_two_runs(visits: tuple[Path, Path], tmp_path: Path) -> None:
+    done = ggslam("report", visits[0], "--changes")
+    assert done.returncode == 2 and "two runs" in done.stderr
+    (tmp_path / "cloud.ply").write_text("ply\n")
+    done = ggslam("compare", visits[0], tmp_path / "cloud.ply", "--changes")
+    assert done.returncode == 2 and "cloud.ply" in done.stderr
+
+
 @pytest.mark.parametrize("frames, own", [([-1, -1, 0, 5], [2, 3]), ([0, 4], [0, 1]), ([-1, -1], [0, 1]), ([], [])])
 def test_keyframes_of_an_earlier_map_are_none_of_a_run(frames: list[int], own: list[int]) -> None:
     keyframes = [{"frame": frame, "T_world_camera": np.eye(4)} for frame in frames]

@@ -7,11 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ggslam.errors import FormatError
 from ggslam.jobs.changes.store_events import events_of_history
+from ggslam.jobs.changes.store_visits import _cells_with_gaussians, _Comparison, _drop_ghosts
+from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, arrays_of_map, cell_arrays, gaussians_to_bytes
 from ggslam.jobs.submaps.fill import list_store
 from ggslam.objects.history import History, VisitRecord
+from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.oriented_box import OrientedBox
 from ggslam.scene.poses import to_matrix
 from ggslam.submaps.grid import GridStore
@@ -93,3 +97,27 @@ def test_damaged_records_are_told_and_cells_still_listed(tmp_path: Path, damage:
         read_objects(store)
     listing = list_store(tmp_path / "map.grid", "monday")
     assert listing.cells == 1 and listing.events is None and OBJECTS_FILE in listing.problems[0]
+
+
+def test_what_went_leaves_the_cells_that_have_the_same_ids(tmp_path: Path) -> None:
+    """Of three earlier cells one belongs to a visit whose ids name other things."""
+
+    def cell_of(ids: list[int], visit: str) -> bytes:
+        made = GaussianMap(0, 2)
+        count = len(ids)
+        made.insert(torch.zeros(count, 3), torch.eye(4)[:1].repeat(count, 1), torch.zeros(count, 3),
+                    torch.zeros(count), torch.zeros(count, 3), object_id=torch.tensor(ids, dtype=torch.int32))  # fmt: skip
+        return gaussians_to_bytes(arrays_of_map(made), visit)
+
+    keys = [(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)]
+    contents = {keys[0]: ([1, 2, 2], "monday"), keys[1]: ([2], "monday"), keys[2]: ([2, 7], "others")}
+    entry = VisitObjects("wednesday", "run", ["c"], None, events=[ObjectEvent("removed", 2, "milk")])
+    with GridStore.create(tmp_path / "map.grid") as store:
+        for visit in ("monday", "others", "wednesday"):
+            store.begin_visit(visit)
+            for key, (ids, by) in {**contents, keys[3]: ([1], "wednesday")}.items():
+                if by == visit:
+                    store.put(key, {GAUSSIANS: cell_of(ids, by)}, counts={GAUSSIANS: len(ids)})
+        assert _drop_ghosts(store, _Comparison(entry, {}, set()), {"others"}) == []
+        left = {key: cell_arrays(store, key)[0]["object_id"].tolist() for key in _cells_with_gaussians(store)}
+    assert left == {keys[0]: [1], keys[2]: [2, 7], keys[3]: [1]}

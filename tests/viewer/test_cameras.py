@@ -9,6 +9,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import is_valid_pose, se3_exp, transform_points
 from ggslam.viewer.cameras import (
     HEADROOM_M,
+    best_view,
     box_lines,
     canvas_camera,
     fitting_fov,
@@ -92,3 +93,16 @@ def test_upright_axes_are_a_rotation_about_up() -> None:
 def test_the_shorter_side_of_a_window() -> None:
     assert math.isclose(shorter_fov(1.0, 1.5), 1.0)
     assert math.isclose(math.tan(shorter_fov(1.0, 0.5) / 2), math.tan(0.5) / 2)
+
+
+def test_boxes_are_looked_at_from_the_nearest_camera_that_sees_them() -> None:
+    def at(x: float, z: float, turned: bool = False) -> np.ndarray:
+        T = se3_exp(np.array([0, 0, 0, 0, np.pi if turned else 0.0, 0]))
+        T[:3, 3] = x, 0, z
+        return T
+
+    box = (np.array([0.1, 0.0, 3.0]), np.eye(3), np.full(3, 0.2))
+    poses = [at(0, 0), at(0, 1.5), at(0, 2.5, turned=True), at(2.0, 2.5)]  # far, near, near and away, near and beside
+    view = best_view([box], poses, CAMERA, 0.05)
+    assert np.allclose(view.position, [0, 0, 1.5]) and np.allclose(view.look_at, box[0], atol=1e-6)
+    assert np.allclose(view.up, [0, -1, 0]) and view.near == 0.05
