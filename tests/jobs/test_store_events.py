@@ -105,8 +105,8 @@ def test_what_went_leaves_the_cells_that_have_the_same_ids(tmp_path: Path) -> No
     def cell_of(ids: list[int], visit: str) -> bytes:
         made = GaussianMap(0, 2)
         count = len(ids)
-        made.insert(torch.zeros(count, 3), torch.eye(4)[:1].repeat(count, 1), torch.zeros(count, 3),
-                    torch.zeros(count), torch.zeros(count, 3), object_id=torch.tensor(ids, dtype=torch.int32))  # fmt: skip
+        zeros, owner = torch.zeros(count, 3), torch.tensor(ids, dtype=torch.int32)
+        made.insert(zeros, torch.eye(4)[:1].repeat(count, 1), zeros, zeros[:, 0], zeros, object_id=owner)
         return gaussians_to_bytes(arrays_of_map(made), visit)
 
     keys = [(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)]

@@ -232,6 +232,15 @@ def test_changes_of_other_runs_are_told(run: RunFolder, tmp_path: Path) -> None:
         ViewedRun(run, changes=tmp_path)
 
 
+def test_damaged_changes_do_not_hide_the_map(run: RunFolder, tmp_path: Path) -> None:
+    copy = RunFolder(Path(shutil.copytree(run.path, tmp_path / "run")))
+    written_changes(copy.path / "changes", run.path, tmp_path / "newer")
+    assert len(ViewedRun(copy).changes()) == 2  # as of an updated run
+    (copy.path / "changes" / "changes.json").write_text('{"changes": [{"kind": "moved"}]}')
+    viewed = ViewedRun(copy)
+    assert not viewed.changes() and [note for note in viewed.notes if "changes.json" in note]
+
+
 def test_changes_are_stepped_through(run: RunFolder, tmp_path: Path) -> None:
     pytest.importorskip("viser")
     server = open_server(port=0)

@@ -76,7 +76,7 @@ class ViewedRun:
         if not self.frame_poses:
             raise RunFolderError(f"{folder.path}: no frame of this run was located, so there is nowhere to look from")
         self.notes: list[str] = []
-        self._changes = changes_of(folder, _MANY) if changes is None else self._given_changes(changes)
+        self._changes = self._own_changes() if changes is None else self._given_changes(changes)
         self._recording = self._open_recording(sequence)
         self._read_map()
         self.up = upright_of(self._gaussians, np.stack(list(self.frame_poses.values()))).up
@@ -89,13 +89,20 @@ class ViewedRun:
             found.setdefault(self._record.walk_of(frame), []).append(pose[:3, 3])
         return [np.stack(positions) for positions in found.values()]
 
+    def _own_changes(self) -> ChangesShown | None:
+        try:
+            return changes_of(self.folder, _MANY)
+        except GgslamError as error:  # the map is there
+            self.notes.append(f"shown without what changed: {error}")
+            return None
+
     def _given_changes(self, place: Path) -> ChangesShown:
-        shown = read_changes(place, _MANY)
-        own, newer = self.folder.path.resolve(), Path(shown.record.new).resolve()
-        if own == newer:
-            raise ConfigError(f"{place}: lies in the world of the older run; view {shown.record.old} with it")
-        if own != Path(shown.record.old).resolve():
-            self.notes.append(f"{place}: says that it is of {shown.record.old}, not of this run")
+        shown, own = read_changes(place, _MANY), self.folder.path.resolve()
+        old, new = shown.record.old, shown.record.new
+        if new and own == Path(new).resolve():
+            raise ConfigError(f"{place}: lies in the world of the older run; view {old} with it")
+        if old and own != Path(old).resolve():
+            self.notes.append(f"{place}: says that it is of {old}, not of this run")
         return shown
 
     def _open_recording(self, path: Path | None) -> Sequence | None:
