@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from ggslam.changes.shapes import Shape, _Target
+from ggslam.changes.settings import ChangeSettings
+from ggslam.changes.shapes import Fit, Shape, _stay_level, _Target
 
 THICK_M = 0.02
 
@@ -45,3 +48,35 @@ def test_a_board_that_was_seen_from_the_other_side_stays_as_thick_as_it_is(faces
 
 def test_a_shape_without_points_has_none() -> None:
     assert Shape.from_views(*(np.zeros((0, 3)) for _ in range(3))).normals.shape == (0, 3)
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def basket(low: float, high: float, at: float) -> Shape:
+    """The wall of a round basket between two heights, seen from all around."""
+    turn, height = (a.ravel() for a in np.meshgrid(np.arange(0, 2 * np.pi, 0.05), np.arange(low, high, 0.006)))
+    out = np.stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))], 1)
+    points = 0.12 * out + np.stack([np.full(len(turn), at), np.zeros(len(turn)), height], 1)
+    return Shape.from_views(points, np.full((len(turn), 3), 0.5, np.float32), out.astype(np.float32))
+
+
+@pytest.mark.parametrize("rise, costs, level", [
+    (0.06, 0.1, True), (-0.06, 0.1, True),
+    (0.06, 0.2, False),  # it stands on a book now
+    (0.4, 0.1, False),  # from the floor onto a table
+    (0.005, 0.1, False),  # nothing to speak of
+])  # fmt: skip
+def test_a_thing_that_seems_to_rise_a_little_stays_at_its_height(rise: float, costs: float, level: bool) -> None:
+    """The visits saw the lower and the upper part of a wall, which slide upon each other; `costs`: how much worse the
+    fit is if it stays at its height."""
+    old, new = basket(0.0, 0.2, 0.0), basket(0.1, 0.3, 0.5)
+    found = np.eye(4)
+    found[:3, 3] = 0.508, 0.0, rise
+
+    def fit(T: np.ndarray) -> Fit:
+        return Fit(T, share=0.9 if abs(T[2, 3] - rise) < 1e-6 else 0.9 - costs, seen=1.0, color_apart=0.0)
+
+    judge = SimpleNamespace(fit=fit, settings=ChangeSettings())
+    kept = _stay_level(fit(found), judge, (_Target(new), _Target(new, faces=True)), old, UP)  # type: ignore[arg-type]
+    assert np.allclose(kept.T_new_old[:3, 3], [0.5, 0, 0] if level else found[:3, 3], atol=0.002)
