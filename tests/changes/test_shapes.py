@@ -62,7 +62,8 @@ def basket(low: float, high: float, at: float) -> Shape:
 
 
 @pytest.mark.parametrize("rise, costs, level", [
-    (0.06, 0.1, True), (-0.06, 0.1, True),
+    (0.06, 0.09, True), (-0.06, 0.09, True),
+    (0.06, 0.11, False),  # too little fits for it to be the same thing
     (0.06, 0.2, False),  # it stands on a book now
     (0.4, 0.1, False),  # from the floor onto a table
     (0.005, 0.1, False),  # nothing to speak of
