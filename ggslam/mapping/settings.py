@@ -129,14 +129,17 @@ class ExposureSettings:
 
 @settings_class(frozen=True)
 class ViewAlignmentSettings:
-    """Alignment of frames to the map by colour alone, where depth errs more than its images show (on the CPU, in
-    synchronous runs)."""
+    """Alignment of frames to the map by colour alone (on the CPU): of those that are no keyframes after the last frame,
+    and, where depth errs more than its images show, of all as they come (in synchronous runs)."""
 
     enabled: bool = setting(True, basic=True)
     """Whether frames are aligned to the map so."""
     hidden_noise: float = setting(8.0, 1, 1e6)
     """Frames are aligned so where the residuals of tracking are this many times what the first image shows of noise:
     errors that neighbouring pixels share, and so many points do not help against them."""
+    last_noise: float = setting(0.2, 0, 1e6, "px")
+    """After the last frame, frames are aligned where the noise of depth is as wide as this in the image: there colour
+    tells a pose better."""
     points: int = setting(8000, 500, 10**6)
     """Textured pixels at most."""
     min_gradient: float = setting(0.01, 1e-4, 1)

@@ -7,6 +7,8 @@ map is the mean over many frames, and a picture of it fits a camera's image to a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -32,7 +34,7 @@ def grey_of(color: np.ndarray) -> np.ndarray:
 
 def align_view(
     grey: np.ndarray, rendered: np.ndarray, depth: np.ndarray, alpha: np.ndarray, camera: Camera,
-    settings: ViewAlignmentSettings,
+    settings: ViewAlignmentSettings, blurs: Sequence[float] = BLURS,
 ) -> np.ndarray | None:  # fmt: skip
     """How the camera that saw an image stands to the pose that a map was rendered from.
 
@@ -46,12 +48,13 @@ def align_view(
         alpha: of the map [H, W].
         camera: of both.
         settings: number of points and iterations.
+        blurs: standard deviations in pixels of the smoothing, one after the other.
 
     Returns:
         T_camera_rendered [4, 4], None if too little texture is seen or the solution leaves the image.
     """
     T, exposure = np.eye(4), np.array([1.0, 0.0])
-    for blur in BLURS:
+    for blur in blurs:
         ours, theirs = (cv2.GaussianBlur(image, (0, 0), blur) for image in (grey, rendered))
         pixels = _choose_textured(theirs, depth, alpha, settings)
         if len(pixels) < FEWEST_POINTS:

@@ -1,29 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of frames by colour against the map, where depth errs more than its images show."""
+"""Poses of frames by colour against the map: at the end where depth is noisy, and all along where it errs more than its
+images show."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.mapper import Mapper
-from ggslam.mapping.view_alignment import align_view, grey_of
+from ggslam.mapping.settings import ViewAlignmentSettings
+from ggslam.mapping.view_alignment import BLURS, align_view, grey_of
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.slam.frame_poses import FramePoses
+from ggslam.slam.result import TrackedFrame
 from ggslam.tracking.tracker import TrackerState, TrackingResult, TrackingStatus
 
 UNDECIDED = 32
 """Of so many first frames images are kept in case frames are to be aligned, of later ones once they are."""
 KEPT_BYTES = 1 << 26
-"""Memory for images of frames that are aligned once more at the end; later frames stay as they were aligned first."""
+"""Memory for coded images of frames that are aligned at the end; later ones are aligned as they come."""
+JPEG_QUALITY = 90
+"""Of kept images: 21 KB at 320x240, where one costs 77 KB uncoded."""
+LAST_BLURS, LAST_POINTS, LAST_ITERATIONS = (0.7,), 3000, 4
+"""Of the alignment at the end, whose start is near: as good as with the settings of `ViewAlignmentSettings`, in half the
+time."""
+REPORT_EVERY = 20
+HIDDEN_MARGIN = 9
+"""Pixels across, around those that show something else."""
 
 
 @dataclass
 class ColorPoses:
-    """Aligns located frames to the map as it is, and once more to the map as it is at the end.
+    """Aligns located frames to the map as it is, where that is due, and to the map as it is at the end.
 
     Args:
         mapper: whose map it is.
@@ -31,74 +44,127 @@ class ColorPoses:
         state: of the tracker, which knows how much noise its images hide.
 
     Attributes:
-        images: of frames that were located: their number among all frames, and grey values uint8 [H, W].
+        images: of frames that were located and are no keyframes: their number among all frames, their median depth in
+            metres, their grey values as a JPEG file, and as a PNG file where they do not show the map, uint8 arrays; an
+            empty one: nowhere.
         held_bytes: what they take.
-        active: whether frames may be aligned: the map is trained on the CPU, and by the thread that tracks.
+        active: whether frames may be aligned: the map is trained on the CPU.
+        live: whether another thread trains the map meanwhile, so that frames can be aligned at the end only.
     """
 
     mapper: Mapper
     poses: FramePoses
     state: TrackerState
-    images: list[tuple[int, np.ndarray]] = field(default_factory=list)
+    images: list[tuple[int, float, np.ndarray, np.ndarray]] = field(default_factory=list)
     held_bytes: int = 0
     active: bool = field(init=False)
+    live: bool = False
 
     def __post_init__(self) -> None:
         self.active = isinstance(self.mapper, CpuMapper) and self.mapper.settings.view_alignment.enabled
 
     def align(self, frame: Frame, found: TrackingResult) -> TrackingResult:
-        """What the tracker found, with the pose by colour where that is due and does not contradict it."""
-        if found.status in (TrackingStatus.LOST, TrackingStatus.FIRST) or not self.active or not self.mapper.keyframes:
+        """What the tracker found, with the pose by colour where depth hides its errors and that does not contradict
+        it."""
+        if found.status in (TrackingStatus.LOST, TrackingStatus.FIRST) or not self.active or self.live:
             return found
-        number = len(self.poses.frames)
-        if not self._is_due and number >= UNDECIDED:
-            return found
-        grey = grey_of(frame.color)
-        if self.held_bytes < KEPT_BYTES:
-            self.images.append((number, np.rint(255 * grey).astype(np.uint8)))
-            self.held_bytes += grey.size
-        if not self._is_due:
+        if not self._is_due or not self.mapper.keyframes:
             return found
         # The map is where its keyframes are by now, the tracker's surface where they were when they came.
         keyframe, T_world_anchor = self.poses.anchor
         T_map_world = self.mapper.keyframes[keyframe].T_world_camera @ inverse(T_world_anchor)
-        T = self._pose(grey, T_map_world @ found.T_world_camera, found.median_depth_m)
+        start, settings = T_map_world @ found.T_world_camera, self.mapper.settings.view_alignment
+        T = self._pose(grey_of(frame.color), start, found.median_depth_m, _hidden(frame), settings)
         return found if T is None else replace(found, T_world_camera=orthonormalize(inverse(T_map_world) @ T))
 
-    def align_again(self) -> None:
-        """Aligns the frames that are no keyframes to the map as it is now."""
-        if not self.active or not self._is_due:
+    def note(self, frame: Frame, found: TrackingResult) -> None:
+        """Keeps the image of the frame that `poses` took last, and that is no keyframe, if it is to be aligned at the
+        end; aligns it now if memory for images is used up."""
+        if not self._at_the_end or found.status in (TrackingStatus.LOST, TrackingStatus.FIRST):
             return
-        frames, keyframes = self.poses.frames, self.mapper.keyframes
-        own = {keyframe.frame_index for keyframe in keyframes}
-        for number, image in self.images:
-            frame = frames[number]
-            if frame.frame_index in own:
+        number, depth = len(self.poses.frames) - 1, found.median_depth_m
+        if not self._tells_more(depth) and number >= UNDECIDED:
+            return
+        grey, hidden = grey_of(frame.color), _hidden(frame)
+        if self.held_bytes >= KEPT_BYTES:
+            if not self.live:
+                self.poses.frames[number] = self._aligned(number, depth, grey, hidden)
+            return
+        coded = cv2.imencode(".jpg", np.rint(255 * grey).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+        mask = np.zeros(0, np.uint8) if hidden is None else cv2.imencode(".png", hidden.view(np.uint8))[1]
+        self.images.append((number, depth, coded.reshape(-1), mask.reshape(-1)))
+        self.held_bytes += coded.nbytes + mask.nbytes
+
+    def align_last(self, report: Callable[[], None] = lambda: None) -> None:
+        """Aligns the frames whose images were kept to the map as it is now; `report` is called now and then."""
+        if not self._at_the_end:
+            return
+        aligned = {}
+        for number, depth, coded, mask in self.images:
+            if not self._tells_more(depth) or self.poses.frames[number].keyframe >= len(self.mapper.keyframes):
                 continue
-            T_world_keyframe = keyframes[frame.keyframe].T_world_camera
-            grey = image.astype(np.float32) / 255
-            T = self._pose(grey, T_world_keyframe @ frame.T_keyframe_camera, None)
-            if T is not None:
-                frames[number] = replace(frame, T_keyframe_camera=inverse(T_world_keyframe) @ T)
+            grey = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
+            hidden = cv2.imdecode(mask, cv2.IMREAD_GRAYSCALE) > 0 if len(mask) else None
+            aligned[number] = self._aligned(number, depth, grey, hidden)
+            if len(aligned) % REPORT_EVERY == 0:
+                report()
+        for number, frame in aligned.items():  # all or none: `report` may end the run
+            self.poses.frames[number] = frame
+
+    @property
+    def _at_the_end(self) -> bool:
+        """Whether frames are aligned at the end: the whole map is in memory then."""
+        return self.active and self.mapper.residency is None
 
     @property
     def _is_due(self) -> bool:
         return self.state.residuals.hidden >= self.mapper.settings.view_alignment.hidden_noise
 
-    def _pose(self, grey: np.ndarray, T_world_camera: np.ndarray, median_depth: float | None) -> np.ndarray | None:
+    def _tells_more(self, depth: float) -> bool:
+        """Whether colour tells a pose better than depth with the noise at a distance in metres."""
+        if self._is_due:
+            return True
+        noise, camera = self.state.noise, self.state.camera
+        least = self.mapper.settings.view_alignment.last_noise
+        return noise is not None and depth > 0 and noise.sigma(depth) * camera.fx / depth >= least
+
+    def _aligned(self, number: int, depth: float, grey: np.ndarray, hidden: np.ndarray | None) -> TrackedFrame:
+        """A frame with its pose as of the finished map."""
+        frame, settings = self.poses.frames[number], self.mapper.settings.view_alignment
+        T_world_keyframe = self.mapper.keyframes[frame.keyframe].T_world_camera
+        last = replace(settings, points=min(LAST_POINTS, settings.points), iterations=LAST_ITERATIONS)
+        T = self._pose(grey, T_world_keyframe @ frame.T_keyframe_camera, depth, hidden, last, LAST_BLURS)
+        if T is None:
+            return frame
+        return replace(frame, T_keyframe_camera=orthonormalize(inverse(T_world_keyframe) @ T))
+
+    def _pose(
+        self, grey: np.ndarray, T_world_camera: np.ndarray, median_depth: float, hidden: np.ndarray | None,
+        settings: ViewAlignmentSettings, blurs: Sequence[float] = BLURS,
+    ) -> np.ndarray | None:  # fmt: skip
         """T_world_camera [4, 4] by colour, from one near by; None if there is none that can be believed."""
-        camera, settings = self.state.camera, self.mapper.settings.view_alignment
-        T_camera_world = inverse(T_world_camera)
+        camera, T_camera_world = self.state.camera, inverse(T_world_camera)
         assert isinstance(self.mapper, CpuMapper)
         view = self.mapper.render_view(camera, T_camera_world)
         depth, alpha = view.expected_depth.numpy(), view.alpha.numpy()
+        if hidden is not None:
+            alpha = np.where(hidden, np.float32(0), alpha)
         rendered = grey_of(np.ascontiguousarray(view.image.numpy().clip(0, 1).transpose(1, 2, 0)))
-        T = align_view(grey, rendered, depth, alpha, camera, settings)
+        T = align_view(grey, rendered, depth, alpha, camera, settings, blurs)
         if T is None or self.state.noise is None:
             return None
         found = inverse(T @ T_camera_world)
-        if median_depth is None:
-            median_depth = float(np.median(depth[alpha > 0.5])) if (alpha > 0.5).any() else 1.0
         moved, turned = separation(found, T_world_camera)
         limit = settings.farthest_sigmas * self.state.noise.sigma(median_depth)
         return found if moved <= limit and np.radians(turned) * median_depth <= limit else None
+
+
+def _hidden(frame: Frame) -> np.ndarray | None:
+    """Where a frame's image does not show the map, bool [H, W]: something moves there, or is fixed to the camera, or
+    there is no image; None: nowhere. What is beside it is not trusted either."""
+    hidden = frame.moving
+    if frame.valid is not None:
+        hidden = ~frame.valid if hidden is None else hidden | ~frame.valid
+    if hidden is None or not hidden.any():
+        return None
+    return cv2.dilate(hidden.astype(np.uint8), np.ones((HIDDEN_MARGIN, HIDDEN_MARGIN), np.uint8)) > 0

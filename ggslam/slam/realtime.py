@@ -41,7 +41,7 @@ class RealtimeSlam:
         self._mapper_error: BaseException | None = None
         self._beside_mapper = slam.mapper.beside_others()
         # The kernels of one context take turns; the tracker must not wait for the mapper's.
-        slam.color_poses.active = False  # the map changes meanwhile
+        slam.color_poses.live = True  # the map changes meanwhile
         slam.tracker.context = slam.movers.context = NativeContext(slam.context.threads, slam.context.instruction_set)
 
     def run(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
@@ -86,6 +86,8 @@ class RealtimeSlam:
             slam.poses.add_keyframe(tracking.T_world_camera)
             self._jobs.put((frame, tracking, slam.moves_followed))
         slam.poses.add(frame, tracking)
+        if not is_keyframe:
+            slam.color_poses.note(frame, tracking)
         slam.times.stop()
         seconds = time.perf_counter() - start
         return slam.note_step(is_keyframe, seconds)

@@ -30,7 +30,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.color_poses import ColorPoses
-from ggslam.slam.config import REFINE_SHARE, Config
+from ggslam.slam.config import REFINE_MOST, REFINE_SHARE, REFINE_VISITS, Config
 from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.map_corrections import MapCorrections
@@ -153,6 +153,8 @@ class Slam:
         self.poses.add(frame, tracking)
         if not (is_keyframe and self._on_device):
             self._train_step(is_keyframe)
+        if not is_keyframe:
+            self.color_poses.note(frame, tracking)
         self.times.stop()
         seconds = time.perf_counter() - start
         return self.note_step(is_keyframe, seconds)
@@ -193,7 +195,8 @@ class Slam:
         if not self.mapper.keyframes or not self.growing:
             return 0
         asked, before = self.config.refine_iterations, self.mapper.times.iterations - self.refine_iterations
-        return asked if asked >= 0 else round(REFINE_SHARE * before)
+        visits = min(REFINE_VISITS * len(self.mapper.keyframes), REFINE_MOST * before)
+        return asked if asked >= 0 else round(max(REFINE_SHARE * before, visits))
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refinement_steps`), then the result. `progress(done, total)` is called now and then."""
@@ -209,7 +212,7 @@ class Slam:
         try:
             if steps:
                 self.mapper.refine(steps, note, begin)
-            self.color_poses.align_again()
+            self.color_poses.align_last(lambda: note(steps, steps))
         finally:  # an interrupted refinement counts for what it did
             self.refine_iterations = begin + self.mapper.times.iterations - before
             self.times.refinement = time.perf_counter() - start

@@ -127,6 +127,61 @@ def test_it_pays_where_depth_drifts(tmp_path: Path) -> None:
     assert len(exact.color_poses.images) <= color_poses.UNDECIDED
 
 
+@pytest.mark.long("three runs over a small room")
+def test_at_the_end_frames_are_laid_onto_the_map_where_depth_is_noisy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room = write_synthetic_sequence(tmp_path / "noisy", frames=24, width=160, height=120)
+    slam, error = tracked(room, drift=False)
+    _, without = tracked(room, "mapping.view_alignment.enabled=false", drift=False)
+    assert not slam.color_poses._is_due
+    assert error < 0.85 * without
+    keyframes = {keyframe.frame_index for keyframe in slam.mapper.keyframes}
+    assert [number for number, *_ in slam.color_poses.images] == [n for n in range(24) if n not in keyframes]
+    monkeypatch.setattr(color_poses, "KEPT_BYTES", 0)  # no memory for images: each as it comes
+    at_once, error = tracked(room, drift=False)
+    assert not at_once.color_poses.images
+    assert error < 0.95 * without
+
+
+def test_what_hides_the_map_is_not_compared(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence, seen = open_sequence(room), []
+    slam = Slam(sequence.camera, load_config(None, ["masks.source=none", "refine_iterations=0"]))
+    slam.step(sequence.frame(0))
+    frame = sequence.frame(1)
+    moving = np.zeros(frame.depth.shape, bool)
+    moving[40:60, 50:90] = True
+    tracking = slam.track(slam.receive(frame))
+    slam.poses.add(frame, tracking)
+    slam.color_poses.note(dataclasses.replace(frame, moving=moving), tracking)
+    monkeypatch.setattr(color_poses, "align_view", lambda _grey, _rendered, _depth, alpha, *_: seen.append(alpha))
+    slam.tracker.state.residuals.hidden = 100
+    slam.color_poses.align_last()
+    margin = color_poses.HIDDEN_MARGIN // 2
+    assert len(seen) == 1 and not seen[0][40 - margin : 60 + margin, 50 - margin : 90 + margin].any()
+    assert (seen[0][: 40 - margin] > 0.5).mean() > 0.5
+
+
+def test_the_end_may_be_interrupted_between_frames(room: Path) -> None:
+    """What was aligned by then is forgotten: a run that goes on later aligns all of them from where they were."""
+    sequence = open_sequence(room)
+    slam = Slam(sequence.camera, load_config(None, ["masks.source=none", "refine_iterations=0"]))
+    for index in range(8):
+        slam.step(sequence.frame(index))
+    before = list(slam.frames)
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(color_poses, "REPORT_EVERY", 2)
+        slam.color_poses.align_last(stop)
+    assert slam.frames == before
+    slam.color_poses.align_last()
+    moved = [a.T_keyframe_camera is not b.T_keyframe_camera for a, b in zip(slam.frames, before, strict=True)]
+    assert any(moved)
+
+
 def test_a_pose_that_contradicts_the_tracker_is_not_believed(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = open_sequence(room)
     slam = Slam(sequence.camera, load_config(None, ["masks.source=none", "refine_iterations=0"]))
