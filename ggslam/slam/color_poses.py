@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
+from ggslam.errors import FormatError
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.settings import ViewAlignmentSettings
@@ -27,8 +28,8 @@ KEPT_BYTES = 1 << 26
 JPEG_QUALITY = 90
 """Of kept images: 21 KB at 320x240, where one costs 77 KB uncoded."""
 LAST_BLURS, LAST_POINTS, LAST_ITERATIONS = (0.7,), 3000, 4
-"""Of the alignment at the end, whose start is near: as good as with the settings of `ViewAlignmentSettings`, in half the
-time."""
+"""Of the alignment at the end, whose start is near: as good as with the settings of `ViewAlignmentSettings`, in half
+the time."""
 REPORT_EVERY = 20
 HIDDEN_MARGIN = 9
 """Pixels across, around those that show something else."""
@@ -103,13 +104,20 @@ class ColorPoses:
         for number, depth, coded, mask in self.images:
             if not self._tells_more(depth) or self.poses.frames[number].keyframe >= len(self.mapper.keyframes):
                 continue
-            grey = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
-            hidden = cv2.imdecode(mask, cv2.IMREAD_GRAYSCALE) > 0 if len(mask) else None
+            grey = self._decoded(coded).astype(np.float32) / 255
+            hidden = self._decoded(mask) > 0 if len(mask) else None
             aligned[number] = self._aligned(number, depth, grey, hidden)
             if len(aligned) % REPORT_EVERY == 0:
                 report()
         for number, frame in aligned.items():  # all or none: `report` may end the run
             self.poses.frames[number] = frame
+
+    def _decoded(self, coded: np.ndarray) -> np.ndarray:
+        """A kept image, uint8 [H, W]."""
+        image, camera = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), self.state.camera
+        if image is None or image.shape != (camera.height, camera.width):  # out of a checkpoint that was tampered with
+            raise FormatError("images of frames that are aligned at the end: not of this recording")
+        return image
 
     @property
     def _at_the_end(self) -> bool:
