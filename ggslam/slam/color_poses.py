@@ -25,6 +25,8 @@ UNDECIDED = 32
 """Of so many first frames images are kept in case frames are to be aligned, of later ones once they are."""
 KEPT_BYTES = 1 << 26
 """Memory for coded images of frames that are aligned at the end; later ones are aligned as they come."""
+KEPT_BYTES_PAGED = 1 << 23
+"""The same where memory is limited."""
 JPEG_QUALITY = 90
 """Of kept images: 21 KB at 320x240, where one costs 77 KB uncoded."""
 LAST_BLURS, LAST_POINTS, LAST_ITERATIONS = (0.7,), 3000, 4
@@ -81,13 +83,13 @@ class ColorPoses:
     def note(self, frame: Frame, found: TrackingResult) -> None:
         """Keeps the image of the frame that `poses` took last, and that is no keyframe, if it is to be aligned at the
         end; aligns it now if memory for images is used up."""
-        if not self._at_the_end or found.status in (TrackingStatus.LOST, TrackingStatus.FIRST):
+        if not self.active or found.status in (TrackingStatus.LOST, TrackingStatus.FIRST):
             return
         number, depth = len(self.poses.frames) - 1, found.median_depth_m
         if not self._tells_more(depth) and number >= UNDECIDED:
             return
         grey, hidden = grey_of(frame.color), _hidden(frame)
-        if self.held_bytes >= KEPT_BYTES:
+        if self.held_bytes >= (KEPT_BYTES if self.mapper.residency is None else KEPT_BYTES_PAGED):
             if not self.live:
                 self.poses.frames[number] = self._aligned(number, depth, grey, hidden)
             return
@@ -98,17 +100,20 @@ class ColorPoses:
 
     def align_last(self, report: Callable[[], None] = lambda: None) -> None:
         """Aligns the frames whose images were kept to the map as it is now; `report` is called now and then."""
-        if not self._at_the_end:
+        if not self.active:
             return
-        aligned = {}
-        for number, depth, coded, mask in self.images:
-            if not self._tells_more(depth) or self.poses.frames[number].keyframe >= len(self.mapper.keyframes):
-                continue
-            grey = self._decoded(coded).astype(np.float32) / 255
-            hidden = self._decoded(mask) > 0 if len(mask) else None
-            aligned[number] = self._aligned(number, depth, grey, hidden)
-            if len(aligned) % REPORT_EVERY == 0:
-                report()
+        aligned, due = {}, [image for image in self.images if self._tells_more(image[1])]
+        residency = self.mapper.residency
+        for numbers in (range(len(self.mapper.keyframes)),) if residency is None or not due else residency.stages():
+            together = set(numbers)
+            for number, depth, coded, mask in due:
+                if self.poses.frames[number].keyframe not in together:
+                    continue
+                grey = self._decoded(coded).astype(np.float32) / 255
+                hidden = self._decoded(mask) > 0 if len(mask) else None
+                aligned[number] = self._aligned(number, depth, grey, hidden)
+                if len(aligned) % REPORT_EVERY == 0:
+                    report()
         for number, frame in aligned.items():  # all or none: `report` may end the run
             self.poses.frames[number] = frame
 
@@ -118,11 +123,6 @@ class ColorPoses:
         if image is None or image.shape != (camera.height, camera.width):  # out of a checkpoint that was tampered with
             raise FormatError("images of frames that are aligned at the end: not of this recording")
         return image
-
-    @property
-    def _at_the_end(self) -> bool:
-        """Whether frames are aligned at the end: the whole map is in memory then."""
-        return self.active and self.mapper.residency is None
 
     @property
     def _is_due(self) -> bool:
