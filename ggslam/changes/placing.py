@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where exactly a thing lies that moved: each visit's surface is brought to agree with the pictures of the other visit.
+
+Surfaces laid upon each other do not tell: of a board one visit saw the front and the other the back, and they are not
+one. Faces, backs and outlines in pictures tell it of every thing, also where visits saw no face in common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.changes.shapes import LEVEL, tilt, upright
+from ggslam.changes.thing_views import ThingViews
+from ggslam.geometry.colored_surface import ColoredSurface
+from ggslam.scene.poses import inverse, se3_exp, transform_points
+
+_SAMPLE = 400
+"""Points of either surface that are looked up in pictures."""
+_BESIDE_M = 0.035
+"""Metres beside the motion that others start at, on the eight sides: half a board or post, at least."""
+_COARSE_M, _FINE_M = 0.02, 0.01
+"""Residuals that count half."""
+_COARSE_STEPS, _FINE_STEPS, _KEPT = 8, 15, 3
+"""Steps of the two stages, and motions that are kept after the first."""
+_DAMPING = (1e-3, 1e-5, 1e3)
+"""Of Levenberg and Marquardt: at the start, the least, and the most."""
+_ENOUGH = 1e-5
+
+
+@dataclass(frozen=True)
+class _Terms:
+    cost: float
+    H: np.ndarray
+    g: np.ndarray
+
+
+class Placing:
+    """A thing in two visits.
+
+    Args:
+        old, new: its surfaces.
+        views: of it in the older and the newer visit.
+    """
+
+    def __init__(self, old: ColoredSurface, new: ColoredSurface, views: tuple[ThingViews, ThingViews]) -> None:
+        rng = np.random.default_rng(0)
+        self._old, self._new = (s.at(rng.permutation(len(s))[:_SAMPLE]) for s in (old, new))
+        self._views = views
+
+    def place(self, T: np.ndarray, up: np.ndarray) -> np.ndarray:
+        """The motion T_new_old [4, 4] near by on which the pictures agree most; what keeps the thing upright goes on
+        doing so. `up`: [3], unit vector."""
+        if not len(self._views[0]) or not len(self._views[1]):
+            return T
+        across = np.linalg.svd(up[None])[2][1:]
+        free = upright(up) if tilt(T, up) < LEVEL else np.eye(6)
+        starts = []
+        for a in (-_BESIDE_M, 0, _BESIDE_M):
+            for b in (-_BESIDE_M, 0, _BESIDE_M):
+                start = T.copy()
+                start[:3, 3] += a * across[0] + b * across[1]
+                starts.append(self._refine(start, free, _COARSE_M, _COARSE_STEPS))
+        starts.sort(key=lambda found: found[1])
+        ends = [self._refine(start, free, _FINE_M, _FINE_STEPS) for start, _ in starts[:_KEPT]]
+        return min(ends, key=lambda found: found[1])[0]
+
+    def cost(self, T: np.ndarray, scale: float = _FINE_M) -> float:
+        """How little the pictures agree, 0 to 1."""
+        return self._terms(T, scale, np.zeros(3)).cost
+
+    def _refine(self, T: np.ndarray, free: np.ndarray, scale: float, steps: int) -> tuple[np.ndarray, float]:
+        """A motion after so many steps, and its cost."""
+        middle = transform_points(self._old.points, T).mean(0)
+        there = np.eye(4)
+        there[:3, 3] = middle
+        terms, (damping, least, most) = self._terms(T, scale, middle), _DAMPING
+        for _ in range(steps):
+            H = free.T @ terms.H @ free
+            H[np.diag_indices(len(H))] += damping * np.diag(H) + 1e-9
+            twist = -free @ np.linalg.solve(H, free.T @ terms.g)
+            tried = there @ se3_exp(twist) @ inverse(there) @ T
+            after = self._terms(tried, scale, middle)
+            if after.cost < terms.cost:
+                gained = terms.cost - after.cost
+                T, terms, damping = tried, after, max(damping / 4, least)
+                if gained < _ENOUGH:
+                    break
+            else:
+                damping *= 8
+                if damping > most:
+                    break
+        return T, terms.cost
+
+    def _terms(self, T: np.ndarray, scale: float, middle: np.ndarray) -> _Terms:
+        """The cost of a motion, and its normal equations for twists about `middle`, in the newer visit. What is far off
+        counts 1 and steers nothing: a part of the thing hides it, or it is noise."""
+        cost, H, g = 0.0, np.zeros((6, 6)), np.zeros(6)
+        for number, surface in enumerate((self._old, self._new)):
+            found = self._views[1 - number].residuals(surface.move(inverse(T) if number else T))
+            along, points = found.along, found.points
+            if number:  # the newer surface stands still, and the older visit's pictures move
+                along, points = -along @ T[:3, :3].T, transform_points(points, T)
+            J = np.concatenate([along, np.cross(points - middle, along)], 1)
+            squares, count = found.off**2, max(1, len(found.off))
+            weight = scale**2 / (squares + scale**2) ** 2 / count
+            H += J.T @ (weight[:, None] * J)
+            g += J.T @ (weight * found.off)
+            cost += float((squares / (squares + scale**2)).sum() / count) / 2
+        return _Terms(cost, H, g)
