@@ -186,10 +186,8 @@ class ChangeDetector:
 
     def _motion_change(self, old: Thing, new: Thing, fit: Fit) -> Change | None:
         """The change that a fit tells, once it is placed exactly; None: it did not move by more than the maps err."""
-        if not self._has_moved(old, fit.T_new_old):
-            return None
-        T = self._place(old, new, fit.T_new_old)
-        if not self._has_moved(old, T):
+        T = fit.T_new_old
+        if not self._has_moved(old, T) or not self._has_moved(old, T := self._place(old, new, T)):
             return None
         confidence = fit.share * min(1.0, max(0.0, 1 - fit.color_apart))
         return Change("moved", old, new, T, replace(fit, T_new_old=T), confidence)

@@ -19,7 +19,11 @@ from ggslam.scene.poses import inverse, se3_exp, transform_points
 _SAMPLE = 400
 """Points of either surface that are looked up in pictures."""
 _BESIDE_M = 0.035
-"""Metres beside the motion that others start at, on the eight sides: half a board or post, at least."""
+"""Metres beside a motion that others start at, on its eight sides: by a board's or a post's thickness it may be off."""
+_FARTHEST_M = 0.08
+"""Metres from a motion that the thing is placed within."""
+_TURNED = np.radians(12)
+"""What others are turned by."""
 _COARSE_M, _FINE_M = 0.02, 0.01
 """Residuals that count half."""
 _COARSE_STEPS, _FINE_STEPS, _KEPT = 8, 15, 3
@@ -27,10 +31,13 @@ _COARSE_STEPS, _FINE_STEPS, _KEPT = 8, 15, 3
 _DAMPING = (1e-3, 1e-5, 1e3)
 """Of Levenberg and Marquardt: at the start, the least, and the most."""
 _ENOUGH = 1e-5
+"""Less of the cost gained ends the steps."""
 
 
 @dataclass(frozen=True)
 class _Terms:
+    """How little pictures agree, 0 to 1, and the normal equations of a better twist."""
+
     cost: float
     H: np.ndarray
     g: np.ndarray
@@ -54,17 +61,20 @@ class Placing:
         doing so. `up`: [3], unit vector."""
         if not len(self._views[0]) or not len(self._views[1]):
             return T
-        across = np.linalg.svd(up[None])[2][1:]
         free = upright(up) if tilt(T, up) < LEVEL else np.eye(6)
-        starts = []
-        for a in (-_BESIDE_M, 0, _BESIDE_M):
-            for b in (-_BESIDE_M, 0, _BESIDE_M):
-                start = T.copy()
-                start[:3, 3] += a * across[0] + b * across[1]
-                starts.append(self._refine(start, free, _COARSE_M, _COARSE_STEPS))
-        starts.sort(key=lambda found: found[1])
-        ends = [self._refine(start, free, _FINE_M, _FINE_STEPS) for start, _ in starts[:_KEPT]]
-        return min(ends, key=lambda found: found[1])[0]
+        beside = np.linalg.svd(up[None])[2][1:] * _BESIDE_M
+        starts = [_shift(a * beside[0] + b * beside[1]) @ T for a in (-1, 0, 1) for b in (-1, 0, 1)]
+        found = [self._refine(start, free, _COARSE_M, _COARSE_STEPS) for start in starts]
+        best = min(found, key=_cost)[0]
+        middle = self._middle(best)
+        for angle in (-_TURNED, _TURNED):
+            turn = se3_exp(angle * np.append(np.zeros(3), up))
+            start = _shift(middle) @ turn @ _shift(-middle) @ best
+            found.append(self._refine(start, free, _COARSE_M, _COARSE_STEPS))
+        kept = sorted(found, key=_cost)[:_KEPT]
+        ends = [self._refine(start, free, _FINE_M, _FINE_STEPS) for start, _ in kept]
+        near = [end for end in ends if np.linalg.norm(self._middle(end[0]) - self._middle(T)) < _FARTHEST_M]
+        return min(near, key=_cost)[0] if near else T
 
     def cost(self, T: np.ndarray, scale: float = _FINE_M) -> float:
         """How little the pictures agree, 0 to 1."""
@@ -72,15 +82,13 @@ class Placing:
 
     def _refine(self, T: np.ndarray, free: np.ndarray, scale: float, steps: int) -> tuple[np.ndarray, float]:
         """A motion after so many steps, and its cost."""
-        middle = transform_points(self._old.points, T).mean(0)
-        there = np.eye(4)
-        there[:3, 3] = middle
+        middle = self._middle(T)
         terms, (damping, least, most) = self._terms(T, scale, middle), _DAMPING
         for _ in range(steps):
             H = free.T @ terms.H @ free
             H[np.diag_indices(len(H))] += damping * np.diag(H) + 1e-9
             twist = -free @ np.linalg.solve(H, free.T @ terms.g)
-            tried = there @ se3_exp(twist) @ inverse(there) @ T
+            tried = _shift(middle) @ se3_exp(twist) @ _shift(-middle) @ T
             after = self._terms(tried, scale, middle)
             if after.cost < terms.cost:
                 gained = terms.cost - after.cost
@@ -92,6 +100,10 @@ class Placing:
                 if damping > most:
                     break
         return T, terms.cost
+
+    def _middle(self, T: np.ndarray) -> np.ndarray:
+        """Of the thing in the newer visit, [3]."""
+        return np.asarray(transform_points(self._old.points, T).mean(0))
 
     def _terms(self, T: np.ndarray, scale: float, middle: np.ndarray) -> _Terms:
         """The cost of a motion, and its normal equations for twists about `middle`, in the newer visit. What is far off
@@ -109,3 +121,13 @@ class Placing:
             g += J.T @ (weight * found.off)
             cost += float((squares / (squares + scale**2)).sum() / count) / 2
         return _Terms(cost, H, g)
+
+
+def _shift(by: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = by
+    return T
+
+
+def _cost(found: tuple[np.ndarray, float]) -> float:
+    return found[1]

@@ -12,15 +12,15 @@ from scipy.spatial import cKDTree
 
 from ggslam.changes.sightings import AROUND, NEAR, Picture, back_project, project
 from ggslam.geometry.colored_surface import ColoredSurface
-from ggslam.scene.poses import transform_points
 
 _FEWEST_PIXELS, _MOST_VIEWS = 12, 24
 """Pixels of the thing that a picture has to show, and pictures that are looked at."""
 _OWN_M, _WINDOW = 0.015, 3
 """Metres from the thing's points that its pixels lie at most, and pixels around them that are looked at."""
-_FACING = 0.2
-"""Cosine of the angle between a face and the way to the camera; of what is turned farther away nothing is said."""
-_THIN_M = 0.005
+_FACING = 0.35
+"""Cosine of the angle between a face and the way to the camera; of what is seen at a smaller one nothing is said: there
+maps err."""
+_THIN_M = 0.01
 """Metres that a face lies behind the other face of the same board, at least."""
 _EDGE_PX = 0.75
 """Pixels beyond the middle of the thing's outermost ones that still are the thing's."""
