@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.changes.shapes import LEVEL, tilt, upright
+from ggslam.changes.shapes import LEVEL, tilt, upright, without_tilt
 from ggslam.changes.thing_views import ThingViews
 from ggslam.geometry.colored_surface import ColoredSurface
 from ggslam.scene.poses import inverse, se3_exp, transform_points
@@ -20,8 +20,10 @@ _SAMPLE = 400
 """Points of either surface that are looked up in pictures."""
 _BESIDE_M = 0.035
 """Metres beside a motion that others start at, on its eight sides: by a board's or a post's thickness it may be off."""
-_FARTHEST_M = 0.08
-"""Metres from a motion that the thing is placed within."""
+_FALLEN, _STANDING_COSTS = np.radians(30), 0.01
+"""What tilts a thing less may be noise, and so much more cost of a motion that keeps it upright."""
+_FARTHEST_M, _AWAY_COSTS = 0.08, 0.1
+"""Metres from a motion that the thing is placed within, and cost of each: of places about as good the nearest is told."""
 _TURNED = np.radians(12)
 """What others are turned by."""
 _COARSE_M, _FINE_M = 0.02, 0.01
@@ -57,11 +59,21 @@ class Placing:
         self._views = views
 
     def place(self, T: np.ndarray, up: np.ndarray) -> np.ndarray:
-        """The motion T_new_old [4, 4] near by on which the pictures agree most; what keeps the thing upright goes on
-        doing so. `up`: [3], unit vector."""
+        """The motion T_new_old [4, 4] near by on which the pictures agree most, one that keeps the thing upright if
+        they agree about as well on it. `up`: [3], unit vector."""
         if not len(self._views[0]) or not len(self._views[1]):
             return T
-        free = upright(up) if tilt(T, up) < LEVEL else np.eye(6)
+        tilted = tilt(T, up)
+        if tilted >= _FALLEN:
+            return self._search(T, np.eye(6), up)[0]
+        level = self._search(without_tilt(T, up, self._old.points.mean(0)), upright(up), up)
+        if tilted < LEVEL:
+            return level[0]
+        free = self._search(T, np.eye(6), up)
+        return level[0] if level[1] <= free[1] + _STANDING_COSTS else free[0]
+
+    def _search(self, T: np.ndarray, free: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
+        """The best motion near one, by twists [6, k] about the thing's middle, and its cost."""
         beside = np.linalg.svd(up[None])[2][1:] * _BESIDE_M
         starts = [_shift(a * beside[0] + b * beside[1]) @ T for a in (-1, 0, 1) for b in (-1, 0, 1)]
         found = [self._refine(start, free, _COARSE_M, _COARSE_STEPS) for start in starts]
@@ -73,8 +85,13 @@ class Placing:
             found.append(self._refine(start, free, _COARSE_M, _COARSE_STEPS))
         kept = sorted(found, key=_cost)[:_KEPT]
         ends = [self._refine(start, free, _FINE_M, _FINE_STEPS) for start, _ in kept]
-        near = [end for end in ends if np.linalg.norm(self._middle(end[0]) - self._middle(T)) < _FARTHEST_M]
-        return min(near, key=_cost)[0] if near else T
+        away = [float(np.linalg.norm(self._middle(end[0]) - self._middle(T))) for end in ends]
+        near = [
+            (cost + _AWAY_COSTS * by, k)
+            for k, ((_, cost), by) in enumerate(zip(ends, away, strict=True))
+            if by < _FARTHEST_M
+        ]
+        return ends[min(near)[1]] if near else (T, self.cost(T))
 
     def cost(self, T: np.ndarray, scale: float = _FINE_M) -> float:
         """How little the pictures agree, 0 to 1."""

@@ -133,7 +133,7 @@ def fit_shapes(
     for T in _motions(old, new, up):
         ways = [target.refine(sample, T, settings.fit_m)]
         if tilt(T, up) < _STANDS:
-            ways.append(target.refine(sample, _without_tilt(T, up, old.points.mean(0)), settings.fit_m, upright(up)))
+            ways.append(target.refine(sample, without_tilt(T, up, old.points.mean(0)), settings.fit_m, upright(up)))
         fits += [judge.fit(T) for T in ways]
     best = max(fits, key=Fit.quality)
     # Of motions as good as the best the one that turns least: round things tell no turn.
@@ -236,7 +236,7 @@ def tilt(T: np.ndarray, up: np.ndarray) -> float:
     return float(np.arccos(np.clip(up @ T[:3, :3] @ up, -1, 1)))
 
 
-def _without_tilt(T: np.ndarray, up: np.ndarray, about: np.ndarray) -> np.ndarray:
+def without_tilt(T: np.ndarray, up: np.ndarray, about: np.ndarray) -> np.ndarray:
     """The motion [4, 4] that does the same to a point and turns about the vertical alone."""
     tilted = T[:3, :3] @ up
     axis = np.cross(tilted, up)
@@ -298,6 +298,10 @@ def _motions(old: Shape, new: Shape, up: np.ndarray) -> list[np.ndarray]:
     motions = np.tile(np.eye(4), (len(rotations), 1, 1))
     motions[:, :3, :3] = rotations
     motions[:, :3, 3] = new.points.mean(0) - motions[:, :3, :3] @ old.points.mean(0)
+    # Most things stay at their height, where the middle of what a visit saw of them may be anywhere.
+    level = motions[: len(upright)].copy()
+    level[:, :3, 3] -= float(up @ (new.points.mean(0) - old.points.mean(0))) * up
+    motions = np.concatenate([motions, level])
     for count, kept, steps in ((_COARSE, _GOOD, _COARSE_STEPS), (_FINE, _BEST, _FINE_STEPS)):
         one, other = (shape.sample(count, rng) for shape in (old, new))
         tree = cKDTree(other.joint())
