@@ -23,7 +23,8 @@ _BESIDE_M = 0.035
 _FALLEN, _STANDING_COSTS = np.radians(30), 0.01
 """What tilts a thing less may be noise, and so much more cost of a motion that keeps it upright."""
 _FARTHEST_M, _AWAY_COSTS = 0.08, 0.1
-"""Metres from a motion that the thing is placed within, and cost of each: of places about as good the nearest is told."""
+"""Metres from a motion that the thing is placed within, and cost of each: of places about as good the nearest
+is told."""
 _TURNED = np.radians(12)
 """What others are turned by."""
 _COARSE_M, _FINE_M = 0.02, 0.01
@@ -85,13 +86,12 @@ class Placing:
             found.append(self._refine(start, free, _COARSE_M, _COARSE_STEPS))
         kept = sorted(found, key=_cost)[:_KEPT]
         ends = [self._refine(start, free, _FINE_M, _FINE_STEPS) for start, _ in kept]
-        away = [float(np.linalg.norm(self._middle(end[0]) - self._middle(T))) for end in ends]
-        near = [
-            (cost + _AWAY_COSTS * by, k)
-            for k, ((_, cost), by) in enumerate(zip(ends, away, strict=True))
-            if by < _FARTHEST_M
-        ]
-        return ends[min(near)[1]] if near else (T, self.cost(T))
+        near = [end for end in ends if self._away(end[0], T) < _FARTHEST_M]
+        return min(near, key=lambda end: end[1] + _AWAY_COSTS * self._away(end[0], T), default=(T, self.cost(T)))
+
+    def _away(self, T: np.ndarray, other: np.ndarray) -> float:
+        """Metres between the thing's middles after two motions."""
+        return float(np.linalg.norm(self._middle(T) - self._middle(other)))
 
     def cost(self, T: np.ndarray, scale: float = _FINE_M) -> float:
         """How little the pictures agree, 0 to 1."""

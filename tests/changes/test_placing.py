@@ -95,6 +95,30 @@ def test_faces_that_are_laid_upon_the_other_sides_are_where_they_cannot_be() -> 
     assert placing.cost(MOVED) < 0.3 * placing.cost(wrong)
 
 
+def test_a_face_is_not_where_it_would_be_seen_from_behind() -> None:
+    (front, _), (_, views) = visit((-90,), np.eye(4)), visit((90,), np.eye(4))
+    upon = np.eye(4)
+    upon[1, 3] = 2 * HALF[1]
+    assert np.median(views.residuals(front).off) == 0
+    assert np.median(views.residuals(front.move(upon)).off) > 0.005
+
+
+def test_what_tilts_a_little_stands_upright() -> None:
+    old, new = visit(FRONT, np.eye(4)), visit(FRONT, MOVED)
+    leaning = MOVED @ se3_exp(np.array([0, 0, 0, np.radians(4), 0, 0]))
+    T = Placing(old[0], new[0], (old[1], new[1])).place(leaning, UP)
+    assert T[2, 2] > 1 - 1e-9 and off(T)[0] < 0.004
+
+
+def test_it_is_placed_near_by_or_not_at_all() -> None:
+    """The pictures agree most 12 cm away."""
+    old, new = visit(FRONT, np.eye(4)), visit(FRONT, MOVED)
+    start = MOVED.copy()
+    start[0, 3] += 0.12
+    T = Placing(old[0], new[0], (old[1], new[1])).place(start, UP)
+    assert np.linalg.norm((T - start)[:3, 3]) < 0.08
+
+
 def test_what_no_picture_shows_stays_where_it_was_found() -> None:
     old, new = visit(FRONT, np.eye(4)), visit(BACK, MOVED)
     none = ThingViews([], cKDTree(new[0].points), np.arange(len(new[0])), (1,))
