@@ -196,8 +196,7 @@ class ChangeDetector:
         """Where exactly a thing lies of which it is known that it moved, and about where to."""
         trees = [tree for tree in self._trees if tree is not None]
         views = [
-            ThingViews(sights.pictures, tree, thing.rows, thing.ids)
-            for sights, tree, thing in zip(self.sights, trees, (old, new), strict=True)
+            ThingViews(self.sights[k].pictures, trees[k], thing.rows, thing.ids) for k, thing in enumerate((old, new))
         ]
         return Placing(self._shape(0, old), self._shape(1, new), (views[0], views[1])).place(T, self._up)
 
