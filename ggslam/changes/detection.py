@@ -3,16 +3,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from ggslam.changes.placing import Placing
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shapes import Fit, Shape, fit_shapes
 from ggslam.changes.sightings import Sightings, Surface, Tolerance, Visit
+from ggslam.changes.thing_views import ThingViews
 from ggslam.changes.things import UNNAMED, JudgedSurface, Thing, things_by_id, things_by_surface
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points, turning_angle
@@ -183,16 +185,29 @@ class ChangeDetector:
         return fit_shapes(before, after, self.sights[0], self.sights[1], self._up, self.settings)
 
     def _motion_change(self, old: Thing, new: Thing, fit: Fit) -> Change | None:
-        """The change that a fit tells; None: it did not move by more than the maps err."""
-        s, judged = self.settings, self.judged[0]
-        middle, error = judged.points[old.rows].mean(0), 0.5 * float(judged.within[old.rows].mean())
-        shift = float(np.linalg.norm(transform_points(middle[None], fit.T_new_old)[0] - middle))
-        turn = float(np.degrees(turning_angle(fit.T_new_old, np.eye(4))))
-        least_turn = max(s.least_turn_deg, float(np.degrees(error / (0.5 * judged.extent(old)))))
-        if shift < max(s.least_motion_m, error) and turn < least_turn:
+        """The change that a fit tells, once it is placed exactly; None: it did not move by more than the maps err."""
+        T = fit.T_new_old
+        if not self._has_moved(old, T) or not self._has_moved(old, T := self._place(old, new, T)):
             return None
         confidence = fit.share * min(1.0, max(0.0, 1 - fit.color_apart))
-        return Change("moved", old, new, fit.T_new_old, fit, confidence)
+        return Change("moved", old, new, T, replace(fit, T_new_old=T), confidence)
+
+    def _place(self, old: Thing, new: Thing, T: np.ndarray) -> np.ndarray:
+        """Where exactly a thing lies of which it is known that it moved, and about where to."""
+        trees = [tree for tree in self._trees if tree is not None]
+        views = [
+            ThingViews(self.sights[k].pictures, trees[k], thing.rows, thing.ids) for k, thing in enumerate((old, new))
+        ]
+        return Placing(self._shape(0, old), self._shape(1, new), (views[0], views[1])).place(T, self._up)
+
+    def _has_moved(self, old: Thing, T_new_old: np.ndarray) -> bool:
+        """Whether by more than the maps err."""
+        s, judged = self.settings, self.judged[0]
+        middle, error = judged.points[old.rows].mean(0), 0.5 * float(judged.within[old.rows].mean())
+        shift = float(np.linalg.norm(transform_points(middle[None], T_new_old)[0] - middle))
+        turn = float(np.degrees(turning_angle(T_new_old, np.eye(4))))
+        least_turn = max(s.least_turn_deg, float(np.degrees(error / (0.5 * judged.extent(old)))))
+        return shift >= max(s.least_motion_m, error) or turn >= least_turn
 
     def _pair_by_id(self, found: Detection, gone: list[Thing], come: list[Thing]) -> None:
         """What has one id in both visits, and is elsewhere: takes it from `gone` and `come`."""

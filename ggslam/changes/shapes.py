@@ -35,7 +35,7 @@ _APART_M = 0.05
 """Metres that surfaces lie apart which count as much as all that fits."""
 _OVERLAP, _JUDGED = 0.6, 3000
 """Share of the points, the nearest, that tell how far surfaces lie apart, and points that motions are judged by."""
-_STANDS, _LEVEL = np.radians(20), np.radians(0.5)
+_STANDS, LEVEL = np.radians(20), np.radians(0.5)
 """What tilts a thing less may be noise; what tilts it less than the other keeps it upright."""
 _STANDING_COSTS = 0.05
 """Worse quality that a motion may have which keeps the thing upright."""
@@ -132,8 +132,8 @@ def fit_shapes(
     fits = list[Fit]()
     for T in _motions(old, new, up):
         ways = [target.refine(sample, T, settings.fit_m)]
-        if _tilt(T, up) < _STANDS:
-            ways.append(target.refine(sample, _without_tilt(T, up, old.points.mean(0)), settings.fit_m, upright(up)))
+        if tilt(T, up) < _STANDS:
+            ways.append(target.refine(sample, without_tilt(T, up, old.points.mean(0)), settings.fit_m, upright(up)))
         fits += [judge.fit(T) for T in ways]
     best = max(fits, key=Fit.quality)
     # Of motions as good as the best the one that turns least: round things tell no turn.
@@ -159,7 +159,7 @@ def _stand_up(chosen: Fit, fits: list[Fit], up: np.ndarray) -> Fit:
     """The fit about as good that keeps the thing upright, if there is one: what tilts it is mostly noise."""
     upright_ones = [
         fit for fit in fits
-        if _tilt(fit.T_new_old, up) < _LEVEL and turning_angle(fit.T_new_old, chosen.T_new_old) < _ALIKE
+        if tilt(fit.T_new_old, up) < LEVEL and turning_angle(fit.T_new_old, chosen.T_new_old) < _ALIKE
         and fit.quality() >= chosen.quality() - _STANDING_COSTS
     ]  # fmt: skip
     return max(upright_ones, key=Fit.quality, default=chosen)
@@ -168,7 +168,7 @@ def _stand_up(chosen: Fit, fits: list[Fit], up: np.ndarray) -> Fit:
 def _settle(fit: Fit, judge: _Judge, target: _Target, sample: Shape, up: np.ndarray) -> Fit:
     """The motion, refined to the end, also from beside: plain surfaces slide upon each other slowly, as only their
     edges pull."""
-    free = upright(up) if _tilt(fit.T_new_old, up) < _LEVEL else None
+    free = upright(up) if tilt(fit.T_new_old, up) < LEVEL else None
 
     def refine(T: np.ndarray) -> Fit:
         return judge.fit(target.refine(sample, T, judge.settings.fit_m, free, _LAST_STEPS))
@@ -192,7 +192,7 @@ def _stay_level(fit: Fit, judge: _Judge, targets: tuple[_Target, ...], sample: S
     middle = sample.points.mean(0)
     rise = float(up @ (transform_points(middle[None], fit.T_new_old)[0] - middle))
     low, high = _RISES_M
-    if not low < abs(rise) < high or _tilt(fit.T_new_old, up) >= _LEVEL:
+    if not low < abs(rise) < high or tilt(fit.T_new_old, up) >= LEVEL:
         return fit
     start = fit.T_new_old.copy()
     start[:3, 3] -= rise * up
@@ -231,19 +231,19 @@ def _along_level(up: np.ndarray) -> np.ndarray:
     return basis
 
 
-def _tilt(T: np.ndarray, up: np.ndarray) -> float:
+def tilt(T: np.ndarray, up: np.ndarray) -> float:
     """Angle by which a motion tilts what stood upright, radians."""
     return float(np.arccos(np.clip(up @ T[:3, :3] @ up, -1, 1)))
 
 
-def _without_tilt(T: np.ndarray, up: np.ndarray, about: np.ndarray) -> np.ndarray:
+def without_tilt(T: np.ndarray, up: np.ndarray, about: np.ndarray) -> np.ndarray:
     """The motion [4, 4] that does the same to a point and turns about the vertical alone."""
     tilted = T[:3, :3] @ up
     axis = np.cross(tilted, up)
     length = float(np.linalg.norm(axis))
     R = T[:3, :3]
     if length > 1e-9:
-        R = _about(axis / length, float(np.degrees(_tilt(T, up)))) @ R
+        R = _about(axis / length, float(np.degrees(tilt(T, up)))) @ R
     level = np.eye(4)
     level[:3, :3] = R
     level[:3, 3] = transform_points(about[None], T)[0] - R @ about
@@ -298,6 +298,10 @@ def _motions(old: Shape, new: Shape, up: np.ndarray) -> list[np.ndarray]:
     motions = np.tile(np.eye(4), (len(rotations), 1, 1))
     motions[:, :3, :3] = rotations
     motions[:, :3, 3] = new.points.mean(0) - motions[:, :3, :3] @ old.points.mean(0)
+    # Most things stay at their height, where the middle of what a visit saw of them may be anywhere.
+    level = motions[: len(upright)].copy()
+    level[:, :3, 3] -= float(up @ (new.points.mean(0) - old.points.mean(0))) * up
+    motions = np.concatenate([motions, level])
     for count, kept, steps in ((_COARSE, _GOOD, _COARSE_STEPS), (_FINE, _BEST, _FINE_STEPS)):
         one, other = (shape.sample(count, rng) for shape in (old, new))
         tree = cKDTree(other.joint())

@@ -29,7 +29,8 @@ _THINNED_EVERY = 8
 """Pictures whose points are gathered before they are thinned out: memory."""
 _BLOCK = 0.25
 """Metres: edge of the blocks of space that are passed by together if a picture cannot show them."""
-_AROUND = np.ones((3, 3), np.uint8)
+AROUND = np.ones((3, 3), np.uint8)
+"""A pixel and those around it."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,11 @@ class Picture:
 
     def nearest(self) -> np.ndarray:
         """Least depth of each pixel and those around it, float32 [H, W]; 0 = one of them shows no surface."""
-        return cv2.erode(self.depth, _AROUND)
+        return cv2.erode(self.depth, AROUND)
 
     def farthest(self) -> np.ndarray:
         """Greatest depth likewise; 0 = none shows a surface."""
-        return cv2.dilate(self.depth, _AROUND)
+        return cv2.dilate(self.depth, AROUND)
 
 
 @dataclass(frozen=True)
@@ -254,7 +255,7 @@ class Sightings:
         for number, picture in enumerate(self.pictures):
             nearest, farthest = picture.nearest(), picture.farthest()
             shown = (nearest > 0) & (farthest - nearest < OUTLINE * farthest)
-            points, counts = _back_project(picture, shown), np.ones(int(shown.sum()), np.int32)
+            points, counts = back_project(picture, shown), np.ones(int(shown.sum()), np.int32)
             toward = inverse(picture.T_camera_world)[:3, 3] - points
             toward /= np.linalg.norm(toward, axis=1, keepdims=True)
             waiting.append(
@@ -312,7 +313,7 @@ class _Measured:
         some = np.zeros(picture.depth.shape, bool)
         some[::_STRIDE, ::_STRIDE] = picture.depth[::_STRIDE, ::_STRIDE] > 0
         good = np.zeros(picture.depth.shape, np.uint8)
-        good[some] = self._off(_back_project(picture, some)) <= self._within.at(picture.depth[some])
+        good[some] = self._off(back_project(picture, some)) <= self._within.at(picture.depth[some])
         small = good[::_STRIDE, ::_STRIDE]
         whole = cv2.resize(small, picture.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
         picture.depth[whole == 0] = 0
@@ -326,7 +327,8 @@ class _Measured:
         return np.where(np.isfinite(apart), off, np.inf).min(1)
 
 
-def _back_project(picture: Picture, where: np.ndarray) -> np.ndarray:
+def back_project(picture: Picture, where: np.ndarray) -> np.ndarray:
+    """World points [n, 3] of the pixels that are true in [H, W], by rows."""
     camera, (row, column) = picture.camera, np.nonzero(where)
     z = picture.depth[where].astype(np.float64)
     local = np.stack([(column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z, z], 1)

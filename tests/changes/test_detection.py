@@ -12,6 +12,7 @@ from small_visits import Box, SmallVisit, detect
 from ggslam.changes.detection import Change, ChangeDetector, Detection
 from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
+from ggslam.changes.shapes import Fit
 from ggslam.changes.sightings import Picture, Sightings, Tolerance, _Blocks
 from ggslam.changes.things import Thing
 from ggslam.native.loader import NativeContext
@@ -180,3 +181,24 @@ def test_what_only_one_visit_shows_much_of_was_not_pushed(count: int, shifted: b
         settings=ChangeSettings(), judged=[judged, judged], _ids_at=lambda _, points: np.zeros(len(points), int)
     )
     assert ChangeDetector._has_shifted(others, strip(259), strip(count)) is shifted  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("placed_m, told", [(0.3, True), (0.0, False)])
+def test_what_moved_is_placed_before_it_is_told(placed_m: float, told: bool) -> None:
+    """What lies where it lay once it is placed did not move."""
+
+    def shifted(by: float) -> np.ndarray:
+        T = np.eye(4)
+        T[0, 3] = by
+        return T
+
+    detector = SimpleNamespace(
+        _has_moved=lambda old, T: T[0, 3] > 0.01, _place=lambda old, new, T: shifted(placed_m),
+    )  # fmt: skip
+    fit = Fit(shifted(0.27), share=0.9, seen=1.0, color_apart=0.0)
+    thing = Thing(2, (2,), np.arange(3), 1.0, 1.0, 0.0)
+    change = ChangeDetector._motion_change(detector, thing, thing, fit)  # type: ignore[arg-type]
+    assert (change is not None) is told
+    if change is not None:
+        assert change.fit is not None and change.T_new_old is not None
+        assert change.T_new_old[0, 3] == change.fit.T_new_old[0, 3] == placed_m and change.fit.share == 0.9

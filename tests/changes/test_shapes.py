@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from ggslam.changes.settings import ChangeSettings
-from ggslam.changes.shapes import Fit, Shape, _stay_level, _Target
+from ggslam.changes.shapes import Fit, Shape, _motions, _stay_level, _Target
+from ggslam.scene.poses import transform_points
 
 THICK_M = 0.02
 
@@ -81,3 +82,17 @@ def test_a_thing_that_seems_to_rise_a_little_stays_at_its_height(rise: float, co
     judge = SimpleNamespace(fit=fit, settings=ChangeSettings())
     kept = _stay_level(fit(found), judge, (_Target(new), _Target(new, faces=True)), old, UP)  # type: ignore[arg-type]
     assert np.allclose(kept.T_new_old[:3, 3], [0.5, 0, 0] if level else found[:3, 3], atol=0.002)
+
+
+def banded(low: float, high: float, at: float) -> Shape:
+    """A basket in bands of colours that do not repeat."""
+    shape = basket(low, high, at)
+    shades = np.random.default_rng(4).random((20, 3)).astype(np.float32)
+    return Shape(shape.points, shades[(shape.points[:, 2] / 0.05).astype(int)], shape.normals)
+
+
+def test_a_thing_of_which_one_visit_saw_the_lower_part_is_looked_for_at_its_height() -> None:
+    """The middles of what was seen lie 20 cm above each other."""
+    motions = _motions(banded(0.0, 0.2, 0.0), banded(0.0, 0.6, 0.5), UP)
+    upright = [T for T in motions if T[2, 2] > 0.99]
+    assert min(np.linalg.norm(transform_points(np.zeros((1, 3)), T)[0] - [0.5, 0, 0]) for T in upright) < 0.02
