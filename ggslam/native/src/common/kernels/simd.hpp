@@ -43,6 +43,15 @@ static inline Float lane_numbers() {
   return v;
 }
 
+// 2^n for n in [0, 30].
+static inline Int power_of_two(Int n) {
+#if defined(__AVX2__)
+  return broadcast_int(1) << n;
+#else
+  return truncate((Float)((n + 127) << 23));
+#endif
+}
+
 // --- comparisons and selection ---------------------------------------------------------------------------------------
 // All comparisons are false where an operand is NaN.
 
@@ -205,6 +214,45 @@ static inline void sum4(Float a, Float b, Float c, Float d, float* out) {
   out[1] = (b[0] + b[2]) + (b[1] + b[3]);
   out[2] = (c[0] + c[2]) + (c[1] + c[3]);
   out[3] = (d[0] + d[2]) + (d[1] + d[3]);
+#endif
+}
+
+// Sums of the lanes of ten vectors at once, to out[0..9]; what follows up to out[15] may be overwritten. The order of the
+// additions is fixed.
+static inline void sum10(const Float* v, float* out) {
+#if defined(__AVX512F__)
+  const auto pair = [](Float a, Float b) {  // per quarter: a0 + a2, b0 + b2, a1 + a3, b1 + b3
+    return (Float)(_mm512_maskz_unpacklo_ps(kAll, (__m512)a, (__m512)b) +
+                   _mm512_maskz_unpackhi_ps(kAll, (__m512)a, (__m512)b));
+  };
+  const auto four = [](Float ab, Float cd) {  // per quarter: the sums of a, b, c, d
+    return (Float)(_mm512_maskz_shuffle_ps(kAll, (__m512)ab, (__m512)cd, 0x44) +
+                   _mm512_maskz_shuffle_ps(kAll, (__m512)ab, (__m512)cd, 0xEE));
+  };
+  const auto quarters = [](Float p, Float q) {  // p0 + p1, p2 + p3, q0 + q1, q2 + q3
+    return (Float)(_mm512_maskz_shuffle_f32x4(kAll, (__m512)p, (__m512)q, 0x88) +
+                   _mm512_maskz_shuffle_f32x4(kAll, (__m512)p, (__m512)q, 0xDD));
+  };
+  const Float first = four(pair(v[0], v[1]), pair(v[2], v[3])), second = four(pair(v[4], v[5]), pair(v[6], v[7]));
+  const Float last = pair(v[8], v[9]), third = four(last, last);
+  store(out, quarters(quarters(first, second), quarters(third, third)));
+#elif defined(__AVX2__)
+  const auto pair = [](Float a, Float b) {
+    return (Float)(_mm256_unpacklo_ps((__m256)a, (__m256)b) + _mm256_unpackhi_ps((__m256)a, (__m256)b));
+  };
+  const auto four = [](Float ab, Float cd) {
+    return (Float)(_mm256_shuffle_ps((__m256)ab, (__m256)cd, 0x44) + _mm256_shuffle_ps((__m256)ab, (__m256)cd, 0xEE));
+  };
+  const __m256 first = (__m256)four(pair(v[0], v[1]), pair(v[2], v[3]));
+  const __m256 second = (__m256)four(pair(v[4], v[5]), pair(v[6], v[7]));
+  const Float last = pair(v[8], v[9]);
+  const __m256 third = (__m256)four(last, last);
+  _mm256_storeu_ps(out, _mm256_permute2f128_ps(first, second, 0x20) + _mm256_permute2f128_ps(first, second, 0x31));
+  _mm_storeu_ps(out + 8, _mm256_castps256_ps128(third) + _mm256_extractf128_ps(third, 1));
+#else
+  sum4(v[0], v[1], v[2], v[3], out);
+  sum4(v[4], v[5], v[6], v[7], out + 4);
+  sum4(v[8], v[9], v[8], v[9], out + 8);
 #endif
 }
 

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // From Gaussians to splats: project, drop what cannot be seen, count the tiles that each one covers.
 #include "rendering/kernels/projection_math.hpp"
+#include "rendering/kernels/tile_layout.hpp"
 #include "rendering/kernels/tile_rectangle.hpp"
 #include "rendering/kernels/view_colour.hpp"
 
@@ -48,7 +49,7 @@ inline void make_splats(const Rasterizer& r, const ViewConstants& c, const std::
   const Float safe = zero_unless(ok, radius2);
   const Float mean_x = c.fx * p.u + c.cx, mean_y = c.fy * p.v + c.cy;
   ok = both(ok, tile_range(mean_x, square_root(safe * p.cov_xx), r.view.width, kTileWidth, out.tile_x0, out.tile_x1));
-  ok = both(ok, tile_range(mean_y, square_root(safe * p.cov_yy), r.view.height, kLanes, out.tile_y0, out.tile_y1));
+  ok = both(ok, tile_range(mean_y, square_root(safe * p.cov_yy), r.view.height, kTileHeight, out.tile_y0, out.tile_y1));
   out.visible = bits(ok) & ((1u << n) - 1);
 
   const Float values[SplatVectors::kFields] = {
@@ -65,7 +66,7 @@ inline TileRectangle tile_rectangle(const SplatVectors& v, int lane) {
 
 }  // namespace
 
-int rasterizer_lanes() { return kLanes; }
+TileLayout tile_layout() { return {kLanes, kTileWidth, kTileHeight}; }
 
 void project_block(Rasterizer& r, int block) {
   const ViewConstants c = view_constants(r.view);
