@@ -109,9 +109,9 @@ Status backward(Rasterizer& r, const ImageGradients& image_gradients, const Gaus
   ThreadPool& pool = r.context.pool;
   const auto differentiate = GGSLAM_DISPATCH(isa, backward_tile);
   const auto gather = GGSLAM_DISPATCH(isa, gather_block);
-  r.slots.reserve(r.pair_count * kSlotStride);
+  r.slots.reserve((r.pair_count + kSlotsAtOnce) * kSlotStride);
   r.feature_slots.reserve(r.pair_count * r.padded_features);
-  r.slot_used.reserve(r.pair_count);
+  r.slot_used.reserve(r.pair_count + kSlotsAtOnce);
   r.block_twist.reserve(6 * kMaxBlocks);
   if (r.pair_count > 0) std::memset(r.slot_used.data(), 0, r.pair_count);
 

@@ -32,6 +32,7 @@ constexpr float kMinQuaternionNorm2 = 1e-20f, kMaxQuaternionNorm2 = 1e20f;
 constexpr int kSubBlocks = 32;                  // sub-blocks of a tile, each of as many pixels as a vector has lanes
 constexpr int kBaseGradients = 10;              // log-alpha moments 1, r, dy, r^2, r dy, dy^2; colour; depth
 constexpr int kSlotStride = 16;                 // floats from one gradient slot to the next: one cache line
+constexpr int kSlotsAtOnce = 4;                 // that are read of every splat, be they its own or not
 constexpr int kMaxBlocks = 32;
 constexpr int kChunk = 64;                      // splats that a tile composites at a time
 
@@ -114,7 +115,7 @@ struct Rasterizer {
   Buffer<float> transmittance;        // [tiles][sub-blocks][lanes], after the last Gaussian
   Buffer<std::int32_t> last_entry;    // [tiles][sub-blocks][lanes]: number in the tile's list of the last contribution
 
-  Buffer<std::uint8_t> slot_used;     // [pairs], Gaussian by Gaussian
+  Buffer<std::uint8_t> slot_used;     // [pairs], Gaussian by Gaussian; some to spare
   Buffer<float> slots;                // [pairs][kSlotStride]
   Buffer<float> feature_slots;        // [pairs][padded_features]
   Buffer<double> block_twist;         // [blocks][6]

@@ -146,29 +146,43 @@ static inline Float reciprocal(Float a) {
 #endif
 }
 
+#if defined(__AVX512F__)
+
+// 2^(j / 32), j = 0..31.
+alignas(64) static constexpr float kRoots[32] = {
+    1.0f, 1.0218972f, 1.04427373f, 1.06714046f, 1.09050775f, 1.1143868f, 1.13878858f, 1.1637249f,
+    1.18920708f, 1.21524739f, 1.24185777f, 1.26905096f, 1.29683959f, 1.32523668f, 1.35425556f, 1.38390994f,
+    1.41421354f, 1.44518077f, 1.47682619f, 1.50916445f, 1.54221082f, 1.5759809f, 1.61049032f, 1.64575553f,
+    1.68179286f, 1.71861935f, 1.75625217f, 1.79470909f, 1.8340081f, 1.87416768f, 1.91520655f, 1.95714414f,
+};
+
+// 2^x, relative error below 2e-7: 2^n times a number of the table times a minimax polynomial on [-1/64, 1/64]. Lanes
+// outside [-126, 127] are garbage, which may be infinite or NaN: callers mask them.
+static inline Float exp2_unchecked(Float x) {
+  constexpr float kMagic = 393216.0f;  // 1.5 * 2^18: adding it leaves 32 x, rounded, in the low mantissa bits
+  const Float shifted = x + kMagic, rounded = shifted - kMagic, f = x - rounded;
+  const Float root =
+      (Float)_mm512_permutex2var_ps(_mm512_load_ps(kRoots), (__m512i)shifted, _mm512_load_ps(kRoots + 16));
+  const Float p = root * (f * (2.402265070e-1f * f + 6.931573442e-1f)) + root;
+  return (Float)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)rounded);
+}
+
+#else
+
 // 2^x, relative error below 1.5e-7 (minimax polynomial on [-1/2, 1/2]). Lanes outside [-126, 127] are garbage, which
 // may be infinite or NaN: callers mask them.
 static inline Float exp2_unchecked(Float x) {
-#if defined(__AVX512F__)
-  constexpr int kToNearest = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
-  const Float rounded = (Float)_mm512_maskz_roundscale_ps(kAll, (__m512)x, kToNearest);
-#else
   constexpr float kMagic = 12582912.0f;  // 1.5 * 2^23: adding it leaves the rounded integer in the low mantissa bits
-  const Float shifted = x + kMagic;
-  const Float rounded = shifted - kMagic;
-#endif
-  const Float f = x - rounded;
+  const Float shifted = x + kMagic, f = x - (shifted - kMagic);
   Float p = 1.327647178e-3f * f + 9.675541333e-3f;
   p = p * f + 5.550713274e-2f;
   p = p * f + 2.402211972e-1f;
   p = p * f + 6.931469671e-1f;
   p = p * f + 1.000000072f;
-#if defined(__AVX512F__)
-  return (Float)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)rounded);
-#else
   return (Float)((Int)p + ((Int)shifted << 23));
-#endif
 }
+
+#endif
 
 // 2^x with x clamped to [-126, 127].
 static inline Float exp2(Float x) { return exp2_unchecked(clamp(x, broadcast(-126.0f), broadcast(127.0f))); }

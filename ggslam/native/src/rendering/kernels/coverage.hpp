@@ -4,8 +4,8 @@
 //
 // The ellipse of a splat is |conic_r| r^2 + |conic_y| dy^2 <= reach, r = dx - slope_x dy. Across a row of sub-blocks,
 // a strip of dy, it extends to the right as far as slope_x dy + sqrt((reach - |conic_y| dy^2) / |conic_r|) does, which
-// is highest at dy = turn, where the whole ellipse is rightmost, or else at that end of the strip which is nearer to it;
-// to the left likewise at -turn. The ellipse being convex, it meets every sub-block of the row in between and no other.
+// is highest at dy = turn, where the whole ellipse is rightmost, or else at that end of the strip which is nearer to
+// it; to the left likewise at -turn. It is convex: it meets every sub-block of the row in between and no other.
 #pragma once
 #include "rendering/kernels/tile.hpp"
 

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The layout of a tile: kSubColumns x kSubRows sub-blocks of 4 x (kLanes / 4) pixels; one vector holds one sub-block, row
-// by row. Larger tiles make fewer pairs of a splat and a tile, smaller sub-blocks fewer pixels that a splat does not
-// reach.
+// The layout of a tile: kSubColumns x kSubRows sub-blocks of 4 x (kLanes / 4) pixels; one vector holds one sub-block,
+// row by row. Larger tiles make fewer pairs of a splat and a tile, but shorter loops over a sub-block's splats.
 #pragma once
 #include "common/kernels/simd.hpp"
 #include "rendering/rasterizer.hpp"

@@ -3,9 +3,11 @@
 // a pixel, t the transmittance before the splat and "behind" the sum of weight * g over all splats behind it (starting
 // from minus the final transmittance times the gradient of the alpha image):
 //     d loss / d alpha = t g - behind / (1 - alpha)
-// so one scalar per pixel stands for everything behind. The transmittance is recovered by dividing by 1 - alpha.
+// so one scalar per pixel stands for everything behind. With t' = (1 - alpha) t, the transmittance after the splat, and
+// the odds o = alpha / (1 - alpha):
+//     weight = alpha t = o t',   t = t' + weight,   G := alpha d loss / d alpha = o (t' g - behind).
 //
-// d loss / d log(alpha) =: G leads to the splat's geometry through its moments sum G (1, r, dy, r^2, r dy, dy^2), r as
+// G, d loss / d log(alpha), leads to the splat's geometry through its moments sum G (1, r, dy, r^2, r dy, dy^2), r as
 // in the splat. The sums over the tile's pixels go to the pair's own slot; gather.cpp adds up a Gaussian's slots.
 //
 // Splats are taken in chunks, from the last one of the tile. First the sub-blocks in turn keep what they know of their
@@ -17,6 +19,9 @@
 
 namespace ggslam::GGSLAM_ISA {
 namespace {
+
+// alpha / (1 - alpha) at the limit, less what rounding may do.
+constexpr float kOddsAtLimit = 0.9999f * kMaxAlpha / (1.0f - kMaxAlpha);
 
 enum FeatureMode { kNoFeatures, kFeaturesReachGeometry, kFeaturesDetached };
 
@@ -36,14 +41,23 @@ struct Contribution {
 struct Chunk {
   Splat splats[kChunk];
   std::size_t pairs[kChunk];
-  std::uint32_t contributed[kChunk];
-  std::uint64_t contributing[kSubBlocks];     // the same, per sub-block
-  std::int32_t first[kChunk + 1];             // number of a splat's first contribution
-  std::int32_t next[kChunk];                  // of its next one while they are written
-  std::int32_t numbers[kChunk];               // of the splats in the tile's list
+  std::uint32_t contributed[kChunk];             // one bit per sub-block
+  std::uint64_t contributing[kSubBlocks];        // the same, per sub-block
+  std::int32_t first[kChunk + 1];                // number of a splat's first contribution
+  std::int32_t next[kChunk];                     // of its next one while they are written
+  std::int32_t numbers[kChunk];                  // of the splats in the tile's list
   std::uint8_t sub_blocks[kChunk * kSubBlocks];  // of the contributions
   Contribution* contributions;
 };
+
+// alpha / (1 - alpha), 0 for 0.
+inline Float odds(Float alpha) {
+#if defined(__AVX512F__)
+  return alpha * reciprocal(1.0f - alpha);
+#else
+  return alpha / (1.0f - alpha);
+#endif
+}
 
 void load_gradients(const Rasterizer& r, int index, const Tile& tile, const ImageGradients& in, ThreadScratch& scratch,
                     TileGradients& out) {
@@ -101,13 +115,13 @@ inline void feature_dots(std::uint32_t sub_blocks, const float* features, const 
   if (q < channels) add_feature_dots<4>(sub_blocks, features + q, pixel_features + q * kLanes, channels, dots);
 }
 
-// Values of the splats that contributed to one sub-block, from the last one.
+// The splats that contributed to one sub-block, from the last one, and their exponents, then odds alpha / (1 - alpha).
 struct Stage {
-  std::uint8_t splats[kChunk];                // numbers in the chunk
-  Float alphas[kChunk + 3], inverses[kChunk + 3];     // inverse: 1 / (1 - alpha)
+  std::uint8_t splats[kChunk];  // numbers in the chunk
+  Float values[kChunk + 3];
 };
 
-// Exponents to stage.alphas, very low where the splat was not taken; returns the number of splats.
+// Exponents, very low where the splat was not taken; returns the number of splats.
 inline int find_exponents(const Tile& tile, int s, const Chunk& chunk, const TileGradients& grad, Stage& stage) {
   const Float x = tile.x[s], y = tile.y[s];
   const Int last = grad.last[s];
@@ -119,33 +133,27 @@ inline int find_exponents(const Tile& tile, int s, const Chunk& chunk, const Til
     const Splat& g = chunk.splats[k];
     const Float dy = y - g.mean_y, r = shear(g, x - g.mean_x, dy);
     const Mask shown = greater_equal_int(last, broadcast_int(chunk.numbers[k]));
-    stage.alphas[n] = select(shown, log2_alpha(g, r, dy), broadcast(-200.0f));
+    stage.values[n] = select(shown, log2_alpha(g, r, dy), broadcast(-200.0f));
   }
   return n;
 }
 
 // Four at a time, so that the processor finds enough to do while it waits; what is there beyond n does not matter.
-inline void find_alphas(int n, Stage& stage) {
-  for (int first = 0; first < n; first += 4) {
-    Float alpha[4];
-    for (int i = 0; i < 4; ++i) {
-      const Float exponent = stage.alphas[first + i];
+inline void find_odds(int n, Float* values) {
+  for (int first = 0; first < n; first += 4)
+    for (int i = first; i < first + 4; ++i) {
+      const Float exponent = values[i];
       const Mask taken = greater_equal(exponent, broadcast(kLog2MinAlpha));
-      // alpha = 0 where the splat was not taken: the reciprocal is exactly 1 and all that follows from it vanishes.
-      alpha[i] = minimum(zero_unless(taken, exp2_unchecked(exponent)), broadcast(kMaxAlpha));
+      const Float alpha = minimum(zero_unless(taken, exp2_unchecked(exponent)), broadcast(kMaxAlpha));
+      values[i] = odds(alpha);
     }
-    for (int i = 0; i < 4; ++i) {
-      stage.alphas[first + i] = alpha[i];
-      stage.inverses[first + i] = reciprocal(1.0f - alpha[i]);
-    }
-  }
 }
 
 // G and weights of the chunk's splats in one sub-block.
 template <FeatureMode kMode>
 inline void differentiate_sub_block(const Tile& tile, int s, Chunk& chunk, TileGradients& grad, Stage& stage) {
   const int n = find_exponents(tile, s, chunk, grad, stage);
-  find_alphas(n, stage);
+  find_odds(n, stage.values);
   const Float red = grad.channels[s][0], green = grad.channels[s][1];
   const Float blue = grad.channels[s][2], depth = grad.channels[s][3];
   Float t = grad.transmittance[s], behind = grad.behind[s];
@@ -155,19 +163,39 @@ inline void differentiate_sub_block(const Tile& tile, int s, Chunk& chunk, TileG
     const int place = chunk.next[k]++;
     Contribution& out = chunk.contributions[place];
     chunk.sub_blocks[place] = static_cast<std::uint8_t>(s);
-    const Float alpha = stage.alphas[i], inverse = stage.inverses[i];
-    t = t * inverse;
-    const Float weight = alpha * t;
     Float dot = g.red * red + g.green * green + g.blue * blue + g.depth * depth;
     if (kMode == kFeaturesReachGeometry) dot += out.gradient;
-    const Float alpha_gradient = t * dot - inverse * behind;
+    // Where the splat was not taken the odds are 0, and so is all that follows from them.
+    const Float odds = stage.values[i], weight = odds * t, G = odds * (t * dot - behind);
+    t = t + weight;
     behind = behind + weight * dot;
     // At the limit kMaxAlpha, alpha does not depend on the splat's shape.
-    out.gradient = zero_unless(greater(broadcast(kMaxAlpha), alpha), alpha * alpha_gradient);
+    out.gradient = zero_unless(greater(broadcast(kOddsAtLimit), odds), G);
     out.weight = weight;
   }
   grad.transmittance[s] = t;
   grad.behind[s] = behind;
+}
+
+// One line, past the caches, which have no room for all slots until they are read: then it need not be fetched first.
+inline void write_slot(const float* sums, float* slot) {
+#if defined(__AVX512F__)
+  _mm512_stream_ps(slot, _mm512_load_ps(sums));
+#elif defined(__AVX2__)
+  _mm256_stream_ps(slot, _mm256_load_ps(sums));
+  _mm256_stream_ps(slot + 8, _mm256_load_ps(sums + 8));
+#elif defined(__SSE2__)
+  for (int q = 0; q < kSlotStride; q += 4) _mm_stream_ps(slot + q, _mm_load_ps(sums + q));
+#else
+  __builtin_memcpy(slot, sums, sizeof(float) * kSlotStride);
+#endif
+}
+
+// Other threads may read the slots from now on.
+inline void finish_slots() {
+#if defined(__SSE2__)
+  _mm_sfence();
+#endif
 }
 
 // The sums over a splat's sub-blocks.
@@ -186,7 +214,9 @@ inline void sum_splat(const Tile& tile, const Chunk& chunk, int k, const TileGra
     red += weight * v[0], green += weight * v[1], blue += weight * v[2], depth += weight * v[3];
   }
   const Float sums[kBaseGradients] = {m0, mr, my, mrr, mry, myy, red, green, blue, depth};
-  sum10(sums, slot);
+  alignas(64) float line[kSlotStride];
+  sum10(sums, line);
+  write_slot(line, slot);
 }
 
 // Slots of the feature channels: sums of the contributions' weight times image gradient.
@@ -209,17 +239,16 @@ inline void sum_features(const Chunk& chunk, int k, const float* pixel_features,
   if (q < channels) feature_group<4>(chunk, k, pixel_features + q * kLanes, channels, slot + q);
 }
 
-// Asks for the splats of the chunk that ends at entry `end`, and for the entries of the one before it.
-GGSLAM_PREFETCHING prefetch_splats(const Rasterizer& r, const Tile& tile, std::int32_t end) {
+// Asks for a share of the splats of the next chunk, which ends at entry `end`, while sub-block s is worked on. All at
+// once they would wait for one another.
+GGSLAM_PREFETCHING prefetch_share(const Rasterizer& r, const Tile& tile, std::int32_t end, int s) {
+  constexpr int kShare = kChunk / kSubBlocks;
   const TileEntry* entries = r.entries.data() + tile.begin;
-  const std::uint32_t* contributed = r.contributed.data() + tile.begin;
-  const std::int32_t begin = end > kChunk ? end - kChunk : 0;
-  for (std::int32_t k = begin; k < end; ++k) __builtin_prefetch(r.splats.data() + entries[k].splat);
-  for (std::int32_t k = begin; k > begin - kChunk && k > 0; k -= 8) __builtin_prefetch(entries + k - 8);
-  for (std::int32_t k = begin; k > begin - kChunk && k > 0; k -= 16) __builtin_prefetch(contributed + k - 16);
+  for (int k = kShare * s; k < kShare * (s + 1); ++k)
+    if (k < end) __builtin_prefetch(r.splats.data() + entries[end - 1 - k].splat);
 }
 
-// Entries [begin, begin + n) of the tile's list. Slots are written in random order: their lines are asked for early.
+// Entries [begin, begin + n) of the tile's list.
 void load_chunk(const Rasterizer& r, int index, const Tile& tile, std::int32_t begin, int n, Chunk& chunk) {
   const int tile_x = index % r.tiles_x, tile_y = index / r.tiles_x;
   const TileEntry* entries = r.entries.data() + tile.begin;
@@ -234,8 +263,7 @@ void load_chunk(const Rasterizer& r, int index, const Tile& tile, std::int32_t b
     next += __builtin_popcount(masks[k]);
     const std::uint32_t splat = entries[begin + k].splat;
     const Splat& g = chunk.splats[k] = r.splats[splat];
-    const std::size_t pair = chunk.pairs[k] = r.pair_number(splat, g, tile_x, tile_y);
-    if (masks[k] != 0) __builtin_prefetch(r.slots.data() + pair * kSlotStride, 1);
+    chunk.pairs[k] = r.pair_number(splat, g, tile_x, tile_y);
   }
   chunk.first[n] = next;
 }
@@ -262,16 +290,18 @@ void differentiate_tile(Rasterizer& r, int index, const Tile& tile, TileGradient
   chunk.contributions = reinterpret_cast<Contribution*>(scratch.contributions.data());
   const int channels = r.padded_features;
   std::int32_t end = grad.last_in_tile + 1;
-  prefetch_splats(r, tile, end);
+  for (std::int32_t k = 0; k < kChunk && k < end; ++k)
+    __builtin_prefetch(r.splats.data() + r.entries[tile.begin + end - 1 - k].splat);
   while (end > 0) {
     const std::int32_t begin = end > kChunk ? end - kChunk : 0;
     const int n = end - begin;
     end = begin;
     load_chunk(r, index, tile, begin, n, chunk);
-    prefetch_splats(r, tile, begin);
     if (kMode == kFeaturesReachGeometry) write_feature_dots(r, n, scratch, chunk);
-    for (int s = 0; s < kSubBlocks; ++s)
+    for (int s = 0; s < kSubBlocks; ++s) {
+      prefetch_share(r, tile, begin, s);
       if (chunk.contributing[s] != 0) differentiate_sub_block<kMode>(tile, s, chunk, grad, stage);
+    }
     for (int k = 0; k < n; ++k) {
       if (chunk.contributed[k] == 0) continue;
       const std::size_t pair = chunk.pairs[k];
@@ -281,6 +311,7 @@ void differentiate_tile(Rasterizer& r, int index, const Tile& tile, TileGradient
       r.slot_used[pair] = 1;
     }
   }
+  finish_slots();
 }
 
 }  // namespace

@@ -55,7 +55,6 @@ void load_chunk(const Rasterizer& r, const Tile& tile, std::uint32_t begin, int 
   const std::int32_t first = static_cast<std::int32_t>(begin - tile.begin);
   for (int k = 0; k < kChunk; ++k) chunk.numbers[k] = first + k, chunk.contributed[k] = 0;
   for (int k = 0; k < n; ++k) {
-    if (begin + k + kSplatPrefetch < tile.end) prefetch_splat(r, begin + k + kSplatPrefetch);
     const Splat& splat = chunk.splats[k] = r.splats[r.entries[begin + k].splat];
     ellipses.set(k, splat);
     if (r.padded_features > 0) {
@@ -146,15 +145,19 @@ inline void add_features(const WeightList& list, const float* features, int chan
 
 template <bool kWithFeatures, bool kWithMedian, bool k3dgs = false>
 void composite_tile(Rasterizer& r, const Tile& tile, TileState& state, ThreadScratch& scratch) {
+  constexpr std::uint32_t kShare = kChunk / kSubBlocks;
   Chunk chunk;
   WeightList list;
   const int channels = r.padded_features;
-  for (std::uint32_t e = tile.begin; e < tile.end && e < tile.begin + kSplatPrefetch; ++e) prefetch_splat(r, e);
+  for (std::uint32_t e = tile.begin; e < tile.end && e < tile.begin + kChunk; ++e) prefetch_splat(r, e);
   std::uint32_t begin = tile.begin;
   for (; begin < tile.end && state.alive != 0; begin += kChunk) {
     const int n = static_cast<int>(tile.end - begin < kChunk ? tile.end - begin : kChunk);
     load_chunk(r, tile, begin, n, state.alive, scratch, chunk);
     for (int s = 0; s < kSubBlocks; ++s) {
+      // A share of the next chunk's splats at a time: asked for all at once they would wait for one another.
+      for (std::uint32_t e = begin + kChunk + kShare * s; e < tile.end && e < begin + kChunk + kShare * (s + 1); ++e)
+        prefetch_splat(r, e);
       if (chunk.covering[s] == 0) continue;
       composite<kWithFeatures, kWithMedian, k3dgs>(tile, chunk, s, state, list);
       if (kWithFeatures)
