@@ -54,6 +54,32 @@ def test_nothing_in_view() -> None:
     assert not any(value.any() for value in found.values())
 
 
+def splat_images(position_px: np.ndarray, sigmas_px: list[float], angle: float) -> GaussianTensors:
+    """One Gaussian 2 m in front of a camera at the origin, given by its picture by `CAMERA`."""
+    means = [*((position_px - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy] * 2), 2.0]
+    scales = np.array([*sigmas_px, min(sigmas_px)]) * 2 / CAMERA.fx
+    numbers = {
+        "means": [means], "quaternions": [[np.cos(angle / 2), 0, 0, np.sin(angle / 2)]], "log_scales": [np.log(scales)],
+        "opacity_logits": [1.0], "sh": [[[0.9, 0.4, -0.5]]], "features": np.zeros((1, 0)),
+    }  # fmt: skip
+    return GaussianTensors(**{name: torch.tensor(np.array(v), dtype=torch.float32) for name, v in numbers.items()})
+
+
+@pytest.mark.parametrize("instruction_set", INSTRUCTION_SETS)
+@pytest.mark.parametrize("sigmas", [[0.1, 0.1], [2.0, 1.0], [9.0, 0.2], [60.0, 0.1]])
+def test_a_splat_reaches_every_pixel_that_it_covers(instruction_set: str, sigmas: list[float]) -> None:
+    """Wherever it lies in its tile, however it is turned, and where its mean is beyond the image."""
+    rasterizer, random, seen = CpuRasterizer(1, instruction_set), np.random.default_rng(2), 0
+    for angle in np.linspace(0, np.pi, 9):
+        splat = splat_images(random.uniform([-8, -8], [CAMERA.width + 8, CAMERA.height + 8]), sigmas, angle)
+        found = rasterizer.forward(splat, CAMERA, np.eye(4))
+        expected = render_reference(splat, CAMERA, torch.eye(4))
+        differs = (found.alpha - expected.alpha).abs() > 1e-4  # a pixel may lie on the very rim, where alpha is 1/255
+        assert (found.alpha[differs] - expected.alpha[differs]).abs().sum() < 1.01 / 255 and differs.sum() <= 1
+        seen += int((expected.alpha > 0).any())
+    assert seen >= 3
+
+
 def bad_rows(scene: GaussianTensors) -> torch.Tensor:
     """Spoils the first Gaussians, each in a way of its own; returns which, bool [N]."""
     inf, nan = float("inf"), float("nan")

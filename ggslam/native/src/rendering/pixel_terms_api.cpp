@@ -19,15 +19,15 @@ struct SortedPixels {
 };
 
 SortedPixels sort_pixels(const Rasterizer& r, const std::int32_t* pixels, std::int64_t count) {
-  const int lanes = r.tile_height, sub_height = lanes / 4;  // a sub-block is 4 x (lanes / 4) pixels
+  const int sub_height = r.tile.lanes / 4, sub_columns = r.tile.width / 4;  // a sub-block is 4 pixels wide
   std::vector<TermPixel> found(count);
   std::vector<std::int32_t> key(count), start(static_cast<std::size_t>(r.tiles()) * kSubBlocks + 1, 0);
   for (std::int64_t i = 0; i < count; ++i) {
     const int x = pixels[i] % r.view.width, y = pixels[i] / r.view.width;
-    const int in_x = x % kTileWidth, in_y = y % r.tile_height;
-    const int sub = in_y / sub_height * 4 + in_x / 4;
+    const int in_x = x % r.tile.width, in_y = y % r.tile.height;
+    const int sub = in_y / sub_height * sub_columns + in_x / 4;
     found[i] = {x, y, static_cast<std::int32_t>(i), sub, in_y % sub_height * 4 + in_x % 4};
-    key[i] = (y / r.tile_height * r.tiles_x + x / kTileWidth) * kSubBlocks + sub;
+    key[i] = (y / r.tile.height * r.tiles_x + x / r.tile.width) * kSubBlocks + sub;
     ++start[key[i] + 1];
   }
   for (std::size_t k = 1; k < start.size(); ++k) start[k] += start[k - 1];

@@ -33,9 +33,9 @@ void prepare(Rasterizer& r, const GaussianArrays& gaussians, const CameraView& v
   r.gaussians = gaussians;
   r.view = view;
   r.padded_features = gaussians.render_features ? (gaussians.feature_channels + 3) / 4 * 4 : 0;
-  r.tile_height = GGSLAM_DISPATCH(r.context.isa, rasterizer_lanes)();
-  r.tiles_x = (view.width + kTileWidth - 1) / kTileWidth;
-  r.tiles_y = (view.height + r.tile_height - 1) / r.tile_height;
+  r.tile = GGSLAM_DISPATCH(r.context.isa, tile_layout)();
+  r.tiles_x = (view.width + r.tile.width - 1) / r.tile.width;
+  r.tiles_y = (view.height + r.tile.height - 1) / r.tile.height;
 
   // The cut into blocks must not depend on the number of threads: the pose gradient is summed block by block.
   r.block_shift = 10;
@@ -43,7 +43,7 @@ void prepare(Rasterizer& r, const GaussianArrays& gaussians, const CameraView& v
   r.block_size = std::int64_t{1} << r.block_shift;
   r.blocks = static_cast<int>((gaussians.count + r.block_size - 1) >> r.block_shift);
 
-  const std::size_t tiles = r.tiles(), pixels = tiles * kTileWidth * r.tile_height;
+  const std::size_t tiles = r.tiles(), pixels = tiles * r.tile.width * r.tile.height;
   r.splats.reserve(static_cast<std::size_t>(r.blocks) * r.block_size);
   r.footprints.reserve(static_cast<std::size_t>(r.blocks) * r.block_size);
   r.tile_cursor.reserve(r.blocks * (tiles + 1));
@@ -52,8 +52,9 @@ void prepare(Rasterizer& r, const GaussianArrays& gaussians, const CameraView& v
   r.last_entry.reserve(pixels);
   // Scratch is reserved here, never in a kernel.
   for (int t = 0; t < r.context.pool.size(); ++t) {
-    r.scratch[t].pixel_features.reserve(std::size_t{kSubBlocks} * r.tile_height * r.padded_features);
+    r.scratch[t].pixel_features.reserve(std::size_t{kSubBlocks} * r.tile.lanes * r.padded_features);
     r.scratch[t].gaussian_features.reserve(std::size_t{kChunk} * r.padded_features);
+    r.scratch[t].contributions.reserve(std::size_t{2} * kChunk * kSubBlocks * r.tile.lanes);
   }
 }
 
@@ -108,9 +109,9 @@ Status backward(Rasterizer& r, const ImageGradients& image_gradients, const Gaus
   ThreadPool& pool = r.context.pool;
   const auto differentiate = GGSLAM_DISPATCH(isa, backward_tile);
   const auto gather = GGSLAM_DISPATCH(isa, gather_block);
-  r.slots.reserve(r.pair_count * kSlotStride);
+  r.slots.reserve((r.pair_count + kSlotsAtOnce) * kSlotStride);
   r.feature_slots.reserve(r.pair_count * r.padded_features);
-  r.slot_used.reserve(r.pair_count);
+  r.slot_used.reserve(r.pair_count + kSlotsAtOnce);
   r.block_twist.reserve(6 * kMaxBlocks);
   if (r.pair_count > 0) std::memset(r.slot_used.data(), 0, r.pair_count);
 

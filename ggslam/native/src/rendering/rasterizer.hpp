@@ -29,10 +29,10 @@ constexpr float kMaxDepth = 1e6f;               // metres; Gaussians farther awa
 constexpr float kMinLogScale = -23.0f, kMaxLogScale = 10.0f;  // Gaussians with a scale outside are skipped
 constexpr float kMinQuaternionNorm2 = 1e-20f, kMaxQuaternionNorm2 = 1e20f;
 
-constexpr int kTileWidth = 16;
-constexpr int kSubBlocks = 16;                  // sub-blocks of a tile, 4 x 4, each of kLanes pixels
+constexpr int kSubBlocks = 32;                  // sub-blocks of a tile, each of as many pixels as a vector has lanes
 constexpr int kBaseGradients = 10;              // log-alpha moments 1, r, dy, r^2, r dy, dy^2; colour; depth
 constexpr int kSlotStride = 16;                 // floats from one gradient slot to the next: one cache line
+constexpr int kSlotsAtOnce = 4;                 // that are read of every splat, be they its own or not
 constexpr int kMaxBlocks = 32;
 constexpr int kChunk = 64;                      // splats that a tile composites at a time
 
@@ -41,6 +41,11 @@ constexpr int kChunk = 64;                      // splats that a tile composites
 enum AdamGroup { kMeans, kQuaternions, kLogScales, kOpacityLogits, kShConstant, kShRest, kFeatures, kCorrection };
 
 // --- what the stages hand to one another -----------------------------------------------------------------------------
+
+// Pixels of a sub-block, which are the lanes of a vector, and of a tile along each axis. All are powers of two.
+struct TileLayout {
+  int lanes, width, height;
+};
 
 // Tiles that a splat covers.
 struct TileRectangle {
@@ -78,6 +83,7 @@ struct ThreadScratch {
   Buffer<TileEntry> sorting;
   Buffer<float> pixel_features;     // [sub-blocks][channels][lanes]: accumulated features or their gradients
   Buffer<float> gaussian_features;  // [up to kChunk Gaussians][channels]
+  Buffer<float> contributions;      // [up to kChunk * kSubBlocks][2][lanes]: gradients and weights of the backward pass
 };
 
 struct Rasterizer {
@@ -90,7 +96,8 @@ struct Rasterizer {
   CameraView view{};
   bool as_3dgs = false;     // the last forward was by the rules of 3DGS
   int padded_features = 0;  // rendered feature channels, rounded up to a multiple of 4
-  int tile_height = 0, tiles_x = 0, tiles_y = 0;
+  TileLayout tile{};
+  int tiles_x = 0, tiles_y = 0;
 
   int blocks = 0;                     // Gaussians [b * block_size, (b + 1) * block_size) form block b
   int block_shift = 0;                // log2 of block_size
@@ -104,11 +111,11 @@ struct Rasterizer {
   Buffer<std::uint32_t> tile_cursor;  // [blocks][tiles + 1]: counts, then where the block's next entry goes; one spare
   Buffer<std::uint32_t> tile_start;   // [tiles + 1]
   Buffer<TileEntry> entries;          // [pairs], tile by tile; sorted by depth by forward_tile; one spare per block
-  Buffer<std::uint16_t> contributed;  // [pairs] in the order of entries: sub-blocks to which the splat contributed
+  Buffer<std::uint32_t> contributed;  // [pairs] in the order of entries: sub-blocks to which the splat contributed
   Buffer<float> transmittance;        // [tiles][sub-blocks][lanes], after the last Gaussian
   Buffer<std::int32_t> last_entry;    // [tiles][sub-blocks][lanes]: number in the tile's list of the last contribution
 
-  Buffer<std::uint8_t> slot_used;     // [pairs], Gaussian by Gaussian
+  Buffer<std::uint8_t> slot_used;     // [pairs], Gaussian by Gaussian; some to spare
   Buffer<float> slots;                // [pairs][kSlotStride]
   Buffer<float> feature_slots;        // [pairs][padded_features]
   Buffer<double> block_twist;         // [blocks][6]
@@ -132,8 +139,7 @@ struct Rasterizer {
 
 }  // namespace ggslam
 
-// Number of lanes, which is also the height of a tile in pixels.
-GGSLAM_DECLARE_KERNEL(int rasterizer_lanes())
+GGSLAM_DECLARE_KERNEL(TileLayout tile_layout())
 GGSLAM_DECLARE_KERNEL(void project_block(Rasterizer& r, int block))
 GGSLAM_DECLARE_KERNEL(void scatter_block(Rasterizer& r, int block))
 GGSLAM_DECLARE_KERNEL(void forward_tile(Rasterizer& r, int tile, const RenderTargets& targets, ThreadScratch& scratch))

@@ -43,6 +43,15 @@ static inline Float lane_numbers() {
   return v;
 }
 
+// 2^n for n in [0, 30].
+static inline Int power_of_two(Int n) {
+#if defined(__AVX2__)
+  return broadcast_int(1) << n;
+#else
+  return truncate((Float)((n + 127) << 23));
+#endif
+}
+
 // --- comparisons and selection ---------------------------------------------------------------------------------------
 // All comparisons are false where an operand is NaN.
 
@@ -137,29 +146,43 @@ static inline Float reciprocal(Float a) {
 #endif
 }
 
+#if defined(__AVX512F__)
+
+// 2^(j / 32), j = 0..31.
+alignas(64) static constexpr float kRoots[32] = {
+    1.0f, 1.0218972f, 1.04427373f, 1.06714046f, 1.09050775f, 1.1143868f, 1.13878858f, 1.1637249f,
+    1.18920708f, 1.21524739f, 1.24185777f, 1.26905096f, 1.29683959f, 1.32523668f, 1.35425556f, 1.38390994f,
+    1.41421354f, 1.44518077f, 1.47682619f, 1.50916445f, 1.54221082f, 1.5759809f, 1.61049032f, 1.64575553f,
+    1.68179286f, 1.71861935f, 1.75625217f, 1.79470909f, 1.8340081f, 1.87416768f, 1.91520655f, 1.95714414f,
+};
+
+// 2^x, relative error below 2e-7: 2^n times a number of the table times a minimax polynomial on [-1/64, 1/64]. Lanes
+// outside [-126, 127] are garbage, which may be infinite or NaN: callers mask them.
+static inline Float exp2_unchecked(Float x) {
+  constexpr float kMagic = 393216.0f;  // 1.5 * 2^18: adding it leaves 32 x, rounded, in the low mantissa bits
+  const Float shifted = x + kMagic, rounded = shifted - kMagic, f = x - rounded;
+  const Float root =
+      (Float)_mm512_permutex2var_ps(_mm512_load_ps(kRoots), (__m512i)shifted, _mm512_load_ps(kRoots + 16));
+  const Float p = root * (f * (2.402265070e-1f * f + 6.931573442e-1f)) + root;
+  return (Float)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)rounded);
+}
+
+#else
+
 // 2^x, relative error below 1.5e-7 (minimax polynomial on [-1/2, 1/2]). Lanes outside [-126, 127] are garbage, which
 // may be infinite or NaN: callers mask them.
 static inline Float exp2_unchecked(Float x) {
-#if defined(__AVX512F__)
-  constexpr int kToNearest = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
-  const Float rounded = (Float)_mm512_maskz_roundscale_ps(kAll, (__m512)x, kToNearest);
-#else
   constexpr float kMagic = 12582912.0f;  // 1.5 * 2^23: adding it leaves the rounded integer in the low mantissa bits
-  const Float shifted = x + kMagic;
-  const Float rounded = shifted - kMagic;
-#endif
-  const Float f = x - rounded;
+  const Float shifted = x + kMagic, f = x - (shifted - kMagic);
   Float p = 1.327647178e-3f * f + 9.675541333e-3f;
   p = p * f + 5.550713274e-2f;
   p = p * f + 2.402211972e-1f;
   p = p * f + 6.931469671e-1f;
   p = p * f + 1.000000072f;
-#if defined(__AVX512F__)
-  return (Float)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)rounded);
-#else
   return (Float)((Int)p + ((Int)shifted << 23));
-#endif
 }
+
+#endif
 
 // 2^x with x clamped to [-126, 127].
 static inline Float exp2(Float x) { return exp2_unchecked(clamp(x, broadcast(-126.0f), broadcast(127.0f))); }
@@ -205,6 +228,45 @@ static inline void sum4(Float a, Float b, Float c, Float d, float* out) {
   out[1] = (b[0] + b[2]) + (b[1] + b[3]);
   out[2] = (c[0] + c[2]) + (c[1] + c[3]);
   out[3] = (d[0] + d[2]) + (d[1] + d[3]);
+#endif
+}
+
+// Sums of the lanes of ten vectors at once, to out[0..9]; what follows up to out[15] may be overwritten. The order of the
+// additions is fixed.
+static inline void sum10(const Float* v, float* out) {
+#if defined(__AVX512F__)
+  const auto pair = [](Float a, Float b) {  // per quarter: a0 + a2, b0 + b2, a1 + a3, b1 + b3
+    return (Float)(_mm512_maskz_unpacklo_ps(kAll, (__m512)a, (__m512)b) +
+                   _mm512_maskz_unpackhi_ps(kAll, (__m512)a, (__m512)b));
+  };
+  const auto four = [](Float ab, Float cd) {  // per quarter: the sums of a, b, c, d
+    return (Float)(_mm512_maskz_shuffle_ps(kAll, (__m512)ab, (__m512)cd, 0x44) +
+                   _mm512_maskz_shuffle_ps(kAll, (__m512)ab, (__m512)cd, 0xEE));
+  };
+  const auto quarters = [](Float p, Float q) {  // p0 + p1, p2 + p3, q0 + q1, q2 + q3
+    return (Float)(_mm512_maskz_shuffle_f32x4(kAll, (__m512)p, (__m512)q, 0x88) +
+                   _mm512_maskz_shuffle_f32x4(kAll, (__m512)p, (__m512)q, 0xDD));
+  };
+  const Float first = four(pair(v[0], v[1]), pair(v[2], v[3])), second = four(pair(v[4], v[5]), pair(v[6], v[7]));
+  const Float last = pair(v[8], v[9]), third = four(last, last);
+  store(out, quarters(quarters(first, second), quarters(third, third)));
+#elif defined(__AVX2__)
+  const auto pair = [](Float a, Float b) {
+    return (Float)(_mm256_unpacklo_ps((__m256)a, (__m256)b) + _mm256_unpackhi_ps((__m256)a, (__m256)b));
+  };
+  const auto four = [](Float ab, Float cd) {
+    return (Float)(_mm256_shuffle_ps((__m256)ab, (__m256)cd, 0x44) + _mm256_shuffle_ps((__m256)ab, (__m256)cd, 0xEE));
+  };
+  const __m256 first = (__m256)four(pair(v[0], v[1]), pair(v[2], v[3]));
+  const __m256 second = (__m256)four(pair(v[4], v[5]), pair(v[6], v[7]));
+  const Float last = pair(v[8], v[9]);
+  const __m256 third = (__m256)four(last, last);
+  _mm256_storeu_ps(out, _mm256_permute2f128_ps(first, second, 0x20) + _mm256_permute2f128_ps(first, second, 0x31));
+  _mm_storeu_ps(out + 8, _mm256_castps256_ps128(third) + _mm256_extractf128_ps(third, 1));
+#else
+  sum4(v[0], v[1], v[2], v[3], out);
+  sum4(v[4], v[5], v[6], v[7], out + 4);
+  sum4(v[8], v[9], v[8], v[9], out + 8);
 #endif
 }
 

@@ -3,28 +3,29 @@
 // updates, so step size and bias correction are per row.
 #pragma once
 #include "rendering/rasterizer.hpp"
-#include "common/kernels/simd.hpp"
+#include "common/kernels/columns.hpp"
 
 namespace ggslam::GGSLAM_ISA {
 
-// The rows (at most one vector of them) that are updated together.
+// The rows that are updated together.
 struct AdamRows {
-  const std::int32_t* rows;
-  int n;
-  bool whole_run;                 // kLanes rows that follow one another: no packing needed
-  bool same_count;                // all at the same update: one line of the schedule serves all
-  const float* schedule[kLanes];  // each row's line of AdamArguments::schedule
+  Rows rows;
+  Float schedule[8];              // each row's line of AdamArguments::schedule, by columns
+  const float* lines[kLanes];     // the same lines
 };
 
-static inline AdamRows count_updates(const AdamArguments& adam, const std::int32_t* rows, int n) {
-  AdamRows result{rows, n, n == kLanes && rows[n - 1] - rows[0] == n - 1, true, {}};
-  for (int i = 0; i < n; ++i) {
-    const std::int32_t count = ++adam.updates[rows[i]];
-    const std::int32_t line = (count < adam.schedule_rows ? count : adam.schedule_rows) - 1;
-    result.schedule[i] = adam.schedule + 8 * static_cast<std::size_t>(line);
-    result.same_count &= result.schedule[i] == result.schedule[0];
+static inline void count_updates(const AdamArguments& adam, const Rows& rows, AdamRows& out) {
+  out.rows = rows;
+  for (int i = 0; i < kLanes; ++i) {
+    std::int32_t& updates = adam.updates[rows.numbers[i]];
+    updates += i < rows.n;
+    const std::int32_t line = (updates < adam.schedule_rows ? updates : adam.schedule_rows) - 1;
+    out.lines[i] = adam.schedule + 8 * static_cast<std::size_t>(line);
   }
-  return result;
+  const float* upper[kLanes];
+  for (int i = 0; i < kLanes; ++i) upper[i] = out.lines[i] + 4;
+  load_four_columns(out.lines, out.schedule);
+  load_four_columns(upper, out.schedule + 4);
 }
 
 // Asks early for the cache lines of one row: there are too many arrays for the processor to foresee.
@@ -47,70 +48,45 @@ static inline void adam_step(const AdamArguments& adam, Float gradient, Float st
   v.parameters -= step * v.first / (square_root(v.second) * correction + adam.epsilon);
 }
 
-// Adam on kWidth * kLanes numbers, kWidth per row, side by side.
+// Narrow rows: the first kWidth (3 or 4) columns of an array whose rows are `stride` apart. gradients: by columns.
 template <int kWidth>
-static inline void adam_packed(const AdamArguments& adam, const AdamRows& rows, AdamGroup group, const float* gradients,
-                               AdamArrays packed) {
-  alignas(64) float step[kWidth * kLanes], correction[kWidth * kLanes];
-  if (!rows.same_count) {
-    for (int i = 0; i < kWidth * kLanes; ++i) {
-      const float* line = rows.schedule[i / kWidth < rows.n ? i / kWidth : 0];
-      step[i] = line[group], correction[i] = line[kCorrection];
-    }
+static inline void adam_narrow(const AdamArguments& adam, AdamArrays arrays, int stride, const AdamRows& rows,
+                               AdamGroup group, const Float* gradients) {
+  Float parameters[kWidth], first[kWidth], second[kWidth];
+  load_rows<kWidth>(arrays.parameters, rows.rows, parameters, stride);
+  load_rows<kWidth>(arrays.first_moments, rows.rows, first, stride);
+  load_rows<kWidth>(arrays.second_moments, rows.rows, second, stride);
+  for (int k = 0; k < kWidth; ++k) {
+    AdamVectors v{parameters[k], first[k], second[k]};
+    adam_step(adam, gradients[k], rows.schedule[group], rows.schedule[kCorrection], v);
+    parameters[k] = v.parameters, first[k] = v.first, second[k] = v.second;
   }
-  const Float same_step = broadcast(rows.schedule[0][group]);
-  const Float same_correction = broadcast(rows.schedule[0][kCorrection]);
-  for (int i = 0; i < kWidth * kLanes; i += kLanes) {
-    AdamVectors v{load(packed.parameters + i), load(packed.first_moments + i), load(packed.second_moments + i)};
-    adam_step(adam, load(gradients + i), rows.same_count ? same_step : load(step + i),
-              rows.same_count ? same_correction : load(correction + i), v);
-    store(packed.parameters + i, v.parameters);
-    store(packed.first_moments + i, v.first);
-    store(packed.second_moments + i, v.second);
-  }
+  store_rows<kWidth>(parameters, arrays.parameters, rows.rows, stride);
+  store_rows<kWidth>(first, arrays.first_moments, rows.rows, stride);
+  store_rows<kWidth>(second, arrays.second_moments, rows.rows, stride);
 }
 
-template <int kWidth>
-static inline void pack(const AdamRows& rows, const float* array, std::size_t stride, float* packed) {
-  for (int i = 0; i < kLanes; ++i)  // lanes from n on repeat row 0 and are not written back
-    for (int k = 0; k < kWidth; ++k) packed[i * kWidth + k] = array[rows.rows[i < rows.n ? i : 0] * stride + k];
-}
-
-template <int kWidth>
-static inline void unpack(const AdamRows& rows, const float* packed, std::size_t stride, float* array) {
-  for (int i = 0; i < rows.n; ++i)
-    for (int k = 0; k < kWidth; ++k) array[rows.rows[i] * stride + k] = packed[i * kWidth + k];
-}
-
-// Narrow rows: the first kWidth columns of an array whose rows are `stride` apart. gradients [kLanes][kWidth].
-template <int kWidth>
-static inline void adam_narrow(const AdamArguments& adam, AdamArrays arrays, std::size_t stride, const AdamRows& rows,
-                               AdamGroup group, const float* gradients) {
-  if (rows.whole_run && stride == kWidth) {
-    const std::size_t at = rows.rows[0] * stride;
-    const AdamArrays run{arrays.parameters + at, arrays.first_moments + at, arrays.second_moments + at};
-    return adam_packed<kWidth>(adam, rows, group, gradients, run);
-  }
-  alignas(64) float parameters[kWidth * kLanes], first[kWidth * kLanes], second[kWidth * kLanes];
-  pack<kWidth>(rows, arrays.parameters, stride, parameters);
-  pack<kWidth>(rows, arrays.first_moments, stride, first);
-  pack<kWidth>(rows, arrays.second_moments, stride, second);
-  adam_packed<kWidth>(adam, rows, group, gradients, {parameters, first, second});
-  unpack<kWidth>(rows, parameters, stride, arrays.parameters);
-  unpack<kWidth>(rows, first, stride, arrays.first_moments);
-  unpack<kWidth>(rows, second, stride, arrays.second_moments);
+// Rows of one number.
+static inline void adam_single(const AdamArguments& adam, AdamArrays arrays, const AdamRows& rows, AdamGroup group,
+                               Float gradient) {
+  AdamVectors v{load_column(arrays.parameters, rows.rows), load_column(arrays.first_moments, rows.rows),
+                load_column(arrays.second_moments, rows.rows)};
+  adam_step(adam, gradient, rows.schedule[group], rows.schedule[kCorrection], v);
+  store_column(v.parameters, arrays.parameters, rows.rows);
+  store_column(v.first, arrays.first_moments, rows.rows);
+  store_column(v.second, arrays.second_moments, rows.rows);
 }
 
 // Wide rows: columns [begin, end) of an array with `stride` columns, row by row. Row i's gradients start at
 // gradients + i * gradient_stride (that of column 0).
 static inline void adam_wide(const AdamArguments& adam, AdamArrays arrays, int stride, int begin, int end,
                              const AdamRows& rows, AdamGroup group, const float* gradients, int gradient_stride) {
-  for (int i = 0; i < rows.n; ++i) {
-    const std::size_t at = static_cast<std::size_t>(rows.rows[i]) * stride;
+  for (int i = 0; i < rows.rows.n; ++i) {
+    const std::size_t at = static_cast<std::size_t>(rows.rows.numbers[i]) * stride;
     float* parameters = arrays.parameters + at;
     float *first = arrays.first_moments + at, *second = arrays.second_moments + at;
     const float* gradient = gradients + i * gradient_stride;
-    const Float step = broadcast(rows.schedule[i][group]), correction = broadcast(rows.schedule[i][kCorrection]);
+    const Float step = broadcast(rows.lines[i][group]), correction = broadcast(rows.lines[i][kCorrection]);
     int k = begin;
     for (; k + kLanes <= end; k += kLanes) {
       AdamVectors v{load(parameters + k), load(first + k), load(second + k)};

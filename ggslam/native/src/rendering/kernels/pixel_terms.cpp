@@ -37,7 +37,7 @@ Lanes gather_lanes(const Rasterizer& r, int tile, const TermPixel* pixels, int n
 
 void walk(const Rasterizer& r, int tile, Lanes& lanes, float min_weight, const PixelTerms& out) {
   const TileEntry* entries = r.entries.data() + r.tile_start[tile];
-  const std::uint16_t* contributed = r.contributed.data() + r.tile_start[tile];
+  const std::uint32_t* contributed = r.contributed.data() + r.tile_start[tile];
   Float t = broadcast(1.0f);
   for (std::int32_t k = 0; k <= lanes.last_of_all; ++k) {
     if (k + kSplatPrefetch <= lanes.last_of_all && (contributed[k + kSplatPrefetch] & lanes.sub_blocks) != 0)

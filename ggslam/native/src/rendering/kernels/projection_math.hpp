@@ -3,8 +3,8 @@
 // image of the covariance Sigma = M M^T, M = R(q) diag(exp(log_scale)), under the linearised projection J W is
 // V V^T + low_pass I with V = J W M. Forward and backward share these terms, so that they can never disagree.
 #pragma once
+#include "common/kernels/columns.hpp"
 #include "rendering/rasterizer.hpp"
-#include "common/kernels/simd.hpp"
 
 namespace ggslam::GGSLAM_ISA {
 
@@ -38,23 +38,12 @@ struct RawGaussians {
   Float mean[3], quaternion[4], log_scale[3], opacity_logit;
 };
 
-// Loads rows[0..n) of an array [N, kWidth] as kWidth vectors; lanes from n on repeat row 0.
-template <int kWidth>
-static inline void load_rows(const float* array, const std::int32_t* rows, int n, Float* out) {
-  alignas(64) float columns[kWidth][kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const float* row = array + static_cast<std::size_t>(rows[lane < n ? lane : 0]) * kWidth;
-    for (int k = 0; k < kWidth; ++k) columns[k][lane] = row[k];
-  }
-  for (int k = 0; k < kWidth; ++k) out[k] = load(columns[k]);
-}
-
-static inline RawGaussians load_gaussians(const GaussianArrays& arrays, const std::int32_t* rows, int n) {
+static inline RawGaussians load_gaussians(const GaussianArrays& arrays, const Rows& rows) {
   RawGaussians g;
-  load_rows<3>(arrays.means, rows, n, g.mean);
-  load_rows<4>(arrays.quaternions, rows, n, g.quaternion);
-  load_rows<3>(arrays.log_scales, rows, n, g.log_scale);
-  load_rows<1>(arrays.opacity_logits, rows, n, &g.opacity_logit);
+  load_rows<3>(arrays.means, rows, g.mean);
+  load_rows<4>(arrays.quaternions, rows, g.quaternion);
+  load_rows<3>(arrays.log_scales, rows, g.log_scale);
+  g.opacity_logit = load_column(arrays.opacity_logits, rows);
   return g;
 }
 

@@ -5,6 +5,7 @@
 // Splats are taken in chunks of 64. For each chunk, the sub-blocks in turn keep their transmittance and base channels
 // in registers while running over the chunk's splats that cover them. Feature channels follow in a second pass over
 // the weights, as many at a time as registers hold.
+#include "rendering/kernels/coverage.hpp"
 #include "rendering/kernels/tile.hpp"
 #include "rendering/kernels/tile_sort.hpp"
 
@@ -23,7 +24,7 @@ struct TileState {
 struct Chunk {
   Splat splats[kChunk];
   std::uint64_t covering[kSubBlocks];      // per sub-block, one bit per splat
-  std::uint64_t contributing[kSubBlocks];
+  std::uint32_t contributed[kChunk];       // per splat, one bit per sub-block
   std::int32_t numbers[kChunk];            // of the splats in the tile's list
 };
 
@@ -38,15 +39,24 @@ GGSLAM_PREFETCHING prefetch_splat(const Rasterizer& r, std::uint32_t entry) {
   __builtin_prefetch(r.splats.data() + r.entries[entry].splat);
 }
 
+void find_covered(const Ellipses& ellipses, const Tile& tile, int n, std::uint32_t alive, std::uint64_t* covering) {
+  alignas(64) std::uint32_t masks[kChunk];
+  for (int k = 0; k < n; k += kLanes) {
+    const Int covered = covered_sub_blocks(ellipses, k, tile) & static_cast<std::int32_t>(alive);
+    store_int(reinterpret_cast<std::int32_t*>(masks) + k, covered);
+  }
+  for (int k = n; k < kChunk; ++k) masks[k] = 0;
+  transpose_masks(masks, covering);
+}
+
 void load_chunk(const Rasterizer& r, const Tile& tile, std::uint32_t begin, int n, std::uint32_t alive,
                 ThreadScratch& scratch, Chunk& chunk) {
-  alignas(64) std::uint16_t masks[kChunk] = {};
+  Ellipses ellipses;
   const std::int32_t first = static_cast<std::int32_t>(begin - tile.begin);
-  for (int k = 0; k < kChunk; ++k) chunk.numbers[k] = first + k;
+  for (int k = 0; k < kChunk; ++k) chunk.numbers[k] = first + k, chunk.contributed[k] = 0;
   for (int k = 0; k < n; ++k) {
-    if (begin + k + kSplatPrefetch < tile.end) prefetch_splat(r, begin + k + kSplatPrefetch);
     const Splat& splat = chunk.splats[k] = r.splats[r.entries[begin + k].splat];
-    masks[k] = static_cast<std::uint16_t>(covered_sub_blocks(splat, tile) & alive);
+    ellipses.set(k, splat);
     if (r.padded_features > 0) {
       // The splat's own line must have arrived before its features can be asked for: a shorter distance.
       if (begin + k + kRowPrefetch < tile.end)
@@ -55,7 +65,9 @@ void load_chunk(const Rasterizer& r, const Tile& tile, std::uint32_t begin, int 
                     scratch.gaussian_features.data() + k * r.padded_features);
     }
   }
-  transpose_masks(masks, chunk.covering);
+  const int whole = (n + kLanes - 1) / kLanes * kLanes;
+  for (int k = n; k < whole; ++k) ellipses.set(k, chunk.splats[0]);
+  find_covered(ellipses, tile, n, alive, chunk.covering);
 }
 
 // With k3dgs the Gaussian that would take a pixel below kMinTransmittance is left out, as 3DGS does, and the pixel is
@@ -67,7 +79,6 @@ inline void composite(const Tile& tile, Chunk& chunk, int s, TileState& state, W
   Float red = state.channels[s][kRed], green = state.channels[s][kGreen], blue = state.channels[s][kBlue];
   Float depth = state.channels[s][kDepth];
   Int last = state.last[s];
-  std::uint64_t contributing = 0;
   int size = 0;
   for (std::uint64_t left = chunk.covering[s]; left != 0; left &= left - 1) {
     const int k = __builtin_ctzll(left);
@@ -92,7 +103,7 @@ inline void composite(const Tile& tile, Chunk& chunk, int s, TileState& state, W
     depth += weight * g.depth;
     last = select_int(taken, broadcast_int(chunk.numbers[k]), last);
     const bool contributes = any(taken);
-    contributing |= static_cast<std::uint64_t>(contributes) << k;
+    chunk.contributed[k] |= static_cast<std::uint32_t>(contributes) << s;
     if (kWithMedian) {
       const Mask crossed = both(greater_equal(before, broadcast(0.5f)), greater(broadcast(0.5f), t));
       median = select(crossed, broadcast(g.depth), median);
@@ -109,7 +120,6 @@ inline void composite(const Tile& tile, Chunk& chunk, int s, TileState& state, W
   state.channels[s][kDepth] = depth;
   state.last[s] = last;
   state.median_depth[s] = median;
-  chunk.contributing[s] = contributing;
 }
 
 // Adds weight * feature for kGroup channels. `sums` [kGroup][lanes], `features` the chunk's, from the first channel.
@@ -135,16 +145,19 @@ inline void add_features(const WeightList& list, const float* features, int chan
 
 template <bool kWithFeatures, bool kWithMedian, bool k3dgs = false>
 void composite_tile(Rasterizer& r, const Tile& tile, TileState& state, ThreadScratch& scratch) {
+  constexpr std::uint32_t kShare = kChunk / kSubBlocks;
   Chunk chunk;
   WeightList list;
   const int channels = r.padded_features;
-  for (std::uint32_t e = tile.begin; e < tile.end && e < tile.begin + kSplatPrefetch; ++e) prefetch_splat(r, e);
+  for (std::uint32_t e = tile.begin; e < tile.end && e < tile.begin + kChunk; ++e) prefetch_splat(r, e);
   std::uint32_t begin = tile.begin;
   for (; begin < tile.end && state.alive != 0; begin += kChunk) {
     const int n = static_cast<int>(tile.end - begin < kChunk ? tile.end - begin : kChunk);
     load_chunk(r, tile, begin, n, state.alive, scratch, chunk);
     for (int s = 0; s < kSubBlocks; ++s) {
-      chunk.contributing[s] = 0;
+      // A share of the next chunk's splats at a time: asked for all at once they would wait for one another.
+      for (std::uint32_t e = begin + kChunk + kShare * s; e < tile.end && e < begin + kChunk + kShare * (s + 1); ++e)
+        prefetch_splat(r, e);
       if (chunk.covering[s] == 0) continue;
       composite<kWithFeatures, kWithMedian, k3dgs>(tile, chunk, s, state, list);
       if (kWithFeatures)
@@ -152,9 +165,7 @@ void composite_tile(Rasterizer& r, const Tile& tile, TileState& state, ThreadScr
                      scratch.pixel_features.data() + s * channels * kLanes);
       if (!any(greater_equal(state.transmittance[s], broadcast(kMinTransmittance)))) state.alive &= ~(1u << s);
     }
-    alignas(64) std::uint16_t masks[kChunk];
-    transpose_masks_back(chunk.contributing, masks);
-    __builtin_memcpy(r.contributed.data() + begin, masks, sizeof(*masks) * n);
+    __builtin_memcpy(r.contributed.data() + begin, chunk.contributed, sizeof(*chunk.contributed) * n);
   }
 }
 

@@ -16,19 +16,19 @@ static inline Float viewing_direction(const ViewConstants& c, const Float positi
   return inverse_length;
 }
 
-static inline Float load_sh(const GaussianArrays& arrays, const std::int32_t* rows, int n, int k, int channel) {
+static inline Float load_sh(const GaussianArrays& arrays, const Rows& rows, int k, int channel) {
   Float v;
   for (int lane = 0; lane < kLanes; ++lane) {
-    const std::size_t row = rows[lane < n ? lane : 0];
+    const std::size_t row = rows.numbers[lane];
     v[lane] = arrays.sh[(row * arrays.sh_coefficients + k) * 3 + channel];
   }
   return v;
 }
 
-static inline void view_colour(const GaussianArrays& arrays, const ViewConstants& c, const std::int32_t* rows, int n,
+static inline void view_colour(const GaussianArrays& arrays, const ViewConstants& c, const Rows& rows,
                                const Float position[3], Float colour[3]) {
   if (arrays.sh_coefficients == 1) {
-    load_rows<3>(arrays.sh, rows, n, colour);
+    load_rows<3>(arrays.sh, rows, colour);
     for (int channel = 0; channel < 3; ++channel) colour[channel] = 0.5f + kSh0 * colour[channel];
     return;
   }
@@ -38,16 +38,16 @@ static inline void view_colour(const GaussianArrays& arrays, const ViewConstants
   for (int channel = 0; channel < 3; ++channel) {
     colour[channel] = broadcast(0.5f);
     for (int k = 0; k < arrays.active_sh_coefficients; ++k)
-      colour[channel] += basis[k] * load_sh(arrays, rows, n, k, channel);
+      colour[channel] += basis[k] * load_sh(arrays, rows, k, channel);
   }
 }
 
 // The gradient of the colour before it was cut off at black, from that after it: what is cut off can only brighten.
 static inline void differentiate_cut_at_black(const GaussianArrays& arrays, const ViewConstants& c,
-                                              const std::int32_t* rows, int n, const Float position[3],
+                                              const Rows& rows, const Float position[3],
                                               Float colour_gradient[3]) {
   Float colour[3];
-  view_colour(arrays, c, rows, n, position, colour);
+  view_colour(arrays, c, rows, position, colour);
   for (int channel = 0; channel < 3; ++channel)
     colour_gradient[channel] = select(greater(Float{}, colour[channel]), minimum(colour_gradient[channel], Float{}),
                                       colour_gradient[channel]);
@@ -57,7 +57,7 @@ static inline void differentiate_cut_at_black(const GaussianArrays& arrays, cons
 // `position_gradient` (camera frame) what flows through the viewing direction. Moving the camera by a left
 // perturbation (v, omega) of T_camera_world changes the direction by v only: rotating the camera does not.
 static inline void differentiate_view_colour(const GaussianArrays& arrays, const ViewConstants& c,
-                                             const std::int32_t* rows, int n, const Float position[3],
+                                             const Rows& rows, const Float position[3],
                                              const Float colour_gradient[3], Float basis[16],
                                              Float position_gradient[3]) {
   const int count = arrays.active_sh_coefficients;
@@ -70,7 +70,7 @@ static inline void differentiate_view_colour(const GaussianArrays& arrays, const
   for (int k = 1; k < count; ++k) {
     weight[k] = Float{};
     for (int channel = 0; channel < 3; ++channel)
-      weight[k] += colour_gradient[channel] * load_sh(arrays, rows, n, k, channel);
+      weight[k] += colour_gradient[channel] * load_sh(arrays, rows, k, channel);
   }
   sh_direction_gradient(count, d[0], d[1], d[2], weight, g);
   const Float along = g[0] * d[0] + g[1] * d[1] + g[2] * d[2];
