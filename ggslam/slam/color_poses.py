@@ -4,7 +4,7 @@ images show."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -12,6 +12,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.mapping.cpu.mapper import CpuMapper
+from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.settings import ViewAlignmentSettings
 from ggslam.mapping.view_alignment import BLURS, align_view, grey_of
@@ -77,7 +78,7 @@ class ColorPoses:
         keyframe, T_world_anchor = self.poses.anchor
         T_map_world = self.mapper.keyframes[keyframe].T_world_camera @ inverse(T_world_anchor)
         start, settings = T_map_world @ found.T_world_camera, self.mapper.settings.view_alignment
-        T = self._pose(grey_of(frame.color), start, found.median_depth_m, _hidden(frame), settings)
+        T = self._pose(grey_of(frame.color), start, found.median_depth_m, _hidden(frame.moving, frame.valid), settings)
         return found if T is None else replace(found, T_world_camera=orthonormalize(inverse(T_map_world) @ T))
 
     def note(self, frame: Frame, found: TrackingResult) -> None:
@@ -88,7 +89,7 @@ class ColorPoses:
         number, depth = len(self.poses.frames) - 1, found.median_depth_m
         if not self._tells_more(depth) and number >= UNDECIDED:
             return
-        grey, hidden = grey_of(frame.color), _hidden(frame)
+        grey, hidden = grey_of(frame.color), _hidden(frame.moving, frame.valid)
         if self.held_bytes >= (KEPT_BYTES if self.mapper.residency is None else KEPT_BYTES_PAGED):
             if not self.live:
                 self.poses.frames[number] = self._aligned(number, depth, grey, hidden)
@@ -103,8 +104,7 @@ class ColorPoses:
         if not self.active:
             return
         aligned, due = {}, [image for image in self.images if self._tells_more(image[1])]
-        residency = self.mapper.residency
-        for numbers in (range(len(self.mapper.keyframes)),) if residency is None or not due else residency.stages():
+        for numbers in self._stages() if due else ():
             together = set(numbers)
             for number, depth, coded, mask in due:
                 if self.poses.frames[number].keyframe not in together:
@@ -116,6 +116,27 @@ class ColorPoses:
                     report()
         for number, frame in aligned.items():  # all or none: `report` may end the run
             self.poses.frames[number] = frame
+
+    def align_keyframes(self) -> None:
+        """Aligns all keyframes but the first to the map as it is now, where depth hides its errors: they were placed
+        one after the other, and those that came early see the least of what the others agree on."""
+        if not self.active or not self._is_due:
+            return
+        settings = self.mapper.settings.view_alignment
+        for numbers in self._stages():
+            for keyframe in (self.mapper.keyframes[number] for number in numbers if number > 0):
+                known = keyframe.depth_m()
+                if keyframe.frame_index == ELSEWHERE or not known.any():
+                    continue
+                depth, hidden = float(np.median(known[known > 0])), _hidden(keyframe.moving, None)
+                T = self._pose(grey_of(keyframe.color), keyframe.T_world_camera, depth, hidden, settings, BLURS[-1:])
+                if T is not None:
+                    keyframe.T_camera_world = inverse(orthonormalize(T))
+
+    def _stages(self) -> Iterable[Sequence[int]]:
+        """Numbers of keyframes that are looked at together: of all whose part of the map is in memory then."""
+        residency = self.mapper.residency
+        return (range(len(self.mapper.keyframes)),) if residency is None else residency.stages()
 
     def _decoded(self, coded: np.ndarray) -> np.ndarray:
         """A kept image, uint8 [H, W]."""
@@ -167,12 +188,12 @@ class ColorPoses:
         return found if moved <= limit and np.radians(turned) * median_depth <= limit else None
 
 
-def _hidden(frame: Frame) -> np.ndarray | None:
-    """Where a frame's image does not show the map, bool [H, W]: something moves there, or is fixed to the camera, or
-    there is no image; None: nowhere. What is beside it is not trusted either."""
-    hidden = frame.moving
-    if frame.valid is not None:
-        hidden = ~frame.valid if hidden is None else hidden | ~frame.valid
+def _hidden(moving: np.ndarray | None, valid: np.ndarray | None) -> np.ndarray | None:
+    """Where an image does not show the map, bool [H, W]: something moves there, or is fixed to the camera, or there is
+    no image (see `Frame`); None: nowhere. What is beside it is not trusted either."""
+    hidden = moving
+    if valid is not None:
+        hidden = ~valid if hidden is None else hidden | ~valid
     if hidden is None or not hidden.any():
         return None
     return cv2.dilate(hidden.astype(np.uint8), np.ones((HIDDEN_MARGIN, HIDDEN_MARGIN), np.uint8)) > 0

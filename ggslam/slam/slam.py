@@ -211,6 +211,8 @@ class Slam:
 
         try:
             if steps:
+                if not begin:
+                    self.color_poses.align_keyframes()
                 self.mapper.refine(steps, note, begin)
             self.color_poses.align_last(lambda: note(steps, steps))
         finally:  # an interrupted refinement counts for what it did
