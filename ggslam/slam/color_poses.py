@@ -78,7 +78,7 @@ class ColorPoses:
         keyframe, T_world_anchor = self.poses.anchor
         T_map_world = self.mapper.keyframes[keyframe].T_world_camera @ inverse(T_world_anchor)
         start, settings = T_map_world @ found.T_world_camera, self.mapper.settings.view_alignment
-        T = self._pose(grey_of(frame.color), start, found.median_depth_m, _hidden(frame.moving, frame.valid), settings)
+        T = self._pose(grey_of(frame.color), start, found.median_depth_m, _find_hidden(frame.moving, frame.valid), settings)
         return found if T is None else replace(found, T_world_camera=orthonormalize(inverse(T_map_world) @ T))
 
     def note(self, frame: Frame, found: TrackingResult) -> None:
@@ -89,10 +89,10 @@ class ColorPoses:
         number, depth = len(self.poses.frames) - 1, found.median_depth_m
         if not self._tells_more(depth) and number >= UNDECIDED:
             return
-        grey, hidden = grey_of(frame.color), _hidden(frame.moving, frame.valid)
+        grey, hidden = grey_of(frame.color), _find_hidden(frame.moving, frame.valid)
         if self.held_bytes >= (KEPT_BYTES if self.mapper.residency is None else KEPT_BYTES_PAGED):
             if not self.live:
-                self.poses.frames[number] = self._aligned(number, depth, grey, hidden)
+                self.poses.frames[number] = self._align_frame(number, depth, grey, hidden)
             return
         coded = cv2.imencode(".jpg", np.rint(255 * grey).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
         mask = np.zeros(0, np.uint8) if hidden is None else cv2.imencode(".png", hidden.view(np.uint8))[1]
@@ -109,9 +109,9 @@ class ColorPoses:
             for number, depth, coded, mask in due:
                 if self.poses.frames[number].keyframe not in together:
                     continue
-                grey = self._decoded(coded).astype(np.float32) / 255
-                hidden = self._decoded(mask) > 0 if len(mask) else None
-                aligned[number] = self._aligned(number, depth, grey, hidden)
+                grey = self._decode(coded).astype(np.float32) / 255
+                hidden = self._decode(mask) > 0 if len(mask) else None
+                aligned[number] = self._align_frame(number, depth, grey, hidden)
                 if len(aligned) % REPORT_EVERY == 0:
                     report()
         for number, frame in aligned.items():  # all or none: `report` may end the run
@@ -128,7 +128,7 @@ class ColorPoses:
                 known = keyframe.depth_m()
                 if keyframe.frame_index == ELSEWHERE or not known.any():
                     continue
-                depth, hidden = float(np.median(known[known > 0])), _hidden(keyframe.moving, None)
+                depth, hidden = float(np.median(known[known > 0])), _find_hidden(keyframe.moving, None)
                 T = self._pose(grey_of(keyframe.color), keyframe.T_world_camera, depth, hidden, settings, BLURS[-1:])
                 if T is not None:
                     keyframe.T_camera_world = inverse(orthonormalize(T))
@@ -138,7 +138,7 @@ class ColorPoses:
         residency = self.mapper.residency
         return (range(len(self.mapper.keyframes)),) if residency is None else residency.stages()
 
-    def _decoded(self, coded: np.ndarray) -> np.ndarray:
+    def _decode(self, coded: np.ndarray) -> np.ndarray:
         """A kept image, uint8 [H, W]."""
         image, camera = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), self.state.camera
         if image is None or image.shape != (camera.height, camera.width):  # out of a checkpoint that was tampered with
@@ -157,7 +157,7 @@ class ColorPoses:
         least = self.mapper.settings.view_alignment.last_noise
         return noise is not None and depth > 0 and noise.sigma(depth) * camera.fx / depth >= least
 
-    def _aligned(self, number: int, depth: float, grey: np.ndarray, hidden: np.ndarray | None) -> TrackedFrame:
+    def _align_frame(self, number: int, depth: float, grey: np.ndarray, hidden: np.ndarray | None) -> TrackedFrame:
         """A frame with its pose as of the finished map."""
         frame, settings = self.poses.frames[number], self.mapper.settings.view_alignment
         T_world_keyframe = self.mapper.keyframes[frame.keyframe].T_world_camera
@@ -188,7 +188,7 @@ class ColorPoses:
         return found if moved <= limit and np.radians(turned) * median_depth <= limit else None
 
 
-def _hidden(moving: np.ndarray | None, valid: np.ndarray | None) -> np.ndarray | None:
+def _find_hidden(moving: np.ndarray | None, valid: np.ndarray | None) -> np.ndarray | None:
     """Where an image does not show the map, bool [H, W]: something moves there, or is fixed to the camera, or there is
     no image (see `Frame`); None: nowhere. What is beside it is not trusted either."""
     hidden = moving
