@@ -78,7 +78,8 @@ class ColorPoses:
         keyframe, T_world_anchor = self.poses.anchor
         T_map_world = self.mapper.keyframes[keyframe].T_world_camera @ inverse(T_world_anchor)
         start, settings = T_map_world @ found.T_world_camera, self.mapper.settings.view_alignment
-        T = self._pose(grey_of(frame.color), start, found.median_depth_m, _find_hidden(frame.moving, frame.valid), settings)
+        hidden = _find_hidden(frame.moving, frame.valid)
+        T = self._pose(grey_of(frame.color), start, found.median_depth_m, hidden, settings)
         return found if T is None else replace(found, T_world_camera=orthonormalize(inverse(T_map_world) @ T))
 
     def note(self, frame: Frame, found: TrackingResult) -> None:
