@@ -237,7 +237,7 @@ class Mapper(ABC):
         """Remembers where images of a frame's camera show something: nothing else is trained on."""
         self._valid[frame.camera_number] = frame.valid
 
-    def _valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
+    def valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
         """Where a keyframe shows something, bool [H, W]; None: everywhere, or it is of another recording."""
         valid = self._valid.get(keyframe.camera_number) if keyframe.frame_index != ELSEWHERE else None
         if valid is not None and valid.shape != keyframe.color.shape[:2]:

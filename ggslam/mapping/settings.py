@@ -130,7 +130,8 @@ class ExposureSettings:
 @settings_class(frozen=True)
 class ViewAlignmentSettings:
     """Alignment of frames to the map by colour alone (on the CPU): of those that are no keyframes after the last frame,
-    and, where depth errs more than its images show, of all as they come (in synchronous runs)."""
+    and, where depth errs more than its images show, of all as they come (in synchronous runs) and of keyframes before
+    the last steps."""
 
     enabled: bool = setting(True, basic=True)
     """Whether frames are aligned to the map so."""

@@ -121,15 +121,16 @@ class ColorPoses:
     def align_keyframes(self) -> None:
         """Aligns all keyframes but the first to the map as it is now, where depth hides its errors: they were placed
         one after the other, and those that came early see the least of what the others agree on."""
-        if not self.active or not self._is_due:
+        if not (self.active and self._is_due and self.mapper.settings.pose_refinement.enabled):
             return
         settings = self.mapper.settings.view_alignment
         for numbers in self._stages():
             for keyframe in (self.mapper.keyframes[number] for number in numbers if number > 0):
                 known = keyframe.depth_m()
-                if keyframe.frame_index == ELSEWHERE or not known.any():
-                    continue
-                depth, hidden = float(np.median(known[known > 0])), _find_hidden(keyframe.moving, None)
+                if keyframe.frame_index == ELSEWHERE or keyframe.instant is not None or not known.any():
+                    continue  # keyframes of a rig stay as the rig has them
+                depth = float(np.median(known[known > 0]))
+                hidden = _find_hidden(None, self.mapper.valid_of(keyframe))
                 T = self._pose(grey_of(keyframe.color), keyframe.T_world_camera, depth, hidden, settings, BLURS[-1:])
                 if T is not None:
                     keyframe.T_camera_world = inverse(orthonormalize(T))
@@ -138,6 +139,16 @@ class ColorPoses:
         """Numbers of keyframes that are looked at together: of all whose part of the map is in memory then."""
         residency = self.mapper.residency
         return (range(len(self.mapper.keyframes)),) if residency is None else residency.stages()
+
+    def check(self) -> None:
+        """Raises FormatError if what is kept cannot be of this run: it may have come out of a file."""
+        for kept in self.images:
+            number, depth, *coded = kept if isinstance(kept, (tuple, list)) and len(kept) == 4 else (-1, 0.0)
+            known = isinstance(number, int) and 0 <= number < len(self.poses.frames) and isinstance(depth, float)
+            if not known or any(not isinstance(a, np.ndarray) or a.dtype != np.uint8 or a.ndim != 1 for a in coded):
+                raise FormatError("images of frames that are aligned at the end: not of this recording")
+            if not len(coded[0]):
+                raise FormatError("images of frames that are aligned at the end: an empty one")
 
     def _decode(self, coded: np.ndarray) -> np.ndarray:
         """A kept image, uint8 [H, W]."""

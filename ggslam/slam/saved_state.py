@@ -131,6 +131,7 @@ def check_state(slam: Slam) -> None:
         arrays = (view.depth, view.near, view.far, view.whole, view.smooth)
         if any(array.shape != (view.camera.height, view.camera.width) for array in arrays):
             raise FormatError("views of what may move: not of their camera")
+    slam.color_poses.check()
     counts = [len(surface), slam.poses.keyframes_made, len(mapper.keyframes)]
     counts += [] if slam.loops is None else [len(slam.loops.poses), len(slam.loops.places)]
     if len(set(counts)) > 1:

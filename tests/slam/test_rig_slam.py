@@ -185,3 +185,11 @@ def test_another_run_goes_on_bit_for_bit(sequence: RigSequence) -> None:
 def test_what_a_rig_does_not_go_with_is_refused(sequence: RigSequence, setting: str) -> None:
     with pytest.raises(ConfigError, match=f"^{setting.partition('=')[0]}: a rig of cameras does not go with"):
         RigSlam(sequence.rig, load_config(None, [setting]))
+
+
+def test_keyframes_of_a_rig_are_not_aligned_one_by_one(sequence: RigSequence) -> None:
+    slam = run(sequence)
+    slam.tracker.state.residuals.hidden = 100
+    before = [keyframe.T_world_camera for keyframe in slam.mapper.keyframes]
+    slam.color_poses.align_keyframes()
+    assert all(np.array_equal(k.T_world_camera, T) for k, T in zip(slam.mapper.keyframes, before, strict=True))

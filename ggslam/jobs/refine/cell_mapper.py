@@ -132,7 +132,7 @@ class StillMapper(CpuMapper):
         before, after = np.mean(ends, axis=0) if ends else (np.nan, np.nan)
         return float(before), float(after)
 
-    def _valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
+    def valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
         return self._counted[keyframe.index]
 
     def _is_exposed(self, keyframe: Keyframe) -> bool:

@@ -48,7 +48,8 @@ class Resumption:
         where = Checkpoints(folder.path).folder / StartRecord.FILE
         if start.ggslam != __version__ or start.version != VERSION:
             raise RunFolderError(
-                f"{folder.path}: was begun with ggslam {start.ggslam}, this is {__version__}: resume it with that one"
+                f"{folder.path}: was begun with ggslam {start.ggslam} (checkpoints of version {start.version}), "
+                f"this is {__version__} (version {VERSION}): resume it with that one"
             )
         if hash_of(start.config) != start.config_hash:
             raise RunFolderError(f"{where}: the settings are not those that the run was begun with")

@@ -91,7 +91,7 @@ class CpuMapper(Mapper):
             where = find_unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
             color = self._compensate(keyframe, depth, view)
-        valid = self._valid_of(keyframe)
+        valid = self.valid_of(keyframe)
         if valid is not None:
             alpha = np.where(valid, alpha, np.float32(1))  # where images show nothing there is nothing to fill
         if self.identity is not None and labeller is not None:
@@ -153,7 +153,7 @@ class CpuMapper(Mapper):
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> CpuLossResult:
         exposure = keyframe.exposure if self._is_exposed(keyframe) else None
-        valid = self._valid_of(keyframe)
+        valid = self.valid_of(keyframe)
         target = LossTarget(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure, valid)
         return self._loss.evaluate(view, target, self.settings.loss)
 

@@ -177,7 +177,7 @@ class CudaMapper(Mapper):
         assert isinstance(keyframe, CudaKeyframe)
         images, s = keyframe.device_images, self.settings
         exposure = self._states.exposure(keyframe.index) if s.exposure.enabled else None
-        valid = self._valid_of(keyframe)
+        valid = self.valid_of(keyframe)
         if valid is not None and (self._valid_on_device is None or self._valid_on_device[0] is not valid):
             self._valid_on_device = (valid, torch.from_numpy(valid).to(self.device))
         shown = None if valid is None or self._valid_on_device is None else self._valid_on_device[1]
