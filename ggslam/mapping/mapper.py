@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -252,13 +252,14 @@ class Mapper(ABC):
     def _draw(self, numbers: Sequence[int]) -> Keyframe:
         return self.keyframes[numbers[self._sampler.draw(len(numbers))]]
 
+    def stages(self) -> Iterable[Sequence[int]]:
+        """Numbers of all keyframes, some after the others: of those handed out the whole map is in memory."""
+        return (range(len(self.keyframes)),) if self.residency is None else self.residency.stages()
+
     def _stages(self, steps: int) -> Iterator[tuple[Sequence[int], int]]:
         """Keyframes to train together, and how many of `steps` are theirs: as many as their share of all keyframes."""
-        if self.residency is None:
-            yield range(len(self.keyframes)), steps
-            return
         done = 0
-        for numbers in self.residency.stages():
+        for numbers in self.stages():
             before, done = done, done + len(numbers)
             yield numbers, steps * done // len(self.keyframes) - steps * before // len(self.keyframes)
 

@@ -4,7 +4,7 @@ images show."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -105,7 +105,7 @@ class ColorPoses:
         if not self.active:
             return
         aligned, due = {}, [image for image in self.images if self._tells_more(image[1])]
-        for numbers in self._stages() if due else ():
+        for numbers in self.mapper.stages() if due else ():
             together = set(numbers)
             for number, depth, coded, mask in due:
                 if self.poses.frames[number].keyframe not in together:
@@ -124,7 +124,7 @@ class ColorPoses:
         if not (self.active and self._is_due and self.mapper.settings.pose_refinement.enabled):
             return
         settings = self.mapper.settings.view_alignment
-        for numbers in self._stages():
+        for numbers in self.mapper.stages():
             for keyframe in (self.mapper.keyframes[number] for number in numbers if number > 0):
                 known = keyframe.depth_m()
                 if keyframe.frame_index == ELSEWHERE or keyframe.instant is not None or not known.any():
@@ -134,11 +134,6 @@ class ColorPoses:
                 T = self._pose(grey_of(keyframe.color), keyframe.T_world_camera, depth, hidden, settings, BLURS[-1:])
                 if T is not None:
                     keyframe.T_camera_world = inverse(orthonormalize(T))
-
-    def _stages(self) -> Iterable[Sequence[int]]:
-        """Numbers of keyframes that are looked at together: of all whose part of the map is in memory then."""
-        residency = self.mapper.residency
-        return (range(len(self.mapper.keyframes)),) if residency is None else residency.stages()
 
     def check(self) -> None:
         """Raises FormatError if what is kept cannot be of this run: it may have come out of a file."""
