@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
+from insertion_reference import grid_selection, surface_normals
+from insertion_reference import new_gaussians as reference
 
-from ggslam.mapping.cpu.insertion import find_unexplained, grid_selection, new_gaussians, surface_normals
+from ggslam.errors import InputError
+from ggslam.mapping.cpu.insertion import find_unexplained, new_gaussians
 from ggslam.mapping.settings import InsertionSettings
+from ggslam.native.loader import NativeContext, available_instruction_sets
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import quaternion_to_matrix, se3_exp
 
@@ -72,6 +77,98 @@ def test_adaptive_stride_thins_flat_regions_only() -> None:
     rng = np.random.default_rng(0)
     color = np.full((48, 64, 3), 100, np.uint8)
     color[:, 32:] = rng.integers(0, 255, (48, 32, 3))
-    chosen, stride = grid_selection(color, np.ones((48, 64), np.float32), InsertionSettings(adaptive_stride=True))
+    depth = np.ones((48, 64), np.float32)
+    chosen, stride = grid_selection(color, depth, InsertionSettings(adaptive_stride=True))
     assert chosen[8:40, 40:56].all() and (stride[8:40, 40:56] == 1).all()
     assert chosen[8:40, 4:24].mean() == 0.25 and (stride[8:40, 4:24] == 2).all()
+    new = new_gaussians(color, depth, CAMERA, np.eye(4), None, InsertionSettings(adaptive_stride=True))
+    assert np.array_equal(new.pixels, np.flatnonzero(chosen))
+
+
+# --- the compiled core against the reference --------------------------------------------------------------------------
+
+POSE = se3_exp(np.array([0.3, -0.2, 0.5, 0.2, 0.4, -0.3]))
+SIZES = [(37, 53), (48, 64), (1, 20), (20, 1), (2, 2), (1, 1), (2, 19), (3, 70), (5, 5), (120, 161)]
+
+
+def make_images(height: int, width: int, holes: float = 0.02) -> tuple[np.ndarray, np.ndarray, np.ndarray, Camera]:
+    """Colour, depth, where to insert, and the camera of a sloped floor with a box in front of it, textured on half of
+    it, with holes large and small."""
+    rng = np.random.default_rng(height * 1000 + width)
+    v, u = np.mgrid[0:height, 0:width].astype(np.float32)
+    depth = 1.5 + 0.01 * u + 0.6 * v / height + rng.normal(0, 5e-4, (height, width)).astype(np.float32)
+    depth[height // 3 : height // 2, width // 4 : width // 2] = 0.9
+    depth[rng.random((height, width)) < holes] = 0
+    depth[2 * height // 3 : 2 * height // 3 + 9, width // 2 : width // 2 + 14] = 0
+    depth[:, -1] = 30  # too far away
+    color = np.full((height, width, 3), 120, np.uint8)
+    color[:, width // 2 :] = rng.integers(0, 256, (height, width - width // 2, 3))
+    color = cv2.blur(color, (3, 3))
+    camera = Camera(width, height, 60.0, 61.5, 0.5 * width - 0.3, 0.5 * height + 0.2)
+    return color, depth.astype(np.float32), rng.random((height, width)) < 0.8, camera
+
+
+def check_same(color: np.ndarray, depth: np.ndarray, where: np.ndarray, camera: Camera, s: InsertionSettings,
+               context: NativeContext | None = None) -> int:  # fmt: skip
+    found = new_gaussians(color, depth, camera, POSE, where, s, context)
+    expected = reference(color, depth, camera, POSE, where, s)
+    assert np.array_equal(found.pixels, expected.pixels)
+    for name, tolerance in (("means", 2e-6), ("log_scales", 2e-5), ("rgb", 1e-7)):
+        assert np.allclose(getattr(found, name), getattr(expected, name), rtol=0, atol=tolerance), name
+    apart = 1 - np.abs(np.einsum("ni,ni->n", found.quaternions.astype(float), expected.quaternions.astype(float)))
+    assert np.abs(np.linalg.norm(found.quaternions, axis=1) - 1).max(initial=0) < 1e-6
+    assert apart.max(initial=0) < 1e-6
+    return len(found)
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_the_core_gives_what_the_reference_gives(size: tuple[int, int], adaptive: bool) -> None:
+    s = InsertionSettings(adaptive_stride=adaptive, flatness=0.3)
+    made = check_same(*make_images(*size), s)
+    assert made or min(size) <= 3
+
+
+@pytest.mark.parametrize("instruction_set", available_instruction_sets())
+def test_every_instruction_set_gives_the_same(instruction_set: str) -> None:
+    assert check_same(*make_images(53, 75), InsertionSettings(), NativeContext(2, instruction_set)) > 500
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    color, depth, where, camera = make_images(120, 161)
+    one, three = (
+        new_gaussians(color, depth, camera, POSE, where, InsertionSettings(), NativeContext(n)) for n in (1, 3)
+    )
+    for name in ("means", "quaternions", "log_scales", "rgb", "pixels"):
+        assert getattr(one, name).tobytes() == getattr(three, name).tobytes(), name
+
+
+def test_nothing_selected_makes_nothing() -> None:
+    color, depth, where, camera = make_images(37, 53)
+    for images in ((color, depth, np.zeros_like(where)), (color, np.zeros_like(depth), where)):
+        new = new_gaussians(*images[:2], camera, POSE, images[2], InsertionSettings())
+        assert [len(a) for a in (new.means, new.quaternions, new.log_scales, new.rgb, new.pixels)] == [0] * 5
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
+def test_depth_that_is_none_makes_nothing_and_spoils_nothing(bad: float) -> None:
+    color, depth, _, camera = make_images(48, 64)
+    spoilt = depth.copy()
+    spoilt[10:14, 20:24] = bad
+    new = new_gaussians(color, spoilt, camera, POSE, None, InsertionSettings())
+    assert not np.isin(np.ravel_multi_index(np.mgrid[10:14, 20:24], depth.shape), new.pixels).any()
+    for array in (new.means, new.quaternions, new.log_scales):
+        assert np.isfinite(array).all()
+    holes = np.where(np.isfinite(spoilt) & (spoilt > 0), spoilt, np.float32(0))
+    expected = reference(color, holes, camera, POSE, np.ones(depth.shape, bool), InsertionSettings())
+    near = np.zeros(depth.shape, bool)
+    near[6:18, 16:28] = True  # beside what is none the grid may be finer
+    far = [a.pixels[~near.reshape(-1)[a.pixels]] for a in (new, expected)]
+    assert np.array_equal(*far)
+
+
+def test_images_of_another_kind_are_refused() -> None:
+    color, depth, where, camera = make_images(37, 53)
+    for images in ((color[1:], depth, where), (color, depth.astype(float), where), (color, depth, where.astype(int))):
+        with pytest.raises(InputError, match="insertion: .*: expected .*, found "):
+            new_gaussians(*images[:2], camera, POSE, images[2], InsertionSettings())

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The compiled core's image loss.
+// The compiled core's image loss, and the Gaussians that a keyframe brings.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -37,6 +37,25 @@ struct ImageLossJob {
   double exposure_gradient[6];
 };
 
+// One keyframe to insert Gaussians for; H = height, W = width.
+struct InsertionJob {
+  const uint8_t* color;  // [H, W, 3]
+  const float* depth;    // [H, W], metres; 0, or NaN, where nothing was measured
+  const uint8_t* where;  // [H, W], 0 where nothing is inserted; may be null
+  uint8_t* marks;        // [H, W], what the selection tells the shaping of each pixel
+  int64_t* pixels;       // room for H * W: flat indices of the selected ones, ascending
+  // Results, a row for each selected pixel: world frame; wxyz; natural logarithm of metres; in [0, 1].
+  float* means;
+  float* quaternions;
+  float* log_scales;
+  float* rgb;
+  int32_t height, width;
+  int32_t adaptive_stride;  // one Gaussian per 2x2 pixels where nothing changes, else one per pixel
+  float fx, fy, cx, cy;
+  float rotation[9], translation[3];  // of T_world_camera
+  float texture_threshold, max_depth, scale_pixels, flatness, max_slope;  // see mapping.settings.InsertionSettings
+};
+
 }  // namespace ggslam
 
 GGSLAM_EXPORT void* ggslam_image_loss_create();
@@ -44,3 +63,8 @@ GGSLAM_EXPORT int ggslam_image_loss_destroy(void* workspace);
 
 // Returns 0, or 1 when memory ran out. The caller has checked sizes and pointers.
 GGSLAM_EXPORT int ggslam_image_loss_evaluate(void* context, void* workspace, ggslam::ImageLossJob* job);
+
+// Chooses the pixels: `marks` and `pixels`; returns their number.
+GGSLAM_EXPORT int64_t ggslam_insertion_select(void* context, ggslam::InsertionJob* job);
+// Makes the Gaussians of the first `count` pixels that were chosen.
+GGSLAM_EXPORT int ggslam_insertion_shape(void* context, const ggslam::InsertionJob* job, int64_t count);

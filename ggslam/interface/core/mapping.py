@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 # Written by scripts/make_native_mirrors.py from mapping.hpp; changes are lost.
-"""The compiled core's image loss."""
+"""The compiled core's image loss, and the Gaussians that a keyframe brings."""
 
 from __future__ import annotations
 
-from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_void_p
+from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int64, c_void_p
 from typing import Any
 
 HEADER = "core/mapping.hpp"
-HEADER_SHA256 = "31ac22453a8885aabf09b206fc5cafd9d219a9f2603d7b8197ec238890fba1db"
+HEADER_SHA256 = "c3c95252042196d4b9aaa180868e335dbfbaf35501d873b5d1a25b7ec0ca5613"
 
 
 class ImageLossJob(Structure):
@@ -26,10 +26,25 @@ class ImageLossJob(Structure):
     ]
 
 
-STRUCTURES: tuple[type[Structure], ...] = (ImageLossJob,)
+class InsertionJob(Structure):
+    """One keyframe to insert Gaussians for; H = height, W = width."""
+
+    _fields_ = [
+        ("color", c_void_p), ("depth", c_void_p), ("where", c_void_p), ("marks", c_void_p), ("pixels", c_void_p),
+        ("means", c_void_p), ("quaternions", c_void_p), ("log_scales", c_void_p), ("rgb", c_void_p),
+        ("height", c_int32), ("width", c_int32), ("adaptive_stride", c_int32), ("fx", c_float), ("fy", c_float),
+        ("cx", c_float), ("cy", c_float), ("rotation", c_float * 9), ("translation", c_float * 3),
+        ("texture_threshold", c_float), ("max_depth", c_float), ("scale_pixels", c_float), ("flatness", c_float),
+        ("max_slope", c_float),
+    ]
+
+
+STRUCTURES: tuple[type[Structure], ...] = (ImageLossJob, InsertionJob)
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_image_loss_create": (c_void_p, []),
     "ggslam_image_loss_destroy": (c_int, [c_void_p]),
     "ggslam_image_loss_evaluate": (c_int, [c_void_p, c_void_p, POINTER(ImageLossJob)]),
+    "ggslam_insertion_select": (c_int64, [c_void_p, POINTER(InsertionJob)]),
+    "ggslam_insertion_shape": (c_int, [c_void_p, POINTER(InsertionJob), c_int64]),
 }
 """Result and arguments of each."""

@@ -7,6 +7,7 @@
 #include "interface/core/mapping.hpp"
 
 using ggslam::ImageLossJob;
+using ggslam::InsertionJob;
 
 namespace {
 constexpr std::size_t kLayout[] = {
@@ -21,6 +22,14 @@ constexpr std::size_t kLayout[] = {
     offsetof(ImageLossJob, color), offsetof(ImageLossJob, l1), offsetof(ImageLossJob, ssim),
     offsetof(ImageLossJob, depth_term), offsetof(ImageLossJob, opacity_term), offsetof(ImageLossJob, depth_l1_m),
     offsetof(ImageLossJob, psnr), offsetof(ImageLossJob, valid_pixels), offsetof(ImageLossJob, exposure_gradient),
+    sizeof(InsertionJob), offsetof(InsertionJob, color), offsetof(InsertionJob, depth), offsetof(InsertionJob, where),
+    offsetof(InsertionJob, marks), offsetof(InsertionJob, pixels), offsetof(InsertionJob, means),
+    offsetof(InsertionJob, quaternions), offsetof(InsertionJob, log_scales), offsetof(InsertionJob, rgb),
+    offsetof(InsertionJob, height), offsetof(InsertionJob, width), offsetof(InsertionJob, adaptive_stride),
+    offsetof(InsertionJob, fx), offsetof(InsertionJob, fy), offsetof(InsertionJob, cx), offsetof(InsertionJob, cy),
+    offsetof(InsertionJob, rotation), offsetof(InsertionJob, translation), offsetof(InsertionJob, texture_threshold),
+    offsetof(InsertionJob, max_depth), offsetof(InsertionJob, scale_pixels), offsetof(InsertionJob, flatness),
+    offsetof(InsertionJob, max_slope),
 };
 }  // namespace
 

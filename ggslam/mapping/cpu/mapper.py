@@ -49,7 +49,7 @@ class CpuMapper(Mapper):
         identity: CpuIdentityLearner | None = None,
     ) -> None:
         super().__init__(gaussians, settings, seed, identity)
-        self._losses = LossSums()
+        self._losses, self._context = LossSums(), context
         self._last_psnr = float("nan")
         self._rasterizer = CpuRasterizer(context=context)
         self._loss = CpuImageLoss(context)
@@ -82,7 +82,7 @@ class CpuMapper(Mapper):
 
     def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None) -> None:
         depth, s = keyframe.depth_m(), self.settings.insertion
-        where, alpha = np.ones(depth.shape, bool), np.zeros(depth.shape, np.float32)
+        where, alpha = None, np.zeros(depth.shape, np.float32)
         show: Callable[[], MapLabels] | None = None
         color = keyframe.color
         if self.map.count:
@@ -96,7 +96,7 @@ class CpuMapper(Mapper):
             alpha = np.where(valid, alpha, np.float32(1))  # where images show nothing there is nothing to fill
         if self.identity is not None and labeller is not None:
             self._take_labels(keyframe, labeller(keyframe, show))
-        parts = [new_gaussians(color, depth, keyframe.camera, T_world_camera, where, s)]
+        parts = [new_gaussians(color, depth, keyframe.camera, T_world_camera, where, s, self._context)]
         if s.fill_stride:
             parts.append(fill_gaussians(color, depth, alpha, keyframe.camera, T_world_camera, s))
         logit = float(np.log(s.opacity / (1 - s.opacity)))
