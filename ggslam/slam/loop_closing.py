@@ -126,11 +126,11 @@ class LoopCloser:
 
     def begin(self, frame: Frame) -> None:
         """Starts to describe the frame that is added next, in another thread: for a caller that has other things to do
-        than to compute on the CPU until then."""
+        until then."""
         if self._helper is None:
             self._helper = ThreadPoolExecutor(1, thread_name_prefix="places")
         view = FeatureView(frame.color, frame.depth, np.eye(4))
-        self._begun = frame.index, self._helper.submit(self.places.describe, view)
+        self._begun = frame.index, self._helper.submit(self.places.describe, view, frame.camera)
 
     def _describe(self, frame: Frame, T_world_camera: np.ndarray) -> Place:
         begun, self._begun = self._begun, None

@@ -372,6 +372,8 @@ class Slam:
             moves_followed: the corrections that this knows of.
         """
         tracking = self._corrections.follow(tracking, moves_followed)
+        if self.loops is not None:
+            self.loops.begin(frame)  # features are found by one thread alone, while much of what follows is, too
         if self.pager is not None:
             self.pager.prepare(tracking.T_world_camera, frame.depth)
         before = self.map.count
