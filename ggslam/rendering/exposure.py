@@ -42,14 +42,12 @@ def measure_exposure(
     """
     some = (slice(None, None, STEP), slice(None, None, STEP))
     depth, rendered_depth = depth[some], rendered_depth[some]
-    seen = color[some].astype(np.float32) / 255
-    shown = np.moveaxis(image[:, ::STEP, ::STEP], 0, 2)
     near = np.abs(rendered_depth - depth) < SAME_DEPTH * depth
     known = (depth > 0) & (alpha[some] > OPAQUE) & near
-    exposure = identity_exposure()
+    seen, exposure = color[some][known], identity_exposure()
     for channel in range(3):
-        x, y = shown[..., channel], seen[..., channel]
-        used = known & (x > DARK) & (x < BRIGHT) & (y < BRIGHT)
+        x, y = image[channel][some][known], seen[:, channel].astype(np.float32) / 255
+        used = (x > DARK) & (x < BRIGHT) & (y < BRIGHT)
         if used.sum() < FEWEST_SHARE * known.size:
             return None
         exposure[channel, 0] = float(np.median(y[used] / x[used]))

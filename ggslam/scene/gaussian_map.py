@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 
 from ggslam.errors import InputError
@@ -76,6 +77,7 @@ class GaussianMap:
             raise InputError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
         self._storage: dict[str, torch.Tensor] = {}
         self._views: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
+        self._moments: tuple[tuple[int, int], dict[str, tuple[torch.Tensor, torch.Tensor]]] = ((-1, -1), {})
         self._allocate(0)
 
     # --- storage -------------------------------------------------------------------------------------------------
@@ -104,6 +106,7 @@ class GaussianMap:
 
     def _allocate(self, capacity: int) -> None:
         self.allocations += 1
+        self._moments = ((-1, -1), {})  # views of them would keep the old arrays in memory, too
         for name in self._names:  # one after the other, so that no more than one of them is there twice
             new = torch.zeros((capacity, *self._shape(name)), dtype=self._dtype(name), device=self.device)
             if name in self._storage:
@@ -148,8 +151,11 @@ class GaussianMap:
         """Adam's first and second moment of each parameter, views of the used rows."""
         if not self.with_moments:
             return {}
-        rows, arrays = self.count, self._storage
-        return {name: (arrays[f"{name}.first"][:rows], arrays[f"{name}.second"][:rows]) for name in _PARAMETERS}
+        key, rows, arrays = (self.allocations, self.count), self.count, self._storage
+        if self._moments[0] != key:  # every optimisation step asks for them
+            views = {n: (arrays[f"{n}.first"][:rows], arrays[f"{n}.second"][:rows]) for n in _PARAMETERS}
+            self._moments = (key, views)
+        return self._moments[1]
 
     # --- derived quantities ----------------------------------------------------------------------------------------
 
@@ -170,7 +176,11 @@ class GaussianMap:
 
     def bound_colors(self) -> None:
         """Brings colours of degree 0 between black and white."""
-        self.sh[:, 0].clamp_(-0.5 / SH_C0, 0.5 / SH_C0)
+        colors, bound = self.sh[:, 0].detach(), 0.5 / SH_C0
+        if colors.is_cpu:  # torch's threads take longer to wake than this takes
+            np.clip(colors.numpy(), -bound, bound, out=colors.numpy())
+        else:
+            colors.clamp_(-bound, bound)
 
     # --- whole rows --------------------------------------------------------------------------------------------------
 

@@ -60,6 +60,10 @@ class MapCorrections:
             tracking = replace(tracking, T_world_camera=T_new_old @ tracking.T_world_camera)
         return tracking
 
+    def begin_points(self, tracking: TrackingResult) -> None:
+        """Starts in another thread what `add_points` will have to do."""
+        self._surface.begin(tracking.points, tracking.T_world_camera)
+
     def add_points(self, tracking: TrackingResult) -> None:
         """The points of a new keyframe join the surface."""
         with self._publishing:

@@ -227,7 +227,9 @@ RULES: Rules = {
     CameraMotion: _but("reference"),
     FeatureView: _but("_features"),
     KeyframePolicy: _but("settings"),
-    MeasuredSurface: _but("_context", "_archive", "target", "finish", after=MeasuredSurface.gather_again),
+    MeasuredSurface: _but(
+        "_context", "_archive", "target", "finish", "_helper", "_begun", after=MeasuredSurface.gather_again
+    ),
     _Part: Rule(fixed=_names("_arrays")),
     LocalFeatureMap: _but("settings", "clock", "_aligner"),
     FeatureMap: _but("settings", "_shift", "_mask", "_corners", "_ones", "_isotropic"),

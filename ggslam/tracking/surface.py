@@ -11,6 +11,8 @@ G-ICP Gaussian SLAM escapes this by hardly training positions at all, at the pri
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -56,6 +58,22 @@ class _Part:
         return (self._arrays if self._archive is None else self._archive.get(self._name))[name]
 
 
+@dataclass(frozen=True)
+class _Begun:
+    """Points that will be added from a pose to a target, as keyframe `number`, and the part and target they give."""
+
+    points: PointSource
+    T_world_camera: np.ndarray
+    base: GicpTarget | None
+    number: int
+    result: Future[tuple[_Part, GicpTarget]]
+
+    def is_for(self, points: PointSource, T_world_camera: np.ndarray, base: GicpTarget | None, number: int) -> bool:
+        """Whether that is what is to be added now: the surface may have changed since."""
+        same = points is self.points and base is self.base and number == self.number
+        return same and np.array_equal(T_world_camera, self.T_world_camera)
+
+
 class MeasuredSurface:
     """Keyframes' points gathered into one target, keyframe by keyframe. Which of the keyframes take part can be
     chosen, and keyframes can be moved: after a loop was closed the surface is where they are.
@@ -79,15 +97,40 @@ class MeasuredSurface:
         """What has been gathered so far; None before the first keyframe. Each change makes a new one."""
         self._joined: list[list[int]] = []
         """The keyframes of the target, in the groups in which they joined it."""
+        self._helper: ThreadPoolExecutor | None = None
+        self._begun: _Begun | None = None
 
     def __len__(self) -> int:
         return len(self._parts)
 
+    def begin(self, points: PointSource, T_world_camera: np.ndarray) -> None:
+        """Starts in another thread what `add` will have to do, for a caller that has other things to do until then."""
+        if self._archive is not None:
+            return
+        if self._helper is None:
+            self._helper = ThreadPoolExecutor(1, thread_name_prefix="surface")
+        T, base, number = np.array(T_world_camera, float), self.target, len(self._parts)
+
+        def prepare() -> tuple[_Part, GicpTarget]:
+            read = points.read()
+            part = _Part(number, read.points.copy(), read.normals.copy(), T, None)
+            return part, self._gather([part], base)
+
+        self._begun = _Begun(points, T, base, number, self._helper.submit(prepare))
+
     def add(self, points: PointSource, T_world_camera: np.ndarray) -> GicpTarget:
         """Adds the points of a keyframe seen from `T_world_camera` [4, 4]; returns the new target."""
+        begun, self._begun = self._begun, None
+        number = len(self._parts)
+        if begun is not None and begun.is_for(points, T_world_camera, self.target, number):
+            part, self.target = begun.result.result()
+            self._parts.append(part)
+            self.active.add(number)
+            self._joined.append([number])
+            return self.target
         read = points.read()
         self._append(read.points.copy(), read.normals.copy(), np.array(T_world_camera, float))
-        return self._join([len(self._parts) - 1])
+        return self._join([number])
 
     def _join(self, numbers: list[int]) -> GicpTarget:
         """These keyframes take part, too."""

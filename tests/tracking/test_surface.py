@@ -105,6 +105,30 @@ def test_keyframes_can_be_moved_and_put_aside() -> None:
     np.testing.assert_allclose(a, b, atol=1e-4)
 
 
+def test_what_was_begun_is_what_is_added() -> None:
+    settings, context = TrackerSettings(), NativeContext(2)
+    poses = [se3_exp(np.array(t, float)) for t in ([0] * 6, [0.1, 0, 0, 0, 0.1, 0], [0, 0.1, 0, 0.1, 0, 0])]
+    points = [extract_points(corner_depth(T), CAMERA, settings.points, DepthNoise(), context) for T in poses]
+    plain, begun, misled = (MeasuredSurface(settings.target, context) for _ in range(3))
+    for number, (T, p) in enumerate(zip(poses, points, strict=True)):
+        plain.add(p, T)
+        begun.begin(p, T)
+        begun.add(p, T)
+        misled.begin(points[0], poses[2])  # something else is added then...
+        misled.add(p, T)
+        misled.begin(p, T)
+        misled.arrange(set(range(number)))  # ...or to something else
+        misled.arrange(set(range(number + 1)))
+    for surface in (begun, misled):
+        assert surface.target is not None and plain.target is not None and surface.active == plain.active
+        assert len(surface) == 3 and len(surface.target) == len(plain.target)
+    for level in (0, 1):
+        a, b = begun.target.voxels(level), plain.target.voxels(level)
+        assert all(a[name].tobytes() == b[name].tobytes() for name in a)
+    begun.gather_again()
+    assert begun.target.voxels()["means"].tobytes() == plain.target.voxels()["means"].tobytes()
+
+
 def test_a_surface_comes_back_from_its_arrays() -> None:
     settings, context = TrackerSettings(), NativeContext(2)
     surface, again = (MeasuredSurface(settings.target, context) for _ in range(2))

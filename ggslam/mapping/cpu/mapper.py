@@ -49,7 +49,7 @@ class CpuMapper(Mapper):
         identity: CpuIdentityLearner | None = None,
     ) -> None:
         super().__init__(gaussians, settings, seed, identity)
-        self._losses, self._context = LossSums(), context
+        self._losses = LossSums()
         self._last_psnr = float("nan")
         self._rasterizer = CpuRasterizer(context=context)
         self._loss = CpuImageLoss(context)
@@ -87,16 +87,17 @@ class CpuMapper(Mapper):
         color = keyframe.color
         if self.map.count:
             view = self._render(keyframe, features=False)
-            alpha, rendered = view.alpha.numpy(), view.expected_depth.numpy()
+            alpha, rendered = view.alpha.numpy(), _expected_depth(view)
             where = find_unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
-            color = self._compensate(keyframe, depth, view)
+            color = self._compensate(keyframe, depth, view, rendered)
         valid = self.valid_of(keyframe)
         if valid is not None:
             alpha = np.where(valid, alpha, np.float32(1))  # where images show nothing there is nothing to fill
         if self.identity is not None and labeller is not None:
             self._take_labels(keyframe, labeller(keyframe, show))
-        parts = [new_gaussians(color, depth, keyframe.camera, T_world_camera, where, s, self._context)]
+        context = self._rasterizer.context
+        parts = [new_gaussians(color, depth, keyframe.camera, T_world_camera, where, s, context)]
         if s.fill_stride:
             parts.append(fill_gaussians(color, depth, alpha, keyframe.camera, T_world_camera, s))
         logit = float(np.log(s.opacity / (1 - s.opacity)))
@@ -110,12 +111,14 @@ class CpuMapper(Mapper):
                 labels = np.zeros(len(new.pixels), np.uint16) if mask is None else mask.reshape(-1)[new.pixels]
                 self.identity.begin(self.map, rows, labels)
 
-    def _compensate(self, keyframe: Keyframe, depth: np.ndarray, view: RenderBuffers) -> np.ndarray:
+    def _compensate(
+        self, keyframe: Keyframe, depth: np.ndarray, view: RenderBuffers, rendered_depth: np.ndarray
+    ) -> np.ndarray:
         """A keyframe seen with another exposure than the map gets what is measured; its colours [H, W, 3] as the map's
         exposure would have shown them."""
         if not self.settings.exposure.compensate:
             return keyframe.color
-        images = (view.image.numpy(), view.alpha.numpy(), view.expected_depth.numpy())
+        images = (view.image.numpy(), view.alpha.numpy(), rendered_depth)
         found = measure_exposure(keyframe.color, depth, *images)
         if found is None:
             return keyframe.color
@@ -170,3 +173,9 @@ class CpuMapper(Mapper):
         self._losses.color += loss.values.color
         self._losses.ssim += loss.values.ssim
         self._losses.depth += loss.values.depth
+
+
+def _expected_depth(view: RenderBuffers) -> np.ndarray:
+    """As `RenderBuffers.expected_depth`, float32 [H, W], in this thread: torch would wake others for it."""
+    alpha, depth = view.alpha.numpy(), view.depth.numpy()
+    return np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha >= np.float32(1e-3))
