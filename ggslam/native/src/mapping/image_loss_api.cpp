@@ -14,7 +14,7 @@ namespace ggslam {
 namespace {
 
 // A band repeats 10 rows of blurring above and below itself; more bands balance better over threads.
-constexpr int kBandRows = 60;
+constexpr int kBandRows = 120;
 constexpr int kPrepareRows = 32;
 
 class ImageLossWorkspace {
