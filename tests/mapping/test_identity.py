@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.errors import CoreInputError
 from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES
 from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.identity import CpuIdentityLearner, cross_entropy
@@ -21,13 +20,13 @@ from ggslam.mapping.labelling import KeyframeLabels
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.settings import LearningRates, MapperSettings
 from ggslam.mapping.votes import merge_votes, vote_labels
-from ggslam.native.loader import NativeContext, available_instruction_sets
+from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import render_labels
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import NOTHING_LOGIT
 
 CAMERA = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
 
@@ -212,44 +211,6 @@ def test_cross_entropy_has_the_gradients_of_torch() -> None:
     assert loss == pytest.approx(expected.item(), rel=1e-5)
     assert np.allclose(gradient, f.grad, atol=1e-6)
     assert np.allclose(rows[:, :16], w.grad, atol=1e-6) and np.allclose(rows[:, 16], b.grad, atol=1e-6)
-
-
-@pytest.mark.parametrize("instruction_set", available_instruction_sets())
-@pytest.mark.parametrize(("pixels", "classes", "channels"), [(700, 33, 16), (129, 1, 16), (5, 130, 3), (300, 16, 20)])
-def test_cross_entropy_of_any_size_has_the_gradients_of_torch(
-    pixels: int, classes: int, channels: int, instruction_set: str
-) -> None:
-    random = np.random.default_rng(pixels)
-    weight = random.normal(size=(classes, channels)).astype(np.float32)
-    classifier = IdentityClassifier(np.arange(1, classes + 1).astype(np.uint16), weight, weight[:, 0] / 3)
-    features = random.normal(scale=2, size=(pixels, channels)).astype(np.float32)
-    true = random.integers(-1, classes, pixels)
-    true[0] = 0
-    arguments = features, classifier, true, np.arange(classes)
-    loss, gradient, rows = cross_entropy(*arguments, NativeContext(2, instruction_set))
-    f, w, b = (torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in (features, weight, classifier.bias))
-    kept = torch.from_numpy(true >= 0)
-    logits = with_nothing(f @ w.T + b)[kept]
-    torch.nn.functional.cross_entropy(logits, torch.from_numpy(true)[kept]).backward()
-    assert loss == pytest.approx(torch.nn.functional.cross_entropy(logits, torch.from_numpy(true)[kept]).item())
-    assert np.abs(gradient - f.grad.numpy()).max() < 2e-6 and not gradient[true < 0].any()
-    assert np.abs(rows[:, :-1] - w.grad.numpy()).max() < 2e-6 and np.abs(rows[:, -1] - b.grad.numpy()).max() < 2e-6
-    again = cross_entropy(*arguments, NativeContext(3, instruction_set))
-    assert (again[0], again[1].tobytes(), again[2].tobytes()) == (loss, gradient.tobytes(), rows.tobytes())
-
-
-def test_cross_entropy_of_nothing() -> None:
-    classifier = IdentityClassifier(np.array([4], np.uint16), np.ones((1, 16), np.float32), np.zeros(1, np.float32))
-    for pixels, chosen in ((0, 1), (3, 1), (3, 0)):
-        features, true = np.ones((pixels, 16), np.float32), np.full(pixels, -1)
-        loss, gradient, rows = cross_entropy(features, classifier, true, np.arange(chosen))
-        assert np.isnan(loss) and not gradient.any() and not rows.any() and rows.shape == (chosen, 17)
-
-
-def test_classes_that_there_are_not_are_refused() -> None:
-    classifier = IdentityClassifier(np.array([4], np.uint16), np.ones((1, 16), np.float32), np.zeros(1, np.float32))
-    with pytest.raises(CoreInputError, match="classes: expected -1 to 0, found 1"):
-        cross_entropy(np.ones((2, 16), np.float32), classifier, np.array([0, 5]), np.arange(1))
 
 
 def test_cross_entropy_over_some_classes() -> None:

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The compiled core's image loss, the Gaussians that a keyframe brings, and the loss of their objects.
+// The compiled core's image loss, and the Gaussians that a keyframe brings.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -56,22 +56,6 @@ struct InsertionJob {
   float texture_threshold, max_depth, scale_pixels, flatness, max_slope;  // see mapping.settings.InsertionSettings
 };
 
-// Softmax cross-entropy of P rendered identity vectors of F channels over K classes, and nothing as one more.
-struct ClassLossJob {
-  const float* features;   // [P, F]
-  const int32_t* classes;  // [P], true class of each, -1: it does not count
-  const float* weights;    // [K, F], of the linear classifier
-  const float* biases;     // [K]
-  // Results: the gradients of the mean loss.
-  float* d_features;  // [P, F]
-  float* d_rows;      // [K, F + 1], by weights, then by bias
-  int64_t pixels;
-  int32_t class_count, channels;
-  float nothing_logit;
-  int32_t counted;  // pixels that count
-  double loss;      // mean over them, NaN without any
-};
-
 }  // namespace ggslam
 
 GGSLAM_EXPORT void* ggslam_image_loss_create();
@@ -84,5 +68,3 @@ GGSLAM_EXPORT int ggslam_image_loss_evaluate(void* context, void* workspace, ggs
 GGSLAM_EXPORT int64_t ggslam_insertion_select(void* context, ggslam::InsertionJob* job);
 // Makes the Gaussians of the first `count` pixels that were chosen.
 GGSLAM_EXPORT int ggslam_insertion_shape(void* context, const ggslam::InsertionJob* job, int64_t count);
-
-GGSLAM_EXPORT int ggslam_class_loss(void* context, ggslam::ClassLossJob* job);

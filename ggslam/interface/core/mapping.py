@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # Written by scripts/make_native_mirrors.py from mapping.hpp; changes are lost.
-"""The compiled core's image loss, the Gaussians that a keyframe brings, and the loss of their objects."""
+"""The compiled core's image loss, and the Gaussians that a keyframe brings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/mapping.hpp"
-HEADER_SHA256 = "129de6dc1f7e0d87fb5c429895896d7b60cf03e67c044e2b9124d413eb181579"
+HEADER_SHA256 = "c3c95252042196d4b9aaa180868e335dbfbaf35501d873b5d1a25b7ec0ca5613"
 
 
 class ImageLossJob(Structure):
@@ -39,23 +39,12 @@ class InsertionJob(Structure):
     ]
 
 
-class ClassLossJob(Structure):
-    """Softmax cross-entropy of P rendered identity vectors of F channels over K classes, and nothing as one more."""
-
-    _fields_ = [
-        ("features", c_void_p), ("classes", c_void_p), ("weights", c_void_p), ("biases", c_void_p),
-        ("d_features", c_void_p), ("d_rows", c_void_p), ("pixels", c_int64), ("class_count", c_int32),
-        ("channels", c_int32), ("nothing_logit", c_float), ("counted", c_int32), ("loss", c_double),
-    ]
-
-
-STRUCTURES: tuple[type[Structure], ...] = (ImageLossJob, InsertionJob, ClassLossJob)
+STRUCTURES: tuple[type[Structure], ...] = (ImageLossJob, InsertionJob)
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_image_loss_create": (c_void_p, []),
     "ggslam_image_loss_destroy": (c_int, [c_void_p]),
     "ggslam_image_loss_evaluate": (c_int, [c_void_p, c_void_p, POINTER(ImageLossJob)]),
     "ggslam_insertion_select": (c_int64, [c_void_p, POINTER(InsertionJob)]),
     "ggslam_insertion_shape": (c_int, [c_void_p, POINTER(InsertionJob), c_int64]),
-    "ggslam_class_loss": (c_int, [c_void_p, POINTER(ClassLossJob)]),
 }
 """Result and arguments of each."""

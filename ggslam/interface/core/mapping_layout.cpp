@@ -6,7 +6,6 @@
 
 #include "interface/core/mapping.hpp"
 
-using ggslam::ClassLossJob;
 using ggslam::ImageLossJob;
 using ggslam::InsertionJob;
 
@@ -31,11 +30,6 @@ constexpr std::size_t kLayout[] = {
     offsetof(InsertionJob, rotation), offsetof(InsertionJob, translation), offsetof(InsertionJob, texture_threshold),
     offsetof(InsertionJob, max_depth), offsetof(InsertionJob, scale_pixels), offsetof(InsertionJob, flatness),
     offsetof(InsertionJob, max_slope),
-    sizeof(ClassLossJob), offsetof(ClassLossJob, features), offsetof(ClassLossJob, classes),
-    offsetof(ClassLossJob, weights), offsetof(ClassLossJob, biases), offsetof(ClassLossJob, d_features),
-    offsetof(ClassLossJob, d_rows), offsetof(ClassLossJob, pixels), offsetof(ClassLossJob, class_count),
-    offsetof(ClassLossJob, channels), offsetof(ClassLossJob, nothing_logit), offsetof(ClassLossJob, counted),
-    offsetof(ClassLossJob, loss),
 };
 }  // namespace
 

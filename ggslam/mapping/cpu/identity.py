@@ -3,22 +3,18 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from ggslam.interface.arrays import address
-from ggslam.interface.core.mapping import ClassLossJob
 from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
 from ggslam.mapping.cpu.pixel_pool import draw_pool
 from ggslam.mapping.identity import BIRTH_VOTE, MIN_WEIGHT, SPLIT_STRIDE, TERMS, IdentityLearner, MaskedKeyframe
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.votes import merge_votes, vote_labels
-from ggslam.native.loader import NativeContext, load_library
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.pixel_terms import CpuPixelTerms, FeatureAdamSettings
 from ggslam.rendering.types import RenderBuffers
@@ -131,9 +127,7 @@ class CpuIdentityLearner(IdentityLearner):
         pixels, classes = pixels[classes >= 0], classes[classes >= 0]
         features = view.features.numpy().reshape(IDENTITY_CHANNELS, -1)
         chosen = np.arange(self.table.count)
-        self.last_loss, gradient, rows = cross_entropy(
-            features[:, pixels].T, self.classifier, classes, chosen, rasterizer.context
-        )
+        self.last_loss, gradient, rows = cross_entropy(features[:, pixels].T, self.classifier, classes, chosen)
         self.table.step(chosen, s.weight * rows, s.classifier_rate)
         out = np.zeros_like(features)
         out[:, pixels] = s.weight * gradient.T
@@ -149,10 +143,12 @@ class CpuIdentityLearner(IdentityLearner):
     ) -> None:  # fmt: skip
         """Votes and a step at pixels with these labels and their classes, int32 [P], some of which are none (-1): an
         object may have been taken back since its pixels were drawn."""
-        s = self.settings
-        chosen, features = self._choose_competitors(classes[classes >= 0]), terms.features(gaussians)
-        self.last_loss, gradient, rows = cross_entropy(features, self.classifier, classes, chosen, terms.context)
-        gradient *= np.float32(s.weight)
+        s, known = self.settings, classes >= 0
+        chosen = self._choose_competitors(classes[known])
+        features = terms.features(gaussians)
+        gradient = np.zeros_like(features)
+        self.last_loss, of_known, rows = cross_entropy(features[known], self.classifier, classes[known], chosen)
+        gradient[known] = s.weight * of_known
         if self._pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
             terms = terms.append(CpuPixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
@@ -185,33 +181,32 @@ class CpuIdentityLearner(IdentityLearner):
 
 
 def cross_entropy(
-    features: np.ndarray, classifier: IdentityClassifier, classes: np.ndarray, chosen: np.ndarray,
-    context: NativeContext | None = None,
-) -> tuple[float, np.ndarray, np.ndarray]:  # fmt: skip
+    features: np.ndarray, classifier: IdentityClassifier, classes: np.ndarray, chosen: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Mean softmax cross-entropy of classified features; being nothing competes with the classes.
 
     Args:
         features: float32 [P, F].
         classifier: C classes.
-        classes: true class of each, int [P]; -1: it does not count.
+        classes: true class of each, int [P].
         chosen: classes that the softmax runs over, int [K], sorted, all of `classes` among them.
-        context: threads to work on; None: this one.
 
     Returns:
-        The mean (NaN where none counts), its gradient by the features [P, F], and by the rows of `chosen` [K, F + 1]
-        (weights, then bias), float32.
+        The mean, its gradient by the features [P, F], and by the rows of `chosen` [K, F + 1] (weights, then bias).
     """
-    features = np.ascontiguousarray(features, np.float32)
-    true = np.where(classes < 0, -1, np.searchsorted(chosen, classes)).astype(np.int32)
-    weight, bias = np.ascontiguousarray(classifier.weight[chosen]), np.ascontiguousarray(classifier.bias[chosen])
-    gradient, rows = np.empty_like(features), np.empty((len(chosen), features.shape[1] + 1), np.float32)
-    job = ClassLossJob(
-        *map(address, (features, true, weight, bias, gradient, rows)), pixels=len(features), class_count=len(chosen),
-        channels=features.shape[1], nothing_logit=NOTHING_LOGIT,
-    )  # fmt: skip
-    context = context or NativeContext(threads=1)
-    load_library().ggslam_class_loss(context.handle, ctypes.byref(job))
-    return job.loss, gradient, rows
+    weight = classifier.weight[chosen]
+    z = features @ weight.T + classifier.bias[chosen]
+    highest = z.max(1, keepdims=True, initial=NOTHING_LOGIT)
+    z -= highest
+    rows, true = np.arange(len(z)), np.searchsorted(chosen, classes)
+    right = z[rows, true]
+    np.exp(z, out=z)
+    sums = z.sum(1) + np.exp(NOTHING_LOGIT - highest[:, 0])
+    loss = float((np.log(sums) - right).mean())
+    z /= sums[:, None]
+    z[rows, true] -= 1
+    z /= len(z)
+    return loss, z @ weight, np.concatenate([z.T @ features, z.sum(0)[:, None]], 1)
 
 
 def by_parts(
