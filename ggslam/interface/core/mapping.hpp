@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The compiled core's image loss.
+// The compiled core's losses: of images, and of what pixels are classified as.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -37,6 +37,21 @@ struct ImageLossJob {
   double exposure_gradient[6];
 };
 
+// Softmax cross-entropy of classified features at P pixels; F channels, K classes. Being nothing competes with the
+// classes.
+struct CrossEntropyOfPixels {
+  const float* features;   // [P, F]
+  const int32_t* classes;  // [P], the true class below K; -1: none, the pixel does not count
+  const float* weight;     // [K, F]
+  const float* bias;       // [K]
+  float* d_features;       // [P, F], gradient of the mean; 0 where there is no true class
+  float* d_rows;           // [K, F + 1], gradient by the weights, then by the bias
+  int64_t pixels;
+  int32_t channels, count;
+  float nothing_logit;
+  double loss;  // result: mean over the pixels that count; 0 without any
+};
+
 }  // namespace ggslam
 
 GGSLAM_EXPORT void* ggslam_image_loss_create();
@@ -44,3 +59,6 @@ GGSLAM_EXPORT int ggslam_image_loss_destroy(void* workspace);
 
 // Returns 0, or 1 when memory ran out. The caller has checked sizes and pointers.
 GGSLAM_EXPORT int ggslam_image_loss_evaluate(void* context, void* workspace, ggslam::ImageLossJob* job);
+
+// The result is the same, bit for bit, for any number of threads.
+GGSLAM_EXPORT int ggslam_cross_entropy_of_pixels(void* context, ggslam::CrossEntropyOfPixels* job);

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 # Written by scripts/make_native_mirrors.py from mapping.hpp; changes are lost.
-"""The compiled core's image loss."""
+"""The compiled core's losses: of images, and of what pixels are classified as."""
 
 from __future__ import annotations
 
-from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_void_p
+from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int64, c_void_p
 from typing import Any
 
 HEADER = "core/mapping.hpp"
-HEADER_SHA256 = "31ac22453a8885aabf09b206fc5cafd9d219a9f2603d7b8197ec238890fba1db"
+HEADER_SHA256 = "6456956172492d59cc0fdb5a611c056947e42359f52c025111a3f0414004d607"
 
 
 class ImageLossJob(Structure):
@@ -26,10 +26,22 @@ class ImageLossJob(Structure):
     ]
 
 
-STRUCTURES: tuple[type[Structure], ...] = (ImageLossJob,)
+class CrossEntropyOfPixels(Structure):
+    """Softmax cross-entropy of classified features at P pixels; F channels, K classes. Being nothing competes with
+    the classes."""
+
+    _fields_ = [
+        ("features", c_void_p), ("classes", c_void_p), ("weight", c_void_p), ("bias", c_void_p),
+        ("d_features", c_void_p), ("d_rows", c_void_p), ("pixels", c_int64), ("channels", c_int32), ("count", c_int32),
+        ("nothing_logit", c_float), ("loss", c_double),
+    ]
+
+
+STRUCTURES: tuple[type[Structure], ...] = (ImageLossJob, CrossEntropyOfPixels)
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_image_loss_create": (c_void_p, []),
     "ggslam_image_loss_destroy": (c_int, [c_void_p]),
     "ggslam_image_loss_evaluate": (c_int, [c_void_p, c_void_p, POINTER(ImageLossJob)]),
+    "ggslam_cross_entropy_of_pixels": (c_int, [c_void_p, POINTER(CrossEntropyOfPixels)]),
 }
 """Result and arguments of each."""

@@ -6,6 +6,7 @@
 
 #include "interface/core/mapping.hpp"
 
+using ggslam::CrossEntropyOfPixels;
 using ggslam::ImageLossJob;
 
 namespace {
@@ -21,6 +22,12 @@ constexpr std::size_t kLayout[] = {
     offsetof(ImageLossJob, color), offsetof(ImageLossJob, l1), offsetof(ImageLossJob, ssim),
     offsetof(ImageLossJob, depth_term), offsetof(ImageLossJob, opacity_term), offsetof(ImageLossJob, depth_l1_m),
     offsetof(ImageLossJob, psnr), offsetof(ImageLossJob, valid_pixels), offsetof(ImageLossJob, exposure_gradient),
+    sizeof(CrossEntropyOfPixels), offsetof(CrossEntropyOfPixels, features), offsetof(CrossEntropyOfPixels, classes),
+    offsetof(CrossEntropyOfPixels, weight), offsetof(CrossEntropyOfPixels, bias),
+    offsetof(CrossEntropyOfPixels, d_features), offsetof(CrossEntropyOfPixels, d_rows),
+    offsetof(CrossEntropyOfPixels, pixels), offsetof(CrossEntropyOfPixels, channels),
+    offsetof(CrossEntropyOfPixels, count), offsetof(CrossEntropyOfPixels, nothing_logit),
+    offsetof(CrossEntropyOfPixels, loss),
 };
 }  // namespace
 
