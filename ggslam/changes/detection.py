@@ -10,9 +10,11 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from ggslam.changes.fits import Fit
 from ggslam.changes.placing import Placing
 from ggslam.changes.settings import ChangeSettings
-from ggslam.changes.shapes import Fit, Shape, fit_shapes
+from ggslam.changes.shape import Shape
+from ggslam.changes.shapes import fit_shapes
 from ggslam.changes.sightings import Sightings, Surface, Tolerance, Visit
 from ggslam.changes.thing_views import ThingViews
 from ggslam.changes.things import UNNAMED, JudgedSurface, Thing, things_by_id, things_by_surface

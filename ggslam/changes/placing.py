@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.changes.shapes import LEVEL, tilt, upright, without_tilt
 from ggslam.changes.thing_views import ThingViews
+from ggslam.changes.upright import LEVEL, tilt, upright, without_tilt
 from ggslam.geometry.colored_surface import ColoredSurface
 from ggslam.scene.poses import inverse, se3_exp, transform_points
 

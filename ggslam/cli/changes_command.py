@@ -85,7 +85,8 @@ def _row(change: Change, found: ChangeTable) -> list[str]:
     moved = ["", ""]
     if change.T_new_old is not None:
         metres, degrees = found.motion(change)
-        moved = [f"{100 * metres:.1f} cm", f"{degrees:.1f} deg"]
+        known = change.fit is None or change.fit.turn_known
+        moved = [f"{100 * metres:.1f} cm", f"{degrees:.1f} deg" if known else "not known"]
     return [_WORDS[change.kind], found.label(change), *moved, f"{change.confidence:.0%}"]
 
 

@@ -10,9 +10,9 @@ import pytest
 from small_visits import Box, SmallVisit, detect
 
 from ggslam.changes.detection import Change, ChangeDetector, Detection
+from ggslam.changes.fits import Fit
 from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
-from ggslam.changes.shapes import Fit
 from ggslam.changes.sightings import Picture, Sightings, Tolerance, _Blocks
 from ggslam.changes.things import Thing
 from ggslam.native.loader import NativeContext

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from ggslam.changes.placing import Placing
-from ggslam.changes.shapes import Shape
+from ggslam.changes.shape import Shape
 from ggslam.changes.sightings import Picture
 from ggslam.changes.thing_views import ThingViews
 from ggslam.scene.camera import Camera

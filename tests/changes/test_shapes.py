@@ -8,8 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ggslam.changes.fits import Fit
+from ggslam.changes.motions import likeliest_motions
 from ggslam.changes.settings import ChangeSettings
-from ggslam.changes.shapes import Fit, Shape, _motions, _stay_level, _Target
+from ggslam.changes.shape import Shape, Target
+from ggslam.changes.shapes import _stay_level
 from ggslam.scene.poses import transform_points
 
 THICK_M = 0.02
@@ -43,7 +46,7 @@ def test_a_board_that_was_seen_from_the_other_side_stays_as_thick_as_it_is(faces
     after = board(face(-THICK_M / 2, -1.0), face(THICK_M / 2, 1.0, until=0.05))
     start = np.eye(4)
     start[2, 3] = -0.015
-    T = _Target(after, faces).refine(before, start, 0.012, np.eye(6)[:, 2:3])
+    T = Target(after, faces).refine(before, start, 0.012, np.eye(6)[:, 2:3])
     assert T[2, 3] == pytest.approx(0 if faces else -THICK_M, abs=0.003)
 
 
@@ -80,7 +83,7 @@ def test_a_thing_that_seems_to_rise_a_little_stays_at_its_height(rise: float, co
         return Fit(T, share=0.9 if abs(T[2, 3] - rise) < 1e-6 else 0.9 - costs, seen=1.0, color_apart=0.0)
 
     judge = SimpleNamespace(fit=fit, settings=ChangeSettings())
-    kept = _stay_level(fit(found), judge, (_Target(new), _Target(new, faces=True)), old, UP)  # type: ignore[arg-type]
+    kept = _stay_level(fit(found), judge, (Target(new), Target(new, faces=True)), old, UP)  # type: ignore[arg-type]
     assert np.allclose(kept.T_new_old[:3, 3], [0.5, 0, 0] if level else found[:3, 3], atol=0.002)
 
 
@@ -93,6 +96,6 @@ def banded(low: float, high: float, at: float) -> Shape:
 
 def test_a_thing_of_which_one_visit_saw_the_lower_part_is_looked_for_at_its_height() -> None:
     """The middles of what was seen lie 20 cm above each other."""
-    motions = _motions(banded(0.0, 0.2, 0.0), banded(0.0, 0.6, 0.5), UP)
+    motions = likeliest_motions(banded(0.0, 0.2, 0.0), banded(0.0, 0.6, 0.5), UP)
     upright = [T for T in motions if T[2, 2] > 0.99]
     assert min(np.linalg.norm(transform_points(np.zeros((1, 3)), T)[0] - [0.5, 0, 0]) for T in upright) < 0.02

@@ -11,7 +11,7 @@ import torch
 
 from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES
 from ggslam.mapping.cpu.class_table import CpuClassTable
-from ggslam.mapping.cpu.identity import CpuIdentityLearner, cross_entropy
+from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
 from ggslam.mapping.cpu.pixel_pool import at_boundary, draw_pool
@@ -194,35 +194,6 @@ def test_the_map_shows_its_labels_to_the_next_keyframe() -> None:
 
 def with_nothing(logits: torch.Tensor) -> torch.Tensor:
     return torch.cat([logits, torch.full((*logits.shape[:-1], 1), NOTHING_LOGIT, dtype=logits.dtype)], -1)
-
-
-def test_cross_entropy_has_the_gradients_of_torch() -> None:
-    random = np.random.default_rng(0)
-    table = CpuClassTable(random)
-    table.add(np.arange(1, 8, dtype=np.uint16))
-    features = random.normal(size=(30, 16)).astype(np.float32)
-    classes = random.integers(0, 7, 30)
-    loss, gradient, rows = cross_entropy(features, table.classifier, classes, np.arange(7))
-    f = torch.tensor(features, requires_grad=True)
-    w = torch.tensor(table.classifier.weight, requires_grad=True)
-    b = torch.tensor(table.classifier.bias, requires_grad=True)
-    expected = torch.nn.functional.cross_entropy(with_nothing(f @ w.T + b), torch.from_numpy(classes))
-    expected.backward()
-    assert loss == pytest.approx(expected.item(), rel=1e-5)
-    assert np.allclose(gradient, f.grad, atol=1e-6)
-    assert np.allclose(rows[:, :16], w.grad, atol=1e-6) and np.allclose(rows[:, 16], b.grad, atol=1e-6)
-
-
-def test_cross_entropy_over_some_classes() -> None:
-    random = np.random.default_rng(0)
-    table = CpuClassTable(random)
-    table.add(np.arange(1, 300, dtype=np.uint16))
-    features = random.normal(size=(5, 16)).astype(np.float32)
-    chosen = np.array([3, 50, 200])
-    loss, gradient, rows = cross_entropy(features, table.classifier, np.array([50, 3, 3, 200, 50]), chosen)
-    logits = torch.from_numpy(table.classifier.logits(features)[:, chosen])
-    expected = torch.nn.functional.cross_entropy(with_nothing(logits), torch.tensor([1, 0, 0, 2, 1]))
-    assert loss == pytest.approx(float(expected), rel=1e-5) and rows.shape == (3, 17) and gradient.shape == (5, 16)
 
 
 def test_kl_has_the_gradients_of_torch() -> None:

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The compiled core's image loss, and the Gaussians that a keyframe brings.
+// The compiled core's losses, of images and of what pixels are classified as, and the Gaussians that a keyframe brings.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -56,6 +56,21 @@ struct InsertionJob {
   float texture_threshold, max_depth, scale_pixels, flatness, max_slope;  // see mapping.settings.InsertionSettings
 };
 
+// Softmax cross-entropy of classified features at P pixels; F channels, K classes. Being nothing competes with the
+// classes.
+struct CrossEntropyOfPixels {
+  const float* features;   // [P, F]
+  const int32_t* classes;  // [P], the true class below K; -1: none, the pixel does not count
+  const float* weight;     // [K, F]
+  const float* bias;       // [K]
+  float* d_features;       // [P, F], gradient of the mean; 0 where there is no true class
+  float* d_rows;           // [K, F + 1], gradient by the weights, then by the bias
+  int64_t pixels;
+  int32_t channels, count;
+  float nothing_logit;
+  double loss;  // result: mean over the pixels that count; 0 without any
+};
+
 }  // namespace ggslam
 
 GGSLAM_EXPORT void* ggslam_image_loss_create();
@@ -68,3 +83,6 @@ GGSLAM_EXPORT int ggslam_image_loss_evaluate(void* context, void* workspace, ggs
 GGSLAM_EXPORT int64_t ggslam_insertion_select(void* context, ggslam::InsertionJob* job);
 // Makes the Gaussians of the first `count` pixels that were chosen.
 GGSLAM_EXPORT int ggslam_insertion_shape(void* context, const ggslam::InsertionJob* job, int64_t count);
+
+// The result is the same, bit for bit, for any number of threads.
+GGSLAM_EXPORT int ggslam_cross_entropy_of_pixels(void* context, ggslam::CrossEntropyOfPixels* job);

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # Written by scripts/make_native_mirrors.py from mapping.hpp; changes are lost.
-"""The compiled core's image loss, and the Gaussians that a keyframe brings."""
+"""The compiled core's losses, of images and of what pixels are classified as, and the Gaussians that a keyframe
+brings."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/mapping.hpp"
-HEADER_SHA256 = "c3c95252042196d4b9aaa180868e335dbfbaf35501d873b5d1a25b7ec0ca5613"
+HEADER_SHA256 = "7d1b9a44e1b4fc3f622cad80b3a3ba5fd512a7f14579b46254e12b6697954a9d"
 
 
 class ImageLossJob(Structure):
@@ -39,12 +40,24 @@ class InsertionJob(Structure):
     ]
 
 
-STRUCTURES: tuple[type[Structure], ...] = (ImageLossJob, InsertionJob)
+class CrossEntropyOfPixels(Structure):
+    """Softmax cross-entropy of classified features at P pixels; F channels, K classes. Being nothing competes with
+    the classes."""
+
+    _fields_ = [
+        ("features", c_void_p), ("classes", c_void_p), ("weight", c_void_p), ("bias", c_void_p),
+        ("d_features", c_void_p), ("d_rows", c_void_p), ("pixels", c_int64), ("channels", c_int32), ("count", c_int32),
+        ("nothing_logit", c_float), ("loss", c_double),
+    ]
+
+
+STRUCTURES: tuple[type[Structure], ...] = (ImageLossJob, InsertionJob, CrossEntropyOfPixels)
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_image_loss_create": (c_void_p, []),
     "ggslam_image_loss_destroy": (c_int, [c_void_p]),
     "ggslam_image_loss_evaluate": (c_int, [c_void_p, c_void_p, POINTER(ImageLossJob)]),
     "ggslam_insertion_select": (c_int64, [c_void_p, POINTER(InsertionJob)]),
     "ggslam_insertion_shape": (c_int, [c_void_p, POINTER(InsertionJob), c_int64]),
+    "ggslam_cross_entropy_of_pixels": (c_int, [c_void_p, POINTER(CrossEntropyOfPixels)]),
 }
 """Result and arguments of each."""

@@ -6,6 +6,7 @@
 
 #include "interface/core/mapping.hpp"
 
+using ggslam::CrossEntropyOfPixels;
 using ggslam::ImageLossJob;
 using ggslam::InsertionJob;
 
@@ -30,6 +31,12 @@ constexpr std::size_t kLayout[] = {
     offsetof(InsertionJob, rotation), offsetof(InsertionJob, translation), offsetof(InsertionJob, texture_threshold),
     offsetof(InsertionJob, max_depth), offsetof(InsertionJob, scale_pixels), offsetof(InsertionJob, flatness),
     offsetof(InsertionJob, max_slope),
+    sizeof(CrossEntropyOfPixels), offsetof(CrossEntropyOfPixels, features), offsetof(CrossEntropyOfPixels, classes),
+    offsetof(CrossEntropyOfPixels, weight), offsetof(CrossEntropyOfPixels, bias),
+    offsetof(CrossEntropyOfPixels, d_features), offsetof(CrossEntropyOfPixels, d_rows),
+    offsetof(CrossEntropyOfPixels, pixels), offsetof(CrossEntropyOfPixels, channels),
+    offsetof(CrossEntropyOfPixels, count), offsetof(CrossEntropyOfPixels, nothing_logit),
+    offsetof(CrossEntropyOfPixels, loss),
 };
 }  // namespace
 

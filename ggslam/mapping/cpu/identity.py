@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ggslam.mapping.cpu.class_table import CpuClassTable
+from ggslam.mapping.cpu.cross_entropy import cross_entropy
 from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
 from ggslam.mapping.cpu.pixel_pool import draw_pool
 from ggslam.mapping.identity import BIRTH_VOTE, MIN_WEIGHT, SPLIT_STRIDE, TERMS, IdentityLearner, MaskedKeyframe
@@ -19,7 +20,7 @@ from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.pixel_terms import CpuPixelTerms, FeatureAdamSettings
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
-from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
 
 KEPT_POOLS = 64
 """Keyframes whose pixels drawn ahead are kept, 64 KB for each with the settings' defaults."""
@@ -127,7 +128,8 @@ class CpuIdentityLearner(IdentityLearner):
         pixels, classes = pixels[classes >= 0], classes[classes >= 0]
         features = view.features.numpy().reshape(IDENTITY_CHANNELS, -1)
         chosen = np.arange(self.table.count)
-        self.last_loss, gradient, rows = cross_entropy(features[:, pixels].T, self.classifier, classes, chosen)
+        shown = features[:, pixels].T
+        self.last_loss, gradient, rows = cross_entropy(shown, self.classifier, classes, chosen, rasterizer.context)
         self.table.step(chosen, s.weight * rows, s.classifier_rate)
         out = np.zeros_like(features)
         out[:, pixels] = s.weight * gradient.T
@@ -143,12 +145,10 @@ class CpuIdentityLearner(IdentityLearner):
     ) -> None:  # fmt: skip
         """Votes and a step at pixels with these labels and their classes, int32 [P], some of which are none (-1): an
         object may have been taken back since its pixels were drawn."""
-        s, known = self.settings, classes >= 0
-        chosen = self._choose_competitors(classes[known])
-        features = terms.features(gaussians)
-        gradient = np.zeros_like(features)
-        self.last_loss, of_known, rows = cross_entropy(features[known], self.classifier, classes[known], chosen)
-        gradient[known] = s.weight * of_known
+        s, features = self.settings, terms.features(gaussians)
+        chosen = self._choose_competitors(classes[classes >= 0])
+        self.last_loss, gradient, rows = cross_entropy(features, self.classifier, classes, chosen, terms.context)
+        gradient *= np.float32(s.weight)
         if self._pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
             terms = terms.append(CpuPixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
@@ -178,35 +178,6 @@ class CpuIdentityLearner(IdentityLearner):
     def _learned_labels(self, gaussians: GaussianMap) -> torch.Tensor:
         ids = by_parts(self.classifier, gaussians.features.numpy(), self.settings.min_confidence)
         return torch.from_numpy(ids.astype(np.int32))
-
-
-def cross_entropy(
-    features: np.ndarray, classifier: IdentityClassifier, classes: np.ndarray, chosen: np.ndarray
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mean softmax cross-entropy of classified features; being nothing competes with the classes.
-
-    Args:
-        features: float32 [P, F].
-        classifier: C classes.
-        classes: true class of each, int [P].
-        chosen: classes that the softmax runs over, int [K], sorted, all of `classes` among them.
-
-    Returns:
-        The mean, its gradient by the features [P, F], and by the rows of `chosen` [K, F + 1] (weights, then bias).
-    """
-    weight = classifier.weight[chosen]
-    z = features @ weight.T + classifier.bias[chosen]
-    highest = z.max(1, keepdims=True, initial=NOTHING_LOGIT)
-    z -= highest
-    rows, true = np.arange(len(z)), np.searchsorted(chosen, classes)
-    right = z[rows, true]
-    np.exp(z, out=z)
-    sums = z.sum(1) + np.exp(NOTHING_LOGIT - highest[:, 0])
-    loss = float((np.log(sums) - right).mean())
-    z /= sums[:, None]
-    z[rows, true] -= 1
-    z /= len(z)
-    return loss, z @ weight, np.concatenate([z.T @ features, z.sum(0)[:, None]], 1)
 
 
 def by_parts(

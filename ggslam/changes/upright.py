@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motions about the vertical: most things stand, and stay at their height."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.scene.poses import se3_exp, transform_points
+
+LEVEL = np.radians(0.5)
+"""What tilts a thing less keeps it upright."""
+
+
+def upright(up: np.ndarray) -> np.ndarray:
+    """Twists [6, 4] that keep a thing upright."""
+    basis = np.zeros((6, 4))
+    basis[:3, :3], basis[3:, 3] = np.eye(3), up
+    return basis
+
+
+def along_level(up: np.ndarray) -> np.ndarray:
+    """Twists [6, 3] that keep a thing upright and at its height."""
+    basis = np.zeros((6, 3))
+    basis[:3, :2], basis[3:, 2] = np.linalg.svd(up[None])[2][1:].T, up
+    return basis
+
+
+def tilt(T: np.ndarray, up: np.ndarray) -> float:
+    """Angle by which a motion tilts what stood upright, radians."""
+    return float(np.arccos(np.clip(up @ T[:3, :3] @ up, -1, 1)))
+
+
+def without_tilt(T: np.ndarray, up: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The motion [4, 4] that does the same to a point and turns about the vertical alone."""
+    tilted = T[:3, :3] @ up
+    axis = np.cross(tilted, up)
+    length = float(np.linalg.norm(axis))
+    R = T[:3, :3]
+    if length > 1e-9:
+        R = about(axis / length, float(np.degrees(tilt(T, up)))) @ R
+    level = np.eye(4)
+    level[:3, :3] = R
+    level[:3, 3] = transform_points(point[None], T)[0] - R @ point
+    return level
+
+
+def about(axis: np.ndarray, degrees: float) -> np.ndarray:
+    """The rotation [3, 3] about an axis [3], a unit vector."""
+    return se3_exp(np.concatenate([np.zeros(3), np.radians(degrees) * axis]))[:3, :3]
