@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ggslam.jobs.merge.sources import MergeSource
+from ggslam.jobs.merge.unseen import UnseenGaussians
 from ggslam.jobs.progress import Observer
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
 from ggslam.mapping.mapper import Mapper
@@ -45,7 +46,7 @@ class SeamTraining:
     sigma: float
 
     def run(self, steps: int, context: NativeContext, observer: Observer) -> None:
-        """Trains with falling rates, by turns on all keyframes at the seams."""
+        """Trains with falling rates, by turns on all keyframes at the seams. What these do not see stays as it is."""
         mapper = make_mapper(replace(self.config, device="cpu"), self.objects is not None, context, None)
         self.gaussians.updates[:] = _GROWN_UP
         self.gaussians.feature_updates[:] = _GROWN_UP
@@ -60,11 +61,13 @@ class SeamTraining:
 
     def _train(self, mapper: Mapper, steps: int, observer: Observer) -> None:
         random, turn = np.random.default_rng(self.config.seed), list[int]()
+        unseen = UnseenGaussians(self.gaussians, [self.keyframes[k] for k in self.seam], self.sigma)
         observer.begin("train at the seams", steps)
         for step in range(steps):
             turn = turn or random.permutation(self.seam).tolist()
             factor = self.config.mapping.refine_decay ** (step / max(1, steps - 1))
             mapper.iterate(self.keyframes[turn.pop()], factor)
+            unseen.restore()
             observer.advance(step + 1, steps)
 
 

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussians that the keyframes at hand hardly see, and that training on these is not to change.
+
+What lies behind a surface or beside an image still shines through by a thousandth. The optimizer steps as far for a
+thousandth as for all of a pixel, so that within a few hundred steps such Gaussians take any colour; other views, which
+are not trained on, see it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import transform_points
+
+BEHIND_SIGMAS, BEHIND_RELATIVE = 3.0, 0.02
+"""A Gaussian is hidden that lies farther behind what a keyframe measured than so many standard deviations of depth, and
+than this share of the distance."""
+_KEPT = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features")
+
+
+def find_seen(gaussians: GaussianMap, keyframes: Iterable[Keyframe], sigma: float) -> np.ndarray:
+    """Whether a keyframe sees a Gaussian, bool [N]: its middle falls into the image, with nothing measured before it.
+
+    Args:
+        gaussians: the map, on the CPU.
+        keyframes: with images.
+        sigma: standard deviation of depth, metres.
+    """
+    means = gaussians.means.detach().numpy().astype(np.float64)
+    seen = np.zeros(len(means), bool)
+    for keyframe in keyframes:
+        there = transform_points(means, keyframe.T_camera_world)
+        row, column, inside = keyframe.camera.project(there)
+        depth = keyframe.depth_m()[row, column]
+        behind = there[:, 2] - depth > np.maximum(BEHIND_SIGMAS * sigma, BEHIND_RELATIVE * depth)
+        seen |= inside & ~(behind & (depth > 0))
+    return seen
+
+
+class UnseenGaussians:
+    """Remembers those that no keyframe sees.
+
+    Args:
+        gaussians, keyframes, sigma: see `find_seen`.
+    """
+
+    def __init__(self, gaussians: GaussianMap, keyframes: Iterable[Keyframe], sigma: float) -> None:
+        self._map, self._order = gaussians, gaussians.order
+        self._rows = torch.from_numpy(np.flatnonzero(~find_seen(gaussians, keyframes, sigma)))
+        self._values = {name: getattr(gaussians, name)[self._rows].clone() for name in _KEPT}
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def restore(self) -> None:
+        """Brings them back as they were; none may have been removed or put elsewhere since."""
+        assert self._map.order == self._order
+        for name, values in self._values.items():
+            getattr(self._map, name)[self._rows] = values
