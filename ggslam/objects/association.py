@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ggslam.objects.bounding_planes import BoundingPlanes, Plane
+from ggslam.objects.bounding_planes import BoundingPlane, BoundingPlanes
 from ggslam.objects.consistency import ConsistencyJudge
 from ggslam.objects.evidence import PairEvidence, find_touching_pairs
 from ggslam.objects.fragments import Fragment, FragmentMemory
@@ -158,10 +158,10 @@ class Associator:
 
     def _choose(
         self, overlap: SegmentOverlap, depth: np.ndarray, camera: Camera | None, T_world_camera: np.ndarray | None
-    ) -> tuple[np.ndarray, dict[int, Fragment], dict[int, Plane]]:
+    ) -> tuple[np.ndarray, dict[int, Fragment], dict[int, BoundingPlane]]:
         best = self._best(overlap)
         parts: dict[int, Fragment] = {}
-        planes: dict[int, Plane] = {}
+        planes: dict[int, BoundingPlane] = {}
         if camera is not None and T_world_camera is not None:
             parts = self._fragments.observe(overlap, best, depth, camera, T_world_camera)
             planes = self._planes.look(overlap, depth, camera, T_world_camera)
@@ -177,7 +177,7 @@ class Associator:
 
     def _match(
         self, view: MapView, overlap: SegmentOverlap, best: np.ndarray, parts: dict[int, Fragment],
-        planes: dict[int, Plane],
+        planes: dict[int, BoundingPlane],
     ) -> Association:  # fmt: skip
         covered = self._find_covered(overlap)
         created: list[int] = []

@@ -8,6 +8,7 @@ the room, and whatever lies on it, at either side of an island, is one floor or 
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,19 +25,25 @@ _BEHIND, _BEYOND = 0.01, 0.08
 _SAME_DIRECTION, _SAME_PLACE = 0.995, 0.04
 """Cosine of the angle, and metres, between planes that are one."""
 
-Plane = tuple[np.ndarray, float, np.ndarray]
-"""Unit normal towards the camera, offset n . x, and the middle of what was seen of it; world."""
+
+@dataclass
+class BoundingPlane:
+    """Unit normal [3] towards the camera, offset n . x, and the middle [3] of what was seen of it; world, metres."""
+
+    normal: np.ndarray
+    offset: float
+    middle: np.ndarray
 
 
 class BoundingPlanes:
     """Remembers which objects are floors and walls."""
 
     def __init__(self) -> None:
-        self._of: dict[int, Plane] = {}
+        self._of: dict[int, BoundingPlane] = {}
 
     def look(
         self, overlap: SegmentOverlap, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
-    ) -> dict[int, Plane]:
+    ) -> dict[int, BoundingPlane]:
         """The planes of those segments of a keyframe that bound the room, by number of the segment. Of several on one
         plane only the largest: the others are pictures on the wall or rugs on the floor."""
         z = depth[::_STRIDE, ::_STRIDE].ravel()
@@ -44,7 +51,7 @@ class BoundingPlanes:
         rays = camera.rays()[::_STRIDE, ::_STRIDE].reshape(-1, 3)
         points = rays[seen].astype(np.float64) * z[seen][:, None]
         row = overlap.row[::_STRIDE, ::_STRIDE].ravel()[seen]
-        found: dict[int, Plane] = {}
+        found: dict[int, BoundingPlane] = {}
         order = np.argsort(-overlap.area, kind="stable")
         for k in order[overlap.area[order] >= _LEAST * overlap.row.size].tolist():
             own = points[row == k]
@@ -55,19 +62,19 @@ class BoundingPlanes:
             if np.mean(points @ normal - offset < -_BEYOND * np.maximum(1, points[:, 2] / 2)) < _BEHIND:
                 world = T_world_camera[:3, :3] @ normal
                 middle = T_world_camera[:3, :3] @ own.mean(0) + T_world_camera[:3, 3]
-                bounding = world, float(offset + world @ T_world_camera[:3, 3]), middle
+                bounding = BoundingPlane(world, float(offset + world @ T_world_camera[:3, 3]), middle)
                 if not any(_are_one(bounding, other) for other in found.values()):
                     found[k] = bounding
         return found
 
-    def object_on(self, plane: Plane) -> int:
+    def object_on(self, plane: BoundingPlane) -> int:
         """The object that lies on the plane; 0: none that is known."""
         for i, other in self._of.items():
             if _are_one(plane, other):
                 return i
         return 0
 
-    def note(self, object_id: int, plane: Plane) -> None:
+    def note(self, object_id: int, plane: BoundingPlane) -> None:
         """An object is a floor or a wall; the last view counts."""
         self._of[object_id] = plane
 
@@ -83,10 +90,11 @@ class BoundingPlanes:
             self._of.pop(i, None)
 
 
-def _are_one(plane: Plane, other: Plane) -> bool:
+def _are_one(plane: BoundingPlane, other: BoundingPlane) -> bool:
     # Compared where either was seen: far from there, directions that are a little wrong say nothing.
-    apart = max(abs(plane[0] @ other[2] - plane[1]), abs(other[0] @ plane[2] - other[1]))
-    return bool(plane[0] @ other[0] > _SAME_DIRECTION and apart < _SAME_PLACE)
+    there = abs(plane.normal @ other.middle - plane.offset)
+    here = abs(other.normal @ plane.middle - other.offset)
+    return bool(plane.normal @ other.normal > _SAME_DIRECTION and max(here, there) < _SAME_PLACE)
 
 
 def _fit(points: np.ndarray) -> tuple[np.ndarray, float] | None:
