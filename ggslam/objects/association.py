@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ggslam.objects.bounding_planes import BoundingPlane, BoundingPlanes
 from ggslam.objects.consistency import ConsistencyJudge
 from ggslam.objects.evidence import PairEvidence, find_touching_pairs
 from ggslam.objects.fragments import Fragment, FragmentMemory
@@ -67,6 +68,7 @@ class Associator:
         self._judge = ConsistencyJudge()
         self._evidence = PairEvidence(self._settings)
         self._fragments = FragmentMemory(self._settings)
+        self._planes = BoundingPlanes()
         self._current = np.arange(_IDS).astype(np.uint16)
         """Id -> id of the object that it is part of by now."""
         self._used = np.zeros(_IDS, bool)
@@ -132,6 +134,7 @@ class Associator:
         """What was called `dropped` is called `kept` from now on."""
         self._current[self._current == dropped] = kept
         self._fragments.rename(kept, dropped)
+        self._planes.rename(kept, dropped)
 
     def _join_sightings(self, kept: int, dropped: int) -> None:
         self.sightings[kept] = max(self.sightings.get(kept, 0), self.sightings.pop(dropped, 0))
@@ -148,18 +151,21 @@ class Associator:
             self._current[np.isin(self._current, gone)] = 0
             self._evidence.forget(set(gone))
             self._fragments.forget(set(gone))
+            self._planes.forget(gone)
             for i in gone:
                 del self.sightings[i]
         return gone
 
     def _choose(
         self, overlap: SegmentOverlap, depth: np.ndarray, camera: Camera | None, T_world_camera: np.ndarray | None
-    ) -> tuple[np.ndarray, dict[int, Fragment]]:
+    ) -> tuple[np.ndarray, dict[int, Fragment], dict[int, BoundingPlane]]:
         best = self._best(overlap)
         parts: dict[int, Fragment] = {}
+        planes: dict[int, BoundingPlane] = {}
         if camera is not None and T_world_camera is not None:
             parts = self._fragments.observe(overlap, best, depth, camera, T_world_camera)
-        return best, parts
+            planes = self._planes.look(overlap, depth, camera, T_world_camera)
+        return best, parts, planes
 
     def _own_ids(self, segments: np.ndarray, overlap: SegmentOverlap) -> Association:
         new = overlap.segments[~self._used[overlap.segments]].tolist()
@@ -170,8 +176,9 @@ class Associator:
         return Association(segments.copy(), [], new)
 
     def _match(
-        self, view: MapView, overlap: SegmentOverlap, best: np.ndarray, parts: dict[int, Fragment]
-    ) -> Association:
+        self, view: MapView, overlap: SegmentOverlap, best: np.ndarray, parts: dict[int, Fragment],
+        planes: dict[int, BoundingPlane],
+    ) -> Association:  # fmt: skip
         covered = self._find_covered(overlap)
         created: list[int] = []
         ids = np.zeros(len(overlap.segments) + 1, np.uint16)  # the last one: no segment
@@ -180,9 +187,13 @@ class Associator:
                 ids[k] = parts[k].object_id
             elif best[k] >= 0 and k not in parts:
                 ids[k] = overlap.objects[best[k]]
+            elif k in planes and (wall := self._planes.object_on(planes[k])) and wall not in overlap.objects:
+                ids[k] = wall
             else:
                 ids[k] = self._new_id(int(overlap.segments[k]))
                 created += [int(ids[k])] if ids[k] else []
+            if k in planes and ids[k]:
+                self._planes.note(int(ids[k]), planes[k])
             if k in parts:
                 parts[k].object_id = int(ids[k])
                 covered[k] = False

@@ -7,7 +7,7 @@ structured-light cameras, which grows with the square of depth, is the same ever
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,6 +19,8 @@ _LEAST_NOISE = 2e-4
 """1/m: an inverse depth known better than this gains nothing."""
 _MOST_NOISE = 5e-3
 """1/m: what looks noisier (2 cm at 2 m) is clutter."""
+_STEEPEST = 0.02
+"""Depth over which a surface may fall off from pixel to pixel, as a share of its depth."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,31 @@ class DepthSurface:
     def noise(self) -> np.ndarray:
         """Standard deviation of depth, float32 [H, W], metres."""
         return np.float32(self.sigma) * self.depth**2
+
+
+def unbroken(surface: DepthSurface, axis: int, tolerance: np.ndarray) -> np.ndarray:
+    """Whether a pixel and its right (axis 1) or lower (axis 0) neighbour are on one surface: bool [H, W-1] or [H-1, W].
+
+    They are if their depths differ by less than `tolerance` (metres, [H, W]), or if either, continued from the pixel
+    beyond it, meets the other: seen at a flat angle, a table top or a floor falls off by centimetres from row to row,
+    but straight in inverse depth.
+    """
+    if axis == 0:
+        return unbroken(_with_axes_swapped(surface), 1, tolerance.T).T
+    z, inverse = surface.depth, surface.inverse
+    step = np.abs(z[:, 1:] - z[:, :-1])
+    near = step < tolerance[:, :-1]
+    bend = np.abs(inverse[:, 2:] - 2 * inverse[:, 1:-1] + inverse[:, :-2])
+    miss = np.full(z.shape, np.inf, np.float32)
+    miss[:, 1:-1] = bend
+    miss *= z * z
+    straight = np.minimum(miss[:, :-1], miss[:, 1:]) < tolerance[:, :-1]
+    near |= straight & (step < 4 * tolerance[:, :-1] + _STEEPEST * z[:, :-1])
+    return near & surface.valid[:, 1:] & surface.valid[:, :-1]
+
+
+def _with_axes_swapped(surface: DepthSurface) -> DepthSurface:
+    return replace(surface, valid=surface.valid.T, depth=surface.depth.T, inverse=surface.inverse.T)
 
 
 def surface_of(depth: np.ndarray, camera: Camera, max_depth: float) -> DepthSurface:

@@ -12,8 +12,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ggslam.objects.depth_surfaces import DepthSurface, surface_of
+from ggslam.objects.depth_surfaces import DepthSurface, surface_of, unbroken
+from ggslam.objects.hollows import join_insides, join_panes
+from ggslam.objects.overhangs import join_overhangs
 from ggslam.objects.plane_colors import colors_to_compare, find_flat_things
+from ggslam.objects.plane_parts import part_planes
 from ggslam.objects.planes import find_planes
 from ggslam.objects.regions import Borders, Groups, find_borders, gap_tolerance
 from ggslam.objects.segments import connected_pieces
@@ -52,22 +55,24 @@ class GeometricSegmenter:
         surface = surface_of(depth, camera, self._settings.max_depth_m)
         if not surface.valid.any():
             return np.zeros(depth.shape, np.uint16)
-        plane_of, planes = find_planes(surface, camera, self._settings)
+        plane_of, planes = part_planes(*find_planes(surface, camera, self._settings), surface, camera, self._settings)
         normals = surface.normals.copy()
         on_plane = plane_of > 0
         if len(planes):
             unit = -planes / np.linalg.norm(planes, axis=1, keepdims=True)
             normals[on_plane] = unit[plane_of[on_plane] - 1]
-        regions = self._regions(surface, plane_of)
-        regions = self._join_regions(regions, planes, surface, normals, color)
+        regions, body_of = self._join_regions(self._regions(surface, plane_of), planes, surface, normals, color)
+        regions = join_panes(regions, surface)
         things = find_flat_things(color, np.where(regions <= len(planes), regions, 0), self._settings)
-        regions = np.where(things > 0, int(regions.max()) + things, regions)
+        regions = np.where(things > 0, len(body_of) + things, body_of[regions])
         return _by_size(regions, surface.valid, self._settings.min_area)
 
     def _regions(self, surface: DepthSurface, plane_of: np.ndarray) -> np.ndarray:
         """Planes, and the smooth pieces of the rest: int32 [H, W] from 1 on, 0 = no depth or a crumb."""
         rest = surface.valid & (plane_of == 0)
-        links = [self._smooth_links(surface, rest, axis) for axis in (1, 0)]
+        tolerance = gap_tolerance(surface, self._settings)
+        closed = unbroken(surface, 1, tolerance), unbroken(surface, 0, tolerance)
+        links = [self._smooth_links(surface, rest, axis, closed[1 - axis]) for axis in (1, 0)]
         pieces = connected_pieces(rest.astype(np.uint8), (links[0], links[1]))
         area = np.bincount(pieces[rest], minlength=int(pieces.max()) + 1)
         # Strips along edges, where normals are blurred, are left to be grown over.
@@ -79,14 +84,13 @@ class GeometricSegmenter:
         number = np.zeros(len(area), np.int32)
         number[kept] = int(plane_of.max()) + 1 + np.arange(len(kept))
         regions = np.where(rest, number[pieces], plane_of)
-        return _grow(regions, surface, gap_tolerance(surface, self._settings), _GROWTH * surface.step)
+        return _grow(regions, surface.valid, closed, _GROWTH * surface.step)
 
-    def _smooth_links(self, surface: DepthSurface, rest: np.ndarray, axis: int) -> np.ndarray:
-        """bool [H, W-1] (axis 1) or [H-1, W] (axis 0): neighbours of the rest without a gap or a concave edge."""
+    def _smooth_links(self, surface: DepthSurface, rest: np.ndarray, axis: int, closed: np.ndarray) -> np.ndarray:
+        """bool [H, W-1] (axis 1) or [H-1, W] (axis 0): neighbours of the rest without a gap (`closed`, of the same
+        shape) or a concave edge."""
         first, second = _ends(axis, 1)
-        z, tolerance = surface.depth, gap_tolerance(surface, self._settings)
-        connected = rest[first] & rest[second]
-        connected &= np.abs(z[first] - z[second]) < tolerance[first]
+        connected = rest[first] & rest[second] & closed
         # Concavity is looked at across a few pixels, where the edge itself does not blur the normals.
         before, after = _ends(axis, 2 * surface.step + 1)
         middle = _middle(axis, surface.step)
@@ -98,14 +102,15 @@ class GeometricSegmenter:
         way = points.take(end, 0) - points.take(start, 0)
         n, m = normals.take(start, 0), normals.take(end, 0)
         concave = (_dot(n, m) < np.cos(np.radians(self._settings.concave_degrees))) & (_dot(m - n, way) < 0)
-        concave &= np.abs(way[:, 2]) < 0.05 * z.ravel()[start]
+        concave &= np.abs(way[:, 2]) < 0.05 * surface.depth.ravel()[start]
         connected[middle][rows[concave], columns[concave]] = False
         return connected
 
     def _join_regions(
         self, regions: np.ndarray, planes: np.ndarray, surface: DepthSurface, normals: np.ndarray, color: np.ndarray
-    ) -> np.ndarray:
-        """Regions with convex and smooth neighbours joined; what is flat on a plane and looks like it is the plane."""
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Regions with convex and smooth neighbours joined; what is flat on a plane and looks like it is the plane. And
+        the number of the body that each region is a face of, by region."""
         settings = self._settings
         borders = find_borders(regions, surface, normals, colors_to_compare(color), surface.step + 1, settings)
         groups = Groups(int(regions.max()) + 1)
@@ -113,8 +118,12 @@ class GeometricSegmenter:
         parts = _is_hollow(borders, len(planes)) | self._is_flat(borders, alike, regions, planes, surface)
         for k in np.flatnonzero(_is_convex(borders) | (alike & parts)):
             groups.join(*borders.pairs[k].tolist())
-        regions = groups.roots().astype(np.int32)[regions]
-        return _without_flakes(regions, len(planes), borders, groups, self._settings.min_area)
+        pairs = np.column_stack([borders.pairs, borders.length])
+        join_insides(groups, regions, len(planes), surface, pairs)
+        joined = groups.roots().astype(np.int32)[regions]
+        joined = _without_flakes(joined, len(planes), borders, groups, self._settings.min_area)
+        join_overhangs(groups, regions, surface, pairs)
+        return joined, groups.roots().astype(np.int32)
 
     def _is_flat(
         self, borders: Borders, asked: np.ndarray, regions: np.ndarray, planes: np.ndarray, surface: DepthSurface
@@ -184,18 +193,22 @@ def _middle(axis: int, margin: int) -> tuple[slice, ...]:
     return np.s_[:, margin:-margin] if axis else np.s_[margin:-margin, :]
 
 
-def _grow(regions: np.ndarray, surface: DepthSurface, tolerance: np.ndarray, passes: int) -> np.ndarray:
-    """Regions grown over valid pixels without region, one pixel a pass, where no gap is in between."""
+def _grow(regions: np.ndarray, valid: np.ndarray, closed: tuple[np.ndarray, np.ndarray], passes: int) -> np.ndarray:
+    """Regions grown over valid pixels without region, one pixel a pass, where no gap is in between.
+
+    Args:
+        closed: bool [H, W-1] and [H-1, W], whether there is none between a pixel and its right and its lower neighbour.
+    """
     width = regions.shape[1] + 2
-    label, depth = np.pad(regions, 1).ravel(), np.pad(surface.depth, 1).ravel()
-    limit = np.pad(tolerance, 1).ravel()
-    free = np.flatnonzero(np.pad((regions == 0) & surface.valid, 1).ravel())
+    label = np.pad(regions, 1).ravel()
+    right = np.pad(closed[0], ((1, 1), (1, 2))).ravel()
+    below = np.pad(closed[1], ((1, 2), (1, 1))).ravel()
+    free = np.flatnonzero(np.pad((regions == 0) & valid, 1).ravel())
     for _ in range(passes):
         found = np.zeros(len(free), label.dtype)
-        for offset in (-1, 1, -width, width):
-            other = label[free + offset]
-            near = np.abs(depth[free + offset] - depth[free]) < limit[free]
-            found = np.where((found == 0) & near, other, found)
+        for offset, link in ((-1, right), (1, right), (-width, below), (width, below)):
+            near = link[free + min(offset, 0)]
+            found = np.where((found == 0) & near, label[free + offset], found)
         label[free] = found
         free = free[found == 0]
     return label.reshape(-1, width)[1:-1, 1:-1]

@@ -13,6 +13,7 @@ import numpy as np
 
 from ggslam.objects.segments import connected_pieces
 from ggslam.objects.settings import GeometricSettings
+from ggslam.objects.strange_colors import HUE, find_strange_colors
 
 _WIDTH = 160
 """Pixels across of the image in which colours are compared."""
@@ -26,8 +27,11 @@ _REPEATED, _REPEATED_ON_PLANE = 0.5, 0.01
 """A piece's colour may be on so much of its plane besides: shares of the piece and of the plane."""
 _SHADE = (0.45, 1.6)
 """Ratios of brightness between which a piece of the same hue may be in shadow or in the sun."""
+_SQUARE = np.ones((3, 3), np.uint8)
 _SOLID = 0.6
 """Share of its convex hull that a thing fills."""
+_SURE = 0.1
+"""Share of it that differs in more than what a shadow changes."""
 
 
 def colors_to_compare(color: np.ndarray) -> np.ndarray:
@@ -63,7 +67,8 @@ def find_flat_things(color: np.ndarray, plane_of: np.ndarray, settings: Geometri
     pieces = connected_pieces(plane, _links(plane, lab, _LINK * settings.color_contrast))
     for number in np.flatnonzero(large):
         strange = _strange_pieces(pieces, plane == number, lab, settings.color_contrast)
-        _add_compact(things, strange, plane == number)
+        kind = find_strange_colors(lab, plane == number, pieces, settings.color_contrast)
+        _add_compact(things, strange | (kind > 0), strange | (kind == HUE), plane == number)
     enlarged = cv2.resize(things.astype(np.float32), plane_of.shape[::-1], interpolation=cv2.INTER_NEAREST)
     found = enlarged.astype(np.int32)
     on_plane = cv2.resize(plane.astype(np.float32), plane_of.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -101,15 +106,26 @@ def _strange_pieces(pieces: np.ndarray, inside: np.ndarray, lab: np.ndarray, con
     return out
 
 
-def _add_compact(things: np.ndarray, strange: np.ndarray, inside: np.ndarray) -> None:
-    """Numbers what hangs together of `strange` and is compact; with what it encloses."""
+def _add_compact(things: np.ndarray, strange: np.ndarray, sure: np.ndarray, inside: np.ndarray) -> None:
+    """Numbers what hangs together of `strange`, is compact and partly `sure` to be no shadow; with what it encloses."""
     if not strange.any():
         return
-    grown = cv2.dilate(strange.astype(np.uint8), np.ones((3, 3), np.uint8)) & inside
-    outlines, _ = cv2.findContours(grown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    for outline in outlines:
-        filled = cv2.drawContours(np.zeros(grown.shape, np.uint8), [outline], -1, 1, cv2.FILLED)
-        hull = cv2.drawContours(np.zeros(grown.shape, np.uint8), [cv2.convexHull(outline)], -1, 1, cv2.FILLED)
-        area = np.count_nonzero(filled)
-        if _LEAST_PIECE * filled.size <= area and area >= _SOLID * np.count_nonzero(hull):
-            things[(filled > 0) & inside] = things.max() + 1
+    grown = cv2.dilate(strange.astype(np.uint8), _SQUARE) & inside
+    # Pieces within one another's convex hulls are one thing: the frame of a picture and what it shows.
+    together = _hulls(_hulls(grown))
+    _, number = cv2.connectedComponents(together, connectivity=4, ltype=cv2.CV_32S)
+    # Growing bridged gaps; a thing ends where its own pixels do.
+    number[~inside | ((cv2.erode(together, _SQUARE) == 0) & ~strange)] = 0
+    area, own = np.bincount(number.ravel()), np.bincount(number[grown > 0], minlength=int(number.max()) + 1)
+    least, most = _LEAST_PIECE * inside.size, _MOST_PIECE * np.count_nonzero(inside)
+    certain = np.bincount(number[sure], minlength=len(area))
+    compact = (area >= least) & (area <= most) & (own >= _SOLID * area) & (certain >= _SURE * area)
+    for k in np.flatnonzero(compact):
+        if k:
+            things[number == k] = things.max() + 1
+
+
+def _hulls(image: np.ndarray) -> np.ndarray:
+    """Convex hulls of the connected pieces of uint8 [h, w], drawn into one."""
+    outlines, _ = cv2.findContours(image, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(np.zeros_like(image), [cv2.convexHull(o) for o in outlines], -1, 1, cv2.FILLED)

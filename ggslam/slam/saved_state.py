@@ -42,6 +42,7 @@ from ggslam.movers.surface import MoverSurface
 from ggslam.movers.tracks import MoverTracks, Track
 from ggslam.movers.trail import Trail
 from ggslam.objects.association import Associator
+from ggslam.objects.bounding_planes import BoundingPlane, BoundingPlanes
 from ggslam.objects.consistency import ConsistencyJudge
 from ggslam.objects.evidence import PairEvidence, _Pair
 from ggslam.objects.fragments import Fragment, FragmentMemory
@@ -260,6 +261,7 @@ RULES: Rules = {
          FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes,
          KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
+         BoundingPlanes, BoundingPlane,
          ShutterTimes, RigClock),
         Rule(),
     ),

@@ -188,7 +188,7 @@ def test_a_flat_rim_of_the_same_colour_is_a_part_of_its_plane() -> None:
     color = grey(CAMERA)
     for settings, expected in ((GeometricSettings(), True), (GeometricSettings(color_contrast=0), False)):
         segments = GeometricSegmenter(settings).segment(color, depth, CAMERA)
-        assert (segments[120, 160] == segments[120, 160 + 87]) == expected
+        assert (segments[120, 20] == segments[120, 160 + 87]) == expected
     color[ring] = (128, 20, 20)
     segments = GeometricSegmenter().segment(color, depth, CAMERA)
-    assert segments[120, 160] != segments[120, 160 + 87]
+    assert segments[120, 20] != segments[120, 160 + 87]

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flat faces of one body that a step parts: the top of a table stands out over its front, that of a cabinet over its
+doors. The faces of a convex body lie behind one another's planes, all but the rim that stands out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.objects.depth_surfaces import DepthSurface
+from ggslam.objects.regions import Groups
+
+_STEP = 0.15
+"""Metres that a face may stand out over another one."""
+_CLEAR = 0.003
+"""Metres behind the other's plane from which a point counts as behind it: no low thing on a table is its edge."""
+_BEHIND = 0.6
+"""Share of a face's points that lie behind the other's plane at least: the others stand out."""
+_FLAT = (0.15, 0.003)
+"""Thickness of a flat face at most (root mean square): a share of its width, plus metres."""
+_CORNER = 0.64
+"""Cosine of the angle between the normals of two faces at most: 50 degrees."""
+_PARALLEL = 0.9
+_RIM = 0.12
+"""Share of the outline of one of the two that lies between them."""
+_LEAST, _LEAST_FACE = 12, 30
+"""Pixels of border, and of a face on a grid of every second, at least."""
+
+
+def join_overhangs(groups: Groups, regions: np.ndarray, surface: DepthSurface, pairs: np.ndarray) -> None:
+    """Joins flat regions that are faces of one convex body.
+
+    Args:
+        groups: of the regions; changed in place.
+        regions: int32 [H, W], 0 = none.
+        pairs: int [n, 3], touching regions with the number of links between them.
+    """
+    n = len(groups.roots())
+    rim = np.bincount(pairs[:, :2].ravel(), np.repeat(pairs[:, 2], 2), n)
+    fewer = rim[pairs[:, :2]].min(1)
+    asked = pairs[(pairs[:, 2] >= _LEAST) & (pairs[:, 2] >= _RIM * fewer)]
+    if not len(asked):
+        return
+    faces = _Faces(regions, surface, n)
+    for a, b, _ in asked.tolist():
+        if groups.find(a) != groups.find(b) and (
+            faces.are_corner(a, b) or faces.is_below(groups, a, b) or faces.is_below(groups, b, a)
+        ):
+            groups.join(a, b)
+
+
+class _Faces:
+    """Points and mean normals of regions, on every second pixel and row."""
+
+    def __init__(self, regions: np.ndarray, surface: DepthSurface, n: int) -> None:
+        number = regions[::2, ::2].ravel()
+        order = np.argsort(number, kind="stable")
+        self._points = surface.points[::2, ::2].reshape(-1, 3)[order]
+        count = np.bincount(number, minlength=n)
+        self._start = np.concatenate([[0], np.cumsum(count)])
+        self._count = count
+        self._normals: dict[int, np.ndarray | None] = {}
+
+    def _normal(self, k: int) -> np.ndarray | None:
+        if k not in self._normals:
+            self._normals[k] = self._fit(k) if k > 0 and self._count[k] >= _LEAST_FACE else None
+        return self._normals[k]
+
+    def _fit(self, k: int) -> np.ndarray | None:
+        """Normal towards the camera of a flat region; None if it is not flat."""
+        points = self._some(k).astype(np.float64)
+        centre = points.mean(0)
+        values, axes = np.linalg.eigh(np.cov((points - centre).T))
+        thickness, width = np.sqrt(np.maximum(values[:2], 0))
+        if thickness > _FLAT[0] * width + _FLAT[1]:
+            return None
+        normal: np.ndarray = axes[:, 0]
+        return -normal if normal @ centre > 0 else normal
+
+    def _some(self, k: int) -> np.ndarray:
+        points = self._points[self._start[k] : self._start[k + 1]]
+        return points[:: max(1, len(points) // 400)]
+
+    def are_corner(self, a: int, b: int) -> bool:
+        """Whether both are flat, stand at an angle and lie behind one another."""
+        n, m = self._normal(a), self._normal(b)
+        if n is None or m is None or n @ m > _CORNER:
+            return False
+        return self._is_behind(a, b, m) and self._is_behind(b, a, n)
+
+    def is_below(self, groups: Groups, a: int, edge: int) -> bool:
+        """Whether `a` is set back behind the parallel `edge` of a board that lies on it: a front below a table top."""
+        n, m = self._normal(a), self._normal(edge)
+        if n is None or m is None or n @ m < _PARALLEL or not self._is_behind(a, edge, m):
+            return False
+        root = groups.find(edge)
+        boards = [k for k in range(1, len(self._count)) if k not in (a, edge) and groups.find(k) == root]
+        return any(self.are_corner(a, k) for k in boards)
+
+    def _is_behind(self, a: int, b: int, normal: np.ndarray) -> bool:
+        """Whether the points of `a` lie behind the face `b`, but for what may stand out, and reach up to it."""
+        out = np.sort(self._some(a) @ normal - np.median(self._some(b) @ normal))
+        high = out[round(0.98 * (len(out) - 1))]
+        return bool(out[int(_BEHIND * (len(out) - 1))] < -_CLEAR and -_STEP < high < _STEP)
