@@ -19,7 +19,9 @@ def look(depth: np.ndarray) -> Keyframe:
     """From the origin along z."""
     color = np.full((30, 40, 3), 128, np.uint8)
     return make_keyframe(
-        0, Frame(index=0, timestamp=0.0, color=color, depth=depth.astype(np.float32), camera=CAMERA), np.eye(4)
+        0,
+        Frame(index=0, source_index=0, timestamp=0.0, color=color, depth=depth.astype(np.float32), camera=CAMERA),
+        np.eye(4),
     )
 
 
