@@ -69,7 +69,8 @@ class _Faces:
         """Normal towards the camera of a flat region; None if it is not flat."""
         points = self._some(k).astype(np.float64)
         centre = points.mean(0)
-        values, axes = np.linalg.eigh(np.cov((points - centre).T))
+        away = points - centre
+        values, axes = np.linalg.eigh(away.T @ away / (len(away) - 1))
         thickness, width = np.sqrt(np.maximum(values[:2], 0))
         if thickness > _FLAT[0] * width + _FLAT[1]:
             return None
@@ -98,6 +99,7 @@ class _Faces:
 
     def _is_behind(self, a: int, b: int, normal: np.ndarray) -> bool:
         """Whether the points of `a` lie behind the face `b`, but for what may stand out, and reach up to it."""
-        out = np.sort(self._some(a) @ normal - np.median(self._some(b) @ normal))
+        face = np.sort(self._some(b) @ normal)
+        out = np.sort(self._some(a) @ normal) - face[len(face) // 2]
         high = out[round(0.98 * (len(out) - 1))]
         return bool(out[int(_BEHIND * (len(out) - 1))] < -_CLEAR and -_STEP < high < _STEP)

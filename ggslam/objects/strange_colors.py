@@ -42,16 +42,17 @@ def find_strange_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray,
     rows, columns = np.nonzero(inside)
     size = max(1, inside.shape[1] // _CELLS)
     cell = rows // size * _CELLS * 2 + columns // size
-    _, cell, pixels = np.unique(cell, return_inverse=True, return_counts=True)
+    cell, _, pixels = _number(cell)
     counted = pixels >= 0.2 * size * size
     if counted.sum() < _LEAST_CELLS:
         return out
     colors = lab[rows, columns].copy()
     colors[:, 0] -= _light(rows, columns, colors[:, 0])
-    bins = np.floor(colors / (contrast * np.array([_BRIGHTNESS, _HUE, _HUE], np.float32))).astype(np.int64)
+    bins = np.floor(colors / (contrast * np.array([_BRIGHTNESS, _HUE, _HUE], np.float32))).astype(np.int32)
     bins -= bins.min(0)
-    code, which = np.unique((bins[:, 0] << 40) | (bins[:, 1] << 20) | bins[:, 2], return_inverse=True)
-    place = np.stack([code >> 40, code >> 20 & 0xFFFFF, code & 0xFFFFF], 1)
+    sides = bins.max(0) + 1
+    which, code, _ = _number((bins[:, 0] * sides[1] + bins[:, 1]) * sides[2] + bins[:, 2])
+    place = np.stack(np.unravel_index(code, sides), 1)
     table = np.bincount(which * len(pixels) + cell, minlength=len(code) * len(pixels)).reshape(len(code), -1)
     # Bins that touch are alike: a colour is not at another place for being on the other side of a bin's edge.
     near = np.ones((len(code), len(code)), bool)
@@ -68,6 +69,15 @@ def find_strange_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray,
     base = np.bincount(number) >= _BASE * len(rows)
     out[rows, columns] = np.where(base[number], 0, np.where(telling[which], HUE, np.where(usual[which], 0, BRIGHTNESS)))
     return out
+
+
+def _number(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Small whole numbers [n] numbered through: each one's number [n], the values in order and how often each occurs."""
+    count = np.bincount(values)
+    there = np.flatnonzero(count)
+    number = np.zeros(len(count), np.int32)
+    number[there] = np.arange(len(there))
+    return number[values], there, count[there]
 
 
 def _light(rows: np.ndarray, columns: np.ndarray, brightness: np.ndarray) -> np.ndarray:
