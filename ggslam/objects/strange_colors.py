@@ -72,7 +72,7 @@ def find_strange_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray,
 
 
 def _number(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Small whole numbers [n] numbered through: each one's number [n], the values in order and how often each occurs."""
+    """Small whole numbers [n] numbered through: each one's number [n], the values in order, how often each occurs."""
     count = np.bincount(values)
     there = np.flatnonzero(count)
     number = np.zeros(len(count), np.int32)
