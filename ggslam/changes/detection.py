@@ -34,7 +34,7 @@ class Change:
     """What became of a thing.
 
     Attributes:
-        kind: see `Kind`; "unseen": of the older visit, and the newer one did not look there.
+        kind: see `Kind`; "unseen": of the older visit, and the newer one did not look there, or saw too little to tell.
         old, new: the thing in either visit; None: it is not there.
         T_new_old: float64 [4, 4], world: what moved; None of other kinds.
         fit: how a moved thing's surfaces lie upon each other.
@@ -150,8 +150,9 @@ class ChangeDetector:
 
     def _compare(self, found: Detection) -> None:
         gone, come = ([t for t in things if self._is_changed(t, found.ids_believed)] for things in self.things)
+        doubted = {id(thing) for thing in gone if thing.changed >= self.settings.whole}
         if found.ids_believed:
-            self._drop_hardly_seen(gone, come)
+            doubted |= {id(thing) for thing in self._drop_hardly_seen(gone, come)}
             self._pair_by_id(found, gone, come)
             self._find_replaced(gone, come)
         else:
@@ -162,9 +163,11 @@ class ChangeDetector:
         self._compare_looks(found)
         known = {id(change.old) for change in found.changes}
         for thing in self.things[0]:
-            if thing.seen < self.settings.min_seen:
+            if id(thing) in known:
+                continue
+            if thing.seen < self.settings.min_seen or id(thing) in doubted:  # whether it moved or stayed cannot be told
                 found.unseen.append(Change("unseen", thing, None))
-            elif id(thing) not in known:
+            else:
                 found.stayed += 1
 
     def _is_changed(self, thing: Thing, ids_believed: bool) -> bool:
@@ -239,12 +242,15 @@ class ChangeDetector:
                 if change is not None:
                     found.changes.append(change)
 
-    def _drop_hardly_seen(self, gone: list[Thing], come: list[Thing]) -> None:
-        """What a visit has too little of to be a thing did not come or go."""
+    def _drop_hardly_seen(self, gone: list[Thing], come: list[Thing]) -> list[Thing]:
+        """What a visit has too little of to be a thing did not come or go; returns what seemed to be gone of these."""
+        before = list(gone)
         for number, things in enumerate((gone, come)):
             known = set(np.unique(self.visits[1 - number].gaussians.object_id.numpy()).tolist())
             known -= {t.label for t in self.things[1 - number]}
             things[:] = [t for t in things if t.label not in known]
+        kept = set(map(id, gone))
+        return [thing for thing in before if id(thing) not in kept]
 
     def _find_replaced(self, gone: list[Thing], come: list[Thing]) -> None:
         """What stands where something else of another id stood: that was removed, and this was added."""

@@ -17,6 +17,7 @@ from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Visit
 from ggslam.errors import ConfigError
+from ggslam.jobs.changes.ghosts import without_ghosts
 from ggslam.jobs.changes.pictures import picture_of_change
 from ggslam.jobs.changes.shown import MOST_PICTURES, ChangesShown
 from ggslam.jobs.merge.placing import find_joint_poses, place_maps
@@ -150,6 +151,6 @@ def _visit(source: MergeSource, placed: PlacedRun, T_new_old: np.ndarray, counte
     points = [transform_points(known.points[k].astype(float), poses[k]) for k in counted]
     normals = [known.normals[k].astype(float) @ poses[k, :3, :3].T for k in counted]
     return Visit(
-        placed.gaussians, [placed.cameras[k] for k in counted], placed.T_world_camera[list(counted)],
+        without_ghosts(source, placed), [placed.cameras[k] for k in counted], placed.T_world_camera[list(counted)],
         np.concatenate(points), np.concatenate(normals), source.objects is not None,
     )  # fmt: skip

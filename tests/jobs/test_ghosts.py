@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a visit that began in an earlier map looked through is not there any more."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ggslam.jobs.changes.ghosts import without_ghosts
+from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.tracking.settings import DepthNoise
+
+CAMERA = Camera(40, 30, 30.0, 30.0, 19.5, 14.5)
+WALL_M = 2.0
+
+
+def visit(points: list[list[float]], births: list[int], own: int, depth: np.ndarray, recording: bool = True) -> Any:
+    """A run whose first keyframe is of an earlier map, with `own` more that look along z; and where its map is."""
+    gaussians, count = GaussianMap(0, 4), len(points)
+    gaussians.insert(
+        torch.tensor(points), torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.full((count, 3), -3.0),
+        torch.zeros(count), torch.full((count, 3), 0.5),
+    )  # fmt: skip
+    gaussians.birth_keyframe[:] = torch.tensor(births, dtype=gaussians.birth_keyframe.dtype)
+    color = np.zeros((30, 40, 3), np.uint8)
+    frame = Frame(index=0, source_index=0, timestamp=0.0, color=color, depth=depth.astype(np.float32), camera=CAMERA)
+    source = SimpleNamespace(
+        record=SimpleNamespace(keyframes=[SimpleNamespace(frame=f) for f in (ELSEWHERE, *range(own))]),
+        sequence=SimpleNamespace(frame=lambda index, masks: frame) if recording else None,
+        known=SimpleNamespace(noise=DepthNoise()),
+    )
+    placed = SimpleNamespace(gaussians=gaussians, T_world_camera=np.tile(np.eye(4), (own + 1, 1, 1)))
+    return source, placed
+
+
+POINTS = [[0, 0, 1.0], [0.4, 0, 1.99], [0, 0, 2.5], [5, 0, 1.0], [0, 0, 1.2]]
+"""Looked through; on the wall; behind it; outside; looked through, but the visit's own."""
+BIRTHS = [0, 0, 0, 0, 1]
+
+
+def test_what_the_earlier_map_shows_before_a_wall_goes() -> None:
+    source, placed = visit(POINTS, BIRTHS, own=2, depth=np.full((30, 40), WALL_M))
+    kept = without_ghosts(source, placed).means.numpy()
+    assert np.allclose(kept, np.array(POINTS[1:], np.float32)) and len(placed.gaussians) == len(POINTS)
+
+
+@pytest.mark.parametrize("case", ["one keyframe", "no depth", "an edge beside it", "no recording", "no earlier map"])
+def test_what_is_not_surely_gone_stays(case: str) -> None:
+    depth = np.full((30, 40), WALL_M)
+    if case == "no depth":
+        depth[:] = 0
+    if case == "an edge beside it":
+        depth[13:16, 21] = 1.0
+    own = 1 if case == "one keyframe" else 2
+    source, placed = visit(POINTS[:1], [0], own, depth, recording=case != "no recording")
+    if case == "no earlier map":
+        source.record.keyframes = source.record.keyframes[1:]
+    assert len(without_ghosts(source, placed)) == 1
