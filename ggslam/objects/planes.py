@@ -31,6 +31,7 @@ def find_planes(surface: DepthSurface, camera: Camera, settings: GeometricSettin
         float32 [P, 3], per plane the vector w with 1/z = w . ray, in other words its normal over its distance.
     """
     size = max(4, round(settings.block_pixels * camera.width / _REFERENCE_WIDTH))
+    size = min(size, camera.width, camera.height)
     blocks = _Blocks(surface, camera, size)
     group = _grow(blocks, surface.sigma, settings)
     planes, supports = _fit(blocks, group, surface.sigma, settings)

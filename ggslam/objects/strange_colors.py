@@ -12,6 +12,8 @@ _CELLS = 12
 """Cells of the image across, in which it is noted which colours occur."""
 _BRIGHTNESS, _HUE = 1.0, 0.5
 """Width of bins of L and of a and b, as shares of the contrast."""
+_LEAST_WIDTH = 8.0
+"""Contrast that bins are at least made for: their number goes with its third power."""
 _OCCURS = 0.03
 """Share of a cell's pixels from which a colour occurs in it."""
 _USUAL = 0.3
@@ -48,7 +50,8 @@ def find_strange_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray,
         return out
     colors = lab[rows, columns].copy()
     colors[:, 0] -= _light(rows, columns, colors[:, 0])
-    bins = np.floor(colors / (contrast * np.array([_BRIGHTNESS, _HUE, _HUE], np.float32))).astype(np.int32)
+    width = max(contrast, _LEAST_WIDTH) * np.array([_BRIGHTNESS, _HUE, _HUE], np.float32)
+    bins = np.floor(colors / width).astype(np.int32)
     bins -= bins.min(0)
     sides = bins.max(0) + 1
     which, code, _ = _number((bins[:, 0] * sides[1] + bins[:, 1]) * sides[2] + bins[:, 2])

@@ -192,3 +192,10 @@ def test_a_flat_rim_of_the_same_colour_is_a_part_of_its_plane() -> None:
     color[ring] = (128, 20, 20)
     segments = GeometricSegmenter().segment(color, depth, CAMERA)
     assert segments[120, 20] != segments[120, 160 + 87]
+
+
+@pytest.mark.parametrize("size", [(9, 1000), (1000, 9), (1, 60), (4, 4)])
+def test_images_of_any_shape_have_segments(size: tuple[int, int]) -> None:
+    camera = Camera(size[1], size[0], 300.0, 300.0, size[1] / 2 - 0.5, size[0] / 2 - 0.5)
+    found = GeometricSegmenter().segment(np.zeros((*size, 3), np.uint8), np.full(size, 2.0, np.float32), camera)
+    assert found.shape == size and found.dtype == np.uint16

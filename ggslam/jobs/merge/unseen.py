@@ -31,15 +31,17 @@ def find_seen(gaussians: GaussianMap, keyframes: Iterable[Keyframe], sigma: floa
         keyframes: with images.
         sigma: standard deviation of depth, metres.
     """
-    means = gaussians.means.detach().numpy().astype(np.float64)
-    seen = np.zeros(len(means), bool)
+    means = gaussians.means.detach().numpy()
+    left, found = np.arange(len(means)), np.zeros(len(means), bool)
     for keyframe in keyframes:
-        there = transform_points(means, keyframe.T_camera_world)
+        there = transform_points(means[left].astype(np.float64), keyframe.T_camera_world)
         row, column, inside = keyframe.camera.project(there)
         depth = keyframe.depth_m()[row, column]
         behind = there[:, 2] - depth > np.maximum(BEHIND_SIGMAS * sigma, BEHIND_RELATIVE * depth)
-        seen |= inside & ~(behind & (depth > 0))
-    return seen
+        seen = inside & ~(behind & (depth > 0))
+        found[left[seen]] = True
+        left = left[~seen]
+    return found
 
 
 class UnseenGaussians:
