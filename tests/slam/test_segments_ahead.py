@@ -38,16 +38,14 @@ def test_what_is_begun_ahead_is_what_would_be_found() -> None:
         if index == 3:  # too soon after the first one
             assert found is None and expected is None
         else:
-            assert found is not None and expected is not None
-            assert np.array_equal(found, expected) and len(np.unique(found)) == 2
+            assert found is not None and np.array_equal(found, expected) and len(np.unique(found)) == 2
 
 
 def test_what_was_begun_of_another_frame_is_not_taken() -> None:
     masks = ObjectMasks(MaskSettings(source="geometry"))
     masks.begin(shown(30))
     expected = mask_of(ObjectMasks(MaskSettings(source="geometry")), shown(0))
-    found = mask_of(masks, shown(0))
-    assert expected is not None and found is not None and np.array_equal(found, expected)
+    assert expected is not None and np.array_equal(mask_of(masks, shown(0)), expected)
 
 
 def test_a_failure_reaches_the_one_who_asks() -> None:
