@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import field, replace
 from typing import Literal
 
@@ -80,9 +79,6 @@ class ObjectMasks:
             self._segment = lambda frame: model.segment(frame.color)
         self._associator = self._make_associator()
         self._segmented: dict[int, int] = {}  # of each camera the last frame, or instant, that was
-        self._helper: ThreadPoolExecutor | None = None
-        self._begun: tuple[Frame, Future[np.ndarray]] | None = None
-        """A frame that `labels` will be asked for, and its segments as soon as they are found."""
 
     def _make_associator(self) -> Associator:
         """A segmenter's ids mean nothing from one frame to the next; a recording's may."""
@@ -104,16 +100,6 @@ class ObjectMasks:
         if self._source == "model":
             return "model"
         return "masks" if self._associator.uses_own_ids is not False else "associated masks"
-
-    def begin(self, frame: Frame) -> None:
-        """Starts to segment the frame that `labels` is asked for next, in another thread: for a caller that has other
-        things to do until then."""
-        self._begun = None
-        if self._source not in ("geometry", "model") or self._passes_over(frame):
-            return
-        if self._helper is None:
-            self._helper = ThreadPoolExecutor(1, thread_name_prefix="segments")
-        self._begun = frame, self._helper.submit(self._run_segmenter, frame)
 
     def labels(
         self, frame: Frame, keyframe: Keyframe, show: Callable[[], MapLabels] | None
@@ -165,14 +151,11 @@ class ObjectMasks:
         """Whether too few frames have passed since the last one that was segmented."""
         if self._source not in ("geometry", "model"):
             return False
-        rests = self._passes_over(frame)
+        number, now = frame.camera_number, frame.index if frame.instant is None else frame.instant
+        rests = number in self._segmented and 0 <= now - self._segmented[number] < self.settings.every
         if not rests:
-            self._segmented[frame.camera_number] = _time_of(frame)
+            self._segmented[number] = now
         return rests
-
-    def _passes_over(self, frame: Frame) -> bool:
-        number = frame.camera_number
-        return number in self._segmented and 0 <= _time_of(frame) - self._segmented[number] < self.settings.every
 
     def _segments(self, frame: Frame) -> np.ndarray | None:
         if self._source in (None, "recording"):
@@ -182,12 +165,6 @@ class ObjectMasks:
                 self._associator = self._make_associator()
             if self._source == "recording":
                 return mask if mask is None else _check_mask(mask, frame)
-        begun, self._begun = self._begun, None
-        if begun is not None and begun[0] is frame:
-            return begun[1].result()
-        return self._run_segmenter(frame)
-
-    def _run_segmenter(self, frame: Frame) -> np.ndarray:
         if self._segment is None:
             segmenter = GeometricSegmenter(self.settings.geometry)
             self._segment = lambda frame: segmenter.segment(frame.color, frame.depth, frame.camera)
@@ -222,11 +199,6 @@ def _choose(settings: MaskSettings, has_masks: bool | None) -> Source | None:
     if settings.source == "recording" and has_masks is False:
         raise SequenceError("masks.source=recording: the recording has no masks")
     return settings.source
-
-
-def _time_of(frame: Frame) -> int:
-    """By which frames are counted: a rig's frames of one instant are one."""
-    return frame.index if frame.instant is None else frame.instant
 
 
 def _check_mask(mask: np.ndarray, frame: Frame) -> np.ndarray:

@@ -220,7 +220,7 @@ RULES: Rules = {
     MoverSurface: _but("_tree"),
     MovingPixels: Rule(fixed=_names("masks")),
     CoarseView: Rule(fixed=_names("depth", "near", "far", "whole", "smooth")),
-    ObjectMasks: _but("settings", "_segment", "_helper", "_begun"),
+    ObjectMasks: _but("settings", "_segment"),
     # tracking
     GicpTracker: _but("_given_engine", "_features"),
     FeatureTracker: _but("features", "_extractor"),

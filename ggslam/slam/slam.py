@@ -373,10 +373,8 @@ class Slam:
         """
         tracking = self._corrections.follow(tracking, moves_followed)
         if self.loops is not None:
-            self.loops.begin(frame)  # this, the surface and segments are made beside what one thread alone does
+            self.loops.begin(frame)  # this and the surface are made beside what follows, which one thread alone does
         self._corrections.begin_points(tracking)
-        if self.mapper.identity is not None:
-            self.masks.begin(frame)
         if self.pager is not None:
             self.pager.prepare(tracking.T_world_camera, frame.depth)
         before = self.map.count
