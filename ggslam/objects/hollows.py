@@ -44,7 +44,7 @@ def join_insides(groups: Groups, regions: np.ndarray, planes: int, surface: Dept
     Args:
         groups: of the regions; changed in place.
         regions: int32 [H, W]; those up to `planes` are planes, 0 = none.
-        pairs: int [n, 2], touching regions with the number of links between them, int [n, 3].
+        pairs: int [n, 3], touching regions with the number of links between them.
     """
     bodies = _bodies(np.where(regions > planes, regions, 0), surface)
     rim = np.bincount(pairs[:, :2].ravel(), np.repeat(pairs[:, 2], 2), len(bodies.count))

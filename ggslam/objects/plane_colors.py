@@ -13,7 +13,7 @@ import numpy as np
 
 from ggslam.objects.segments import connected_pieces
 from ggslam.objects.settings import GeometricSettings
-from ggslam.objects.strange_colors import HUE, find_strange_colors
+from ggslam.objects.strange_colors import HUE, SHADE, find_strange_colors
 
 _WIDTH = 160
 """Pixels across of the image in which colours are compared."""
@@ -25,8 +25,6 @@ _LINK = 0.6
 """Neighbouring pixels belong together up to this share of the contrast that tells a thing."""
 _REPEATED, _REPEATED_ON_PLANE = 0.5, 0.01
 """A piece's colour may be on so much of its plane besides: shares of the piece and of the plane."""
-_SHADE = (0.45, 1.6)
-"""Ratios of brightness between which a piece of the same hue may be in shadow or in the sun."""
 _SQUARE = np.ones((3, 3), np.uint8)
 _SOLID = 0.6
 """Share of its convex hull that a thing fills."""
@@ -101,7 +99,7 @@ def _strange_pieces(pieces: np.ndarray, inside: np.ndarray, lab: np.ndarray, con
         usual = np.median(rest, 0)
         hue = float(np.linalg.norm(mean[1:] - usual[1:]))
         shade = mean[0] / max(usual[0], 1.0)
-        if hue >= 0.5 * contrast or not _SHADE[0] < shade < _SHADE[1]:
+        if hue >= 0.5 * contrast or not SHADE[0] < shade < SHADE[1]:
             out |= pieces == piece
     return out
 

@@ -20,8 +20,8 @@ _USUAL = 0.3
 """Share of a plane's cells in which its own colours occur at least."""
 _BASE = 0.3
 """A piece without edges that is so much of the plane is the plane."""
-_SHADE = (0.45, 1.6)
-"""Ratios of brightness between which a colour of the same hue is the plane in shadow or in the sun."""
+SHADE = (0.45, 1.6)
+"""Ratios of brightness between which a colour of the same hue may be the plane in shadow or in the sun."""
 _SAME_HUE = 0.2
 """Difference of hue of such colours at most, as a share of the contrast."""
 _LEAST_CELLS = 6
@@ -66,7 +66,7 @@ def find_strange_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray,
     mean = np.stack([np.bincount(which, lab[rows, columns, k]) / np.bincount(which) for k in range(3)], 1)
     shade = mean[:, None, 0] / np.maximum(mean[None, usual, 0], 1)
     hue = np.hypot(*(mean[:, None, k] - mean[None, usual, k] for k in (1, 2)))
-    shaded = (hue < _SAME_HUE * contrast) & (shade > _SHADE[0]) & (shade < _SHADE[1])
+    shaded = (hue < _SAME_HUE * contrast) & (shade > SHADE[0]) & (shade < SHADE[1])
     telling = ~usual & ~shaded.any(1)
     number = pieces[rows, columns]
     base = np.bincount(number) >= _BASE * len(rows)

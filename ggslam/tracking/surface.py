@@ -123,21 +123,22 @@ class MeasuredSurface:
         begun, self._begun = self._begun, None
         number = len(self._parts)
         if begun is not None and begun.is_for(points, T_world_camera, self.target, number):
-            part, self.target = begun.result.result()
+            part, target = begun.result.result()
             self._parts.append(part)
-            self.active.add(number)
-            self._joined.append([number])
-            return self.target
+            return self._note_joined([number], target)
         read = points.read()
         self._append(read.points.copy(), read.normals.copy(), np.array(T_world_camera, float))
         return self._join([number])
 
     def _join(self, numbers: list[int]) -> GicpTarget:
         """These keyframes take part, too."""
+        return self._note_joined(numbers, self._gather([self._parts[number] for number in numbers], self.target))
+
+    def _note_joined(self, numbers: list[int], target: GicpTarget) -> GicpTarget:
         self.active |= set(numbers)
         self._joined.append(numbers)
-        self.target = self._gather([self._parts[number] for number in numbers], self.target)
-        return self.target
+        self.target = target
+        return target
 
     def _append(self, points: np.ndarray, normals: np.ndarray, T_world_camera: np.ndarray) -> _Part:
         part = _Part(len(self._parts), points, normals, T_world_camera, self._archive)

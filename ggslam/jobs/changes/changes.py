@@ -17,20 +17,18 @@ from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Visit
 from ggslam.errors import ConfigError
-from ggslam.jobs.changes.ghosts import without_ghosts
+from ggslam.jobs.changes.ghosts import own_keyframes, without_ghosts
 from ggslam.jobs.changes.pictures import picture_of_change
 from ggslam.jobs.changes.shown import MOST_PICTURES, ChangesShown
 from ggslam.jobs.merge.placing import find_joint_poses, place_maps
 from ggslam.jobs.merge.sources import MergeSource, read_sources
 from ggslam.jobs.progress import Observer, SilentObserver
-from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.merging.coverage import PlacedRun
 from ggslam.merging.joint_graph import JointPoses
 from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.records.changes import ChangesRecord
-from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.poses import transform_points
 from ggslam.system.atomic import write_text
 from ggslam.system.json_files import json_ready
@@ -135,13 +133,6 @@ def show_changes(outcome: ChangesOutcome, old: str | Path, new: str | Path, most
         for number, change in enumerate(found[:most])
     }
     return ChangesShown(record, pictures, left_out=len(found[most:]))
-
-
-def own_keyframes(record: KeyframesRecord) -> Sequence[int]:
-    """Numbers of the keyframes of a run's own recording. A run that began in another's map has that one's, too: they
-    saw what was there before. All of them if none is its own."""
-    own = [number for number, keyframe in enumerate(record.keyframes) if keyframe.frame != ELSEWHERE]
-    return own or range(len(record.keyframes))
 
 
 def _visit(source: MergeSource, placed: PlacedRun, T_new_old: np.ndarray, counted: Sequence[int]) -> Visit:

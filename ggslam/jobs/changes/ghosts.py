@@ -7,6 +7,8 @@ nothing would be seen to have changed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import torch
@@ -14,6 +16,7 @@ import torch
 from ggslam.jobs.merge.sources import MergeSource
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.merging.coverage import PlacedRun
+from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, transform_points
 
@@ -25,6 +28,13 @@ _TIMES = 2
 _AROUND = np.ones((3, 3), np.uint8)
 
 
+def own_keyframes(record: KeyframesRecord) -> Sequence[int]:
+    """Numbers of the keyframes of a run's own recording. A run that began in another's map has that one's, too: they
+    saw what was there before. All of them if none is its own."""
+    own = [number for number, keyframe in enumerate(record.keyframes) if keyframe.frame != ELSEWHERE]
+    return own or range(len(record.keyframes))
+
+
 def without_ghosts(source: MergeSource, placed: PlacedRun) -> GaussianMap:
     """The map of a run without Gaussians of the map it began with that its own keyframes look through. The map as it is
     if the run began with none, or its recording is not there.
@@ -34,8 +44,8 @@ def without_ghosts(source: MergeSource, placed: PlacedRun) -> GaussianMap:
         placed: its map, and where its keyframes are.
     """
     gaussians, sequence, noise = placed.gaussians, source.sequence, source.known.noise
-    own = [k for k, record in enumerate(source.record.keyframes) if record.frame != ELSEWHERE]
-    if sequence is None or len(own) in (0, len(source.record.keyframes)):
+    own = own_keyframes(source.record)
+    if sequence is None or len(own) == len(source.record.keyframes):
         return gaussians
     rows = np.flatnonzero(~np.isin(gaussians.birth_keyframe.numpy(), own))
     means = gaussians.means.numpy()[rows].astype(np.float64)
