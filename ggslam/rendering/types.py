@@ -81,6 +81,10 @@ class RenderBuffers:
     @property
     def expected_depth(self) -> torch.Tensor:
         """[H, W] metres: depth / alpha, 0 where alpha is below 0.001."""
+        if self.depth.device.type == "cpu" and not (self.depth.requires_grad or self.alpha.requires_grad):
+            alpha, depth = self.alpha.numpy(), self.depth.numpy()  # torch would wake its threads for this
+            seen = alpha >= np.float32(1e-3)
+            return torch.from_numpy(np.divide(depth, alpha, out=np.zeros_like(depth), where=seen))
         return torch.where(self.alpha >= 1e-3, self.depth / self.alpha.clamp_min(1e-3), torch.zeros_like(self.depth))
 
 

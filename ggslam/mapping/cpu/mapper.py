@@ -87,7 +87,7 @@ class CpuMapper(Mapper):
         color = keyframe.color
         if self.map.count:
             view = self._render(keyframe, features=False)
-            alpha, rendered = view.alpha.numpy(), _expected_depth(view)
+            alpha, rendered = view.alpha.numpy(), view.expected_depth.numpy()
             where = find_unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
             color = self._compensate(keyframe, depth, view, rendered)
@@ -173,9 +173,3 @@ class CpuMapper(Mapper):
         self._losses.color += loss.values.color
         self._losses.ssim += loss.values.ssim
         self._losses.depth += loss.values.depth
-
-
-def _expected_depth(view: RenderBuffers) -> np.ndarray:
-    """As `RenderBuffers.expected_depth`, float32 [H, W], in this thread: torch would wake others for it."""
-    alpha, depth = view.alpha.numpy(), view.depth.numpy()
-    return np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha >= np.float32(1e-3))
