@@ -12,14 +12,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ggslam.objects.depth_surfaces import DepthSurface, surface_of, unbroken
+from ggslam.objects.depth_surface import DepthSurface
+from ggslam.objects.depth_surfaces import surface_of
 from ggslam.objects.hollows import join_insides, join_panes
 from ggslam.objects.overhangs import join_overhangs
+from ggslam.objects.pixel_passes import connected_pieces, grow_regions, link_surfaces, share_near_planes
 from ggslam.objects.plane_colors import colors_to_compare, find_flat_things
 from ggslam.objects.plane_parts import part_planes
 from ggslam.objects.planes import find_planes
-from ggslam.objects.regions import Borders, Groups, find_borders, gap_tolerance
-from ggslam.objects.segments import connected_pieces
+from ggslam.objects.regions import Borders, Groups, find_borders
 from ggslam.objects.settings import GeometricSettings
 from ggslam.scene.camera import Camera
 
@@ -56,12 +57,7 @@ class GeometricSegmenter:
         if not surface.valid.any():
             return np.zeros(depth.shape, np.uint16)
         plane_of, planes = part_planes(*find_planes(surface, camera, self._settings), surface, camera, self._settings)
-        normals = surface.normals.copy()
-        on_plane = plane_of > 0
-        if len(planes):
-            unit = -planes / np.linalg.norm(planes, axis=1, keepdims=True)
-            normals[on_plane] = unit[plane_of[on_plane] - 1]
-        regions, body_of = self._join_regions(self._regions(surface, plane_of), planes, surface, normals, color)
+        regions, body_of = self._join_regions(self._regions(surface, plane_of), plane_of, planes, surface, color)
         regions = join_panes(regions, surface)
         things = find_flat_things(color, np.where(regions <= len(planes), regions, 0), self._settings)
         regions = np.where(things > 0, len(body_of) + things, body_of[regions])
@@ -70,10 +66,8 @@ class GeometricSegmenter:
     def _regions(self, surface: DepthSurface, plane_of: np.ndarray) -> np.ndarray:
         """Planes, and the smooth pieces of the rest: int32 [H, W] from 1 on, 0 = no depth or a crumb."""
         rest = surface.valid & (plane_of == 0)
-        tolerance = gap_tolerance(surface, self._settings)
-        closed = unbroken(surface, 1, tolerance), unbroken(surface, 0, tolerance)
-        links = [self._smooth_links(surface, rest, axis, closed[1 - axis]) for axis in (1, 0)]
-        pieces = connected_pieces(rest.astype(np.uint8), (links[0], links[1]))
+        closed, smooth = link_surfaces(surface, rest, self._settings)
+        pieces = connected_pieces(rest, smooth)
         area = np.bincount(pieces[rest], minlength=int(pieces.max()) + 1)
         # Strips along edges, where normals are blurred, are left to be grown over.
         inner = cv2.erode(rest.astype(np.uint8), _SQUARE) > 0
@@ -84,35 +78,15 @@ class GeometricSegmenter:
         number = np.zeros(len(area), np.int32)
         number[kept] = int(plane_of.max()) + 1 + np.arange(len(kept))
         regions = np.where(rest, number[pieces], plane_of)
-        return _grow(regions, surface.valid, closed, _GROWTH * surface.step)
-
-    def _smooth_links(self, surface: DepthSurface, rest: np.ndarray, axis: int, closed: np.ndarray) -> np.ndarray:
-        """bool [H, W-1] (axis 1) or [H-1, W] (axis 0): neighbours of the rest without a gap (`closed`, of the same
-        shape) or a concave edge."""
-        first, second = _ends(axis, 1)
-        connected = rest[first] & rest[second] & closed
-        # Concavity is looked at across a few pixels, where the edge itself does not blur the normals.
-        before, after = _ends(axis, 2 * surface.step + 1)
-        middle = _middle(axis, surface.step)
-        rows, columns = np.nonzero(rest[before] & rest[after] & connected[middle])
-        width = rest.shape[1]
-        start = rows * width + columns
-        end = start + (2 * surface.step + 1) * (1 if axis else width)
-        points, normals = surface.points.reshape(-1, 3), surface.normals.reshape(-1, 3)
-        way = points.take(end, 0) - points.take(start, 0)
-        n, m = normals.take(start, 0), normals.take(end, 0)
-        concave = (_dot(n, m) < np.cos(np.radians(self._settings.concave_degrees))) & (_dot(m - n, way) < 0)
-        concave &= np.abs(way[:, 2]) < 0.05 * surface.depth.ravel()[start]
-        connected[middle][rows[concave], columns[concave]] = False
-        return connected
+        return grow_regions(regions, surface.valid, closed, _GROWTH * surface.step)
 
     def _join_regions(
-        self, regions: np.ndarray, planes: np.ndarray, surface: DepthSurface, normals: np.ndarray, color: np.ndarray
+        self, regions: np.ndarray, plane_of: np.ndarray, planes: np.ndarray, surface: DepthSurface, color: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Regions with convex and smooth neighbours joined; what is flat on a plane and looks like it is the plane. And
         the number of the body that each region is a face of, by region."""
         settings = self._settings
-        borders = find_borders(regions, surface, normals, colors_to_compare(color), surface.step + 1, settings)
+        borders = find_borders(regions, surface, plane_of, planes, colors_to_compare(color), surface.step + 1, settings)
         groups = Groups(int(regions.max()) + 1)
         alike = ~_is_convex(borders) & (borders.contrast < _ALIKE * settings.color_contrast)
         parts = _is_hollow(borders, len(planes)) | self._is_flat(borders, alike, regions, planes, surface)
@@ -131,11 +105,9 @@ class GeometricSegmenter:
         """bool [n]: those of the borders `asked` that part a plane and something that lies flat on it."""
         first, second = borders.pairs.T
         asked = asked & (first <= len(planes)) & (second > len(planes)) & (borders.length >= _FLAT_BORDER)
-        flat = np.zeros(len(asked), bool)
-        for k in np.flatnonzero(asked & (borders.closed >= 0.5 * borders.length)):
-            plane, points = planes[first[k] - 1], surface.points[regions == second[k]]
-            away = np.abs(points @ plane - 1) / np.linalg.norm(plane)
-            flat[k] = np.count_nonzero(away < self._settings.flat_m) >= _FLAT_SHARE * len(away)
+        flat, places = np.zeros(len(asked), bool), np.flatnonzero(asked & (borders.closed >= 0.5 * borders.length))
+        questions = [(int(second[k]), planes[first[k] - 1]) for k in places]
+        flat[places] = share_near_planes(surface.points, regions, questions, self._settings.flat_m) >= _FLAT_SHARE
         return flat
 
 
@@ -176,42 +148,6 @@ def _is_hollow(borders: Borders, planes: int) -> np.ndarray:
     inside and the outside of a bowl."""
     rim = np.bincount(borders.pairs.ravel(), np.repeat(borders.length, 2), int(borders.pairs.max(initial=0)) + 1)
     return (borders.pairs[:, 0] > planes) & (borders.length >= _HOLLOW * rim[borders.pairs].min(1))
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("ij,ij->i", a, b)
-
-
-def _ends(axis: int, distance: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Index of all pixels, and of those `distance` further along `axis`."""
-    if axis:
-        return np.s_[:, :-distance], np.s_[:, distance:]
-    return np.s_[:-distance, :], np.s_[distance:, :]
-
-
-def _middle(axis: int, margin: int) -> tuple[slice, ...]:
-    return np.s_[:, margin:-margin] if axis else np.s_[margin:-margin, :]
-
-
-def _grow(regions: np.ndarray, valid: np.ndarray, closed: tuple[np.ndarray, np.ndarray], passes: int) -> np.ndarray:
-    """Regions grown over valid pixels without region, one pixel a pass, where no gap is in between.
-
-    Args:
-        closed: bool [H, W-1] and [H-1, W], whether there is none between a pixel and its right and its lower neighbour.
-    """
-    width = regions.shape[1] + 2
-    label = np.pad(regions, 1).ravel()
-    right = np.pad(closed[0], ((1, 1), (1, 2))).ravel()
-    below = np.pad(closed[1], ((1, 2), (1, 1))).ravel()
-    free = np.flatnonzero(np.pad((regions == 0) & valid, 1).ravel())
-    for _ in range(passes):
-        found = np.zeros(len(free), label.dtype)
-        for offset, link in ((-1, right), (1, right), (-width, below), (width, below)):
-            near = link[free + min(offset, 0)]
-            found = np.where((found == 0) & near, label[free + offset], found)
-        label[free] = found
-        free = free[found == 0]
-    return label.reshape(-1, width)[1:-1, 1:-1]
 
 
 def _by_size(regions: np.ndarray, valid: np.ndarray, min_area: float) -> np.ndarray:

@@ -4,13 +4,11 @@ frame all around, such as the panes of a window."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ggslam.objects.depth_surfaces import DepthSurface
+from ggslam.objects.depth_surface import DepthSurface
+from ggslam.objects.pixel_passes import Bodies, connected_pieces, count_contacts, find_bodies
 from ggslam.objects.regions import Groups
-from ggslam.objects.segments import connected_pieces
 
 _CONCAVE = -0.35
 """Correlation of normals and places below which a surface is the inside of something."""
@@ -26,16 +24,8 @@ _BEHIND = 0.7
 """Share of that outline at which the pane is not before the frame."""
 _FRAME = (0.04, 0.015)
 """How far panes lie behind their frame at most: metres, plus a share of the depth."""
-
-
-@dataclass(frozen=True)
-class _Bodies:
-    """Per region: pixels, centre float64 [n, 3], radius (root mean square, metres) and how concave it is, -1 to 1."""
-
-    count: np.ndarray
-    centre: np.ndarray
-    radius: np.ndarray
-    bend: np.ndarray
+_BEFORE = 0.001
+"""...and before it: a share of the depth."""
 
 
 def join_insides(groups: Groups, regions: np.ndarray, planes: int, surface: DepthSurface, pairs: np.ndarray) -> None:
@@ -46,7 +36,7 @@ def join_insides(groups: Groups, regions: np.ndarray, planes: int, surface: Dept
         regions: int32 [H, W]; those up to `planes` are planes, 0 = none.
         pairs: int [n, 3], touching regions with the number of links between them.
     """
-    bodies = _bodies(np.where(regions > planes, regions, 0), surface)
+    bodies = find_bodies(np.where(regions > planes, regions, 0), surface)
     rim = np.bincount(pairs[:, :2].ravel(), np.repeat(pairs[:, 2], 2), len(bodies.count))
     for a, b, length in pairs[(pairs[:, :2] > planes).all(1)].tolist():
         for inside, vessel in ((a, b), (b, a)):
@@ -54,7 +44,7 @@ def join_insides(groups: Groups, regions: np.ndarray, planes: int, surface: Dept
                 groups.join(inside, vessel)
 
 
-def _fits(bodies: _Bodies, inside: int, vessel: int) -> bool:
+def _fits(bodies: Bodies, inside: int, vessel: int) -> bool:
     larger = max(bodies.radius[inside], bodies.radius[vessel])
     if larger > _LARGEST:
         return False
@@ -64,49 +54,17 @@ def _fits(bodies: _Bodies, inside: int, vessel: int) -> bool:
     return bool(np.sqrt(together / (n + m)) <= _WIDER * larger)
 
 
-def _bodies(regions: np.ndarray, surface: DepthSurface) -> _Bodies:
-    inside = np.flatnonzero(regions)
-    which, n = regions.ravel()[inside], int(regions.max(initial=0)) + 1
-    p = surface.points.reshape(-1, 3)[inside].astype(np.float64)
-    q = surface.normals.reshape(-1, 3)[inside].astype(np.float64)
-    count = np.maximum(np.bincount(which, minlength=n), 1)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.bincount(which, values, n) / count
-
-    centre = np.stack([mean(p[:, k]) for k in range(3)], 1)
-    facing = np.stack([mean(q[:, k]) for k in range(3)], 1)
-    p, q = p - centre[which], q - facing[which]
-    square = mean((p * p).sum(1))
-    spread = mean((q * q).sum(1))
-    bend = mean((p * q).sum(1)) / np.sqrt(np.maximum(square * spread, 1e-12))
-    return _Bodies(count, centre, np.sqrt(square), bend)
-
-
 def join_panes(regions: np.ndarray, surface: DepthSurface) -> np.ndarray:
     """Regions int32 [H, W] (0 = none) with pieces that one other region frames given to that."""
     pieces = connected_pieces(regions)
     n = int(pieces.max()) + 1
     owner = np.zeros(n, np.int64)
     owner[pieces.ravel()] = regions.ravel()
-    outline = np.bincount(np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]]), minlength=n)
-    codes, steps, depths = [], [], []
-    for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        rows, columns = np.nonzero(pieces[first] != pieces[second])
-        p, q = pieces[first][rows, columns].astype(np.int64), pieces[second][rows, columns].astype(np.int64)
-        z, w = surface.depth[first][rows, columns], surface.depth[second][rows, columns]
-        codes += [p << 32 | owner[q], q << 32 | owner[p]]
-        steps += [z - w, w - z]
-        depths += [z, w]
-    step, depth = np.concatenate(steps), np.concatenate(depths)
-    found, place = np.unique(np.concatenate(codes), return_inverse=True)
-    length = np.bincount(place)
-    limit = _FRAME[0] + _FRAME[1] * depth
-    near = np.bincount(place, np.abs(step) < limit)
-    behind = np.bincount(place, step > -0.001 * depth)
-    piece, frame = found >> 32, found & 0xFFFFFFFF
+    pairs, counts = count_contacts(pieces, owner, surface.depth, _FRAME, _BEFORE)
+    (piece, frame), (length, near, behind, hidden) = pairs.T, counts.T
     # What stands far before the pane, or the image's border, cuts it off: who knows what is there.
-    seen = np.bincount(piece, length - np.bincount(place, step >= limit), n)
+    seen = np.bincount(piece, length - hidden, n)
+    outline = np.bincount(np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]]), minlength=n)
     outline = outline + np.bincount(piece, length, n)
     framed = (length >= _HALF * outline[piece]) & (near >= _ENCLOSED * seen[piece])
     framed &= (near >= _BEHIND * length) & (behind >= _BEHIND * length)

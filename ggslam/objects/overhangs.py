@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ggslam.objects.depth_surfaces import DepthSurface
+from ggslam.objects.depth_surface import DepthSurface
 from ggslam.objects.regions import Groups
 
 _STEP = 0.15
@@ -24,6 +24,8 @@ _RIM = 0.12
 """Share of the outline of one of the two that lies between them."""
 _LEAST, _LEAST_FACE = 12, 30
 """Pixels of border, and of a face on a grid of every second, at least."""
+_POINTS = 400
+"""Points of a face that are looked at, about."""
 
 
 def join_overhangs(groups: Groups, regions: np.ndarray, surface: DepthSurface, pairs: np.ndarray) -> None:
@@ -49,57 +51,69 @@ def join_overhangs(groups: Groups, regions: np.ndarray, surface: DepthSurface, p
 
 
 class _Faces:
-    """Points and mean normals of regions, on every second pixel and row."""
+    """Points and normals of regions, on every second pixel and row, of each region at most some hundreds."""
 
     def __init__(self, regions: np.ndarray, surface: DepthSurface, n: int) -> None:
         number = regions[::2, ::2].ravel()
         order = np.argsort(number, kind="stable")
-        self._points = surface.points[::2, ::2].reshape(-1, 3)[order]
         count = np.bincount(number, minlength=n)
-        self._start = np.concatenate([[0], np.cumsum(count)])
-        self._count = count
-        self._normals: dict[int, np.ndarray | None] = {}
+        rank = np.arange(len(order)) - (np.cumsum(count) - count)[number[order]]
+        some = order[rank % np.maximum(1, count // _POINTS)[number[order]] == 0]
+        self._points = surface.points[::2, ::2].reshape(-1, 3)[some]
+        self._start = np.searchsorted(number[some], np.arange(n + 1))
+        self._is_face = count >= _LEAST_FACE
+        self._is_face[0] = False
+        self._fit(number[some], n)
+        self._heights: dict[int, float] = {}
+
+    def _fit(self, number: np.ndarray, n: int) -> None:
+        """Normals towards the camera of the regions that are flat."""
+        size = np.diff(self._start)
+        centre = _sums(self._points.astype(np.float64), number, n) / np.maximum(size, 1)[:, None]
+        away = self._points - centre[number]
+        spread = _sums((away[:, :, None] * away[:, None, :]).reshape(-1, 9), number, n).reshape(-1, 3, 3)
+        values, axes = np.linalg.eigh(spread / np.maximum(size - 1, 1)[:, None, None])
+        thickness, width = np.sqrt(np.maximum(values[:, :2], 0)).T
+        self._is_face &= thickness <= _FLAT[0] * width + _FLAT[1]
+        normals = axes[:, :, 0]
+        self._normals = np.where(((normals * centre).sum(1) > 0)[:, None], -normals, normals)
 
     def _normal(self, k: int) -> np.ndarray | None:
-        if k not in self._normals:
-            self._normals[k] = self._fit(k) if k > 0 and self._count[k] >= _LEAST_FACE else None
-        return self._normals[k]
-
-    def _fit(self, k: int) -> np.ndarray | None:
-        """Normal towards the camera of a flat region; None if it is not flat."""
-        points = self._some(k).astype(np.float64)
-        centre = points.mean(0)
-        away = points - centre
-        values, axes = np.linalg.eigh(away.T @ away / (len(away) - 1))
-        thickness, width = np.sqrt(np.maximum(values[:2], 0))
-        if thickness > _FLAT[0] * width + _FLAT[1]:
-            return None
-        normal: np.ndarray = axes[:, 0]
-        return -normal if normal @ centre > 0 else normal
+        return self._normals[k] if self._is_face[k] else None
 
     def _some(self, k: int) -> np.ndarray:
-        points = self._points[self._start[k] : self._start[k + 1]]
-        return points[:: max(1, len(points) // 400)]
+        return self._points[self._start[k] : self._start[k + 1]]
+
+    def _height(self, k: int) -> float:
+        """Where the plane of a flat region is, along its normal."""
+        if k not in self._heights:
+            heights = self._some(k) @ self._normals[k]
+            self._heights[k] = np.partition(heights, len(heights) // 2)[len(heights) // 2]
+        return self._heights[k]
 
     def are_corner(self, a: int, b: int) -> bool:
         """Whether both are flat, stand at an angle and lie behind one another."""
         n, m = self._normal(a), self._normal(b)
         if n is None or m is None or n @ m > _CORNER:
             return False
-        return self._is_behind(a, b, m) and self._is_behind(b, a, n)
+        return self._is_behind(a, b) and self._is_behind(b, a)
 
     def is_below(self, groups: Groups, a: int, edge: int) -> bool:
         """Whether `a` is set back behind the parallel `edge` of a board that lies on it: a front below a table top."""
         n, m = self._normal(a), self._normal(edge)
-        if n is None or m is None or n @ m < _PARALLEL or not self._is_behind(a, edge, m):
+        if n is None or m is None or n @ m < _PARALLEL or not self._is_behind(a, edge):
             return False
         root = groups.find(edge)
-        boards = [k for k in range(1, len(self._count)) if k not in (a, edge) and groups.find(k) == root]
+        boards = [k for k in range(1, len(self._is_face)) if k not in (a, edge) and groups.find(k) == root]
         return any(self.are_corner(a, k) for k in boards)
 
-    def _is_behind(self, a: int, b: int, normal: np.ndarray) -> bool:
+    def _is_behind(self, a: int, b: int) -> bool:
         """Whether the points of `a` lie behind the face `b`, but for what may stand out, and reach up to it."""
-        face = np.sort(self._some(b) @ normal)
-        out = np.sort(self._some(a) @ normal) - face[len(face) // 2]
+        out = np.sort(self._some(a) @ self._normals[b]) - self._height(b)
         high = out[round(0.98 * (len(out) - 1))]
         return bool(out[int(_BEHIND * (len(out) - 1))] < -_CLEAR and -_STEP < high < _STEP)
+
+
+def _sums(rows: np.ndarray, number: np.ndarray, n: int) -> np.ndarray:
+    """Sums of the rows [m, c] of each number below n: float64 [n, c]."""
+    return np.stack([np.bincount(number, column, n) for column in rows.T], 1)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ggslam.objects.segments import connected_pieces
+from ggslam.objects.pixel_passes import connected_pieces, count_alike
 from ggslam.objects.settings import GeometricSettings
 from ggslam.objects.strange_colors import HUE, SHADE, find_strange_colors
 
@@ -89,13 +89,11 @@ def _strange_pieces(pieces: np.ndarray, inside: np.ndarray, lab: np.ndarray, con
     numbers, colors = pieces[inside], lab[inside]
     area = np.bincount(numbers)
     candidates = np.flatnonzero((area >= _LEAST_PIECE * inside.size) & (area <= _MOST_PIECE * len(numbers)))
-    for piece in candidates:
-        own = numbers == piece
-        mean, rest = colors[own].mean(0), colors[~own]
-        away = rest - mean
-        alike = np.count_nonzero(np.einsum("ij,ij->i", away, away) < contrast**2)
-        if alike > _REPEATED * area[piece] + _REPEATED_ON_PLANE * len(numbers):
-            continue
+    means = np.array([colors[numbers == piece].mean(0) for piece in candidates], np.float32).reshape(-1, 3)
+    alike = count_alike(colors, numbers, candidates, means, contrast)
+    single = alike <= _REPEATED * area[candidates] + _REPEATED_ON_PLANE * len(numbers)
+    for piece, mean in zip(candidates[single], means[single], strict=True):
+        rest = colors[numbers != piece]
         usual = np.median(rest, 0)
         hue = float(np.linalg.norm(mean[1:] - usual[1:]))
         shade = mean[0] / max(usual[0], 1.0)

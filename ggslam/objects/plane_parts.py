@@ -10,8 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ggslam.objects.depth_surfaces import DepthSurface
-from ggslam.objects.segments import connected_pieces
+from ggslam.objects.depth_surface import DepthSurface
+from ggslam.objects.pixel_passes import connected_pieces
 from ggslam.objects.settings import GeometricSettings
 from ggslam.scene.camera import Camera
 

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from ggslam.objects.depth_surfaces import DepthSurface
-from ggslam.objects.segments import connected_pieces
+from ggslam.objects.depth_surface import DepthSurface
+from ggslam.objects.pixel_passes import claim_planes, connected_pieces
 from ggslam.objects.settings import GeometricSettings
 from ggslam.scene.camera import Camera
 
@@ -34,8 +32,8 @@ def find_planes(surface: DepthSurface, camera: Camera, settings: GeometricSettin
     size = min(size, camera.width, camera.height)
     blocks = _Blocks(surface, camera, size)
     group = _grow(blocks, surface.sigma, settings)
-    planes, supports = _fit(blocks, group, surface.sigma, settings)
-    return _claim(surface, camera, planes, supports, size, settings), planes
+    planes, plane_of_block = _fit(blocks, group, surface.sigma, settings)
+    return _claim(surface, camera, planes, plane_of_block, size, settings), planes
 
 
 class _Blocks:
@@ -67,18 +65,38 @@ class _Blocks:
         self.full = self.count >= 0.9 * size * size
         self.plane, self.error = fit(self.moments, self.right, self.squares, self.count)
 
-    def fit_union(self, members: np.ndarray) -> tuple[np.ndarray, float]:
-        """Plane [3] and its error of the blocks `members` (bool [rows, columns])."""
-        sums = [array[members].sum(0) for array in (self.moments, self.right, self.squares, self.count)]
-        plane, error = fit(*sums)
-        return plane, float(error)
+    def sums_of(self, group: np.ndarray, n: int) -> _Sums:
+        """Sums over the blocks of each of n groups (int [rows, columns], number of the group, others left out)."""
+        inside = np.flatnonzero((group.ravel() >= 0) & (group.ravel() < n))
+        which, rows = group.ravel()[inside], self._rows()[inside]
+        return _Sums(np.stack([np.bincount(which, column, n) for column in rows.T], 1))
 
-    def error_of(self, plane: np.ndarray, members: np.ndarray) -> float:
-        """Root mean square distance, in 1/m, of the blocks `members` from a plane [3]."""
-        moments, right, squares, count = (
-            array[members].sum(0) for array in (self.moments, self.right, self.squares, self.count)
-        )
-        return float(np.sqrt(max(squares - 2 * plane @ right + plane @ moments @ plane, 0.0) / max(count, 1)))
+    def _rows(self) -> np.ndarray:
+        """Moments, right sides, squares, counts and mean inverse depths of blocks: float64 [rows * columns, 15]."""
+        middle = self.right[..., 2] / np.maximum(self.count, 1)
+        columns = self.moments.reshape(-1, 9), self.right.reshape(-1, 3), self.squares, self.count, middle
+        return np.column_stack([part.reshape(self.count.size, -1) for part in columns])
+
+
+class _Sums:
+    """What `_Blocks` has, summed over groups of blocks: a row a group."""
+
+    def __init__(self, rows: np.ndarray) -> None:
+        self.rows = rows
+
+    def fit(self) -> tuple[np.ndarray, np.ndarray]:
+        """Planes [n, 3] and their errors [n]."""
+        return fit(self.rows[:, :9].reshape(-1, 3, 3), self.rows[:, 9:12], self.rows[:, 12], self.rows[:, 13])
+
+    def inverse(self) -> np.ndarray:
+        """Sum over blocks of their mean inverse depth [n]."""
+        return self.rows[:, 14]
+
+    def errors_from(self, k: int, planes: np.ndarray) -> np.ndarray:
+        """Root mean square distance, in 1/m, of group k from planes [P, 3]: [P]."""
+        row = self.rows[k]
+        bent = np.einsum("pi,ij,pj->p", planes, row[:9].reshape(3, 3), planes)
+        return np.sqrt(np.maximum(row[12] - 2 * planes @ row[9:12] + bent, 0.0) / max(row[13], 1))
 
 
 def fit(
@@ -98,80 +116,66 @@ def _grow(blocks: _Blocks, sigma: float, settings: GeometricSettings) -> np.ndar
     unit = blocks.plane / np.maximum(np.linalg.norm(blocks.plane, axis=-1, keepdims=True), 1e-9)
     centre = blocks.right[..., 2] / np.maximum(blocks.count, 1)
     limit = np.cos(np.radians(settings.plane_degrees))
-    number = np.arange(flat.size).reshape(flat.shape)
     ray = blocks.moments[..., 2, :] / np.maximum(blocks.count, 1)[..., None]
-    starts, ends = [], []
+    links = []
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         alike = flat[a] & flat[b] & ((unit[a] * unit[b]).sum(-1) > limit)
         for own, other in ((a, b), (b, a)):
             reach = np.abs((blocks.plane[own] * ray[other]).sum(-1) - centre[other])
             alike &= reach < 3 * sigma + settings.tolerance_m * centre[other] ** 2
-        starts.append(number[a][alike])
-        ends.append(number[b][alike])
-    links = np.concatenate(starts), np.concatenate(ends)
-    graph = coo_matrix((np.ones(len(links[0]), bool), links), shape=(flat.size, flat.size))
-    group = connected_components(graph, directed=False)[1].reshape(flat.shape)
-    return np.where(flat, group, -1)
+        links.append(alike)
+    return np.where(flat, connected_pieces(flat, (links[0], links[1])), -1)
 
 
 def _fit(
     blocks: _Blocks, group: np.ndarray, sigma: float, settings: GeometricSettings
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Planes [P, 3] of the groups that are large and flat as a whole, largest first, and their blocks.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Planes [P, 3] of the groups that are large and flat as a whole, largest first, and the number of each block's,
+    int32 [rows, columns], from 1 on, 0 = none.
 
     Groups on the plane of a larger one join it, wherever they are: noise breaks one wall into several groups.
     """
     sizes = np.bincount(group[group >= 0], minlength=1)
-    planes: list[np.ndarray] = []
-    supports: list[np.ndarray] = []
-    for k in np.argsort(-sizes, kind="stable"):
-        if sizes[k] < settings.min_plane_blocks:
-            break
-        members = group == k
-        plane, error = blocks.fit_union(members)
-        inverse = float((blocks.right[members][:, 2] / blocks.count[members]).mean())
-        limit = _PLANE_SIGMAS * sigma + settings.tolerance_m * inverse**2
-        if error >= limit:
-            continue
-        angles = [_cosine(plane, other) for other in planes]
-        alike = [
-            i for i, other in enumerate(planes)
-            if angles[i] > np.cos(np.radians(2 * settings.plane_degrees)) and blocks.error_of(other, members) < limit
-        ]  # fmt: skip
-        if alike:
-            i = max(alike, key=lambda i: angles[i])
-            supports[i] = supports[i] | members
-            planes[i] = blocks.fit_union(supports[i])[0]
+    order = np.argsort(-sizes, kind="stable")
+    order = order[sizes[order] >= settings.min_plane_blocks]
+    number = np.full(len(sizes) + 1, -1)  # the last one: of blocks without group
+    number[order] = np.arange(len(order))
+    group = number[group]
+    sums = blocks.sums_of(group, len(order))
+    fitted, error = sums.fit()
+    limit = _PLANE_SIGMAS * sigma + settings.tolerance_m * (sums.inverse() / sizes[order]) ** 2
+    planes = np.zeros((0, 3))
+    members: list[list[int]] = []
+    for k in np.flatnonzero(error < limit).tolist():
+        angle = _cosines(fitted[k], planes)
+        alike = np.flatnonzero(angle > np.cos(np.radians(2 * settings.plane_degrees)))
+        alike = alike[sums.errors_from(k, planes[alike]) < limit[k]]
+        if len(alike):
+            i = int(alike[angle[alike].argmax()])
+            members[i].append(k)
+            planes[i] = _Sums(sums.rows[members[i]].sum(0, keepdims=True)).fit()[0][0]
         else:
-            planes.append(plane)
-            supports.append(members)
-    return np.array(planes, np.float32).reshape(-1, 3), supports
+            planes = np.concatenate([planes, fitted[k : k + 1]])
+            members.append([k])
+    plane_of = np.zeros(len(order) + 1, np.int32)  # the last one: of blocks without plane
+    for i, joined in enumerate(members, 1):
+        plane_of[joined] = i
+    return planes.astype(np.float32), plane_of[group]
 
 
-def _cosine(a: np.ndarray, b: np.ndarray) -> float:
-    return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
+def _cosines(plane: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Cosines of the angles between the normals of a plane [3] and of others [P, 3]: [P]."""
+    return others @ plane / (np.linalg.norm(others, axis=1) * np.linalg.norm(plane))
 
 
 def _claim(
-    surface: DepthSurface, camera: Camera, planes: np.ndarray, supports: list[np.ndarray], size: int,
+    surface: DepthSurface, camera: Camera, planes: np.ndarray, plane_of_block: np.ndarray, size: int,
     settings: GeometricSettings,
 ) -> np.ndarray:  # fmt: skip
     """Plane of each pixel: the nearest of those that it lies on and has the normal of, in pieces with blocks."""
-    rays = camera.rays()
-    x, y = rays[:1, :, 0], rays[:, :1, 1]
-    label = np.zeros(surface.valid.shape, np.int32)
-    nearest = settings.tolerance_sigmas * surface.sigma + settings.tolerance_m * surface.inverse**2
-    nearest[~surface.valid] = 0
-    limit, normals = np.cos(np.radians(_NORMAL_DEGREES)), surface.normals.reshape(-1, 3)
-    for number, plane in enumerate(planes, 1):
-        away = np.abs(surface.inverse - (plane[0] * x + (plane[1] * y + plane[2])))
-        chosen = np.flatnonzero(away < nearest)
-        chosen = chosen[normals.take(chosen, 0) @ (-plane / np.linalg.norm(plane)) > limit]
-        label.ravel()[chosen] = number
-        nearest.ravel()[chosen] = away.ravel()[chosen]
+    label = claim_planes(surface, camera.rays(), planes, np.cos(np.radians(_NORMAL_DEGREES)), settings)
     support = np.zeros(label.shape, np.int32)
-    blocks = sum((k * members for k, members in enumerate(supports, 1)), np.zeros((1, 1), np.int32))
-    grown = blocks.repeat(size, 0).repeat(size, 1)
+    grown = plane_of_block.repeat(size, 0).repeat(size, 1)
     support[: grown.shape[0], : grown.shape[1]] = grown
     pieces = connected_pieces(label)
     kept = np.zeros(int(pieces.max()) + 1, bool)

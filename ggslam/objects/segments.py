@@ -9,32 +9,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from ggslam.objects.pixel_passes import connected_pieces
 from ggslam.objects.settings import CleaningSettings
 
 _REFERENCE_WIDTH = 320
 _SMALL_SQUARE = np.ones((3, 3), np.uint8)
 _DIRECTIONS = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
-
-
-def connected_pieces(segments: np.ndarray, connected: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
-    """Numbers the 4-connected pieces of equal id, int32 [H, W] from 1 on in raster order; id 0 is an id like others.
-
-    Args:
-        segments: [H, W] of any integer type.
-        connected: bool [H, W-1] and [H-1, W], whether a pixel belongs with its right and its lower neighbour;
-            default: if their ids are equal.
-
-    The image is drawn at twice its size with the links between pixels as pixels of their own, so that one pass of a
-    binary labelling does for all ids.
-    """
-    height, width = segments.shape
-    if connected is None:
-        connected = segments[:, :-1] == segments[:, 1:], segments[:-1] == segments[1:]
-    links = np.zeros((2 * height - 1, 2 * width - 1), np.uint8)
-    links[::2, ::2] = 1
-    links[::2, 1::2], links[1::2, ::2] = connected
-    _, pieces = cv2.connectedComponents(links, connectivity=4, ltype=cv2.CV_32S)
-    return np.ascontiguousarray(pieces[::2, ::2])
 
 
 def fill_from_nearest(segments: np.ndarray, missing: np.ndarray) -> np.ndarray:

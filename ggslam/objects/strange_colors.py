@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ggslam.objects.pixel_passes import strange_colors
+
 BRIGHTNESS, HUE = 1, 2
 
 _CELLS = 12
@@ -40,58 +42,29 @@ def find_strange_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray,
         uint8 [h, w]: 0, or in what the colour differs from those that occur all over the plane, BRIGHTNESS (which may
         be a shadow's) or HUE.
     """
-    out = np.zeros(inside.shape, np.uint8)
     rows, columns = np.nonzero(inside)
     size = max(1, inside.shape[1] // _CELLS)
-    cell = rows // size * _CELLS * 2 + columns // size
-    cell, _, pixels = _number(cell)
-    counted = pixels >= 0.2 * size * size
-    if counted.sum() < _LEAST_CELLS:
-        return out
-    colors = lab[rows, columns].copy()
-    colors[:, 0] -= _light(rows, columns, colors[:, 0])
-    width = max(contrast, _LEAST_WIDTH) * np.array([_BRIGHTNESS, _HUE, _HUE], np.float32)
-    bins = np.floor(colors / width).astype(np.int32)
-    bins -= bins.min(0)
-    sides = bins.max(0) + 1
-    which, code, _ = _number((bins[:, 0] * sides[1] + bins[:, 1]) * sides[2] + bins[:, 2])
-    place = np.stack(np.unravel_index(code, sides), 1)
-    table = np.bincount(which * len(pixels) + cell, minlength=len(code) * len(pixels)).reshape(len(code), -1)
-    # Bins that touch are alike: a colour is not at another place for being on the other side of a bin's edge.
-    near = np.ones((len(code), len(code)), bool)
-    for axis in place.T.astype(np.int16):
-        near &= np.abs(axis[:, None] - axis[None]) <= 1
-    share = (near.astype(np.float32) @ table.astype(np.float32)) / pixels
-    usual = (share[:, counted] >= _OCCURS).mean(1) >= _USUAL
-    mean = np.stack([np.bincount(which, lab[rows, columns, k]) / np.bincount(which) for k in range(3)], 1)
-    shade = mean[:, None, 0] / np.maximum(mean[None, usual, 0], 1)
-    hue = np.hypot(*(mean[:, None, k] - mean[None, usual, k] for k in (1, 2)))
-    shaded = (hue < _SAME_HUE * contrast) & (shade > SHADE[0]) & (shade < SHADE[1])
-    telling = ~usual & ~shaded.any(1)
-    number = pieces[rows, columns]
-    base = np.bincount(number) >= _BASE * len(rows)
-    out[rows, columns] = np.where(base[number], 0, np.where(telling[which], HUE, np.where(usual[which], 0, BRIGHTNESS)))
-    return out
-
-
-def _number(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Small whole numbers [n] numbered through: each one's number [n], the values in order, how often each occurs."""
-    count = np.bincount(values)
-    there = np.flatnonzero(count)
-    number = np.zeros(len(count), np.int32)
-    number[there] = np.arange(len(there))
-    return number[values], there, count[there]
+    least = 0.2 * size * size
+    if np.count_nonzero(np.bincount(rows // size * _CELLS * 2 + columns // size) >= least) < _LEAST_CELLS:
+        return np.zeros(inside.shape, np.uint8)
+    width = max(contrast, _LEAST_WIDTH)
+    return strange_colors(
+        lab, inside, pieces, light=_light(rows, columns, lab[rows, columns, 0]),
+        bins=(_BRIGHTNESS * width, _HUE * width, _HUE * width), cell=size, least_cell=least, occurs=_OCCURS,
+        usual=_USUAL, base=_BASE, same_hue=_SAME_HUE * contrast, shade=SHADE,
+    )  # fmt: skip
 
 
 def _light(rows: np.ndarray, columns: np.ndarray, brightness: np.ndarray) -> np.ndarray:
-    """Brightness of the plane by a linear fit, which things of other brightness hardly move."""
+    """Brightness of the plane as a linear function of row, column and 1, float64 [3], which things of other brightness
+    hardly move."""
     step = max(1, len(rows) // 1000)
-    A = np.stack([rows, columns, np.ones(len(rows))], 1).astype(np.float64)
-    some, values = A[::step], brightness[::step].astype(np.float64)
+    rows, columns, values = rows[::step], columns[::step], brightness[::step].astype(np.float64)
+    some = np.stack([rows, columns, np.ones(len(rows))], 1)
     weight: np.ndarray = np.ones(len(some))
     fit: np.ndarray = np.zeros(3)
     for _ in range(3):
         weighted = some * weight[:, None]
         fit = np.linalg.solve(weighted.T @ some + 1e-6 * np.eye(3), weighted.T @ values)
         weight = 1 / (1 + np.abs(values - some @ fit) / 10) ** 2
-    return (A @ fit).astype(np.float32)
+    return fit

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from ggslam.errors import ConfigError
-from ggslam.objects.segments import boundary_trust, clean_segments, connected_pieces
+from ggslam.objects.pixel_passes import connected_pieces
+from ggslam.objects.segments import boundary_trust, clean_segments
 from ggslam.objects.settings import CleaningSettings
 from ggslam.sequences import open_sequence
 

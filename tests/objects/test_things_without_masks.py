@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ggslam.objects.association import Associator, MapView
-from ggslam.objects.depth_surfaces import surface_of, unbroken
+from ggslam.objects.depth_surfaces import surface_of
 from ggslam.objects.geometric_segmenter import GeometricSegmenter
-from ggslam.objects.regions import gap_tolerance
+from ggslam.objects.pixel_passes import link_surfaces
 from ggslam.objects.settings import AssociationSettings, GeometricSettings
 from ggslam.scene.camera import Camera
 
@@ -62,7 +62,7 @@ def test_a_top_seen_at_a_flat_angle_is_unbroken_and_what_stands_before_a_wall_is
     scene.box((-9, -9, 4), (9, 9, 4.1), 1)
     scene.box((-0.6, 0.5, 2.2), (0.6, 1, 3.4), 2)  # its top spans twenty rows, centimetres of depth each
     surface = surface_of(scene.depth.astype(np.float32), CAMERA, 8.0)
-    closed = unbroken(surface, 0, gap_tolerance(surface, GeometricSettings()))
+    (_, closed), _ = link_surfaces(surface, surface.valid, GeometricSettings())
     column = scene.ids[:, 160]
     top = np.flatnonzero(column == 2)[:6]
     assert (np.diff(scene.depth[top, 160]) < -0.03).any()
