@@ -22,7 +22,8 @@ _MOST_NOISE = 5e-3
 
 
 def surface_of(depth: np.ndarray, camera: Camera, max_depth: float) -> DepthSurface:
-    """Prepares a depth image float32 [H, W] (metres, 0 = unknown)."""
+    """Prepares a depth image [H, W] (metres, 0 = unknown)."""
+    depth = np.asarray(depth, np.float32)
     measured = (depth > 0) & (depth <= max_depth)
     bridged = _bridge(np.where(measured, depth, np.float32(0)), max(1, round(camera.width / _REFERENCE_WIDTH)))
     valid = bridged > 0

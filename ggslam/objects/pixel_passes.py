@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.interface.arrays import address
 from ggslam.interface.core import objects as core
 from ggslam.native.loader import load_library
@@ -27,7 +28,7 @@ def link_surfaces(surface: DepthSurface, rest: np.ndarray, settings: GeometricSe
     centimetres from row to row, but straight in inverse depth. Smooth are those of them without a concave edge, which
     is looked at across a few pixels, where the edge itself does not blur the normals.
     """
-    rest = np.ascontiguousarray(rest)
+    rest = np.ascontiguousarray(rest, bool)
     closed, smooth = _empty_links(rest.shape), _empty_links(rest.shape)
     job = core.SurfaceLinksJob(
         _surface(surface, settings), address(rest), _edge_cosine(settings), _links(closed), _links(smooth)
@@ -55,7 +56,7 @@ def connected_pieces(segments: np.ndarray, connected: Links | None = None) -> np
 def grow_regions(regions: np.ndarray, valid: np.ndarray, closed: Links, passes: int) -> np.ndarray:
     """Regions (int32 [H, W], 0 = none) grown over valid pixels without region, one pixel a pass, where neighbours are
     on one surface (`closed`)."""
-    grown, free, kept = np.array(regions, np.int32, order="C"), np.ascontiguousarray(valid), _contiguous(closed)
+    grown, free, kept = np.array(regions, np.int32, order="C"), np.ascontiguousarray(valid, bool), _contiguous(closed)
     job = core.GrowthJob(address(grown), address(free), _links(kept), *regions.shape, passes)
     load_library().ggslam_grow_regions(ctypes.byref(job))
     return grown
@@ -95,7 +96,7 @@ def share_near_planes(
     rows = (core.RegionOnPlane * len(asked))()
     for row, (region, plane) in zip(rows, asked, strict=True):
         row.region, row.plane[:] = region, plane.tolist()
-    points, regions = np.ascontiguousarray(points), np.ascontiguousarray(regions, np.int32)
+    points, regions = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(regions, np.int32)
     job = core.RegionsOnPlanesJob(
         address(points), address(regions), regions.size, int(regions.max(initial=0)) + 1, limit,
         ctypes.addressof(rows), len(asked),
@@ -223,7 +224,7 @@ def strange_colors(
 ) -> np.ndarray:  # fmt: skip
     """Pixels of a plane whose colour occurs in few places of it, uint8 [H, W], see `find_strange_colors`; what the
     numbers are, tells `StrangeColorsJob` in interface/core/objects.hpp."""
-    lab, inside = np.ascontiguousarray(lab, np.float32), np.ascontiguousarray(inside)
+    lab, inside = np.ascontiguousarray(lab, np.float32), np.ascontiguousarray(inside, bool)
     pieces, kind = np.ascontiguousarray(pieces, np.int32), np.empty(inside.shape, np.uint8)
     job = core.StrangeColorsJob(
         address(lab), address(inside), address(pieces), *inside.shape, int(pieces.max(initial=0)) + 1, cell=cell,
@@ -246,6 +247,12 @@ def _edge_cosine(settings: GeometricSettings) -> float:
 
 def _surface(surface: DepthSurface, settings: GeometricSettings) -> core.SegmentedSurface:
     height, width = surface.valid.shape
+    for name, channels, kind in (("valid", (), np.bool_), ("depth", (), np.float32), ("inverse", (), np.float32),
+                                 ("points", (3,), np.float32), ("normals", (3,), np.float32)):  # fmt: skip
+        array = getattr(surface, name)
+        if array.dtype != kind or array.shape != (height, width, *channels) or not array.flags.c_contiguous:
+            expected = f"contiguous {np.dtype(kind)} {[height, width, *channels]}"
+            raise InputError(f"surface: {name}: expected {expected}, found {array.dtype} {list(array.shape)}")
     return core.SegmentedSurface(
         address(surface.valid), address(surface.depth), address(surface.inverse), address(surface.points),
         address(surface.normals), height, width, surface.step, surface.sigma, settings.jump_m, settings.jump_sigmas,

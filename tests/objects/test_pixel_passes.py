@@ -8,6 +8,7 @@ import ctypes
 import importlib
 import pkgutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import pytest
 from test_geometric_segmenter import CAMERA, ray_cast
 
 import ggslam.objects
-from ggslam.errors import CoreInputError
+from ggslam.errors import CoreInputError, InputError
 from ggslam.interface.arrays import address
 from ggslam.interface.core import objects as core
 from ggslam.native.loader import load_library
@@ -170,3 +171,12 @@ def test_numbers_outside_of_their_tables_are_refused() -> None:
     regions[1], asked.region = 2, -1
     with pytest.raises(CoreInputError, match="region: expected 0 to 2, found -1"):
         load_library().ggslam_regions_on_planes(ctypes.byref(job))
+
+
+def test_surfaces_of_another_type_are_refused_and_depth_of_any_is_taken() -> None:
+    camera = Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
+    surface = surface_of(np.full((30, 40), 2.0), camera, 8.0)  # float64
+    assert pixel_passes.link_surfaces(surface, surface.valid, GeometricSettings())[0][0].all()
+    wrong = replace(surface, depth=surface.depth.astype(np.float64))
+    with pytest.raises(InputError, match=r"surface: depth: expected contiguous float32 \[30, 40\], found float64"):
+        pixel_passes.link_surfaces(wrong, surface.valid, GeometricSettings())
