@@ -198,7 +198,7 @@ class Associator:
                 parts[k].object_id = int(ids[k])
                 covered[k] = False
         image = ids[overlap.row]
-        self._keep_known(image, overlap, covered, best, parts)
+        self._keep_known(image, overlap, covered, best, parts, planes)
         shown = np.where(overlap.column >= 0, view.ids, np.uint16(0))
         self._evidence.observe(overlap, find_touching_pairs(shown))
         merges = self._evidence.merges()
@@ -230,10 +230,11 @@ class Associator:
         return best
 
     def _keep_known(
-        self, image: np.ndarray, overlap: SegmentOverlap, covered: np.ndarray, best: np.ndarray, parts: Collection[int]
-    ) -> None:
+        self, image: np.ndarray, overlap: SegmentOverlap, covered: np.ndarray, best: np.ndarray, parts: Collection[int],
+        planes: Collection[int],
+    ) -> None:  # fmt: skip
         """Where a segment has several objects, the map's labels stand, and new ground is nobody's unless one object
-        dominates."""
+        dominates, or the segment is a floor or a wall, of which corners were seen before."""
         rows = np.array([k for k in np.flatnonzero(best >= 0) if k not in parts], int)
         covered[rows, best[rows]] = True
         for k in np.flatnonzero(covered.sum(1) > 1):
@@ -241,7 +242,7 @@ class Associator:
             column = overlap.column[inside]
             keep = (column >= 0) & covered[k, column]
             label = np.where(keep, overlap.objects[column], image[inside])
-            if overlap.within[k].max() < _DOMINANT:
+            if overlap.within[k].max() < _DOMINANT and k not in planes:
                 label[column < 0] = 0
             image[inside] = label
 

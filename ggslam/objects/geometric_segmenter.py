@@ -33,6 +33,7 @@ _FLAT_BORDER = 12
 _FLAT_SHARE = 0.9
 _ALIKE = 0.75
 _HOLLOW = 0.3
+_EVEN, _PAINTED, _ENCLOSED = 0.25, 1.5, 0.7
 _SQUARE = np.ones((3, 3), np.uint8)
 
 
@@ -90,7 +91,8 @@ class GeometricSegmenter:
         groups = Groups(int(regions.max()) + 1)
         alike = ~_is_convex(borders) & (borders.contrast < _ALIKE * settings.color_contrast)
         parts = _is_hollow(borders, len(planes)) | self._is_flat(borders, alike, regions, planes, surface)
-        for k in np.flatnonzero(_is_convex(borders) | (alike & parts)):
+        bodies = _is_convex(borders) & ~_is_painted(borders, settings.color_contrast)
+        for k in np.flatnonzero(bodies | (alike & parts)):
             groups.join(*borders.pairs[k].tolist())
         pairs = np.column_stack([borders.pairs, borders.length])
         join_insides(groups, regions, len(planes), surface, pairs)
@@ -143,11 +145,23 @@ def _is_convex(borders: Borders) -> np.ndarray:
     return closed & judged & (borders.concave <= _CONVEX_BENT * borders.judged)
 
 
+def _is_painted(borders: Borders, color_contrast: float) -> np.ndarray:
+    """bool [n]: borders that are no edge, at which the colour changes: smooth, but not for being one body. A curtain
+    hangs before a window, by less than the noise of its depth. A picture in its frame is one thing."""
+    even = (borders.bent <= _EVEN * borders.judged) & (borders.length < _ENCLOSED * _shorter_outline(borders))
+    return even & (borders.contrast >= _PAINTED * color_contrast) & (color_contrast > 0)
+
+
 def _is_hollow(borders: Borders, planes: int) -> np.ndarray:
     """bool [n]: borders between two things, none of them a plane, that make up much of the outline of one: perhaps the
     inside and the outside of a bowl."""
+    return (borders.pairs[:, 0] > planes) & (borders.length >= _HOLLOW * _shorter_outline(borders))
+
+
+def _shorter_outline(borders: Borders) -> np.ndarray:
+    """Of each border, links about the region that has fewer, [n]."""
     rim = np.bincount(borders.pairs.ravel(), np.repeat(borders.length, 2), int(borders.pairs.max(initial=0)) + 1)
-    return (borders.pairs[:, 0] > planes) & (borders.length >= _HOLLOW * rim[borders.pairs].min(1))
+    return rim[borders.pairs].min(1)
 
 
 def _by_size(regions: np.ndarray, valid: np.ndarray, min_area: float) -> np.ndarray:

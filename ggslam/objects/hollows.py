@@ -26,6 +26,9 @@ _FRAME = (0.04, 0.015)
 """How far panes lie behind their frame at most: metres, plus a share of the depth."""
 _BEFORE = 0.001
 """...and before it: a share of the depth."""
+_HIDES = (0.02, 0.005)
+"""Where something stands so far before a pane, a curtain, it hides where the pane goes on: metres, plus a share of the
+depth."""
 
 
 def join_insides(groups: Groups, regions: np.ndarray, planes: int, surface: DepthSurface, pairs: np.ndarray) -> None:
@@ -60,9 +63,9 @@ def join_panes(regions: np.ndarray, surface: DepthSurface) -> np.ndarray:
     n = int(pieces.max()) + 1
     owner = np.zeros(n, np.int64)
     owner[pieces.ravel()] = regions.ravel()
-    pairs, counts = count_contacts(pieces, owner, surface.depth, _FRAME, _BEFORE)
+    pairs, counts = count_contacts(pieces, owner, surface.depth, _FRAME, _HIDES, _BEFORE)
     (piece, frame), (length, near, behind, hidden) = pairs.T, counts.T
-    # What stands far before the pane, or the image's border, cuts it off: who knows what is there.
+    # What stands before the pane, or the image's border, cuts it off: who knows what is there.
     seen = np.bincount(piece, length - hidden, n)
     outline = np.bincount(np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]]), minlength=n)
     outline = outline + np.bincount(piece, length, n)

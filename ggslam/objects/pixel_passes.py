@@ -155,8 +155,9 @@ def count_borders(
 
 
 def count_contacts(
-    pieces: np.ndarray, owner: np.ndarray, depth: np.ndarray, near: tuple[float, float], behind: float
-) -> tuple[np.ndarray, np.ndarray]:
+    pieces: np.ndarray, owner: np.ndarray, depth: np.ndarray, near: tuple[float, float], before: tuple[float, float],
+    behind: float,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """What other regions touch the pieces of an image.
 
     Args:
@@ -164,6 +165,7 @@ def count_contacts(
         owner: int [n], the region of each piece.
         depth: float32 [H, W], metres.
         near: steps are small below near[0] metres + near[1] times the depth.
+        before: from such a step on, given alike, the neighbour is far before the piece.
         behind: share of the depth by which a piece that is not before its neighbour may be so.
 
     Returns:
@@ -176,8 +178,8 @@ def count_contacts(
     while True:
         pairs, counts = np.empty((room, 2), np.int64), np.empty((room, 4), np.int64)
         job = core.ContactsJob(
-            address(pieces), address(depth), address(owner), *pieces.shape, len(owner), *near, behind, room,
-            address(pairs), address(counts),
+            address(pieces), address(depth), address(owner), *pieces.shape, len(owner), *near, *before, behind,
+            room, address(pairs), address(counts),
         )  # fmt: skip
         found = load_library().ggslam_piece_contacts(ctypes.byref(job))
         if found <= room:

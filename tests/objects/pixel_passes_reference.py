@@ -196,8 +196,9 @@ def _shift(index: np.ndarray, shape: tuple[int, ...], axis: int, by: int) -> np.
 
 
 def count_contacts(
-    pieces: np.ndarray, owner: np.ndarray, depth: np.ndarray, near: tuple[float, float], behind: float
-) -> tuple[np.ndarray, np.ndarray]:
+    pieces: np.ndarray, owner: np.ndarray, depth: np.ndarray, near: tuple[float, float], before: tuple[float, float],
+    behind: float,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     codes, steps, depths = [], [], []
     for first, second in (_ends(1, 1), _ends(0, 1)):
         rows, columns = np.nonzero(pieces[first] != pieces[second])
@@ -209,7 +210,7 @@ def count_contacts(
     step, z = np.concatenate(steps), np.concatenate(depths)
     found, place = np.unique(np.concatenate(codes), return_inverse=True)
     limit = near[0] + near[1] * z
-    kinds = np.abs(step) < limit, step > -behind * z, step >= limit
+    kinds = np.abs(step) < limit, step > -behind * z, step >= before[0] + before[1] * z
     counts = [np.bincount(place, kind, len(found)).astype(np.int64) for kind in (np.ones(len(z)), *kinds)]
     return np.stack([found >> 32, found & 0xFFFFFFFF], 1), np.stack(counts, 1)
 

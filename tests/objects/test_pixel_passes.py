@@ -157,7 +157,7 @@ def test_more_borders_and_contacts_than_room_was_made_for() -> None:
     ours, theirs = (module.count_borders(regions, surface, *rest) for module in (pixel_passes, reference))
     assert len(ours[0]) == 30 * 39 + 29 * 40
     assert all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
-    arguments = (regions, np.arange(1201), surface.depth, (0.04, 0.015), 0.001)
+    arguments = (regions, np.arange(1201), surface.depth, (0.04, 0.015), (0.02, 0.005), 0.001)
     for a, b in zip(pixel_passes.count_contacts(*arguments), reference.count_contacts(*arguments), strict=True):
         assert np.array_equal(a, b)
 

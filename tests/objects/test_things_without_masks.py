@@ -166,3 +166,48 @@ def test_a_floor_on_both_sides_of_an_island_is_one_and_a_step_is_another(height:
     found = associator.associate(segments, nothing, depth, CAMERA, pose)
     assert (int(found.ids[segments == 1][0]) == floor) == (height == 0)
     assert floor not in found.created
+
+
+def test_new_ground_between_known_corners_of_a_floor_is_floor() -> None:
+    """Two corners of the floor right of the island are in the map as things of their own."""
+    associator = Associator(AssociationSettings(mode="always"))
+    depth, segments, pose = floor_and_island(1.6)
+    segments[:190][segments[:190] == 1] = 0  # what lies farther away is hidden
+    corners = np.zeros_like(segments)
+    corners[210:, 275:], corners[210:, 200:240] = 1, 2
+    seen = associator.associate(corners, None, depth, CAMERA, pose).ids
+    assert len(np.unique(seen[corners > 0])) == 2
+    shown = MapView(seen, (seen > 0).astype(np.float32), np.where(seen > 0, depth, 0))
+    found = associator.associate(segments, shown, depth, CAMERA, pose).ids
+    new_ground = (segments == 1) & (seen == 0)
+    assert np.isin(found[new_ground], seen[corners > 0]).all()
+
+
+def test_panes_beside_a_curtain_belong_to_their_frame() -> None:
+    """The curtain hangs five centimetres before the outer edge of a pane: less than a frame may stand out."""
+    scene = Scene(pitch=0)
+    scene.box((-9, -9, 2.02), (9, 9, 3), 1)
+    for x in (-0.5, -0.03, 0.44):
+        scene.box((x, -0.5, 1.98), (x + 0.06, 0.5, 1.999), 2)
+    for y in (-0.5, 0.44):
+        scene.box((-0.5, y, 1.98), (0.5, y + 0.06, 1.999), 2)
+    scene.box((-0.8, -0.7, 1.96), (-0.35, 0.7, 1.97), 3)
+    segments = scene.segments()
+    assert segments[119, 130] == segments[119, 159]  # the pane that the curtain hides in part, and the frame
+    assert segments[119, 130] not in (segments[119, 90], segments[119, 20])  # curtain, wall
+
+
+@pytest.mark.parametrize("painted", [False, True])
+def test_a_slight_bend_parts_what_has_two_colours(painted: bool) -> None:
+    """Two faces at 15 degrees: of one body, unless their colours say otherwise."""
+    rays = CAMERA.rays().astype(np.float64)
+    angle = np.radians(7.5)
+    normal = np.array([np.sin(angle), 0, -np.cos(angle)])
+    left = np.broadcast_to(np.arange(320) < 160, (240, 320))
+    depth = np.where(left, -2 / (rays @ (normal * [-1, 1, 1])), -2 / (rays @ normal)).astype(np.float32)
+    depth[:60] += 1  # a wall behind
+    color = np.where((left & painted)[..., None], (190, 60, 50), (150, 150, 150)).astype(np.uint8)
+    segments = GeometricSegmenter().segment(color, depth, CAMERA)
+    assert (segments[119, 60] != segments[119, 260]) == painted
+    blind = GeometricSegmenter(GeometricSettings(color_contrast=0)).segment(color, depth, CAMERA)
+    assert blind[119, 60] == blind[119, 260]

@@ -164,6 +164,7 @@ struct ContactsJob {
   const int32_t* owner;   // [pieces_end], region of each
   int32_t height, width, pieces_end;
   float near_m, near_relative;  // steps below near_m + near_relative * depth are small
+  float before_m, before_relative;  // the neighbour is far before the piece from such a step on
   float behind_relative;        // the piece is not before its neighbour unless by more than this share of the depth
   int64_t room;                 // rows that there is room for
   // Results: piece and region, ascending; links, those with a small step, those where the piece is not before the

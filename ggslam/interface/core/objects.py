@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/objects.hpp"
-HEADER_SHA256 = "24e1cbc35e8379c27870ead214f95758c76a0883a480afcf336090af3cc3d3a8"
+HEADER_SHA256 = "9f7aa22e17201c8b20ed8c6a8721b7ffc7d788987048e966b775419e76220900"
 
 
 class SegmentedSurface(Structure):
@@ -134,8 +134,9 @@ class ContactsJob(Structure):
 
     _fields_ = [
         ("pieces", c_void_p), ("depth", c_void_p), ("owner", c_void_p), ("height", c_int32), ("width", c_int32),
-        ("pieces_end", c_int32), ("near_m", c_float), ("near_relative", c_float), ("behind_relative", c_float),
-        ("room", c_int64), ("pairs", c_void_p), ("counts", c_void_p),
+        ("pieces_end", c_int32), ("near_m", c_float), ("near_relative", c_float), ("before_m", c_float),
+        ("before_relative", c_float), ("behind_relative", c_float), ("room", c_int64), ("pairs", c_void_p),
+        ("counts", c_void_p),
     ]
 
 

@@ -66,8 +66,9 @@ constexpr std::size_t kLayout[] = {
     offsetof(BodiesJob, bends),
     sizeof(ContactsJob), offsetof(ContactsJob, pieces), offsetof(ContactsJob, depth), offsetof(ContactsJob, owner),
     offsetof(ContactsJob, height), offsetof(ContactsJob, width), offsetof(ContactsJob, pieces_end),
-    offsetof(ContactsJob, near_m), offsetof(ContactsJob, near_relative), offsetof(ContactsJob, behind_relative),
-    offsetof(ContactsJob, room), offsetof(ContactsJob, pairs), offsetof(ContactsJob, counts),
+    offsetof(ContactsJob, near_m), offsetof(ContactsJob, near_relative), offsetof(ContactsJob, before_m),
+    offsetof(ContactsJob, before_relative), offsetof(ContactsJob, behind_relative), offsetof(ContactsJob, room),
+    offsetof(ContactsJob, pairs), offsetof(ContactsJob, counts),
 };
 }  // namespace
 

@@ -117,9 +117,10 @@ std::int64_t find_contacts(const ContactsJob& job) {
   PairCounts<4> found;
   const auto add = [&](std::int32_t piece, std::int32_t other, float own, float beyond) {
     const float step = own - beyond, limit = job.near_m + job.near_relative * own;
+    const float before = job.before_m + job.before_relative * own;
     auto& counts = found.counts[found.row_of(piece, job.owner[other])];
     counts[0] += 1, counts[1] += std::fabs(step) < limit;
-    counts[2] += step > -job.behind_relative * own, counts[3] += step >= limit;
+    counts[2] += step > -job.behind_relative * own, counts[3] += step >= before;
   };
   over_axes(job.height, job.width, [&](const LinkAxis& axis) {
     for (int y = 0; y < axis.rows; ++y)
