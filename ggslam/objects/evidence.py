@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,9 +17,17 @@ _FULLY_VISIBLE = 0.5
 
 @dataclass
 class _Pair:
+    """What is known of two objects.
+
+    Attributes:
+        together, apart: weight of what says that they lie in one segment, or in two.
+        keyframes: numbers of those in which they lay in one. Each counts once: a segment across many pieces of a wall
+            says no more than that it is one segment, however many of them become one meanwhile.
+    """
+
     together: float = 0.0
     apart: float = 0.0
-    observations: int = 0
+    keyframes: set[int] = field(default_factory=set)
 
 
 class PairEvidence:
@@ -33,6 +41,7 @@ class PairEvidence:
         self._settings = settings
         self._pairs: dict[tuple[int, int], _Pair] = {}
         self._largest: dict[int, int] = {}
+        self._keyframe = 0
 
     def observe(self, overlap: SegmentOverlap, neighbours: set[tuple[int, int]]) -> None:
         """Takes a keyframe into account.
@@ -42,6 +51,7 @@ class PairEvidence:
             neighbours: pairs of ids (smaller first) that touch each other in the map's view. Other pairs are noted
                 only once they have been seen together.
         """
+        self._keyframe += 1
         if not overlap.shared.size:
             return
         visible = overlap.shared.sum(0)
@@ -56,7 +66,7 @@ class PairEvidence:
                 for b in inside[k + 1 :]:
                     pair = self._pairs.setdefault((a, b), _Pair())
                     pair.together += min(found[a][1], found[b][1])
-                    pair.observations += 1
+                    pair.keyframes.add(self._keyframe)
         for key in neighbours:
             self._pairs.setdefault(key, _Pair())
         for (a, b), pair in self._pairs.items():
@@ -90,7 +100,7 @@ class PairEvidence:
             del self._pairs[key]
 
     def _is_one(self, pair: _Pair) -> bool:
-        enough = pair.observations >= self._settings.merge_observations
+        enough = len(pair.keyframes) >= self._settings.merge_observations
         return enough and pair.together > self._settings.merge_ratio * pair.apart
 
     def join(self, kept: int, dropped: int) -> None:
@@ -104,7 +114,7 @@ class PairEvidence:
             into = self._pairs.setdefault((min(kept, other), max(kept, other)), _Pair())
             into.together += pair.together
             into.apart += pair.apart
-            into.observations += pair.observations
+            into.keyframes |= pair.keyframes
 
 
 def find_touching_pairs(ids: np.ndarray) -> set[tuple[int, int]]:

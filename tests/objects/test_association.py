@@ -10,6 +10,8 @@ from simulated_map import LabelledVoxels, assigned_iou, scramble
 
 from ggslam.errors import ConfigError
 from ggslam.objects.association import Association, Associator, MapView
+from ggslam.objects.evidence import PairEvidence
+from ggslam.objects.overlap import SegmentOverlap
 from ggslam.objects.segments import clean_segments
 from ggslam.objects.settings import AssociationSettings
 from ggslam.scene.camera import Camera
@@ -142,6 +144,17 @@ def test_fewer_observations_than_asked_for_merge_nothing() -> None:
     born[:60, 90:] = 4
     associator = started(born, AssociationSettings(mode="always", merge_observations=50))
     assert not any(associator.associate(scene(31, 32, 33), shown(born), DEPTH).merges for _ in range(8))
+
+
+def test_a_segment_across_many_pieces_counts_once_a_keyframe() -> None:
+    """Two pieces become one in the third keyframe; the third piece lay with both of them in the first two only."""
+    evidence = PairEvidence(ALWAYS)
+    pieces, pixel = np.array([1, 2, 3], np.uint16), np.zeros(1, np.int32)
+    across = SegmentOverlap(np.array([9], np.uint16), pieces, np.array([[30, 20, 10]]), np.array([60]), pixel, pixel)
+    two = SegmentOverlap(np.array([9], np.uint16), pieces[:2], np.array([[30, 20]]), np.array([50]), pixel, pixel)
+    for overlap, expected in ((across, []), (across, []), (two, [(1, 2)]), (across, [(1, 3)])):
+        evidence.observe(overlap, set())
+        assert evidence.merges() == expected
 
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
