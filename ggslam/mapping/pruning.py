@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 import torch
 
@@ -14,6 +15,11 @@ from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.settings import PruningSettings
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
+
+OUTLINE = 9
+"""Pixels across what is searched for the depth of a thing at its outline."""
+THICK_M, THICK_RELATIVE = 0.02, 0.01
+"""Metres, and share of the distance, by which Gaussians of a surface may lie behind what was measured of it."""
 
 
 def prune(gaussians: GaussianMap, settings: PruningSettings) -> int:
@@ -36,11 +42,44 @@ def drop_moved(gaussians: GaussianMap, parts: Sequence[tuple[Keyframe, np.ndarra
     for keyframe, part in parts:
         rows = np.flatnonzero(birth == keyframe.index)
         stays[rows] = ~is_in_image_part(transform_points(means[rows], keyframe.T_camera_world), part, keyframe.camera)
-        keyframe.moving = part if keyframe.moving is None else keyframe.moving | part
-        keyframe.depth = np.where(part, np.uint16(0), keyframe.depth)
-        if keyframe.mask is not None:
-            keyframe.mask = np.where(part, np.uint16(0), keyframe.mask)
+        blank_part(keyframe, part)
     gaussians.keep(torch.from_numpy(stays))
+
+
+def drop_before(
+    gaussians: GaussianMap, births: np.ndarray, parts: Sequence[tuple[Keyframe, np.ndarray, np.ndarray]]
+) -> int:
+    """Takes out what keyframes saw that is gone, but not what lies behind it.
+
+    Args:
+        gaussians: the map.
+        births: numbers of the keyframes whose Gaussians may go.
+        parts: keyframes; bool [H, W], what was there is gone; and bool [H, W], the same with its outlines.
+
+    Returns:
+        How many Gaussians went.
+    """
+    rows = np.flatnonzero(np.isin(gaussians.birth_keyframe.cpu().numpy(), births))
+    means, goes = gaussians.means.detach().cpu().numpy()[rows], np.zeros(len(rows), bool)
+    for keyframe, gone, around in parts:
+        # Of the thing; about it images show what is farther.
+        last = cv2.dilate(np.where(gone, keyframe.depth_m(), np.float32(0)), np.ones((OUTLINE, OUTLINE), np.uint8))
+        seen = transform_points(means, keyframe.T_camera_world)
+        row, column, inside = keyframe.camera.project(seen)
+        farthest = last[row, column] + np.maximum(THICK_M, THICK_RELATIVE * last[row, column])
+        goes |= inside & around[row, column] & (seen[:, 2] < farthest)
+    stays = np.ones(len(gaussians), bool)
+    stays[rows] = ~goes
+    gaussians.keep(torch.from_numpy(stays))
+    return int(goes.sum())
+
+
+def blank_part(keyframe: Keyframe, part: np.ndarray) -> None:
+    """From now on a keyframe's images say nothing in a part of them, bool [H, W]."""
+    keyframe.moving = part if keyframe.moving is None else keyframe.moving | part
+    keyframe.depth = np.where(part, np.uint16(0), keyframe.depth)
+    if keyframe.mask is not None:
+        keyframe.mask = np.where(part, np.uint16(0), keyframe.mask)
 
 
 def drop_pixels(gaussians: GaussianMap, keyframes: Sequence[Keyframe], part: np.ndarray, nearest: float) -> None:

@@ -110,14 +110,14 @@ def gather(
         settings: how much of a thing has to have come.
         moved: ids of the segments that moved in the frame before.
     """
-    blobs = parts_with_seeds(_large(places.novel, settings.min_pixels), places.novel | places.perhaps, 0)
+    blobs = parts_with_seeds(large_parts(places.novel, settings.min_pixels), places.novel | places.perhaps, 0)
     segments = load_segments()
     if segments is None:
         return _as_things(_blobs_that_move(blobs, places, settings), places, None, {})
     small = thin_out(segments, places.factor)
     moving = {number: k for k, number in enumerate(_segments_that_move(small, places, settings, moved), start=1)}
     of_segments = np.isin(small, list(moving)) & (small > 0)
-    left = _large(blobs & ~grow_places(of_segments) & (small == 0), settings.min_pixels)
+    left = large_parts(blobs & ~grow_places(of_segments) & (small == 0), settings.min_pixels)
     return _as_things(_blobs_that_move(left, places, settings), places, segments, moving)
 
 
@@ -169,7 +169,7 @@ def grow_places(mask: np.ndarray) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), _AROUND) > 0
 
 
-def _large(mask: np.ndarray, least: int) -> np.ndarray:
+def large_parts(mask: np.ndarray, least: int) -> np.ndarray:
     """The connected parts of a mask bool [h, w] that have at least so many places."""
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     sizes = np.bincount(labels.reshape(-1), minlength=count)

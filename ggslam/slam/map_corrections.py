@@ -10,20 +10,26 @@ import numpy as np
 
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.mapping.mapper import Mapper
-from ggslam.mapping.pruning import drop_moved, drop_pixels
+from ggslam.mapping.pruning import blank_part, drop_before, drop_moved, drop_pixels
+from ggslam.native.loader import NativeContext
 from ggslam.objects.uniting import FAINT, LabelledVoxels
 from ggslam.scene.frame import Frame
 from ggslam.slam.camera_fixtures import CameraFixtures
+from ggslam.slam.earlier_views import EarlierViews
 from ggslam.slam.loop_closing import Correction, LoopCloser
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.slam.run_movers import RunMovers
 from ggslam.tracking.gicp import GicpTarget
+from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import TrackingResult
 
 LOOKED_BACK = 64
 """So many of the latest keyframes are searched for what has moved since."""
+FILLED_FROM = 100
+"""So many Gaussians leave a hole that the run's keyframes so far fill; smaller ones, at outlines, those that come fill.
+"""
 
 
 class MapCorrections:
@@ -97,6 +103,36 @@ class MapCorrections:
             self._mapper.identity.forget_pixels([k.index for k, _ in parts])
         with self._publishing:
             self._surface.drop_pixels_of({k.index: (part, k.camera) for k, part in parts})
+
+    def take_out_outdated(self, views: EarlierViews, newest: Frame, tracking: TrackingResult, noise: DepthNoise | None,
+                          context: NativeContext) -> None:  # fmt: skip
+        """What a map that the run began with shows, and the run looks through, goes from map, keyframes and surface;
+        what was behind it and own keyframes saw comes in.
+
+        Args:
+            views: of that map.
+            newest: about to become a keyframe.
+            tracking: where it is.
+            noise: of the depth camera.
+            context: that it is computed in.
+        """
+        mapper = self._mapper
+        found = views.look(mapper.keyframes, newest, tracking, noise, context)
+        if not found:
+            return
+        births = np.array([k.index for k in mapper.keyframes if k.frame_index == ELSEWHERE])
+        gone = [(k, parts) for k, parts in found if parts.gone.any()]
+        went = drop_before(mapper.map, births, [(k, parts.gone, parts.around) for k, parts in gone]) if gone else 0
+        for keyframe, parts in found:
+            blank_part(keyframe, parts.around | parts.hidden)
+        if mapper.identity is not None:
+            mapper.identity.forget_pixels([k.index for k, _ in found])
+        with self._publishing:
+            self._surface.drop_pixels_of({k.index: (parts.around, k.camera) for k, parts in gone})
+        views.gaussians += went
+        if went >= FILLED_FROM:
+            viewers = sorted({number for _, parts in gone for number in parts.viewers})
+            mapper.fill_again(number for number in viewers if number < len(mapper.keyframes))
 
     def apply(self, correction: Correction, loops: LoopCloser) -> None:
         """Moves the map after its keyframes, unites objects that both ends have mapped, takes out what is double now,

@@ -36,6 +36,7 @@ from ggslam.mapping.sampling import KeyframeSampler
 from ggslam.movers.detector import MoverDetector
 from ggslam.movers.evidence import CoarseView
 from ggslam.movers.found import MoverSight
+from ggslam.movers.outdated import EarlierView
 from ggslam.movers.patches import Patch
 from ggslam.movers.rigid import RigidTracker
 from ggslam.movers.surface import MoverSurface
@@ -55,6 +56,7 @@ from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.color_poses import ColorPoses
 from ggslam.slam.config import Config
 from ggslam.slam.depth_edges import DepthEdges
+from ggslam.slam.earlier_views import EarlierViews
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.loop_closing import LoopCloser, LoopEvent, _Found
 from ggslam.slam.map_corrections import MapCorrections
@@ -132,6 +134,8 @@ def check_state(slam: Slam) -> None:
         arrays = (view.depth, view.near, view.far, view.whole, view.smooth)
         if any(array.shape != (view.camera.height, view.camera.width) for array in arrays):
             raise FormatError("views of what may move: not of their camera")
+    if not slam.earlier_views.check():
+        raise FormatError("views of the map that the run began with: not of their cameras")
     slam.color_poses.check()
     counts = [len(surface), slam.poses.keyframes_made, len(mapper.keyframes)]
     counts += [] if slam.loops is None else [len(slam.loops.poses), len(slam.loops.places)]
@@ -262,7 +266,7 @@ RULES: Rules = {
          KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
          BoundingPlanes, BoundingPlane,
-         ShutterTimes, RigClock),
+         ShutterTimes, RigClock, EarlierViews, EarlierView),
         Rule(),
     ),
 }  # fmt: skip

@@ -32,6 +32,7 @@ from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.color_poses import ColorPoses
 from ggslam.slam.config import REFINE_MOST, REFINE_SHARE, REFINE_VISITS, Config
 from ggslam.slam.depth_edges import DepthEdges
+from ggslam.slam.earlier_views import EarlierViews
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.parts import check_arguments, device_name, make_parts
@@ -102,6 +103,7 @@ class Slam:
         self._objects = RunObjects(self.masks)
         self.color_poses = ColorPoses(self.mapper, self.poses, self.tracker.state)
         self._depth_edges, self._shutters, self._fixtures = DepthEdges(), ShutterTimes(), CameraFixtures()
+        self.earlier_views = EarlierViews()
         self.movers = RunMovers(self.config.movers, self.config.masks.source in ("auto", "recording"), self.context)
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
@@ -231,6 +233,7 @@ class Slam:
             self.refine_iterations, objects, self.loops.events if self.loops else [],
             self._places(gaussians, cells), cells, None if self.pager is None else self.pager.report(),
             [*self._notes, *self._fixtures.notes(), *self.movers.notes(len(self.frames)),
+             *self.earlier_views.notes(),
              *([] if self.pager is None else self.pager.budget.notes)],
             None if self.pager is None else self.pager.close, self.steps.to_csv(), device_name(self.map.device),
             self.config, self.movers.pixels, self.movers.tracks.describe(),
@@ -348,6 +351,7 @@ class Slam:
         if self.loops is not None:
             self.loops.begin(frame)
         tracking = self._corrections.follow(tracking, self.moves_followed)
+        self._take_out_outdated(frame, tracking)
         self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
         tracking.points.read()  # what waits for the GPU is done in this thread
         with ThreadPoolExecutor(1, thread_name_prefix="surface") as beside:
@@ -372,6 +376,7 @@ class Slam:
             moves_followed: the corrections that this knows of.
         """
         tracking = self._corrections.follow(tracking, moves_followed)
+        self._take_out_outdated(frame, tracking)
         if self.loops is not None:
             self.loops.begin(frame)  # this and the surface are made beside what follows, which one thread alone does
         self._corrections.begin_points(tracking)
@@ -386,6 +391,10 @@ class Slam:
         if self.pager is not None:
             self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
 
+    def _take_out_outdated(self, newest: Frame, tracking: TrackingResult) -> None:
+        """Takes out of the map that the run began with what the frame, about to become a keyframe, helps to tell."""
+        self._corrections.take_out_outdated(self.earlier_views, newest, tracking, self._noise, self.context)
+
     def _clear_map(self, newest: Frame) -> None:
         """Takes out what does not belong there, as far as the newest keyframe tells."""
         self._corrections.leave_out(self._fixtures, newest)
@@ -396,3 +405,4 @@ class Slam:
             correction = self.loops.add(frame, tracking)
             if correction is not None:
                 self._corrections.apply(correction, self.loops)
+                self.earlier_views.forget()

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which parts of an earlier visit's view are not as they were any more, by the depth of the visit that goes on.
+
+Each view of the newer visit that is surely located says of each place of an earlier one whether it looks through what
+was there, or sees it again; and where it sees something that the earlier one looked through. One view may err: by its
+pose, at outlines, where depth was guessed. Several from different poses have to agree, and far more of them than still
+see what was there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+from ggslam.movers.detector import GROWN, grow
+from ggslam.movers.evidence import CoarseView, Margin, PairEvidence, compare, thin_out
+from ggslam.movers.segments import grow_places, large_parts
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse, transform_points
+
+COLUMNS = 160
+"""Pixels: width of the images that are compared, about; small things count."""
+MARGIN_M, MARGIN_SIGMAS = 0.02, 5.0
+"""Depths of one surface differ by no more than so many metres (two visits are less well aligned than two frames of one)
+and so many standard deviations of the depth camera."""
+VIEWS, RATIO = 3, 2
+"""Views that look through a place at least, and so many times as many as still see it."""
+LEAST_PLACES = 6
+"""Connected places that are a thing: fewer are noise."""
+WHOLE = 0.5
+"""Of a segment all is gone, if more than this share was judged, and more than this share of that is gone."""
+HIDDEN_SHARE = 0.25
+"""Of the newer views that see some of what a view sees, so many see something before a place where something stands:
+where outlines err, fewer do."""
+_AROUND = np.ones((3, 3), np.uint8)
+
+
+@dataclass(frozen=True)
+class OutdatedParts:
+    """Parts of an earlier view's image that say nothing of how things are now, bool [H, W] each. Where nothing was
+    told that was not known, they are empty.
+
+    Attributes:
+        gone: what was there was looked through...
+        around: ...the same with its outlines, which are blurred...
+        hidden: ...and where something stands now in front of what was there.
+        viewers: numbers of the newer keyframes that looked through a part of the view.
+    """
+
+    gone: np.ndarray
+    around: np.ndarray
+    hidden: np.ndarray
+    viewers: list[int]
+
+
+@dataclass
+class EarlierView:
+    """An earlier keyframe's depth, and what newer views say of its places.
+
+    Attributes:
+        view: its depth as it was measured; where it is tells `at`.
+        through, same, before: int16 [h, w], newer views that looked through a place, that saw it again, and that saw
+            something which this view looks through.
+        gone, hidden: bool [h, w], places that were told to be so.
+        viewers: numbers of the newer keyframes that looked through something.
+        looks: newer views that were held against it.
+        fresh: whether something was said since `find_outdated`.
+    """
+
+    view: CoarseView
+    through: np.ndarray
+    same: np.ndarray
+    before: np.ndarray
+    gone: np.ndarray
+    hidden: np.ndarray
+    viewers: set[int] = field(default_factory=set)
+    looks: int = 0
+    fresh: bool = False
+
+    @staticmethod
+    def of(view: CoarseView) -> EarlierView:
+        """Of which nothing was said yet."""
+        counts, flags = np.zeros((3, *view.depth.shape), np.int16), np.zeros((2, *view.depth.shape), bool)
+        return EarlierView(view, *(array.copy() for array in (*counts, *flags)))
+
+    def at(self, T_world_camera: np.ndarray) -> CoarseView:
+        """The view from where its keyframe is now, [4, 4]."""
+        return replace(self.view, T_world_camera=np.array(T_world_camera, float))
+
+    def forget(self) -> None:
+        """What was said counts no more: keyframes have moved against each other. What is gone stays so."""
+        for counts in (self.through, self.same, self.before):
+            counts[:] = 0
+        self.looks, self.fresh = 0, False
+
+    def count(self, placed: CoarseView, evidence: PairEvidence, newest: CoarseView, come: np.ndarray, by: int) -> None:
+        """A newer view's evidence counts.
+
+        Args:
+            placed: this view where it is.
+            evidence: of its places, by `newest`.
+            newest: the newer view.
+            come: places of that one, bool [h', w'], which this view looks past.
+            by: number of its keyframe.
+        """
+        self.looks += 1
+        self.through += evidence.passed
+        self.same += evidence.same
+        if evidence.passed.sum() >= LEAST_PLACES:
+            self.viewers.add(by)
+        if come.any():
+            self.before += _places_before(placed, newest, come)
+        self.fresh |= bool(evidence.passed.any() or come.any())
+
+    def find_outdated(self, segments: np.ndarray | None, shape: tuple[int, int]) -> OutdatedParts | None:
+        """What is outdated of the view and was not known to be; None: nothing.
+
+        Args:
+            segments: ids uint16 [H, W] of its keyframe, 0 = none, or None.
+            shape: of its keyframe's images, (H, W).
+        """
+        self.fresh, factor = False, shape[1] // self.view.camera.width
+        gone = large_parts((self.through >= VIEWS) & (self.through >= RATIO * self.same), LEAST_PLACES)
+        hidden = large_parts(self.before >= max(VIEWS, HIDDEN_SHARE * self.looks), LEAST_PLACES)
+        full = _enlarge(gone, factor, shape)
+        if segments is not None and gone.any():
+            small = thin_out(segments, factor)
+            ids = _segments_gone(gone, self.through + self.same >= VIEWS, small, self.view.depth > 0)
+            gone, full = gone | np.isin(small, ids), full | np.isin(segments, ids)
+        # What is next to what was told before is its outline, and was left out with it.
+        new_gone, new_hidden = (
+            large_parts(now & ~grow_places(known), LEAST_PLACES).any()
+            for now, known in ((gone, self.gone), (hidden, self.hidden))
+        )
+        if not new_gone and not new_hidden:
+            return None
+        self.gone |= gone
+        self.hidden |= hidden
+        full = full if new_gone else np.zeros(shape, bool)
+        return OutdatedParts(full, grow(full, GROWN), _enlarge(hidden, factor, shape), sorted(self.viewers))
+
+
+def coarse_factor(camera: Camera) -> int:
+    """How many times smaller the images are that are compared."""
+    return max(1, round(camera.width / COLUMNS))
+
+
+def margin_of(constant: float, square: float) -> Margin:
+    """What depths of one surface may differ by, for a depth camera's noise of constant + square z^2, metres."""
+    return Margin(MARGIN_M, MARGIN_SIGMAS, constant, square)
+
+
+def compare_both_ways(
+    earlier: list[CoarseView], newest: CoarseView, margin: Margin, context: NativeContext
+) -> tuple[list[PairEvidence], list[np.ndarray]]:
+    """What the newest view says of the places of earlier ones; and where each of them looked past something that it
+    sees, bool [h, w] in the newest view. Arguments as of `compare`."""
+    of_earlier = [compare(view, [newest], margin, context)[0] for view in earlier]
+    come = [large_parts(e.passed, LEAST_PLACES) for e in compare(newest, earlier, margin, context)] if earlier else []
+    return of_earlier, come
+
+
+def _places_before(view: CoarseView, newest: CoarseView, come: np.ndarray) -> np.ndarray:
+    """Places of a view, bool [h, w], in front of which the newest view sees what `come` marks there."""
+    points = transform_points(newest.camera.back_project(newest.depth)[come].astype(float), newest.T_world_camera)
+    rows, columns, inside = view.camera.project(transform_points(points, inverse(view.T_world_camera)))
+    marked = np.zeros(view.depth.shape, np.uint8)
+    marked[rows[inside], columns[inside]] = 1
+    return cv2.morphologyEx(marked, cv2.MORPH_CLOSE, _AROUND) > 0  # points of the one leave gaps in the other
+
+
+def _segments_gone(gone: np.ndarray, judged: np.ndarray, small: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Ids of segments that are gone for the most part.
+
+    Args:
+        gone, judged: places, bool [h, w].
+        small: id of the segment at each place, 0 = none.
+        known: places that have depth, bool [h, w].
+    """
+    count = int(small.max()) + 1
+    lost, told, whole = (np.bincount(small[places], minlength=count) for places in (gone, judged, known))
+    ids = np.flatnonzero((lost >= LEAST_PLACES) & (lost > WHOLE * told) & (told > WHOLE * whole))
+    return ids[ids > 0]
+
+
+def _enlarge(places: np.ndarray, factor: int, shape: tuple[int, int]) -> np.ndarray:
+    """Places bool [h, w] as pixels bool [H, W]."""
+    full, (h, w) = np.zeros(shape, bool), places.shape
+    full[: h * factor, : w * factor] = places.repeat(factor, 0).repeat(factor, 1)
+    return full

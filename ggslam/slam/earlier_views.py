@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The views of the map that a run began with, held against the run's own keyframes: what was carried away goes.
+
+A run in another one's map trains on that one's keyframes, too. Where they show what is not there any more they bring
+it back again and again, and the tracker is aligned to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.movers.evidence import CoarseView
+from ggslam.movers.outdated import (
+    EarlierView,
+    OutdatedParts,
+    coarse_factor,
+    compare_both_ways,
+    margin_of,
+)
+from ggslam.native.loader import NativeContext
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse, transform_points, turning_angle
+from ggslam.slam.run_movers import SURE
+from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.tracker import TrackingResult
+
+APART_M, APART_DEG = 0.05, 4.0
+"""Poses are different that are so far apart, or turned so far; of keyframes at one pose the first counts alone, for
+what is wrong with its view is wrong with theirs."""
+MOST_THROUGH = 0.5
+"""A keyframe that looks through more than this share of what can be compared is somewhere else than it seems."""
+SAMPLES = 5
+"""Places of an earlier view along each axis by which it is told whether a keyframe may see the same."""
+
+
+@dataclass
+class EarlierViews:
+    """What a run's own keyframes say of those of the map it began with.
+
+    Attributes:
+        views: of the earlier keyframes that were compared, by number.
+        counted: T_world_camera [4, 4] of the keyframes whose evidence counts.
+        gaussians: how many left the map.
+    """
+
+    views: dict[int, EarlierView] = field(default_factory=dict)
+    counted: list[np.ndarray] = field(default_factory=list)
+    gaussians: int = 0
+
+    def look(
+        self, keyframes: Sequence[Keyframe], newest: Frame, tracking: TrackingResult, noise: DepthNoise | None,
+        context: NativeContext,
+    ) -> list[tuple[Keyframe, OutdatedParts]]:  # fmt: skip
+        """What turns out to be outdated with a frame that is about to become a keyframe.
+
+        Args:
+            keyframes: of the run so far; the frame becomes the next one.
+            newest: the frame, without what moves in it.
+            tracking: where it is; one that is not surely located says nothing.
+            noise: of the depth camera.
+            context: that it is computed in.
+        """
+        T_world_newest = tracking.T_world_camera
+        if tracking.status not in SURE or noise is None or not self._is_new(T_world_newest):
+            return []
+        earlier = [k for k in keyframes if k.frame_index == ELSEWHERE and k.depth.size]
+        near = self._near(earlier, newest, T_world_newest)
+        if not near:
+            return []
+        margin = margin_of(noise.constant, noise.square)
+        view = CoarseView.of(newest.depth, newest.camera, coarse_factor(newest.camera), T_world_newest, margin, context)
+        for k in near:
+            if k.index not in self.views:
+                coarse = CoarseView.of(k.depth_m(), k.camera, coarse_factor(k.camera), np.eye(4), margin, context)
+                self.views[k.index] = EarlierView.of(coarse)
+        placed = [self.views[k.index].at(k.T_world_camera) for k in near]
+        evidence, come = compare_both_ways(placed, view, margin, context)
+        through, same = sum(int(e.passed.sum()) for e in evidence), sum(int(e.same.sum()) for e in evidence)
+        if through > MOST_THROUGH * (through + same):
+            return []
+        self.counted.append(T_world_newest.copy())
+        for k, at, says, before in zip(near, placed, evidence, come, strict=True):
+            self.views[k.index].count(at, says, view, before, by=len(keyframes))
+        found = [(k, self._find_outdated(k)) for k in near if self.views[k.index].fresh]
+        return [(k, parts) for k, parts in found if parts is not None]
+
+    def forget(self) -> None:
+        """A loop was closed: what was said with keyframes where they are no more does not count."""
+        self.counted.clear()
+        for view in self.views.values():
+            view.forget()
+
+    def notes(self) -> list[str]:
+        """What the user should know."""
+        if not self.gaussians:
+            return []
+        return [f"{self.gaussians} Gaussians of the map it began with are left out: the run looks through them"]
+
+    def check(self) -> bool:
+        """Whether all arrays have the shapes of their views."""
+        return all(
+            array.shape == (v.view.camera.height, v.view.camera.width)
+            for v in self.views.values()
+            for array in (v.view.depth, v.view.near, v.view.far, v.view.whole, v.view.smooth, v.through, v.same,
+                          v.before, v.gone, v.hidden)
+        )  # fmt: skip
+
+    def _find_outdated(self, keyframe: Keyframe) -> OutdatedParts | None:
+        return self.views[keyframe.index].find_outdated(keyframe.mask, keyframe.depth.shape)
+
+    def _is_new(self, T_world_camera: np.ndarray) -> bool:
+        """Whether the pose differs from all that count."""
+        for T in self.counted:
+            shift = float(np.linalg.norm(T[:3, 3] - T_world_camera[:3, 3]))
+            if shift < APART_M and np.degrees(turning_angle(T, T_world_camera)) < APART_DEG:
+                return False
+        return True
+
+    def _near(self, earlier: Sequence[Keyframe], newest: Frame, T_world_newest: np.ndarray) -> list[Keyframe]:
+        """Those keyframes that may show what the newest frame sees."""
+        T_newest_world, found = inverse(T_world_newest), []
+        for keyframe in earlier:
+            rows = np.linspace(0, keyframe.depth.shape[0] - 1, SAMPLES).astype(int)
+            columns = np.linspace(0, keyframe.depth.shape[1] - 1, SAMPLES).astype(int)
+            grid = np.ix_(rows, columns)
+            points = keyframe.camera.back_project(keyframe.depth_m())[grid].reshape(-1, 3).astype(float)
+            points = points[points[:, 2] > 0]
+            seen = newest.camera.project(transform_points(points, T_newest_world @ keyframe.T_world_camera))[2]
+            if seen.any():
+                found.append(keyframe)
+        return found
