@@ -173,14 +173,6 @@ class Mapper(ABC):
         self.times.keyframes += 1
         return keyframe
 
-    def fill_again(self, numbers: Iterable[int]) -> None:
-        """Inserts what the map lacks at keyframes that it has already: something was taken out before them."""
-        start = time.perf_counter()
-        for number in numbers:
-            keyframe = self.keyframes[number]
-            self._insert(keyframe, keyframe.T_world_camera, None)
-        self.times.insertion += time.perf_counter() - start
-
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         """Goes on with a map made before. Keyframes without images keep their Gaussians but are never trained on."""
         self.map, self.keyframes = gaussians, keyframes

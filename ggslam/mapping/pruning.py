@@ -16,8 +16,8 @@ from ggslam.mapping.settings import PruningSettings
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
 
-OUTLINE = 9
-"""Pixels across what is searched for the depth of a thing at its outline."""
+OUTLINE = 4
+"""Pixels of a 320 pixel wide image about a thing's outline at which its depth is still that of the thing."""
 THICK_M, THICK_RELATIVE = 0.02, 0.01
 """Metres, and share of the distance, by which Gaussians of a surface may lie behind what was measured of it."""
 
@@ -62,8 +62,9 @@ def drop_before(
     rows = np.flatnonzero(np.isin(gaussians.birth_keyframe.cpu().numpy(), births))
     means, goes = gaussians.means.detach().cpu().numpy()[rows], np.zeros(len(rows), bool)
     for keyframe, gone, around in parts:
+        reach = 1 + 2 * max(1, round(OUTLINE * keyframe.camera.width / 320))
         # Of the thing; about it images show what is farther.
-        last = cv2.dilate(np.where(gone, keyframe.depth_m(), np.float32(0)), np.ones((OUTLINE, OUTLINE), np.uint8))
+        last = cv2.dilate(np.where(gone, keyframe.depth_m(), np.float32(0)), np.ones((reach, reach), np.uint8))
         seen = transform_points(means, keyframe.T_camera_world)
         row, column, inside = keyframe.camera.project(seen)
         farthest = last[row, column] + np.maximum(THICK_M, THICK_RELATIVE * last[row, column])

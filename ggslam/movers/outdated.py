@@ -9,7 +9,7 @@ see what was there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -45,15 +45,13 @@ class OutdatedParts:
 
     Attributes:
         gone: what was there was looked through...
-        around: ...the same with its outlines, which are blurred...
+        around: ...the same with its outlines, where nobody surely looks through...
         hidden: ...and where something stands now in front of what was there.
-        viewers: numbers of the newer keyframes that looked through a part of the view.
     """
 
     gone: np.ndarray
     around: np.ndarray
     hidden: np.ndarray
-    viewers: list[int]
 
 
 @dataclass
@@ -65,7 +63,6 @@ class EarlierView:
         through, same, before: int16 [h, w], newer views that looked through a place, that saw it again, and that saw
             something which this view looks through.
         gone, hidden: bool [h, w], places that were told to be so.
-        viewers: numbers of the newer keyframes that looked through something.
         looks: newer views that were held against it.
         fresh: whether something was said since `find_outdated`.
     """
@@ -76,7 +73,6 @@ class EarlierView:
     before: np.ndarray
     gone: np.ndarray
     hidden: np.ndarray
-    viewers: set[int] = field(default_factory=set)
     looks: int = 0
     fresh: bool = False
 
@@ -96,7 +92,7 @@ class EarlierView:
             counts[:] = 0
         self.looks, self.fresh = 0, False
 
-    def count(self, placed: CoarseView, evidence: PairEvidence, newest: CoarseView, come: np.ndarray, by: int) -> None:
+    def count(self, placed: CoarseView, evidence: PairEvidence, newest: CoarseView, come: np.ndarray) -> None:
         """A newer view's evidence counts.
 
         Args:
@@ -104,13 +100,10 @@ class EarlierView:
             evidence: of its places, by `newest`.
             newest: the newer view.
             come: places of that one, bool [h', w'], which this view looks past.
-            by: number of its keyframe.
         """
         self.looks += 1
         self.through += evidence.passed
         self.same += evidence.same
-        if evidence.passed.sum() >= LEAST_PLACES:
-            self.viewers.add(by)
         if come.any():
             self.before += _places_before(placed, newest, come)
         self.fresh |= bool(evidence.passed.any() or come.any())
@@ -139,8 +132,9 @@ class EarlierView:
             return None
         self.gone |= gone
         self.hidden |= hidden
-        full = full if new_gone else np.zeros(shape, bool)
-        return OutdatedParts(full, grow(full, GROWN), _enlarge(hidden, factor, shape), sorted(self.viewers))
+        if not new_gone:
+            full = np.zeros(shape, bool)
+        return OutdatedParts(full, grow(_grow_by_a_place(full, factor), GROWN), _enlarge(hidden, factor, shape))
 
 
 def coarse_factor(camera: Camera) -> int:
@@ -184,6 +178,11 @@ def _segments_gone(gone: np.ndarray, judged: np.ndarray, small: np.ndarray, know
     lost, told, whole = (np.bincount(small[places], minlength=count) for places in (gone, judged, known))
     ids = np.flatnonzero((lost >= LEAST_PLACES) & (lost > WHOLE * told) & (told > WHOLE * whole))
     return ids[ids > 0]
+
+
+def _grow_by_a_place(mask: np.ndarray, factor: int) -> np.ndarray:
+    """A mask bool [H, W] larger by a place all around."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * factor + 1, 2 * factor + 1), np.uint8)) > 0
 
 
 def _enlarge(places: np.ndarray, factor: int, shape: tuple[int, int]) -> np.ndarray:

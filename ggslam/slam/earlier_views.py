@@ -58,7 +58,7 @@ class EarlierViews:
         """What turns out to be outdated with a frame that is about to become a keyframe.
 
         Args:
-            keyframes: of the run so far; the frame becomes the next one.
+            keyframes: of the run so far.
             newest: the frame, without what moves in it.
             tracking: where it is; one that is not surely located says nothing.
             noise: of the depth camera.
@@ -84,7 +84,7 @@ class EarlierViews:
             return []
         self.counted.append(T_world_newest.copy())
         for k, at, says, before in zip(near, placed, evidence, come, strict=True):
-            self.views[k.index].count(at, says, view, before, by=len(keyframes))
+            self.views[k.index].count(at, says, view, before)
         found = [(k, self._find_outdated(k)) for k in near if self.views[k.index].fresh]
         return [(k, parts) for k, parts in found if parts is not None]
 

@@ -27,9 +27,6 @@ from ggslam.tracking.tracker import TrackingResult
 
 LOOKED_BACK = 64
 """So many of the latest keyframes are searched for what has moved since."""
-FILLED_FROM = 100
-"""So many Gaussians leave a hole that the run's keyframes so far fill; smaller ones, at outlines, those that come fill.
-"""
 
 
 class MapCorrections:
@@ -106,8 +103,7 @@ class MapCorrections:
 
     def take_out_outdated(self, views: EarlierViews, newest: Frame, tracking: TrackingResult, noise: DepthNoise | None,
                           context: NativeContext) -> None:  # fmt: skip
-        """What a map that the run began with shows, and the run looks through, goes from map, keyframes and surface;
-        what was behind it and own keyframes saw comes in.
+        """What a map that the run began with shows, and the run looks through, goes from map, keyframes and surface.
 
         Args:
             views: of that map.
@@ -130,9 +126,6 @@ class MapCorrections:
         with self._publishing:
             self._surface.drop_pixels_of({k.index: (parts.around, k.camera) for k, parts in gone})
         views.gaussians += went
-        if went >= FILLED_FROM:
-            viewers = sorted({number for _, parts in gone for number in parts.viewers})
-            mapper.fill_again(number for number in viewers if number < len(mapper.keyframes))
 
     def apply(self, correction: Correction, loops: LoopCloser) -> None:
         """Moves the map after its keyframes, unites objects that both ends have mapped, takes out what is double now,

@@ -21,20 +21,25 @@ CAMERA = Camera(40, 30, 30.0, 30.0, 19.5, 14.5)
 WALL_M = 2.0
 
 
-def visit(points: list[list[float]], births: list[int], own: int, depth: np.ndarray, recording: bool = True) -> Any:
-    """A run whose first keyframe is of an earlier map, with `own` more that look along z; and where its map is."""
+def visit(
+    points: list[list[float]], births: list[int], own: int, depth: np.ndarray, recording: bool = True,
+    mask: np.ndarray | None = None,
+) -> Any:  # fmt: skip
+    """A run whose first keyframe is of an earlier map, with `own` more that look along z; and where its map is. All is
+    of object 7."""
     gaussians, count = GaussianMap(0, 4), len(points)
     gaussians.insert(
         torch.tensor(points), torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.full((count, 3), -3.0),
         torch.zeros(count), torch.full((count, 3), 0.5),
     )  # fmt: skip
     gaussians.birth_keyframe[:] = torch.tensor(births, dtype=gaussians.birth_keyframe.dtype)
+    gaussians.object_id[:] = 7
     color = np.zeros((30, 40, 3), np.uint8)
-    frame = Frame(index=0, source_index=0, timestamp=0.0, color=color, depth=depth.astype(np.float32), camera=CAMERA)
+    frame = Frame(0, 0, 0.0, color, depth.astype(np.float32), CAMERA, mask=mask)
     source = SimpleNamespace(
         record=SimpleNamespace(keyframes=[SimpleNamespace(frame=f) for f in (ELSEWHERE, *range(own))]),
         sequence=SimpleNamespace(frame=lambda index, masks: frame) if recording else None,
-        known=SimpleNamespace(noise=DepthNoise()),
+        known=SimpleNamespace(noise=DepthNoise()), has_lasting_ids=lambda: mask is not None,
     )
     placed = SimpleNamespace(gaussians=gaussians, T_world_camera=np.tile(np.eye(4), (own + 1, 1, 1)))
     return source, placed
@@ -63,3 +68,16 @@ def test_what_is_not_surely_gone_stays(case: str) -> None:
     if case == "no earlier map":
         source.record.keyframes = source.record.keyframes[1:]
     assert len(without_ghosts(source, placed)) == 1
+
+
+@pytest.mark.parametrize(
+    ("shown", "wall_m", "expected"), [(29, WALL_M, 29), (7, WALL_M, 7), (0, WALL_M, 7), (29, 1.0, 7)]
+)
+def test_an_object_in_whose_place_own_masks_show_another_has_become_it(
+    shown: int, wall_m: float, expected: int
+) -> None:
+    """Masks show another; itself; none; another in front of it."""
+    mask, depth = np.full((30, 40), shown, np.uint16), np.full((30, 40), wall_m)
+    source, placed = visit([[0, 0, 1.99], [0.1, 0, 2.0], [0, 0, 2.5]], [0, 0, 0], own=2, depth=depth, mask=mask)
+    assert without_ghosts(source, placed).object_id.tolist() == [expected] * 3
+    assert placed.gaussians.object_id.tolist() == [7] * 3

@@ -8,6 +8,7 @@ nothing would be seen to have changed.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -25,6 +26,9 @@ _SIGMAS, _LEAST_M, _RELATIVE = 3.0, 0.02, 0.01
 so many metres and so much of the distance."""
 _TIMES = 2
 """Keyframes that look through it at least, and so many times as many as see something there."""
+_MOST, _NEVER = 0.5, 0.01
+"""Share of an object's Gaussians in whose places masks show others; and share of sights that show itself, where masks
+err at outlines."""
 _AROUND = np.ones((3, 3), np.uint8)
 
 
@@ -36,22 +40,72 @@ def own_keyframes(record: KeyframesRecord) -> Sequence[int]:
 
 
 def without_ghosts(source: MergeSource, placed: PlacedRun) -> GaussianMap:
-    """The map of a run without Gaussians of the map it began with that its own keyframes look through. The map as it is
-    if the run began with none, or its recording is not there.
+    """The map of a run without Gaussians of the map it began with that its own keyframes look through. Objects of that
+    map in whose places its own masks always show others have become these: something else stands there. The map as it
+    is if the run began with none, or its recording is not there.
 
     Args:
         source: the run.
         placed: its map, and where its keyframes are.
     """
-    gaussians, sequence, noise = placed.gaussians, source.sequence, source.known.noise
+    gaussians = placed.gaussians
     own = own_keyframes(source.record)
-    if sequence is None or len(own) == len(source.record.keyframes):
+    if source.sequence is None or len(own) == len(source.record.keyframes):
         return gaussians
     rows = np.flatnonzero(~np.isin(gaussians.birth_keyframe.numpy(), own))
-    means = gaussians.means.numpy()[rows].astype(np.float64)
-    through, there = np.zeros(len(rows), int), np.zeros(len(rows), int)
+    seen = _look(source, placed, own, rows)
+    ghosts = rows[(seen.through >= _TIMES) & (seen.through >= _TIMES * seen.there)]
+    replaced = _find_replaced(gaussians.object_id.numpy()[rows], seen)
+    if not len(ghosts) and not replaced:
+        return gaussians
+    cleared = gaussians.copy(gaussians.device)
+    for old, new in replaced.items():  # also where the visit's own Gaussians learned it from those before
+        cleared.object_id[gaussians.object_id == old] = new
+    kept = torch.ones(len(gaussians), dtype=torch.bool)
+    kept[torch.from_numpy(ghosts)] = False
+    cleared.keep(kept)
+    return cleared
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What keyframes say of Gaussians, int [n] each.
+
+    Attributes:
+        through: how many look through one.
+        there: how many see a surface there...
+        alike, other: ...of its object, by their masks; of another one.
+        latest: the other object that was seen last.
+    """
+
+    through: np.ndarray
+    there: np.ndarray
+    alike: np.ndarray
+    other: np.ndarray
+    latest: np.ndarray
+
+
+def _find_replaced(ids: np.ndarray, seen: _Seen) -> dict[int, int]:
+    """Objects, of ids [n], that masks never show where most of their surfaces are seen; and what they show there most.
+    """
+    found = {}
+    for i in np.unique(ids[ids > 0]).tolist():
+        own = ids == i
+        others = own & (seen.other >= _TIMES)
+        if others.sum() > _MOST * own.sum() and seen.alike[own].sum() < _NEVER * seen.other[own].sum():
+            found[i] = int(np.bincount(seen.latest[others]).argmax())
+    return found
+
+
+def _look(source: MergeSource, placed: PlacedRun, own: Sequence[int], rows: np.ndarray) -> _Seen:
+    """What a run's own keyframes, by number, say of some rows of its map."""
+    noise, sequence, masks = source.known.noise, source.sequence, source.has_lasting_ids()
+    assert sequence is not None
+    means = placed.gaussians.means.numpy()[rows].astype(np.float64)
+    ids = placed.gaussians.object_id.numpy()[rows].astype(int)
+    found = _Seen(*np.zeros((5, len(rows)), int))
     for k in own:
-        frame = sequence.frame(source.record.keyframes[k].frame, masks=False)
+        frame = sequence.frame(source.record.keyframes[k].frame, masks=masks)
         seen = transform_points(means, inverse(placed.T_world_camera[k]))
         row, column, inside = frame.camera.project(seen)
         # Where a pixel's surroundings have no depth, or show an edge, it looks through what is nearer than all of them.
@@ -59,13 +113,14 @@ def without_ghosts(source: MergeSource, placed: PlacedRun) -> GaussianMap:
         measured = frame.depth[row, column]
         away = seen[:, 2]
         margin = np.maximum(_SIGMAS * (noise.constant + noise.square * away**2), _LEAST_M + _RELATIVE * away)
-        through += inside & (nearest > 0) & (away < nearest - margin)
-        there += inside & (measured > 0) & (np.abs(away - measured) <= margin)
-    ghosts = rows[(through >= _TIMES) & (through >= _TIMES * there)]
-    if not len(ghosts):
-        return gaussians
-    kept = torch.ones(len(gaussians), dtype=torch.bool)
-    kept[torch.from_numpy(ghosts)] = False
-    cleared = gaussians.copy(gaussians.device)
-    cleared.keep(kept)
-    return cleared
+        there = inside & (measured > 0) & (np.abs(away - measured) <= margin)
+        found.through[:] += inside & (nearest > 0) & (away < nearest - margin)
+        found.there[:] += there
+        mask = frame.load_mask() if masks else None
+        if mask is not None:
+            shown = mask[row, column].astype(int)
+            other = there & (shown > 0) & (shown != ids)
+            found.alike[:] += there & (shown == ids)
+            found.other[:] += other
+            found.latest[other] = shown[other]
+    return found

@@ -117,6 +117,10 @@ class MergeSource:
             return None
         return RunObjects(self.objects.table, self.objects.classifier, self._mask_source(), self.first_frame)
 
+    def has_lasting_ids(self) -> bool:
+        """Whether the masks of its recording taught it objects, with ids that stay."""
+        return self.objects is not None and self._mask_source() is not None
+
     def _mask_source(self) -> str | None:
         """Where masks with constant ids come from; None: they were not such masks."""
         assert self.objects is not None
