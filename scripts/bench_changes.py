@@ -4,6 +4,7 @@
     python scripts/bench_changes.py                          # 20 rooms with 3 to 8 changes, 5 without any
     python scripts/bench_changes.py --rooms 2 --unchanged 1 --folder /tmp/visits
     python scripts/bench_changes.py --geometry               # objects found without masks
+    python scripts/bench_changes.py --map                    # second visits are run in the maps of the first ones
 
 Each room is recorded twice, from other places and with other noise, and each recording is run with the defaults. Only
 what can be known counts: things that both visits looked at (`FEW_PIXELS` in three frames and more), and where something
@@ -52,9 +53,12 @@ class Score:
     seconds: float = 0.0
 
 
-def run_visit(folder: Path, seed: int, count: int, visit: int, given: argparse.Namespace) -> Path:
-    """Records and runs a visit, unless that is done."""
+def run_visit(
+    folder: Path, seed: int, count: int, visit: int, given: argparse.Namespace, in_map: Path | None = None
+) -> Path:
+    """Records and runs a visit, in the map of another one if it is given, unless that is done."""
     recording, out = folder / f"room{seed}-{count}-{visit}", folder / f"run{seed}-{count}-{visit}{given.kind}"
+    out = out.with_name(f"{out.name}-in-map") if in_map else out
     if not recording.is_dir():
         write_synthetic_sequence(
             recording, frames=given.frames, width=given.width, height=given.width * 3 // 4, seed=seed, changes=count,
@@ -63,6 +67,7 @@ def run_visit(folder: Path, seed: int, count: int, visit: int, given: argparse.N
     if not (out / "map.ply").is_file():
         command = [sys.executable, "-m", "ggslam", "run", str(recording), "--out", str(out), "--no-eval", "--overwrite"]
         more = ["--set", "masks.source=geometry"] if given.geometry else []
+        more += ["--map", str(in_map)] if in_map else []
         subprocess.run([*command, *more], check=True, capture_output=True)
     return out
 
@@ -142,7 +147,8 @@ def note_pose(result: Score, c: Change, made: dict[str, Any], T_truth: np.ndarra
 
 def bench_pair(folder: Path, seed: int, count: int, given: argparse.Namespace) -> Score:
     """Both visits to a room."""
-    runs = [run_visit(folder, seed, count, visit, given) for visit in (1, 2)]
+    first = run_visit(folder, seed, count, 1, given)
+    runs = [first, run_visit(folder, seed, count, 2, given, first if given.map else None)]
     recordings = [folder / f"room{seed}-{count}-{visit}" for visit in (1, 2)]
     truth = json.loads((recordings[1] / "changes.json").read_text())["changes"]
     shown = [points_of(recording, {made["instance"] for made in truth}) for recording in recordings]
@@ -184,6 +190,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--width", type=int, default=240)
     parser.add_argument("--geometry", action="store_true", help="objects by geometry instead of masks")
+    parser.add_argument("--map", action="store_true", help="run second visits in the maps of the first ones")
     parser.add_argument("--no-ids", dest="ids", action="store_false", help="do not believe ids")
     parser.add_argument("--folder", type=Path, help="where recordings and runs are kept")
     given = parser.parse_args()

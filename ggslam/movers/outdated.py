@@ -46,7 +46,7 @@ class OutdatedParts:
     Attributes:
         gone: what was there was looked through...
         around: ...the same with its outlines, where nobody surely looks through...
-        hidden: ...and where something stands now in front of what was there.
+        hidden: ...and where something stands now in front of what was there, with its outlines.
     """
 
     gone: np.ndarray
@@ -134,7 +134,8 @@ class EarlierView:
         self.hidden |= hidden
         if not new_gone:
             full = np.zeros(shape, bool)
-        return OutdatedParts(full, grow(_grow_by_a_place(full, factor), GROWN), _enlarge(hidden, factor, shape))
+        around, before = (_with_outlines(mask, factor) for mask in (full, _enlarge(hidden, factor, shape)))
+        return OutdatedParts(full, around, before)
 
 
 def coarse_factor(camera: Camera) -> int:
@@ -180,9 +181,9 @@ def _segments_gone(gone: np.ndarray, judged: np.ndarray, small: np.ndarray, know
     return ids[ids > 0]
 
 
-def _grow_by_a_place(mask: np.ndarray, factor: int) -> np.ndarray:
-    """A mask bool [H, W] larger by a place all around."""
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * factor + 1, 2 * factor + 1), np.uint8)) > 0
+def _with_outlines(mask: np.ndarray, factor: int) -> np.ndarray:
+    """A mask bool [H, W] larger by a place and a little more all around: evidence comes of whole 3x3 places alone."""
+    return grow(cv2.dilate(mask.astype(np.uint8), np.ones((2 * factor + 1, 2 * factor + 1), np.uint8)) > 0, GROWN)
 
 
 def _enlarge(places: np.ndarray, factor: int, shape: tuple[int, int]) -> np.ndarray:
