@@ -14,8 +14,8 @@ from ggslam.rendering.types import RenderBuffers
 
 
 class ExtraLoss(Protocol):
-    """Called in every mapping iteration with what was rendered. Features are rendered for it only if it has a true
-    attribute `uses_features`."""
+    """Called in every mapping iteration with what was rendered: while there is one, all pixels of a keyframe. Features
+    are rendered for it only if it has a true attribute `uses_features`."""
 
     def __call__(self, view: RenderBuffers, keyframe: Keyframe, /) -> torch.Tensor:
         """The loss.

@@ -115,6 +115,7 @@ class CpuRasterizer:
         median_depth: bool = False,
         active_sh_degree: int | None = None,
         as_3dgs: bool = False,
+        low_pass: float | None = None,
     ) -> RenderBuffers:
         """Renders.
 
@@ -127,6 +128,7 @@ class CpuRasterizer:
             active_sh_degree: highest spherical-harmonic degree to evaluate; None: all.
             as_3dgs: draw as 3D Gaussian Splatting does: with its low-pass filter, alpha at most 0.99, and without the
                 Gaussian that would take a pixel's transmittance below 1e-4. No features, no median depth, no backward.
+            low_pass: this once another one than the rasterizer's.
 
         Returns:
             Images that belong to the rasterizer and are overwritten by its next call of `forward`.
@@ -139,7 +141,8 @@ class CpuRasterizer:
         self.rendering += 1
         parameters = checked_parameters(gaussians, _CPU)
         arrays = gaussian_arrays(parameters, features, active_sh_degree)
-        view = posed_view(camera, T_camera_world, self.near_plane, LOW_PASS_3DGS if as_3dgs else self.low_pass)
+        low_pass = self.low_pass if low_pass is None else low_pass
+        view = posed_view(camera, T_camera_world, self.near_plane, LOW_PASS_3DGS if as_3dgs else low_pass)
         channels = arrays.feature_channels if arrays.render_features else 0
         if as_3dgs and (channels or median_depth):
             raise RenderError("as_3dgs: neither features nor median depth can be rendered by the rules of 3DGS")

@@ -25,8 +25,8 @@ COLUMNS = (
 )  # fmt: skip
 """frame: its index; end_s: when its step ended, seconds after the first one began; step_ms: how long the step took;
 *_ms: milliseconds spent in each part since the step before (in a real-time run also by the mapper's thread; loops are
-part of tracking or of the rest); iterations: optimisation steps since then; keyframe: 0 or 1; gaussians of the map;
-resident_mb: resident memory of the process, 10^6 bytes; loss_*: means over those iterations, see `LossSums`; NaN if
+part of tracking or of the rest); iterations: of the mapper since then; keyframe: 0 or 1; gaussians of the map;
+resident_mb: resident memory of the process, 10^6 bytes; loss_*: means over their steps, see `LossSums`; NaN if
 there were none."""
 
 
@@ -36,7 +36,7 @@ class StepLog:
     def __init__(self) -> None:
         self._rows = array("d")
         self._times, self._losses = np.zeros(2 + len(_PARTS)), np.zeros(len(_LOSSES))
-        self._iterations = 0
+        self._iterations = self._steps = 0
 
     def __len__(self) -> int:
         return len(self._rows) // len(COLUMNS)
@@ -58,13 +58,15 @@ class StepLog:
         """
         spent = _spent(times, loops_s, mapper.times)
         sums, iterations = np.array(astuple(mapper.losses)), mapper.times.iterations
-        count = iterations - self._iterations
-        losses = (sums - self._losses) / count if count > 0 else np.full(len(sums), np.nan)
+        count, steps = iterations - self._iterations, mapper.times.steps
+        made = steps - self._steps
+        losses = (sums - self._losses) / made if made > 0 else np.full(len(sums), np.nan)
         self._rows.extend((frame.frame_index, times.wall, 1e3 * seconds))
         self._rows.extend((1e3 * (spent - self._times)).tolist())
         self._rows.extend((count, is_keyframe, gaussians, resident_bytes() / 1e6))
         self._rows.extend(losses.tolist())
         self._times, self._losses, self._iterations = spent, sums, iterations
+        self._steps = steps
         return StepReport(frame, is_keyframe, gaussians, mapper.last_psnr, seconds, float(losses[0]))
 
     def table(self) -> np.ndarray:

@@ -50,6 +50,14 @@ def test_a_run_ends_with_some_more_steps(frames: list[Frame], asked: int, steps:
     assert told[-1:] == ([(steps, steps)] if steps else [])
 
 
+def test_with_noisy_depth_steps_are_on_every_second_pixel(frames: list[Frame]) -> None:
+    for setting, steps in (("mapping.sparse_noise=0.2", 2), ("mapping.sparse_noise=1000", 1)):
+        slam = new_slam(frames, setting, "identity.enabled=false")
+        for frame in frames[:3]:
+            slam.step(frame)
+        assert slam.mapper.times.steps == steps * slam.mapper.times.iterations == steps * 12
+
+
 def test_a_frame_without_depth_is_lost_and_the_next_one_is_found(frames: list[Frame]) -> None:
     slam = new_slam(frames)
     for i, frame in enumerate(frames):

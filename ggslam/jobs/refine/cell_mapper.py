@@ -12,6 +12,7 @@ import torch
 from ggslam.mapping.cpu.losses import CpuLossResult
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.pixel_grid import WHOLE, PixelGrid
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.exposure import identity_exposure
@@ -182,7 +183,7 @@ class CellMapper(StillMapper):
             getattr(self.map, name)[self._own :] = values
         self._box.clamp(self.map.means[: self._own])
 
-    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> CpuLossResult:
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> CpuLossResult:
         shown = torch.from_numpy(self._views[keyframe.index].shown)
         gain, offset = torch.from_numpy(keyframe.exposure.astype(np.float32)).T[:, :, None, None]
         measured = torch.from_numpy(keyframe.color).permute(2, 0, 1) / 255.0

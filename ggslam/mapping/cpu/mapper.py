@@ -18,6 +18,7 @@ from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, m
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
+from ggslam.mapping.pixel_grid import WHOLE, PixelGrid
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
@@ -151,13 +152,17 @@ class CpuMapper(Mapper):
         ids, share = ids.reshape(grid.shape), share.reshape(grid.shape) * (alpha[::stride, ::stride] > 0.5)
         return MapLabels.from_grid(ids, share, depth, stride)
 
-    def _render(self, keyframe: Keyframe, features: bool) -> RenderBuffers:
-        return self._rasterizer.forward(self.map, keyframe.camera, keyframe.T_camera_world, features=features)
+    def _render(self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE) -> RenderBuffers:
+        camera, pose = grid.camera(keyframe.camera), keyframe.T_camera_world
+        low_pass = grid.low_pass(self._rasterizer.low_pass)
+        return self._rasterizer.forward(self.map, camera, pose, features=features, low_pass=low_pass)
 
-    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> CpuLossResult:
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> CpuLossResult:
         exposure = keyframe.exposure if self._is_exposed(keyframe) else None
         valid = self.valid_of(keyframe)
-        target = LossTarget(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE, exposure, valid)
+        color, depth = grid.of(keyframe.color), grid.of(keyframe.depth)
+        shown = None if valid is None else grid.of(valid)
+        target = LossTarget(color, depth, 1 / DEPTH_UNITS_PER_METRE, exposure, shown)
         return self._loss.evaluate(view, target, self.settings.loss)
 
     def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:

@@ -27,6 +27,7 @@ from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, make_keyfra
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
+from ggslam.mapping.pixel_grid import WHOLE, PixelGrid
 from ggslam.mapping.settings import MapperSettings
 from ggslam.mapping.votes import vote_labels
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
@@ -168,12 +169,15 @@ class CudaMapper(Mapper):
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 
-    def _render(self, keyframe: Keyframe, features: bool) -> RenderBuffers:
+    def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
+        return WHOLE
+
+    def _render(self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE) -> RenderBuffers:
         return self._rasterizer.forward(
             self.map, keyframe.camera, self._states.pose(keyframe.index), features=features
         )
 
-    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers) -> CudaLossResult:
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> CudaLossResult:
         assert isinstance(keyframe, CudaKeyframe)
         images, s = keyframe.device_images, self.settings
         exposure = self._states.exposure(keyframe.index) if s.exposure.enabled else None

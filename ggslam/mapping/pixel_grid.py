@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every n-th pixel of every n-th row of an image, as an image of its own.
+
+The map rendered by the grid's camera with the grid's low-pass filter has at each pixel what the whole image has there,
+to rounding: nothing is averaged. The loss is the whole image's at fewer pixels, but for SSIM, whose windows reach n
+times as far. Neighbouring pixels tell much the same where images are noisy, so that steps on fewer pixels of more views
+teach more in the same time; see `MapperSettings.sparse_noise`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.scene.camera import Camera
+
+LEAST_SIZE = 32
+"""Pixels that a grid has along each side at least; of smaller images all pixels are used."""
+_ORDER = ((0, 0), (1, 1), (0, 1), (1, 0))
+
+
+@dataclass(frozen=True)
+class PixelGrid:
+    """Which pixels.
+
+    Attributes:
+        stride: every so manyth of each row and column.
+        row, column: the first of them, below `stride`.
+    """
+
+    stride: int = 1
+    row: int = 0
+    column: int = 0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it has all pixels."""
+        return self.stride == 1
+
+    def of(self, image: np.ndarray) -> np.ndarray:
+        """The grid's pixels [h, w, ...] of an image [H, W, ...], contiguous."""
+        if self.is_whole:
+            return image
+        return np.ascontiguousarray(image[self.row :: self.stride, self.column :: self.stride])
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera whose whole image has the grid's pixels of `camera`'s, through the same rays."""
+        n = self.stride
+        return Camera(
+            -(-(camera.width - self.column) // n), -(-(camera.height - self.row) // n), camera.fx / n, camera.fy / n,
+            (camera.cx - self.column) / n, (camera.cy - self.row) / n,
+        )  # fmt: skip
+
+    def low_pass(self, low_pass: float) -> float:
+        """The filter of the whole image (pixels^2) in pixels of the grid."""
+        return low_pass / self.stride**2
+
+
+WHOLE = PixelGrid()
+
+
+def grid_of_turn(turn: int, camera: Camera) -> PixelGrid:
+    """The grid of a view's next step, of which `turn` counts those before: every second pixel. In four turns each
+    pixel comes once."""
+    if min(camera.width, camera.height) < 2 * LEAST_SIZE:
+        return WHOLE
+    return PixelGrid(2, *_ORDER[turn % 4])
