@@ -49,7 +49,7 @@ def drop_moved(gaussians: GaussianMap, parts: Sequence[tuple[Keyframe, np.ndarra
 def drop_before(
     gaussians: GaussianMap, births: np.ndarray, parts: Sequence[tuple[Keyframe, np.ndarray, np.ndarray]]
 ) -> int:
-    """Takes out what keyframes saw that is gone, but not what lies behind it.
+    """Takes out what keyframes saw that is gone, but not what lies before or behind it.
 
     Args:
         gaussians: the map.
@@ -63,16 +63,25 @@ def drop_before(
     means, goes = gaussians.means.detach().cpu().numpy()[rows], np.zeros(len(rows), bool)
     for keyframe, gone, around in parts:
         reach = 1 + 2 * max(1, round(OUTLINE * keyframe.camera.width / 320))
-        # Of the thing; about it images show what is farther.
-        last = cv2.dilate(np.where(gone, keyframe.depth_m(), np.float32(0)), np.ones((reach, reach), np.uint8))
+        window, depth = np.ones((reach, reach), np.uint8), keyframe.depth_m()
+        known = gone & (depth > 0)
+        # Of the thing; about it images show what is farther, or nearer and hides a part of it.
+        first = cv2.erode(np.where(known, depth, np.float32(np.inf)), window)
+        last = cv2.dilate(np.where(known, depth, np.float32(0)), window)
         seen = transform_points(means, keyframe.T_camera_world)
         row, column, inside = keyframe.camera.project(seen)
-        farthest = last[row, column] + np.maximum(THICK_M, THICK_RELATIVE * last[row, column])
-        goes |= inside & around[row, column] & (seen[:, 2] < farthest)
+        near, far = first[row, column], last[row, column]
+        within = (seen[:, 2] > near - _thickness(far)) & (seen[:, 2] < far + _thickness(far))
+        goes |= inside & around[row, column] & within
     stays = np.ones(len(gaussians), bool)
     stays[rows] = ~goes
     gaussians.keep(torch.from_numpy(stays))
     return int(goes.sum())
+
+
+def _thickness(depth: np.ndarray) -> np.ndarray:
+    """How far the surface of a thing may reach before and behind its measured depth, metres."""
+    return np.maximum(THICK_M, THICK_RELATIVE * depth)
 
 
 def blank_part(keyframe: Keyframe, part: np.ndarray) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, ELSEWHERE, Keyframe
 from ggslam.movers.evidence import CoarseView
 from ggslam.movers.outdated import (
     EarlierView,
@@ -127,7 +127,8 @@ class EarlierViews:
             rows = np.linspace(0, keyframe.depth.shape[0] - 1, SAMPLES).astype(int)
             columns = np.linspace(0, keyframe.depth.shape[1] - 1, SAMPLES).astype(int)
             grid = np.ix_(rows, columns)
-            points = keyframe.camera.back_project(keyframe.depth_m())[grid].reshape(-1, 3).astype(float)
+            depth = keyframe.depth[grid].astype(np.float32) / DEPTH_UNITS_PER_METRE
+            points = (keyframe.camera.rays()[grid] * depth[..., None]).reshape(-1, 3).astype(float)
             points = points[points[:, 2] > 0]
             seen = newest.camera.project(transform_points(points, T_newest_world @ keyframe.T_world_camera))[2]
             if seen.any():

@@ -29,7 +29,7 @@ from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.cpu.neighbours import NeighbourIndex
 from ggslam.mapping.identity import IdentityTimes
-from ggslam.mapping.keyframe import Keyframe, PoseAdam
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, PoseAdam
 from ggslam.mapping.mapper import LossSums, MapperTimes
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.sampling import KeyframeSampler
@@ -120,9 +120,11 @@ def check_state(slam: Slam) -> None:
     """Raises FormatError if parts of a state do not fit together, which compiled code would not survive."""
     mapper, surface = slam.mapper, slam.surface
     for number, keyframe in enumerate(mapper.keyframes):
-        if not 0 <= keyframe.camera_number < len(slam.cameras):
-            raise FormatError(f"keyframe {number}: not of this recording")
-        camera = slam.cameras[keyframe.camera_number]
+        camera = keyframe.camera  # of another recording, which may have had more
+        if keyframe.frame_index != ELSEWHERE:
+            if not 0 <= keyframe.camera_number < len(slam.cameras):
+                raise FormatError(f"keyframe {number}: not of this recording")
+            camera = slam.cameras[keyframe.camera_number]
         shape = (camera.height, camera.width)
         images = (keyframe.color, keyframe.depth)
         empty = all(image.size == 0 for image in images)
@@ -175,14 +177,19 @@ def _save_pool(pool: PixelPool[np.ndarray]) -> dict[str, Any]:
     return {"pixels": pool.pixels[pool.used :], "vote_weights": pool.vote_weights[pool.used :], "used": 0}
 
 
+_INDEX_COUNTERS = ("_growth", "_order", "_size", "_stride", "built")
+
+
 def _save_index(index: NeighbourIndex) -> dict[str, Any]:
     """The tree as its points, which float32 holds."""
     points = None if index._tree is None else np.asarray(index._tree.data).astype(np.float32)
-    return {"growth": index._growth, "order": index._order, "built": index.built, "points": points}
+    counters = {name: getattr(index, name) for name in _INDEX_COUNTERS}
+    return {**counters, "points": points}
 
 
 def _take_index(index: NeighbourIndex, saved: dict[str, Any]) -> None:
-    index._growth, index._order, index.built = saved["growth"], saved["order"], saved["built"]
+    for name in _INDEX_COUNTERS:
+        setattr(index, name, saved[name])
     index._tree = None if saved["points"] is None else index.tree_of(saved["points"])
 
 

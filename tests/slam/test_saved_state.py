@@ -11,14 +11,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from ggslam.errors import ConfigError, FormatError
 from ggslam.loops.activity import ActivitySettings
+from ggslam.mapping.cpu.neighbours import NeighbourIndex
+from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import Config, load_config
 from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.result import SlamResult
-from ggslam.slam.saved_state import describe_state, reason_against_saving, restore_state
+from ggslam.slam.saved_state import (
+    _save_index,
+    _take_index,
+    check_state,
+    describe_state,
+    reason_against_saving,
+    restore_state,
+)
 from ggslam.slam.slam import Slam
 
 FEW = ["mapping.iterations_per_frame=1", "mapping.first_frame_iterations=4", "identity.final_passes=1"]
@@ -70,6 +81,42 @@ def test_another_run_goes_on_bit_for_bit(room: Path, kind: str) -> None:
         elif frame.index > 7:
             slams[1].step(frame)
     assert_same(*(slam.finish() for slam in slams))
+
+
+def test_the_tree_of_neighbours_is_built_anew_when_it_would_have_been() -> None:
+    gaussians, random = GaussianMap(), np.random.default_rng(0)
+
+    def grow(count: int) -> None:
+        means = torch.from_numpy(random.random((count, 3), np.float32))
+        turned, ones = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.ones(count, 3)
+        gaussians.insert(means, turned, -ones, ones[:, 0].clone(), ones / 2, birth_keyframe=0)
+
+    grow(100)
+    indices = NeighbourIndex(0.5), NeighbourIndex(0.5)
+    rows = np.arange(20)
+    indices[0].neighbours(gaussians, rows, 3)
+    _take_index(indices[1], _save_index(indices[0]))
+    for size, built in ((140, 1), (160, 2)):
+        grow(size - len(gaussians))
+        one, other = (index.neighbours(gaussians, rows, 3) for index in indices)
+        assert np.array_equal(one, other) and [index.built for index in indices] == [built, built]
+
+
+@pytest.mark.parametrize(("camera_number", "elsewhere"), [(0, False), (2, True), (2, False)])
+def test_keyframes_of_an_earlier_map_may_be_of_a_rig(room: Path, camera_number: int, elsewhere: bool) -> None:
+    """One whose camera this recording does not have."""
+    sequence = open_sequence(room, stop=3, scale=0.5)
+    slam = Slam(sequence.camera, load_config(None, [*FEW, "identity.enabled=false"]), False)
+    for frame in sequence.stream(masks=False):
+        slam.step(frame)
+    slam.mapper.keyframes[0].camera_number = camera_number
+    if elsewhere:
+        slam.mapper.keyframes[0].frame_index = ELSEWHERE
+    if camera_number and not elsewhere:
+        with pytest.raises(FormatError, match="keyframe 0: not of this recording"):
+            check_state(slam)
+    else:
+        check_state(slam)
 
 
 @pytest.mark.long("three runs with a loop closed and a camera lost")
