@@ -26,6 +26,7 @@ import numpy as np
 import torch
 
 from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.mapping.pixel_grid import PixelGrid
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.votes import vote_labels, vote_shares
 from ggslam.rendering.types import RenderBuffers
@@ -79,6 +80,19 @@ class MaskedKeyframe(Protocol):
 
     @property
     def mask(self) -> np.ndarray | None: ...
+
+
+@dataclass(frozen=True)
+class MaskOnGrid:
+    """A keyframe's mask at the pixels of a grid, uint16 [h, w]; see `MaskedKeyframe`."""
+
+    index: int
+    mask: np.ndarray | None
+
+    @staticmethod
+    def of(keyframe: MaskedKeyframe, grid: PixelGrid) -> MaskOnGrid:
+        """That of a keyframe."""
+        return MaskOnGrid(keyframe.index, None if keyframe.mask is None else grid.of(keyframe.mask))
 
 
 @dataclass
@@ -202,7 +216,8 @@ class IdentityLearner(ABC):
     def step(
         self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, view: RenderBuffers, rate_factor: float = 1.0
     ) -> torch.Tensor | None:
-        """One step on the view that `rasterizer` rendered last, which must be that of `keyframe`. On a GPU it is only
+        """One step on the view that `rasterizer` rendered last, which must be that of `keyframe` (or of its
+        `MaskOnGrid`). On a GPU it is only
         started, and `times.steps` counts the seconds that takes.
 
         Args:
@@ -229,7 +244,10 @@ class IdentityLearner(ABC):
             self._pools.pop(number, None)
 
     def _draw(self, keyframe: Any) -> tuple[Any, Any]:
-        """The next pixels of a keyframe, int32 [P], and the weight each has as a vote."""
+        """The next pixels of a keyframe, int32 [P], and the weight each has as a vote. On a grid none are drawn ahead:
+        the next step has another one."""
+        if isinstance(keyframe, MaskOnGrid):
+            return self._new_pool(keyframe, self.settings.pixels).take(self.settings.pixels)
         pool = self._pools.get(keyframe.index)
         if pool is None or not pool.has(self.settings.pixels):
             pool = self._new_pool(keyframe, POOL_STEPS * self.settings.pixels)

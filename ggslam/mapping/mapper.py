@@ -16,7 +16,7 @@ import torch
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.extra_loss import ExtraLoss, add_extra_loss, uses_features
-from ggslam.mapping.identity import IdentityLearner
+from ggslam.mapping.identity import IdentityLearner, MaskOnGrid
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
 from ggslam.mapping.losses import LossGradients
@@ -241,12 +241,12 @@ class Mapper(ABC):
             self._iterate_over(numbers)
 
     def _iterate_over(self, numbers: Sequence[int], rate_factor: float = 1.0) -> None:
-        """One iteration on some keyframes: a step on all pixels of one, as always when identities are trained, too; or
-        STEPS on every second pixel of as many."""
+        """One iteration on some keyframes: a step on all pixels of one, or STEPS on every second pixel of as many. It
+        is the same whether identities are trained, too, or not."""
         for step in range(STEPS):
             keyframe = self._draw(numbers)
             learns = step == 0 and self._is_identity_due(keyframe)
-            grid = WHOLE if learns else self._choose_grid(keyframe)
+            grid = self._choose_grid(keyframe)
             self._step(keyframe, rate_factor, grid, learns)
             if grid.is_whole:
                 break
@@ -254,7 +254,8 @@ class Mapper(ABC):
 
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
         """Which of a keyframe's pixels the next step looks at."""
-        if self.depth_noise_px < self.settings.sparse_noise or self.extra_loss is not None:
+        dense = self.identity is not None and self.identity.settings.schedule == "dense"
+        if self.depth_noise_px < self.settings.sparse_noise or self.extra_loss is not None or dense:
             return WHOLE
         return grid_of_turn(keyframe.iterations + keyframe.index, keyframe.camera)
 
@@ -318,7 +319,8 @@ class Mapper(ABC):
         times.loss += watch.lap()
         grad_features = None
         if learns and identity is not None:
-            grad_features = identity.step(self.map, self._rasterizer, keyframe, view)
+            masked = keyframe if grid.is_whole else MaskOnGrid.of(keyframe, grid)
+            grad_features = identity.step(self.map, self._rasterizer, masked, view)
         times.identity += watch.lap()
         if self.extra_loss is not None:
             grad_features = add_extra_loss(self.extra_loss, view, keyframe, loss, grad_features)

@@ -3,15 +3,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.mapper import CpuMapper
+from ggslam.mapping.identity import MaskOnGrid
 from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.labelling import KeyframeLabels
-from ggslam.mapping.pixel_grid import grid_of_turn
+from ggslam.mapping.pixel_grid import PixelGrid, grid_of_turn
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
@@ -93,9 +97,13 @@ def test_with_noisy_depth_an_iteration_is_two_steps_on_half_the_rows_and_columns
     assert steps_of(make_mapper(camera=small), 2) == 4 * [(50, 60)]
 
 
-def test_a_loss_of_ones_own_sees_all_pixels() -> None:
+def test_a_loss_of_ones_own_and_a_dense_identity_image_see_all_pixels() -> None:
     mapper = make_mapper()
     mapper.extra_loss = lambda view, keyframe: torch.zeros(())
+    assert set(steps_of(mapper, 1)) == {(70, 97)}
+    mapper = make_mapper(halves())
+    assert mapper.identity is not None
+    mapper.identity.settings = dataclasses.replace(mapper.identity.settings, schedule="dense")
     assert set(steps_of(mapper, 1)) == {(70, 97)}
 
 
@@ -113,8 +121,19 @@ def test_pixels_without_an_image_teach_nothing_on_a_grid(known: bool) -> None:
     assert (mapper.map.rgb[within].mean() < before + 0.01) == known
 
 
-def test_identities_are_trained_on_all_pixels() -> None:
+def test_votes_on_grids_are_those_of_their_pixels() -> None:
     mapper = make_mapper(halves())
-    assert mapper.identity is not None and mapper.identity.settings.every == 5
-    sizes = steps_of(mapper, 10)
-    assert sizes.count((70, 97)) == 4 == mapper.identity.times.count and len(sizes) == 4 + 2 * 16
+    mapper.run(60)
+    ids = mapper.vote_labels()
+    columns = (mapper.map.means[:, 0] / mapper.map.means[:, 2] * CAMERA.fx + CAMERA.cx).numpy()
+    far = np.abs(columns - 39.5) > 3
+    assert (np.where(columns < 39.5, 5, 9) == ids)[far].all() and set(ids) == {5, 9}
+    assert mapper.identity is not None and mapper.identity.times.count == 12
+    assert not mapper.identity._pools  # the next step has another grid: none are drawn ahead
+
+
+def test_a_mask_on_a_grid() -> None:
+    keyframe: Keyframe = make_mapper(halves()).keyframes[0]
+    masked = MaskOnGrid.of(keyframe, PixelGrid(2, 1, 0))
+    assert masked.index == 0 and masked.mask is not None and np.array_equal(masked.mask, halves()[1::2, ::2])
+    assert MaskOnGrid.of(make_mapper().keyframes[0], PixelGrid(2, 1, 0)).mask is None

@@ -121,14 +121,14 @@ def test_iterations_without_room_are_made_again(
     done = mapper.times.iterations
     mapper.run(1)
     assert mapper.times.iterations == done + 3
-    iterate = mapper.iterate
+    count = mapper._count_iteration
 
-    def without_room(*arguments: Any) -> None:
-        iterate(*arguments)
+    def without_room() -> None:
+        count()
         if mapper.times.iterations == done + 4:
             overflows.add_(1)
 
-    monkeypatch.setattr(mapper, "iterate", without_room)
+    monkeypatch.setattr(mapper, "_count_iteration", without_room)
     mapper.refine(3)
     assert mapper.times.iterations == done + 7
 
