@@ -190,7 +190,7 @@ class MapperSettings:
     sparse_noise: float = setting(0.2, 0, 1e6, "px")
     """Where the noise of depth is as wide as this in the image, an iteration is two steps on two keyframes, each on
     every second pixel of every second row, other ones each time, instead of one step on all pixels of one: there that
-    is worth nearly twice the iterations for a tenth more time. With exact depth it is not. 0: always; on the CPU."""
+    is worth nearly twice the iterations for a seventh more time. With exact depth it is not. 0: always; on the CPU."""
     first_frame_iterations: int = setting(10, 0, 10**5)
     """Steps on the first keyframe before the second frame is read."""
     refine_decay: float = setting(0.1, 1e-6, 1)
