@@ -254,10 +254,15 @@ class Mapper(ABC):
 
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
         """Which of a keyframe's pixels the next step looks at."""
-        dense = self.identity is not None and self.identity.settings.schedule == "dense"
-        if self.depth_noise_px < self.settings.sparse_noise or self.extra_loss is not None or dense:
+        noisy = self.depth_noise_px >= self.settings.sparse_noise
+        if not noisy or self.extra_loss is not None or self._is_identity_dense:
             return WHOLE
         return grid_of_turn(keyframe.iterations + keyframe.index, keyframe.camera)
+
+    @property
+    def _is_identity_dense(self) -> bool:
+        """Whether identities are trained on whole rendered images of them."""
+        return self.identity is not None and self.identity.settings.schedule == "dense"
 
     def _is_identity_due(self, keyframe: Keyframe) -> bool:
         return self.identity is not None and self.identity.due(keyframe)
@@ -312,8 +317,8 @@ class Mapper(ABC):
             learns: whether identities are trained, too.
         """
         times, watch, identity = self.times, _Stopwatch(), self.identity
-        dense = learns and identity is not None and identity.settings.schedule == "dense"
-        view = self._render(keyframe, dense or uses_features(self.extra_loss), grid)
+        features = learns and self._is_identity_dense
+        view = self._render(keyframe, features or uses_features(self.extra_loss), grid)
         times.forward += watch.lap()
         loss = self._evaluate_loss(keyframe, view, grid)
         times.loss += watch.lap()

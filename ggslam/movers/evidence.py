@@ -87,6 +87,11 @@ class CoarseView:
     whole: np.ndarray
     smooth: np.ndarray
 
+    def fits(self, *more: np.ndarray) -> bool:
+        """Whether its images, and some more about its places, are of its camera's size."""
+        images = (self.depth, self.near, self.far, self.whole, self.smooth, *more)
+        return all(image.shape == (self.camera.height, self.camera.width) for image in images)
+
     @staticmethod
     def of(
         depth: np.ndarray, camera: Camera, factor: int, T_world_camera: np.ndarray, margin: Margin,

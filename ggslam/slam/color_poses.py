@@ -162,7 +162,7 @@ class ColorPoses:
             return True
         noise, camera = self.state.noise, self.state.camera
         least = self.mapper.settings.view_alignment.last_noise
-        return noise is not None and depth > 0 and noise.sigma(depth) * camera.fx / depth >= least
+        return noise is not None and depth > 0 and noise.in_pixels(depth, camera.fx) >= least
 
     def _align_frame(self, number: int, depth: float, grey: np.ndarray, hidden: np.ndarray | None) -> TrackedFrame:
         """A frame with its pose as of the finished map."""

@@ -102,12 +102,7 @@ class EarlierViews:
 
     def check(self) -> bool:
         """Whether all arrays have the shapes of their views."""
-        return all(
-            array.shape == (v.view.camera.height, v.view.camera.width)
-            for v in self.views.values()
-            for array in (v.view.depth, v.view.near, v.view.far, v.view.whole, v.view.smooth, v.through, v.same,
-                          v.before, v.gone, v.hidden)
-        )  # fmt: skip
+        return all(v.view.fits(v.through, v.same, v.before, v.gone, v.hidden) for v in self.views.values())
 
     def _find_outdated(self, keyframe: Keyframe) -> OutdatedParts | None:
         return self.views[keyframe.index].find_outdated(keyframe.mask, keyframe.depth.shape)

@@ -132,10 +132,8 @@ def check_state(slam: Slam) -> None:
         typed = keyframe.color.dtype == np.uint8 and keyframe.depth.dtype == np.uint16
         if not (good and typed and keyframe.index == number and keyframe.T_camera_world.shape == (4, 4)):
             raise FormatError(f"keyframe {number}: not of this recording")
-    for view in slam.movers.detector.views:
-        arrays = (view.depth, view.near, view.far, view.whole, view.smooth)
-        if any(array.shape != (view.camera.height, view.camera.width) for array in arrays):
-            raise FormatError("views of what may move: not of their camera")
+    if not all(view.fits() for view in slam.movers.detector.views):
+        raise FormatError("views of what may move: not of their camera")
     if not slam.earlier_views.check():
         raise FormatError("views of the map that the run began with: not of their cameras")
     slam.color_poses.check()

@@ -304,7 +304,7 @@ class Slam:
         if self._noise is not None or not self.mapper.keyframes:  # a map made before keeps what it was trained with
             self.mapper.depth_sigma = noise.sigma(median_depth)
         if median_depth > 0:
-            self.mapper.depth_noise_px = noise.sigma(median_depth) * self.camera.fx / median_depth
+            self.mapper.depth_noise_px = noise.in_pixels(median_depth, self.camera.fx)
         self._noise = noise
 
     def use_scale(self, scale: float) -> None:

@@ -31,6 +31,10 @@ class DepthNoise:
         """Standard deviation in metres at depth `z`."""
         return self.constant + self.square * z * z
 
+    def in_pixels(self, z: float, focal_length: float) -> float:
+        """As wide as `sigma(z)` is in the image at depth `z` > 0, pixels as `focal_length` is."""
+        return self.sigma(z) * focal_length / z
+
 
 @settings_class(frozen=True)
 class PointSettings:

@@ -52,6 +52,12 @@ inline float gap_at(const SegmentedSurface& s, std::int64_t pixel) {
   return s.gap_m + s.gap_sigmas * (s.sigma * (s.depth[pixel] * s.depth[pixel]));
 }
 
+// Metres that a surface may fall off from pixel to pixel, steep as it may be.
+inline float steepest_step(float gap, float depth) {
+  constexpr float kSteepest = 0.02f;  // share of the depth
+  return 4 * gap + kSteepest * depth;
+}
+
 inline void check_size(int height, int width) {
   check_range("height", height, 1, kMostPixelsAlong);
   check_range("width", width, 1, kMostPixelsAlong);

@@ -8,7 +8,6 @@
 namespace ggslam {
 namespace {
 
-constexpr float kSteepest = 0.02f;  // share of the depth that a surface may fall off from pixel to pixel
 constexpr float kSameDepth = 0.05f;  // share of the depth across which an edge is looked at
 
 // How far, in metres, a pixel is from the straight line through its neighbours, inverse depth being straight on planes.
@@ -24,7 +23,7 @@ bool is_closed(const SegmentedSurface& s, const LinkAxis& axis, std::int64_t pix
   if (!s.valid[pixel] || !s.valid[next]) return false;
   const float step = std::fabs(s.depth[next] - s.depth[pixel]), gap = gap_at(s, pixel);
   if (step < gap) return true;
-  if (!(step < 4 * gap + kSteepest * s.depth[pixel])) return false;
+  if (!(step < steepest_step(gap, s.depth[pixel]))) return false;
   return std::min(miss_at(s, axis, pixel, place), miss_at(s, axis, next, place + 1)) < gap;
 }
 

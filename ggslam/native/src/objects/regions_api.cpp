@@ -11,7 +11,6 @@
 namespace ggslam {
 namespace {
 
-constexpr float kSteepest = 0.02f;  // share of the depth that a surface may fall off from pixel to pixel
 constexpr int kNone = -1;
 
 // Counts by pairs of numbers, found again in ascending order.
@@ -23,18 +22,18 @@ class PairCounts {
   // Row of a pair; links of one pair come one after the other.
   std::size_t row_of(std::int32_t first, std::int32_t second) {
     const std::uint64_t code = static_cast<std::uint64_t>(first) << 32 | static_cast<std::uint32_t>(second);
-    if (rows_ && code == last_code_) return last_row_;
-    const auto [place, is_new] = row_of_code_.try_emplace(code, rows_);
-    if (is_new) codes_.push_back(code), counts.push_back({}), ++rows_;
+    if (size() && code == last_code_) return last_row_;
+    const auto [place, is_new] = row_of_code_.try_emplace(code, size());
+    if (is_new) codes_.push_back(code), counts.push_back({});
     last_code_ = code, last_row_ = place->second;
     return last_row_;
   }
 
-  std::size_t size() const { return rows_; }
+  std::size_t size() const { return codes_.size(); }
 
   // Rows in ascending order of their pairs.
   std::vector<std::size_t> order() const {
-    std::vector<std::size_t> rows(rows_);
+    std::vector<std::size_t> rows(size());
     std::iota(rows.begin(), rows.end(), std::size_t{0});
     std::sort(rows.begin(), rows.end(), [&](std::size_t a, std::size_t b) { return codes_[a] < codes_[b]; });
     return rows;
@@ -50,7 +49,7 @@ class PairCounts {
  private:
   std::unordered_map<std::uint64_t, std::size_t> row_of_code_;
   std::vector<std::uint64_t> codes_;
-  std::size_t rows_ = 0, last_row_ = 0;
+  std::size_t last_row_ = 0;
   std::uint64_t last_code_ = 0;
 };
 
@@ -75,7 +74,7 @@ Link examine(const BordersJob& job, const LinkAxis& axis, std::int64_t a, int pl
   const float step[3] = {to[0] - from[0], to[1] - from[1], to[2] - from[2]}, gap = gap_at(s, a);
   // Closed unless neither surface, continued, meets the other.
   const bool closed = std::min(std::fabs(dot3(n, step)), std::fabs(dot3(m, step))) < gap &&
-                      std::fabs(step[2]) < 4 * gap + kSteepest * from[2];
+                      std::fabs(step[2]) < steepest_step(gap, from[2]);
   const bool judged = reaches && closed;
   const bool bent = judged && static_cast<double>(dot3(n, m)) < job.least_cosine;
   const bool concave = bent && dot_differences(n, m, row3(s.points, p), row3(s.points, q)) < 0;
@@ -202,8 +201,8 @@ void find_bodies(const BodiesJob& job) {
   }
 }
 
-// For each region the first that is asked about it, and for each of these the next.
 void measure_on_planes(const RegionsOnPlanesJob& job) {
+  // For each region the first that is asked about it, and for each of these the next.
   std::vector<std::int64_t> first(static_cast<std::size_t>(job.regions_end), kNone), next(static_cast<std::size_t>(job.count));
   std::vector<float> norms(static_cast<std::size_t>(job.count));
   for (std::int64_t k = 0; k < job.count; ++k) {
