@@ -262,6 +262,7 @@ if "GGSLAM_SANITIZER" not in os.environ:  # which takes terabytes of addresses
 import numpy as np
 from ggslam.errors import GgslamError
 from ggslam.scene.camera import Camera
+from ggslam.system.process_memory import peak_memory_bytes
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.settings import TsdfSettings
@@ -272,12 +273,12 @@ def pose_at(x):
     return T
 depth = np.full((480, 640), 3.0, np.float32)
 good = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+before = peak_memory_bytes()
 try:
 {body}
 except GgslamError as error:
     print("refused:", error)
-print("MB:", (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
+print("MB:", (peak_memory_bytes() - before) // 1_000_000)
 """
 
 

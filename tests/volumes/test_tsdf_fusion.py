@@ -330,3 +330,20 @@ def test_blocks_far_from_the_origin_and_odd_image_sizes() -> None:
         points = centres(tsdf.blocks().coordinates[tsdf.blocks().dense], SETTINGS.voxel)
         assert stats.made == len(tsdf) > 0
         assert np.abs(points[..., 2] - 5002).min() < SETTINGS.voxel
+
+
+def test_a_view_of_very_many_blocks_is_the_sum_of_its_parts() -> None:
+    """Voxels are updated in parts, of which a small view has only one."""
+    settings, depth = TsdfSettings(voxel=0.0027), render_depth(wall(1.2), CAMERA, FRONT)
+    whole, parts = TsdfMap(settings), TsdfMap(settings)
+    stats = whole.integrate(depth, CAMERA, FRONT)
+    assert stats.updated > 2**14
+    coordinates = whole.blocks().coordinates
+    edges = np.linspace(coordinates[:, 0].min(), coordinates[:, 0].max() + 1, 9).round().astype(int)
+    for first, after in zip(edges[:-1], edges[1:], strict=True):
+        within = np.array([first, -(10**5), -(10**5)]), np.array([after - 1, 10**5, 10**5])
+        assert parts.integrate(depth, CAMERA, FRONT, within=within).updated < 2**14
+    assert len(whole) == len(parts)
+    found, same = whole.read(coordinates), parts.read(coordinates)
+    np.testing.assert_array_equal(found.value, same.value)
+    np.testing.assert_array_equal(found.weight, same.weight)

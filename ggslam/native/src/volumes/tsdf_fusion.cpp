@@ -20,6 +20,8 @@ GGSLAM_DECLARE_KERNEL(unsigned tsdf_decay_block(volumes::VoxelBlock& block, floa
 namespace ggslam::volumes {
 namespace {
 
+constexpr std::size_t kAtOnce = std::size_t{1} << 14;  // blocks with voxels; about what an image at 5 mm shows
+
 using Clock = std::chrono::steady_clock;
 
 double milliseconds(Clock::time_point from, Clock::time_point to) {
@@ -125,11 +127,14 @@ uint16_t grown(uint16_t weight, float measured, float most) {
   return static_cast<uint16_t>(std::min(total, static_cast<float>(kFullWeight)));
 }
 
-// Notes free blocks, makes the blocks of surfaces, and lists the blocks whose voxels are to be updated.
-void make_blocks(Tsdf& map, const FusionSettings& settings, FusionScratch& scratch, FusionStats& stats) {
+// Notes free blocks, makes the blocks of surfaces, and lists those whose voxels are to be updated, up to kAtOnce of them.
+// Returns the first candidate that is left.
+std::size_t make_blocks(Tsdf& map, const FusionSettings& settings, FusionScratch& scratch, FusionStats& stats,
+                        std::size_t first) {
   const float scale = kFullWeight / map.max_weight, most = settings.max_free_weight * scale;
   scratch.updates.clear();
-  for (Candidate& c : scratch.candidates) {
+  for (; first < scratch.candidates.size() && scratch.updates.size() < kAtOnce; ++first) {
+    Candidate& c = scratch.candidates[first];
     const bool is_new = c.row < 0;
     if (is_new) c.row = static_cast<int32_t>(map.insert(c.at));
     Block& block = map.block(c.row);
@@ -145,6 +150,7 @@ void make_blocks(Tsdf& map, const FusionSettings& settings, FusionScratch& scrat
     VoxelBlock* voxels = map.densify(block);
     scratch.updates.push_back({c.at, voxels, c.row, is_new, !was_dense, 0u});
   }
+  return first;
 }
 
 void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context,
@@ -176,9 +182,9 @@ void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings&
 
 uint16_t least_weight(const VoxelBlock& voxels) { return *std::min_element(voxels.weight, voxels.weight + kVoxels); }
 
-// Blocks that are free throughout give their voxels back; those that got voxels for nothing are as they were before.
+// Blocks that are free throughout give their voxels back; those that got voxels for nothing are as they were before, or
+// noted as gone: rows must not change while there are candidates left.
 void finish_blocks(Tsdf& map, FusionScratch& scratch, FusionStats& stats) {
-  scratch.gone.clear();
   for (const FusionScratch::Update& update : scratch.updates) {
     Block& block = map.block(update.row);
     const bool in_vain = update.is_new ? update.flags & kNoneSeen : update.was_free && !(update.flags & kInBand);
@@ -188,6 +194,7 @@ void finish_blocks(Tsdf& map, FusionScratch& scratch, FusionStats& stats) {
       stats.made += update.is_new;
       map.collapse(block, least_weight(*update.voxels));
     } else if (in_vain && update.is_new) {
+      map.collapse(block, 0);
       scratch.gone.push_back(update.at);
     } else if (in_vain) {
       map.collapse(block, block.free_weight);
@@ -195,6 +202,19 @@ void finish_blocks(Tsdf& map, FusionScratch& scratch, FusionStats& stats) {
       block.revision = map.revision;
       stats.made += update.is_new;
     }
+  }
+}
+
+// What the candidates tell, in parts: a camera that looks far past its axis has many that turn out to hold nothing, whose
+// voxels serve those that follow.
+void fuse(Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context, FusionScratch& scratch,
+          FusionStats& stats) {
+  scratch.gone.clear();
+  for (std::size_t first = 0; first < scratch.candidates.size();) {
+    first = make_blocks(map, settings, scratch, stats, first);
+    update_blocks(map, in, settings, context, scratch);
+    finish_blocks(map, scratch, stats);
+    stats.updated += scratch.updates.size();
   }
   for (const BlockCoordinates at : scratch.gone) map.erase(map.find(at));
 }
@@ -209,11 +229,9 @@ FusionStats integrate(Tsdf& map, FusionScratch& scratch, Context& context, const
   const auto prepared = Clock::now();
   select(map, in, settings, context, scratch);
   ++map.revision, ++map.views;
-  make_blocks(map, settings, scratch, stats);
   const auto selected = Clock::now();
-  update_blocks(map, in, settings, context, scratch);
-  finish_blocks(map, scratch, stats);
-  stats.blocks = scratch.candidates.size(), stats.updated = scratch.updates.size();
+  fuse(map, in, settings, context, scratch, stats);
+  stats.blocks = scratch.candidates.size();
   stats.prepare_ms = milliseconds(start, prepared), stats.select_ms = milliseconds(prepared, selected);
   stats.update_ms = milliseconds(selected, Clock::now());
   return stats;
