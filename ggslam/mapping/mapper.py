@@ -318,7 +318,8 @@ class Mapper(ABC):
         """
         times, watch, identity = self.times, _Stopwatch(), self.identity
         features = learns and self._is_identity_dense
-        view = self._render(keyframe, features or uses_features(self.extra_loss), grid)
+        features = features or uses_features(self.extra_loss)
+        view = self._render(keyframe, features, grid, self.settings.close_below)
         times.forward += watch.lap()
         loss = self._evaluate_loss(keyframe, view, grid)
         times.loss += watch.lap()
@@ -379,8 +380,11 @@ class Mapper(ABC):
         return min(refinement.rate_sigmas * self.depth_sigma, refinement.max_rate) if refinement.enabled else 0.0
 
     @abstractmethod
-    def _render(self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE) -> RenderBuffers:
-        """The map as a keyframe sees it at a grid's pixels, with or without identities."""
+    def _render(
+        self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE, close_below: float = 0.0
+    ) -> RenderBuffers:
+        """The map as a keyframe sees it at a grid's pixels, with or without identities. `close_below` as the CPU
+        rasterizer's; others may draw pixels to their end."""
 
     @abstractmethod
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> LossGradients:

@@ -116,6 +116,7 @@ class CpuRasterizer:
         active_sh_degree: int | None = None,
         as_3dgs: bool = False,
         low_pass: float | None = None,
+        close_below: float = 0.0,
     ) -> RenderBuffers:
         """Renders.
 
@@ -129,13 +130,15 @@ class CpuRasterizer:
             as_3dgs: draw as 3D Gaussian Splatting does: with its low-pass filter, alpha at most 0.99, and without the
                 Gaussian that would take a pixel's transmittance below 1e-4. No features, no median depth, no backward.
             low_pass: this once another one than the rasterizer's.
+            close_below: let the Gaussian that takes a pixel's transmittance below this, at most 0.5, take all that is
+                left of it (alpha 0.999, as of rule 5), and none behind it; no median depth. 0: as in rule 6.
 
         Returns:
             Images that belong to the rasterizer and are overwritten by its next call of `forward`.
 
         Raises:
-            RenderError: wrong shapes, dtypes or devices; an impossible pose or degree; out of memory; features or
-                median depth with `as_3dgs`.
+            RenderError: wrong shapes, dtypes or devices; an impossible pose or degree; out of memory; features,
+                median depth or `close_below` with `as_3dgs`; median depth with `close_below`.
         """
         self._last = None
         self.rendering += 1
@@ -146,6 +149,9 @@ class CpuRasterizer:
         channels = arrays.feature_channels if arrays.render_features else 0
         if as_3dgs and (channels or median_depth):
             raise RenderError("as_3dgs: neither features nor median depth can be rendered by the rules of 3DGS")
+        if close_below and (as_3dgs or median_depth or not 0 < close_below <= 0.5):
+            raise RenderError(f"close_below: must be 0 to 0.5, without median depth or as_3dgs, found {close_below}")
+        view.close_below = close_below
         buffers = image_buffers(self._images, camera, channels, median_depth, _CPU)
         targets = structures.RenderTargets(
             **{field[0]: address(getattr(buffers, field[0])) for field in structures.RenderTargets._fields_}

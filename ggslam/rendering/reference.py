@@ -17,7 +17,8 @@ This file is the contract; the other backends are tested against it.
 5.  alpha = sigmoid(opacity_logit) * exp(-d^T cov^-1 d / 2). A contribution with alpha < 1/255 (before the next rule) is
     skipped; alpha is limited to 0.999, and there passes no gradient.
 6.  A pixel takes no further Gaussian once its transmittance T = prod (1 - alpha) is below 1e-4; the Gaussian that took
-    it there still counts. Weight of a Gaussian = alpha * T before it.
+    it there still counts. Weight of a Gaussian = alpha * T before it. With `close_below` > 0 (as in training)
+    that is the limit instead, and the Gaussian that takes T below it counts with alpha 0.999, which passes no gradient.
 7.  image, features, depth = sums of weight times colour, feature, z. alpha = 1 - T at the end = sum of weights.
     Background is black. median_depth = z of the Gaussian that takes T from at least 0.5 to below 0.5, else 0.
 """
@@ -51,6 +52,7 @@ def render_reference(
     active_sh_degree: int | None = None,
     near_plane: float = 0.05,
     low_pass: float = LOW_PASS,
+    close_below: float = 0.0,
 ) -> RenderBuffers:
     """Renders with memory N x H x W: for small scenes.
 
@@ -70,7 +72,7 @@ def render_reference(
     colour = view_colours(gaussians.sh[rows, :coefficients], means, T_camera_world)
     z = position[:, 2]
 
-    weights, before, after = _weights(mean2d, precision, opacities, camera)
+    weights, before, after = _weights(mean2d, precision, opacities, camera, close_below)
     size = (camera.height, camera.width)
     with_features = features and gaussians.features.shape[1] > 0
     crossing = (before >= 0.5) & (after < 0.5)
@@ -142,7 +144,7 @@ def _project(
 
 
 def _weights(
-    mean2d: torch.Tensor, precision: torch.Tensor, opacities: torch.Tensor, camera: Camera
+    mean2d: torch.Tensor, precision: torch.Tensor, opacities: torch.Tensor, camera: Camera, close_below: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Weights [N, H W] of Gaussians in depth order, and transmittance before and after each (rules 5 and 6)."""
     v, u = torch.meshgrid(
@@ -154,10 +156,20 @@ def _weights(
     a, b, d = precision[:, 0, 0, None], precision[:, 0, 1, None], precision[:, 1, 1, None]
     alpha = opacities[:, None] * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + d * dy * dy))
     alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp_max(MAX_ALPHA), torch.zeros_like(alpha))
-    after = torch.cumprod(1 - alpha, 0)
-    before = torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(after) else after
-    weights = alpha * before * (before.detach() >= MIN_TRANSMITTANCE)
+    after, before = _transmittance(alpha)
+    least = MIN_TRANSMITTANCE
+    if close_below > 0:
+        least = close_below
+        closes = (before.detach() >= least) & (after.detach() < least)
+        after, before = _transmittance(alpha := torch.where(closes, torch.full_like(alpha, MAX_ALPHA), alpha))
+    weights = alpha * before * (before.detach() >= least)
     return weights, before.detach(), after.detach()
+
+
+def _transmittance(alpha: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """[N, P] after and before each of the Gaussians with `alpha` [N, P]."""
+    after = torch.cumprod(1 - alpha, 0)
+    return after, torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(after) else after
 
 
 class _CutAtBlack(torch.autograd.Function):

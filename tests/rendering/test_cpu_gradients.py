@@ -74,6 +74,27 @@ def test_more_gaussians_than_one_chunk_and_saturated_pixels() -> None:
     check(scene, CpuRasterizer(2), tolerance=3e-5)
 
 
+@pytest.mark.parametrize("instruction_set", INSTRUCTION_SETS)
+@pytest.mark.parametrize(("close_below", "features"), [(1e-3, 0), (0.02, 5), (0.3, 0)])
+def test_pixels_closed_early(instruction_set: str, close_below: float, features: int) -> None:
+    scene, rasterizer = make_scene(600, features), CpuRasterizer(2, instruction_set)
+    scene.opacity_logits += 1.0
+    check(scene, rasterizer, tolerance=3e-5, close_below=close_below)
+    alpha = rasterizer.forward(scene, CAMERA, POSE, close_below=close_below).alpha
+    assert ((alpha > 0.998) | (alpha <= 1 - close_below)).all() and (alpha > 0.998).sum() > 100
+
+
+def test_closing_pixels_passes_over_most_of_what_is_hidden() -> None:
+    """What lies behind the Gaussian that closes all pixels is not touched."""
+    scene, rasterizer = make_scene(600), CpuRasterizer(1)
+    scene.opacity_logits += 1.0
+    touched = []
+    for close_below in (0.0, 0.05):
+        view = rasterizer.forward(scene, CAMERA, POSE, close_below=close_below)
+        touched.append(int(rasterizer.backward(torch.ones_like(view.image)).touched.sum()))
+    assert touched[1] < 0.8 * touched[0]
+
+
 def test_alpha_limit_passes_no_gradient() -> None:
     scene = make_scene(20)
     scene.opacity_logits[:] = 9.0

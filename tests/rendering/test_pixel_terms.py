@@ -27,12 +27,13 @@ def make_map(features: int = 16, compact: bool = False) -> GaussianMap:
     return gaussians
 
 
+@pytest.mark.parametrize("close_below", [0.0, 0.2])
 @pytest.mark.parametrize("isa", available_instruction_sets())
-def test_terms_compose_the_rendered_features_and_alpha(isa: str) -> None:
+def test_terms_compose_the_rendered_features_and_alpha(isa: str, close_below: float) -> None:
     gaussians, rasterizer = make_map(), CpuRasterizer(2, isa)
-    view = rasterizer.forward(gaussians, CAMERA, POSE)
+    view = rasterizer.forward(gaussians, CAMERA, POSE, close_below=close_below)
     features, alpha = view.features.numpy().reshape(16, -1).T.copy(), view.alpha.numpy().reshape(-1).copy()
-    rasterizer.forward(gaussians, CAMERA, POSE, features=False)
+    rasterizer.forward(gaussians, CAMERA, POSE, features=False, close_below=close_below)
     pixels = np.random.default_rng(0).permutation(ALL)
     terms = rasterizer.pixel_terms(pixels, 300, 0.0)
     assert np.abs(terms.features(gaussians) - features[pixels]).max() < 1e-5

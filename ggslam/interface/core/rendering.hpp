@@ -23,6 +23,7 @@ struct CameraView {
   std::int32_t width, height;
   float fx, fy, cx, cy, near_plane;
   float low_pass;  // pixels^2 added to both diagonal terms of the 2D covariance
+  float close_below;  // transmittance below which a pixel is closed; 0: none is
   float camera_world[12];  // first three rows of T_camera_world
 };
 

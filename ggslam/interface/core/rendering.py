@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_float, c_int, c_int32, c_int64, c_void_
 from typing import Any
 
 HEADER = "core/rendering.hpp"
-HEADER_SHA256 = "da97117ddcf9b8bb887fa508013b07f0608be4c70ebf4d0a4078266b0703a930"
+HEADER_SHA256 = "1f1becba7c365515a7c27c953b73379c097caeba0b0eb39b0d019e498837eec1"
 
 
 class GaussianArrays(Structure):
@@ -26,7 +26,7 @@ class CameraView(Structure):
 
     _fields_ = [
         ("width", c_int32), ("height", c_int32), ("fx", c_float), ("fy", c_float), ("cx", c_float), ("cy", c_float),
-        ("near_plane", c_float), ("low_pass", c_float), ("camera_world", c_float * 12),
+        ("near_plane", c_float), ("low_pass", c_float), ("close_below", c_float), ("camera_world", c_float * 12),
     ]
 
 

@@ -27,7 +27,7 @@ constexpr std::size_t kLayout[] = {
     offsetof(GaussianArrays, feature_channels), offsetof(GaussianArrays, render_features),
     sizeof(CameraView), offsetof(CameraView, width), offsetof(CameraView, height), offsetof(CameraView, fx),
     offsetof(CameraView, fy), offsetof(CameraView, cx), offsetof(CameraView, cy), offsetof(CameraView, near_plane),
-    offsetof(CameraView, low_pass), offsetof(CameraView, camera_world),
+    offsetof(CameraView, low_pass), offsetof(CameraView, close_below), offsetof(CameraView, camera_world),
     sizeof(RenderTargets), offsetof(RenderTargets, image), offsetof(RenderTargets, features),
     offsetof(RenderTargets, depth), offsetof(RenderTargets, alpha), offsetof(RenderTargets, median_depth),
     sizeof(ImageGradients), offsetof(ImageGradients, image), offsetof(ImageGradients, features),

@@ -152,10 +152,14 @@ class CpuMapper(Mapper):
         ids, share = ids.reshape(grid.shape), share.reshape(grid.shape) * (alpha[::stride, ::stride] > 0.5)
         return MapLabels.from_grid(ids, share, depth, stride)
 
-    def _render(self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE) -> RenderBuffers:
+    def _render(
+        self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE, close_below: float = 0.0
+    ) -> RenderBuffers:
         camera, pose = grid.camera(keyframe.camera), keyframe.T_camera_world
         low_pass = grid.low_pass(self._rasterizer.low_pass)
-        return self._rasterizer.forward(self.map, camera, pose, features=features, low_pass=low_pass)
+        return self._rasterizer.forward(
+            self.map, camera, pose, features=features, low_pass=low_pass, close_below=close_below
+        )
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> CpuLossResult:
         exposure = keyframe.exposure if self._is_exposed(keyframe) else None

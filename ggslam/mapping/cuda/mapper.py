@@ -172,7 +172,9 @@ class CudaMapper(Mapper):
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
         return WHOLE
 
-    def _render(self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE) -> RenderBuffers:
+    def _render(
+        self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE, close_below: float = 0.0
+    ) -> RenderBuffers:
         return self._rasterizer.forward(
             self.map, keyframe.camera, self._states.pose(keyframe.index), features=features
         )

@@ -22,6 +22,7 @@ void check_input(const GaussianArrays& g, const CameraView& view, const RenderTa
   check_range("height", view.height, 1, kMostPixelsAlong);
   const float numbers[] = {view.fx, view.fy, view.cx, view.cy, view.near_plane, view.low_pass};
   check_within("camera", numbers, 6, 1e9);
+  check_within("close_below", &view.close_below, 1, 0.5);
   check_within("camera's pose", view.camera_world, 12, 1e12);
   check_array("image", targets.image, 1), check_array("depth", targets.depth, 1), check_array("alpha", targets.alpha, 1);
   if (!g.render_features) return;

@@ -10,6 +10,7 @@ namespace {
 struct Lanes {
   Float x, y;
   Int last;                       // number in the tile's list of the last contribution, -1 beyond the last pixel
+  Int closing;                    // the same of pixels that were closed, else kNever
   std::int32_t rows[kLanes];
   std::int32_t sizes[kLanes];
   std::uint32_t sub_blocks = 0;   // that the pixels lie in
@@ -20,6 +21,7 @@ Lanes gather_lanes(const Rasterizer& r, int tile, const TermPixel* pixels, int n
   Lanes lanes;
   lanes.x = lanes.y = Float{};
   lanes.last = broadcast_int(-1);
+  lanes.closing = broadcast_int(kNever);
   for (int lane = 0; lane < n; ++lane) {
     const TermPixel& p = pixels[lane];
     const std::size_t at = (static_cast<std::size_t>(tile) * kSubBlocks + p.sub_block) * kLanes + p.lane;
@@ -27,6 +29,7 @@ Lanes gather_lanes(const Rasterizer& r, int tile, const TermPixel* pixels, int n
     lanes.x[lane] = static_cast<float>(p.x);
     lanes.y[lane] = static_cast<float>(p.y);
     lanes.last[lane] = last;
+    if (r.transmittance[at] < 0) lanes.closing[lane] = last;
     lanes.rows[lane] = p.row;
     lanes.sizes[lane] = 0;
     lanes.sub_blocks |= 1u << p.sub_block;
@@ -48,7 +51,9 @@ void walk(const Rasterizer& r, int tile, Lanes& lanes, float min_weight, const P
     const Float exponent = log2_alpha(g, shear(g, lanes.x - g.mean_x, dy), dy);
     const Mask taken = both(greater_equal(exponent, broadcast(kLog2MinAlpha)),
                             greater_equal_int(lanes.last, broadcast_int(k)));
-    const Float alpha = zero_unless(taken, minimum(exp2_unchecked(exponent), broadcast(kMaxAlpha)));
+    const Float own = minimum(exp2_unchecked(exponent), broadcast(kMaxAlpha));
+    const Mask closing = greater_equal_int(broadcast_int(k), lanes.closing);
+    const Float alpha = zero_unless(taken, select(closing, broadcast(kMaxAlpha), own));
     const Float weight = alpha * t;
     t = t - weight;
     std::uint32_t wanted = bits(both(taken, greater_equal(weight, broadcast(min_weight))));

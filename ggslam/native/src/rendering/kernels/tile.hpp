@@ -32,6 +32,8 @@ static inline Tile make_tile(const Rasterizer& r, int index) {
   return tile;
 }
 
+constexpr std::int32_t kNever = 0x7fffffff;  // number of no splat
+
 // How far a pixel at (dx, dy) from the mean is from the place of highest alpha in its row.
 static inline Float shear(const Splat& g, Float dx, Float dy) { return dx - g.slope_x * dy; }
 

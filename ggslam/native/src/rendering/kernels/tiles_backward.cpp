@@ -29,6 +29,7 @@ struct TileGradients {
   Float channels[kSubBlocks][4];                   // image gradients: red, green, blue, depth
   Float transmittance[kSubBlocks], behind[kSubBlocks];
   Int last[kSubBlocks];
+  Int closing[kSubBlocks];                         // the same of pixels that were closed, else kNever
   std::int32_t last_in_tile;                       // highest entry that contributed anywhere
 };
 
@@ -70,8 +71,10 @@ void load_gradients(const Rasterizer& r, int index, const Tile& tile, const Imag
     const int x0 = sub_block_x(tile, s), y0 = sub_block_y(tile, s);
     const bool drop = outside(r.view, x0, y0);
     for (int k = 0; k < 4; ++k) out.channels[s][k] = drop ? Float{} : load_sub_block(image[k], r.view, x0, y0);
-    out.transmittance[s] = load(r.transmittance.data() + first + s * kLanes);
+    const Float transmittance = load(r.transmittance.data() + first + s * kLanes);
+    out.transmittance[s] = absolute(transmittance);
     out.last[s] = load_int(r.last_entry.data() + first + s * kLanes);
+    out.closing[s] = select_int(greater(Float{}, transmittance), out.last[s], broadcast_int(kNever));
     const Float alpha = drop ? Float{} : load_sub_block(in.alpha, r.view, x0, y0);
     out.behind[s] = -out.transmittance[s] * alpha;
     for (int lane = 0; lane < kLanes; ++lane)
@@ -124,7 +127,7 @@ struct Stage {
 // Exponents, very low where the splat was not taken; returns the number of splats.
 inline int find_exponents(const Tile& tile, int s, const Chunk& chunk, const TileGradients& grad, Stage& stage) {
   const Float x = tile.x[s], y = tile.y[s];
-  const Int last = grad.last[s];
+  const Int last = grad.last[s], closing = grad.closing[s];
   int n = 0;
   for (std::uint64_t left = chunk.contributing[s]; left != 0; ++n) {
     const int k = 63 - __builtin_clzll(left);
@@ -132,8 +135,10 @@ inline int find_exponents(const Tile& tile, int s, const Chunk& chunk, const Til
     stage.splats[n] = static_cast<std::uint8_t>(k);
     const Splat& g = chunk.splats[k];
     const Float dy = y - g.mean_y, r = shear(g, x - g.mean_x, dy);
-    const Mask shown = greater_equal_int(last, broadcast_int(chunk.numbers[k]));
-    stage.values[n] = select(shown, log2_alpha(g, r, dy), broadcast(-200.0f));
+    const Int number = broadcast_int(chunk.numbers[k]);
+    // The splat that closed a pixel counts as one of full opacity, to which the limit kMaxAlpha applies.
+    const Float exponent = select(greater_equal_int(number, closing), Float{}, log2_alpha(g, r, dy));
+    stage.values[n] = select(greater_equal_int(last, number), exponent, broadcast(-200.0f));
   }
   return n;
 }

@@ -70,10 +70,12 @@ void load_chunk(const Rasterizer& r, const Tile& tile, std::uint32_t begin, int 
   find_covered(ellipses, tile, n, alive, chunk.covering);
 }
 
-// With k3dgs the Gaussian that would take a pixel below kMinTransmittance is left out, as 3DGS does, and the pixel is
-// closed by the sign of its transmittance.
-template <bool kWithFeatures, bool kWithMedian, bool k3dgs>
-inline void composite(const Tile& tile, Chunk& chunk, int s, TileState& state, WeightList& list) {
+// How a pixel ends. kPlain: with the Gaussian that takes it below `least`. k3dgs: that one is left out, as 3DGS does.
+// kClosed: that one takes what is left. In the last two the sign of the transmittance says that the pixel has ended.
+enum Ending { kPlain, k3dgs, kClosed };
+
+template <bool kWithFeatures, bool kWithMedian, Ending kEnding>
+inline void composite(const Tile& tile, Chunk& chunk, int s, float least, TileState& state, WeightList& list) {
   const Float x = tile.x[s], y = tile.y[s];
   Float t = state.transmittance[s], median = state.median_depth[s];
   Float red = state.channels[s][kRed], green = state.channels[s][kGreen], blue = state.channels[s][kBlue];
@@ -86,16 +88,21 @@ inline void composite(const Tile& tile, Chunk& chunk, int s, TileState& state, W
     const Float dy = y - g.mean_y;
     const Float exponent = log2_alpha(g, shear(g, x - g.mean_x, dy), dy);
     const Mask taken = both(greater_equal(exponent, broadcast(kLog2MinAlpha)),
-                            greater_equal(t, broadcast(kMinTransmittance)));
+                            greater_equal(t, broadcast(least)));
     const Float alpha =
-        zero_unless(taken, minimum(exp2_unchecked(exponent), broadcast(k3dgs ? kMaxAlphaOf3dgs : kMaxAlpha)));
+        zero_unless(taken, minimum(exp2_unchecked(exponent), broadcast(kEnding == k3dgs ? kMaxAlphaOf3dgs : kMaxAlpha)));
     Float weight = alpha * t;
     const Float before = t;
     t = t - weight;
-    if (k3dgs) {
-      const Mask closed = greater(broadcast(kMinTransmittance), t);
+    if (kEnding == k3dgs) {
+      const Mask closed = greater(broadcast(least), t);
       weight = select(closed, Float{}, weight);
       t = select(closed, -absolute(before), t);
+    }
+    if (kEnding == kClosed) {
+      const Mask closed = both(taken, greater(broadcast(least), t));
+      weight = select(closed, kMaxAlpha * before, weight);
+      t = select(closed, (kMaxAlpha - 1.0f) * before, t);
     }
     red += weight * g.red;
     green += weight * g.green;
@@ -143,12 +150,13 @@ inline void add_features(const WeightList& list, const float* features, int chan
   if (q < channels) add_feature_group<4>(list, features + q, channels, sums + q * kLanes);
 }
 
-template <bool kWithFeatures, bool kWithMedian, bool k3dgs = false>
+template <bool kWithFeatures, bool kWithMedian, Ending kEnding = kPlain>
 void composite_tile(Rasterizer& r, const Tile& tile, TileState& state, ThreadScratch& scratch) {
   constexpr std::uint32_t kShare = kChunk / kSubBlocks;
   Chunk chunk;
   WeightList list;
   const int channels = r.padded_features;
+  const float least = kEnding == kClosed ? r.view.close_below : kMinTransmittance;
   for (std::uint32_t e = tile.begin; e < tile.end && e < tile.begin + kChunk; ++e) prefetch_splat(r, e);
   std::uint32_t begin = tile.begin;
   for (; begin < tile.end && state.alive != 0; begin += kChunk) {
@@ -159,11 +167,11 @@ void composite_tile(Rasterizer& r, const Tile& tile, TileState& state, ThreadScr
       for (std::uint32_t e = begin + kChunk + kShare * s; e < tile.end && e < begin + kChunk + kShare * (s + 1); ++e)
         prefetch_splat(r, e);
       if (chunk.covering[s] == 0) continue;
-      composite<kWithFeatures, kWithMedian, k3dgs>(tile, chunk, s, state, list);
+      composite<kWithFeatures, kWithMedian, kEnding>(tile, chunk, s, least, state, list);
       if (kWithFeatures)
         add_features(list, scratch.gaussian_features.data(), channels,
                      scratch.pixel_features.data() + s * channels * kLanes);
-      if (!any(greater_equal(state.transmittance[s], broadcast(kMinTransmittance)))) state.alive &= ~(1u << s);
+      if (!any(greater_equal(state.transmittance[s], broadcast(least)))) state.alive &= ~(1u << s);
     }
     __builtin_memcpy(r.contributed.data() + begin, chunk.contributed, sizeof(*chunk.contributed) * n);
   }
@@ -214,11 +222,14 @@ void forward_tile(Rasterizer& r, int index, const RenderTargets& targets, Thread
   start_tile(r, tile, scratch, state);
   sort_by_depth(r.entries.data() + tile.begin, scratch.sorting.data(), tile.end - tile.begin);
   const bool features = r.padded_features > 0, median = targets.median_depth != nullptr;
-  if (r.as_3dgs) composite_tile<false, false, true>(r, tile, state, scratch);
-  if (!r.as_3dgs && features && median) composite_tile<true, true>(r, tile, state, scratch);
-  if (!r.as_3dgs && features && !median) composite_tile<true, false>(r, tile, state, scratch);
-  if (!r.as_3dgs && !features && median) composite_tile<false, true>(r, tile, state, scratch);
-  if (!r.as_3dgs && !features && !median) composite_tile<false, false>(r, tile, state, scratch);
+  const auto composite = r.as_3dgs                              ? composite_tile<false, false, k3dgs>
+                         : r.view.close_below > 0 && features ? composite_tile<true, false, kClosed>
+                         : r.view.close_below > 0             ? composite_tile<false, false, kClosed>
+                         : features && median                 ? composite_tile<true, true>
+                         : features                           ? composite_tile<true, false>
+                         : median                             ? composite_tile<false, true>
+                                                              : composite_tile<false, false>;
+  composite(r, tile, state, scratch);
   finish_tile(r, index, tile, state, scratch, targets);
 }
 
