@@ -40,7 +40,7 @@ def measure(
 ) -> np.ndarray:
     """Milliseconds of `PARTS`."""
     folder = RunFolder.open(run)
-    gaussians, settings = folder.gaussians(with_moments=True), folder.config().mapping.loss
+    gaussians, mapping = folder.gaussians(with_moments=True), folder.config().mapping
     context = NativeContext(threads, instruction_set)
     rasterizer, loss, still = CpuRasterizer(context=context), CpuImageLoss(context), AdamSettings({})
     poses = list(views_of(folder, 1)["keyframes"].items())
@@ -52,10 +52,12 @@ def measure(
     for _ in range(repeat):
         for times, keyframe in zip(best, keyframes, strict=True):
             laps = [clock()]
-            view = rasterizer.forward(gaussians, keyframe.camera, keyframe.T_camera_world, features=False)
+            view = rasterizer.forward(
+                gaussians, keyframe.camera, keyframe.T_camera_world, features=False, close_below=mapping.close_below
+            )
             laps.append(clock())
             target = LossTarget(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE)
-            found = loss.evaluate(view, target, settings)
+            found = loss.evaluate(view, target, mapping.loss)
             laps.append(clock())
             rasterizer.backward_step(gaussians, found.d_image, found.d_depth, found.d_alpha, optimizer=still)
             laps.append(clock())
