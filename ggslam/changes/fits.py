@@ -16,6 +16,8 @@ from ggslam.scene.poses import inverse
 
 _APART_M = 0.05
 """Metres that surfaces lie apart which count as much as all that fits."""
+_TURN_SEEN = 0.5
+"""Share of the surfaces that both visits saw, from which they tell a turn: sides of a thing look alike."""
 _OVERLAP, _JUDGED = 0.6, 3000
 """Share of the points, the nearest, that tell how far surfaces lie apart, and points that motions are judged by."""
 
@@ -31,7 +33,7 @@ class Fit:
         color_apart: how much the colours differ.
         apart_m: how far the surfaces lie apart, in places and colours, where they fit best; metres.
         as_good_deg: turned by so many degrees more about the vertical it fits as well: round things and plain ones tell
-            no turn; None: the turn is known.
+            no turn; None: that does not hold of it.
     """
 
     T_new_old: np.ndarray
@@ -48,7 +50,16 @@ class Fit:
     @property
     def turn_known(self) -> bool:
         """Whether the thing's turn can be told."""
-        return self.as_good_deg is None
+        return self.turn_reason is None
+
+    @property
+    def turn_reason(self) -> str | None:
+        """Why the thing's turn cannot be told; None: it can."""
+        if self.as_good_deg is not None:
+            return f"turned by {self.as_good_deg:g} degrees more it fits as well"
+        if self.seen < _TURN_SEEN:
+            return f"both visits saw only {100 * self.seen:.0f} % of it"
+        return None
 
 
 class Judge:

@@ -74,8 +74,8 @@ class ChangeTable:
             entry["moved_m"], entry["turned_deg"] = self.motion(change)
             entry["T_new_old"] = change.T_new_old.tolist()
             entry["turn_known"] = change.fit.turn_known
-            if change.fit.as_good_deg is not None:
-                entry["turn_reason"] = f"turned by {change.fit.as_good_deg:g} degrees more it fits as well"
+            if not change.fit.turn_known:
+                entry["turn_reason"] = change.fit.turn_reason
             entry["fit"] = {k: v for k, v in asdict(change.fit).items() if k != "T_new_old"}
         return entry
 

@@ -143,6 +143,15 @@ def test_the_turn_of_a_plain_thing_is_said_not_to_be_known() -> None:
     assert said == {2: (False, True), 3: (True, False)}
 
 
+@pytest.mark.parametrize(
+    ("seen", "as_good_deg", "reason"), [(0.9, None, None), (0.4, None, "only 40 %"), (0.9, 15.0, "15 degrees")]
+)
+def test_why_a_turn_is_not_known(seen: float, as_good_deg: float | None, reason: str | None) -> None:
+    fit = Fit(np.eye(4), 1.0, seen, 0.0, as_good_deg=as_good_deg)
+    assert fit.turn_known == (reason is None)
+    assert reason is None or reason in str(fit.turn_reason)
+
+
 def test_what_the_first_visit_hardly_saw_was_not_added() -> None:
     speck = Box(2, (-0.3, 0.3), (0.004, 0.004, 0.004))
     found, detector = detect(SmallVisit([speck, CRATE, BRICK]), SmallVisit([CUP, CRATE, BRICK]), True)
