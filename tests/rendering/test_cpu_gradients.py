@@ -16,6 +16,7 @@ from rendering_scenes import (
     relative_error,
 )
 
+from ggslam.errors import RenderError
 from ggslam.native.loader import available_instruction_sets
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera
@@ -147,3 +148,11 @@ def test_pose_gradient_is_that_of_backward() -> None:
     expected = rasterizer.backward(*gradients.arguments()).twist
     assert np.array_equal(rasterizer.pose_gradient(*gradients.arguments()), expected)
     assert np.abs(expected).min() > 0
+
+
+@pytest.mark.parametrize(
+    "options", [{"close_below": 0.6}, {"close_below": -0.1}, {"median_depth": True}, {"as_3dgs": True}]
+)
+def test_closing_pixels_in_vain_is_refused(options: dict[str, float]) -> None:
+    with pytest.raises(RenderError, match="close_below"):
+        CpuRasterizer(1).forward(make_scene(), CAMERA, POSE, **{"close_below": 0.01, **options})
