@@ -33,7 +33,7 @@ class Fit:
         color_apart: how much the colours differ.
         apart_m: how far the surfaces lie apart, in places and colours, where they fit best; metres.
         as_good_deg: turned by so many degrees more about the vertical it fits as well: round things and plain ones tell
-            no turn; None: that does not hold of it.
+            no turn; None: it does not.
     """
 
     T_new_old: np.ndarray

@@ -217,8 +217,7 @@ class IdentityLearner(ABC):
         self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, view: RenderBuffers, rate_factor: float = 1.0
     ) -> torch.Tensor | None:
         """One step on the view that `rasterizer` rendered last, which must be that of `keyframe` (or of its
-        `MaskOnGrid`). On a GPU it is only
-        started, and `times.steps` counts the seconds that takes.
+        `MaskOnGrid`). On a GPU it is only started, and `times.steps` counts the seconds that takes.
 
         Args:
             rate_factor: multiplies the learning rates (of the sampled schedule).

@@ -161,7 +161,8 @@ def _weights(
     if close_below > 0:
         least = close_below
         closes = (before.detach() >= least) & (after.detach() < least)
-        after, before = _transmittance(alpha := torch.where(closes, torch.full_like(alpha, MAX_ALPHA), alpha))
+        alpha = torch.where(closes, torch.full_like(alpha, MAX_ALPHA), alpha)
+        after, before = _transmittance(alpha)
     weights = alpha * before * (before.detach() >= least)
     return weights, before.detach(), after.detach()
 
