@@ -30,8 +30,9 @@ _FACES_COST = 0.05
 """Worse quality that a motion may have which lays faces upon faces."""
 _PROBED = (15, -15, 30, -30, *range(45, 181, 15), *range(-165, -44, 15))
 """Degrees that a thing is turned by to see whether it would fit as well."""
-_TURN_TELLS = 0.05
-"""Worse quality of further turns by which a turn is known."""
+_TURN_TELLS = (0.05, 0.25)
+"""Worse quality of other turns by which a turn is known: so much at least, and this share of what the turn itself lacks
+of a perfect fit. Of things that fit badly any turn is about as bad."""
 _BESIDE_M, _LAST_STEPS = (0.04, 0.015), 100
 """How far beside a motion others start, metres, and steps of the last refinement."""
 _SHIFTS = np.eye(6)[:, :3]
@@ -128,14 +129,20 @@ def _stay_level(fit: Fit, judge: Judge, targets: tuple[Target, ...], sample: Sha
 
 
 def _find_turn(fit: Fit, judge: Judge, targets: tuple[Target, ...], sample: Shape, up: np.ndarray) -> Fit:
-    """Whether the thing turned further about the vertical fits as well."""
+    """Whether the thing turned otherwise about the vertical fits as well."""
     middle = transform_points(sample.points, fit.T_new_old).mean(0)
+    least, share = _TURN_TELLS
+    as_good = fit.quality() - max(least, share * (1 - fit.quality()))
     for angle in _PROBED:
         further = np.eye(4)
         further[:3, :3] = about(up, angle)
         further[:3, 3] = middle - further[:3, :3] @ middle
         for target in targets:
             T = target.refine(sample, further @ fit.T_new_old, judge.settings.fit_m, _SHIFTS)
-            if judge.fit(T).quality() >= fit.quality() - _TURN_TELLS:
+            if judge.fit(T).quality() >= as_good:
                 return replace(fit, as_good_deg=float(angle))
+            T = target.refine(sample, T, judge.settings.fit_m, upright(up))
+            turned = turning_angle(T, fit.T_new_old)
+            if turned > ALIKE and judge.fit(T).quality() >= as_good:
+                return replace(fit, as_good_deg=float(round(np.degrees(turned))))
     return fit
