@@ -20,6 +20,7 @@ from ggslam.mapping.identity import IdentityLearner, MaskOnGrid
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
 from ggslam.mapping.losses import LossGradients
+from ggslam.mapping.mean_map import MeanMap
 from ggslam.mapping.pixel_grid import WHOLE, PixelGrid, grid_of_turn
 from ggslam.mapping.pruning import prune
 from ggslam.mapping.residency import Residency
@@ -38,6 +39,8 @@ to bytes they cost up to 0.4 dB."""
 STEPS = 2
 """Steps of an iteration on every second pixel of every second row, each of which takes 0.57 of the time of one on
 all."""
+AVERAGE_EVERY = 4
+"""Steps from one map to the next that joins the mean."""
 FINAL_DECAY = 0.2
 """The last identity steps fall to this share of their length."""
 FINAL_STEPS_A_VIEW = 4
@@ -132,6 +135,7 @@ class Mapper(ABC):
         self.extra_loss: ExtraLoss | None = None
         """A loss of the user's own, added to the mapper's; on the CPU only."""
         self._rasterizer: TrainingRasterizer
+        self._mean = MeanMap()
         self._standard_adam = self._adam(1.0)
         self._sampler = KeyframeSampler(float(np.random.default_rng(seed).random()))
 
@@ -402,17 +406,28 @@ class Mapper(ABC):
         """
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None, begin: int = 0) -> None:
-        """Final refinement: learning rates fall exponentially, for each part of a map that is in memory by turns. The
-        first `begin` steps were made before; between steps `progress` is told how many of how many are."""
-        done = 0
+        """Final refinement, for each part of a map that is in memory by turns: the map becomes the mean over the last
+        steps, see `MapperSettings.average_last`, or learning rates fall exponentially. The first `begin` steps were
+        made before; between steps `progress` is told how many of how many are."""
+        share, done = self._averaged_share, 0
+        decay = 1.0 if share else self.settings.refine_decay
         for numbers, steps in self._stages(iterations):
             for i in range(steps):
                 done += 1
                 if done > begin:
-                    self._iterate_over(numbers, self.settings.refine_decay ** (i / max(1, steps - 1)))
+                    self._iterate_over(numbers, decay ** (i / max(1, steps - 1)))
+                    left = steps - 1 - i
+                    if left < share * steps and left % AVERAGE_EVERY == 0:
+                        self._mean.add(self.map)
                 if progress is not None and done > begin and (done % 20 == 0 or done == iterations):
                     progress(done, iterations)
+            self._mean.move_into(self.map)
             self._bound_colors()
+
+    @property
+    def _averaged_share(self) -> float:
+        """Share of the steps, the last ones, that the map becomes the mean over; 0: it is what the last one leaves."""
+        return self.settings.average_last
 
     def finish_identity(self) -> None:
         """The last identity steps, see `IdentitySettings.final_passes`, and every Gaussian's object. Colours, shapes

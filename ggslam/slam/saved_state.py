@@ -31,6 +31,7 @@ from ggslam.mapping.cpu.neighbours import NeighbourIndex
 from ggslam.mapping.identity import IdentityTimes
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, PoseAdam
 from ggslam.mapping.mapper import LossSums, MapperTimes
+from ggslam.mapping.mean_map import MeanMap
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.sampling import KeyframeSampler
 from ggslam.movers.detector import MoverDetector
@@ -136,6 +137,8 @@ def check_state(slam: Slam) -> None:
         raise FormatError("views of what may move: not of their camera")
     if not slam.earlier_views.check():
         raise FormatError("views of the map that the run began with: not of their cameras")
+    if not mapper._mean.fits(mapper.map):
+        raise FormatError("the mean of the map: not of its Gaussians")
     slam.color_poses.check()
     counts = [len(surface), slam.poses.keyframes_made, len(mapper.keyframes)]
     counts += [] if slam.loops is None else [len(slam.loops.poses), len(slam.loops.places)]
@@ -268,7 +271,8 @@ RULES: Rules = {
         (Camera, CameraFixtures, Trail, Track, MoverSight, Patch, RigidTracker, DepthEdges, DepthNoise,
          ResidualNoise, KeyframeKind,
          FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes,
-         KeyframeSampler, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers, IdentityClassifier,
+         KeyframeSampler, MeanMap, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers,
+         IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
          BoundingPlanes, BoundingPlane,
          ShutterTimes, RigClock, EarlierViews, EarlierView),

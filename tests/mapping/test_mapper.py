@@ -11,6 +11,7 @@ from ggslam.mapping.cpu.insertion import fill_gaussians
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.keyframe import PoseAdam, make_keyframe
 from ggslam.mapping.mapper import Mapper
+from ggslam.mapping.mean_map import AVERAGED
 from ggslam.mapping.pruning import prune
 from ggslam.mapping.settings import InsertionSettings, MapperSettings, PruningSettings
 from ggslam.native.loader import NativeContext
@@ -122,14 +123,46 @@ def test_exposure_follows_a_darker_keyframe() -> None:
     assert np.array_equal(mapper.keyframes[0].exposure, np.tile([1.0, 0.0], (3, 1)))
 
 
-def test_refinement_improves_and_its_rates_fall() -> None:
-    mapper = make_mapper()
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_refinement_improves(share: float) -> None:
+    mapper = CpuMapper(GaussianMap(), MapperSettings(average_last=share), NativeContext(2))
     mapper.add_keyframe(wall(), np.eye(4))
     mapper.run(20)
     seen: list[tuple[int, int]] = []
     before = mapper.last_psnr
     mapper.refine(100, lambda done, total: seen.append((done, total)))
     assert mapper.last_psnr > before and seen[-1] == (100, 100)
+
+
+@pytest.mark.parametrize("share, decay", [(0.0, 0.1), (0.5, 1.0)])
+def test_rates_fall_unless_the_map_is_averaged(share: float, decay: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = CpuMapper(GaussianMap(), MapperSettings(average_last=share, refine_decay=0.1), NativeContext(2))
+    mapper.add_keyframe(wall(), np.eye(4))
+    factors: list[float] = []
+    step = mapper._step
+    monkeypatch.setattr(mapper, "_step", lambda k, factor, *rest: (factors.append(factor), step(k, factor, *rest)))
+    mapper.refine(5)
+    assert factors == pytest.approx([decay ** (i / 4) for i in range(5)])
+
+
+def test_the_map_becomes_the_mean_over_the_last_steps() -> None:
+    """Of twelve steps half count: one in four of them, and the last one is among them."""
+    averaged, left = (
+        CpuMapper(GaussianMap(1), MapperSettings(average_last=share, refine_decay=1.0), NativeContext(2))
+        for share in (0.5, 0.0)
+    )
+    for mapper in (averaged, left):
+        mapper.add_keyframe(wall(), np.eye(4))
+        mapper.run(8)
+    averaged.refine(12)
+    left.refine(8)
+    parts = [{name: getattr(left.map, name).clone() for name in AVERAGED}]
+    left.refine(4)
+    parts.append({name: getattr(left.map, name) for name in AVERAGED})
+    for name in AVERAGED:
+        assert torch.allclose(getattr(averaged.map, name), (parts[0][name] + parts[1][name]) / 2, atol=1e-6), name
+        assert not torch.allclose(getattr(averaged.map, name), parts[1][name], atol=1e-6)
+    assert not averaged._mean.arrays  # the next refinement begins anew
 
 
 def test_holes_are_filled_at_the_nearest_depth() -> None:

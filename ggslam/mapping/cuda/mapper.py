@@ -109,6 +109,10 @@ class CudaMapper(Mapper):
             self.iterate(self._draw(numbers), self.settings.refine_decay)
         self._totals.send()
 
+    @property
+    def _averaged_share(self) -> float:
+        return 0.0
+
     def _count_missed(self, overflows: int | None = None) -> int:
         """Iterations that did nothing, as far as is known, because their rendering found no room: to be made again."""
         overflows = int(self._overflows.newest()[0]) if overflows is None else overflows
