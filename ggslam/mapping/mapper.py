@@ -39,8 +39,8 @@ to bytes they cost up to 0.4 dB."""
 STEPS = 2
 """Steps of an iteration on every second pixel of every second row, each of which takes 0.57 of the time of one on
 all."""
-AVERAGE_EVERY = 4
-"""Steps from one map to the next that joins the mean."""
+AVERAGE_EVERY, AVERAGED_MAPS = 4, 8
+"""Steps at most from one map to the next that joins the mean, and maps at least where there are as many steps."""
 FINAL_DECAY = 0.2
 """The last identity steps fall to this share of their length."""
 FINAL_STEPS_A_VIEW = 4
@@ -412,12 +412,13 @@ class Mapper(ABC):
         share, done = self._averaged_share, 0
         decay = 1.0 if share else self.settings.refine_decay
         for numbers, steps in self._stages(iterations):
+            every = max(1, min(AVERAGE_EVERY, int(share * steps) // AVERAGED_MAPS))
             for i in range(steps):
                 done += 1
                 if done > begin:
                     self._iterate_over(numbers, decay ** (i / max(1, steps - 1)))
                     left = steps - 1 - i
-                    if left < share * steps and left % AVERAGE_EVERY == 0:
+                    if left < share * steps and left % every == 0:
                         self._mean.add(self.map)
                 if progress is not None and done > begin and (done % 20 == 0 or done == iterations):
                     progress(done, iterations)
