@@ -425,6 +425,10 @@ class Mapper(ABC):
             self._mean.move_into(self.map)
             self._bound_colors()
 
+    def end_refinement(self) -> None:
+        """Of a refinement that was cut off the map becomes the mean over what it has made of the last steps."""
+        self._mean.move_into(self.map)
+
     @property
     def _averaged_share(self) -> float:
         """Share of the steps, the last ones, that the map becomes the mean over; 0: it is what the last one leaves."""

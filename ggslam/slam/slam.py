@@ -224,6 +224,7 @@ class Slam:
     def result(self) -> SlamResult:
         """What there is so far. The first call settles the objects: it is for the end."""
         self.times.loops = self.loops.seconds if self.loops is not None else 0.0
+        self.mapper.end_refinement()
         objects = self._objects.settle(self.mapper, self.pager) if self.growing else self._objects.learned
         cells = None if self.pager is None else self.pager.settle()
         gaussians = self.map.to(torch.device("cpu"))

@@ -168,6 +168,24 @@ def test_the_map_becomes_the_mean_over_the_last_steps(steps: int, counted: range
     assert not averaged._mean.arrays  # the next refinement begins anew
 
 
+def test_a_refinement_that_is_cut_off_leaves_the_mean_of_what_it_made() -> None:
+    mapper = make_mapper()
+    mapper.add_keyframe(wall(), np.eye(4))
+    mapper.run(8)
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        mapper.refine(30, stop)  # told of the 20th step, the fifth that counts
+    assert mapper._mean.count == 5
+    mean, last = mapper._mean.arrays["means"].clone(), mapper.map.means.clone()
+    mapper.end_refinement()
+    assert torch.equal(mapper.map.means, mean) and not torch.equal(mapper.map.means, last)
+    mapper.end_refinement()
+    assert torch.equal(mapper.map.means, mean)
+
+
 def test_holes_are_filled_at_the_nearest_depth() -> None:
     frame, s = wall(), InsertionSettings(fill_stride=3)
     new = fill_gaussians(frame.color, frame.depth, np.zeros((60, 80), np.float32), CAMERA, np.eye(4), s)
