@@ -244,14 +244,14 @@ class Mapper(ABC):
         for _ in range(iterations):
             self._iterate_over(numbers)
 
-    def _iterate_over(self, numbers: Sequence[int], rate_factor: float = 1.0) -> None:
+    def _iterate_over(self, numbers: Sequence[int], rate_factor: float = 1.0, pose_factor: float = 1.0) -> None:
         """One iteration on some keyframes: a step on all pixels of one, or STEPS on every second pixel of as many. It
         is the same whether identities are trained, too, or not."""
         for step in range(STEPS):
             keyframe = self._draw(numbers)
             learns = step == 0 and self._is_identity_due(keyframe)
             grid = self._choose_grid(keyframe)
-            self._step(keyframe, rate_factor, grid, learns)
+            self._step(keyframe, (rate_factor, pose_factor), grid, learns)
             if grid.is_whole:
                 break
         self._count_iteration()
@@ -308,19 +308,20 @@ class Mapper(ABC):
             keyframe: what to train on.
             rate_factor: multiplies every learning rate.
         """
-        self._step(keyframe, rate_factor, WHOLE, self._is_identity_due(keyframe))
+        self._step(keyframe, (rate_factor, rate_factor), WHOLE, self._is_identity_due(keyframe))
         self._count_iteration()
 
-    def _step(self, keyframe: Keyframe, rate_factor: float, grid: PixelGrid, learns: bool) -> None:
+    def _step(self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool) -> None:
         """One optimisation step: forward, loss, identity, backward with the optimizer fused in.
 
         Args:
             keyframe: what to train on.
-            rate_factor: multiplies every learning rate.
+            factors: multiply the learning rates of the Gaussians, and of poses.
             grid: its pixels that count.
             learns: whether identities are trained, too.
         """
         times, watch, identity = self.times, _Stopwatch(), self.identity
+        rate_factor, pose_factor = factors
         features = learns and self._is_identity_dense
         features = features or uses_features(self.extra_loss)
         view = self._render(keyframe, features, grid, self.settings.close_below)
@@ -341,7 +342,7 @@ class Mapper(ABC):
             detach_features=identity is None or identity.settings.detach,
         )  # fmt: skip
         share = 1 if grid.is_whole else 1 / STEPS  # an iteration moves poses as far
-        pose_rate = 0.0 if self._is_world(keyframe) else share * rate_factor * self._pose_rate
+        pose_rate = 0.0 if self._is_world(keyframe) else share * pose_factor * self._pose_rate
         self._finish_step(keyframe, step.twist, loss, pose_rate)
         times.backward += watch.lap()
         times.steps += 1
@@ -410,13 +411,13 @@ class Mapper(ABC):
         steps, see `MapperSettings.average_last`, or learning rates fall exponentially. The first `begin` steps were
         made before; between steps `progress` is told how many of how many are."""
         share, done = self._averaged_share, 0
-        decay = 1.0 if share else self.settings.refine_decay
         for numbers, steps in self._stages(iterations):
             every = max(1, min(AVERAGE_EVERY, int(share * steps) // AVERAGED_MAPS))
             for i in range(steps):
                 done += 1
                 if done > begin:
-                    self._iterate_over(numbers, decay ** (i / max(1, steps - 1)))
+                    falling = self.settings.refine_decay ** (i / max(1, steps - 1))
+                    self._iterate_over(numbers, 1.0 if share else falling, falling)
                     left = steps - 1 - i
                     if left < share * steps and left % every == 0:
                         self._mean.add(self.map)

@@ -201,8 +201,8 @@ class MapperSettings:
     """Where the map is not averaged (see `average_last`) learning rates fall exponentially to this share of their value
     in the final refinement; so they do on the GPU, at the seams of merged runs and in the cells of stores."""
     average_last: float = setting(0.5, 0, 1)
-    """Final refinement on the CPU: learning rates stay, and the map becomes the mean over this share of the steps, the
-    last ones; 0: rates fall, and it is what the last step leaves."""
+    """Final refinement on the CPU: learning rates, but not those of poses, stay, and the map becomes the mean over this
+    share of the steps, the last ones; 0: rates fall, and it is what the last step leaves."""
     insertion: InsertionSettings = field(default_factory=InsertionSettings)
     rates: LearningRates = field(default_factory=LearningRates)
     loss: LossSettings = field(default_factory=lambda: LossSettings(depth_weight=0.6))

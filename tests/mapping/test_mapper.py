@@ -138,11 +138,11 @@ def test_refinement_improves(share: float) -> None:
 def test_rates_fall_unless_the_map_is_averaged(share: float, decay: float, monkeypatch: pytest.MonkeyPatch) -> None:
     mapper = CpuMapper(GaussianMap(), MapperSettings(average_last=share, refine_decay=0.1), NativeContext(2))
     mapper.add_keyframe(wall(), np.eye(4))
-    factors: list[float] = []
+    factors: list[tuple[float, float]] = []
     step = mapper._step
-    monkeypatch.setattr(mapper, "_step", lambda k, factor, *rest: (factors.append(factor), step(k, factor, *rest)))
+    monkeypatch.setattr(mapper, "_step", lambda k, both, *rest: (factors.append(both), step(k, both, *rest)))
     mapper.refine(5)
-    assert factors == pytest.approx([decay ** (i / 4) for i in range(5)])
+    assert np.allclose(factors, [(decay ** (i / 4), 0.1 ** (i / 4)) for i in range(5)])  # those of poses always fall
 
 
 @pytest.mark.parametrize("steps, counted", [(12, range(7, 13)), (70, range(38, 71, 4))])
