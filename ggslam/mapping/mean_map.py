@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 
 import torch
 
+from ggslam.rendering.types import PARAMETERS
 from ggslam.scene.gaussian_map import GaussianMap
 
-AVERAGED = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+AVERAGED = tuple(name for name in PARAMETERS if name != "features")
 
 
 @dataclass

@@ -111,7 +111,7 @@ class CudaMapper(Mapper):
 
     @property
     def _averaged_share(self) -> float:
-        return 0.0
+        return 0.0  # the mean has not been tried on a GPU
 
     def _count_missed(self, overflows: int | None = None) -> int:
         """Iterations that did nothing, as far as is known, because their rendering found no room: to be made again."""
