@@ -81,3 +81,15 @@ def test_an_object_in_whose_place_own_masks_show_another_has_become_it(
     source, placed = visit([[0, 0, 1.99], [0.1, 0, 2.0], [0, 0, 2.5]], [0, 0, 0], own=2, depth=depth, mask=mask)
     assert without_ghosts(source, placed).object_id.tolist() == [expected] * 3
     assert placed.gaussians.object_id.tolist() == [7] * 3
+
+
+@pytest.mark.parametrize(("elsewhere", "expected"), [(7, 7), (29, 29)])
+def test_an_object_that_masks_show_elsewhere_moved_and_keeps_what_the_visit_made_of_it(
+    elsewhere: int, expected: int
+) -> None:
+    """Where it stood is another thing now. If masks show it nowhere, the visit's own Gaussians only learned its id."""
+    mask = np.full((30, 40), 29, np.uint16)
+    mask[20:23, 20:23] = elsewhere
+    points, births = [[0, 0, 1.99], [0.1, 0, 2.0], [0.1, 0.45, 2.0]], [0, 0, 1]
+    source, placed = visit(points, births, own=2, depth=np.full((30, 40), WALL_M), mask=mask)
+    assert without_ghosts(source, placed).object_id.tolist() == [29, 29, expected]

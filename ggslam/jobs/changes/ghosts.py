@@ -8,7 +8,7 @@ nothing would be seen to have changed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -52,15 +52,18 @@ def without_ghosts(source: MergeSource, placed: PlacedRun) -> GaussianMap:
     own = own_keyframes(source.record)
     if source.sequence is None or len(own) == len(source.record.keyframes):
         return gaussians
-    rows = np.flatnonzero(~np.isin(gaussians.birth_keyframe.numpy(), own))
+    began = ~np.isin(gaussians.birth_keyframe.numpy(), own)
+    rows = np.flatnonzero(began)
     seen = _look(source, placed, own, rows)
     ghosts = rows[(seen.through >= _TIMES) & (seen.through >= _TIMES * seen.there)]
     replaced = _find_replaced(gaussians.object_id.numpy()[rows], seen)
     if not len(ghosts) and not replaced:
         return gaussians
     cleared = gaussians.copy(gaussians.device)
-    for old, new in replaced.items():  # also where the visit's own Gaussians learned it from those before
-        cleared.object_id[gaussians.object_id == old] = new
+    for old, new in replaced.items():
+        # The visit's own Gaussians learned it from those before, unless its masks show it where it went.
+        taken = (gaussians.object_id == old) & torch.from_numpy(began | (old not in seen.shown))
+        cleared.object_id[taken] = new
     kept = torch.ones(len(gaussians), dtype=torch.bool)
     kept[torch.from_numpy(ghosts)] = False
     cleared.keep(kept)
@@ -76,6 +79,7 @@ class _Seen:
         there: how many see a surface there...
         alike, other: ...of its object, by their masks; of another one.
         latest: the other object that was seen last.
+        shown: the objects that masks show anywhere.
     """
 
     through: np.ndarray
@@ -83,6 +87,7 @@ class _Seen:
     alike: np.ndarray
     other: np.ndarray
     latest: np.ndarray
+    shown: set[int] = field(default_factory=set)
 
 
 def _find_replaced(ids: np.ndarray, seen: _Seen) -> dict[int, int]:
@@ -118,6 +123,7 @@ def _look(source: MergeSource, placed: PlacedRun, own: Sequence[int], rows: np.n
         found.there[:] += there
         mask = frame.load_mask() if masks else None
         if mask is not None:
+            found.shown.update(np.unique(mask).tolist())
             shown = mask[row, column].astype(int)
             other = there & (shown > 0) & (shown != ids)
             found.alike[:] += there & (shown == ids)
