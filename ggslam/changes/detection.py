@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from ggslam.changes.fits import Fit
+from ggslam.changes.fits import Fit, Judge
 from ggslam.changes.placing import Placing
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
@@ -18,13 +18,21 @@ from ggslam.changes.shapes import fit_shapes
 from ggslam.changes.sightings import Sightings, Surface, Tolerance, Visit
 from ggslam.changes.thing_views import ThingViews
 from ggslam.changes.things import UNNAMED, JudgedSurface, Thing, things_by_id, things_by_surface
+from ggslam.changes.turns import hidden_sector, tell_turn
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points, turning_angle
 from ggslam.volumes.upright import estimate_up
 
 Kind = Literal["moved", "removed", "added", "look", "unseen"]
+HARDLY_SEEN = "hardly looked at by the newer visit"
+UNCLEAR = "changed, and how cannot be told"
+"""Why nothing is said of a thing."""
 _SAME_PLACE = 0.03
 """Metres: points of two visits so near to each other may be one thing's."""
+_TAKEN = 0.4
+"""Share of what seems to have stayed where other things of the same shape may stand now."""
+_TURNED = 1500
+"""Points of a thing that other turns are tried with."""
 _SAMPLE, _FAR_TOLERANCES = 20_000, 4
 """Points that usual differences are measured at, up to so many times the least tolerance."""
 
@@ -39,6 +47,7 @@ class Change:
         T_new_old: float64 [4, 4], world: what moved; None of other kinds.
         fit: how a moved thing's surfaces lie upon each other.
         confidence: 0 to 1.
+        reason: of what is unseen: why nothing is said of it.
     """
 
     kind: Kind
@@ -47,6 +56,7 @@ class Change:
     T_new_old: np.ndarray | None = None
     fit: Fit | None = None
     confidence: float = 1.0
+    reason: str = ""
 
 
 @dataclass
@@ -55,7 +65,7 @@ class Detection:
 
     Attributes:
         changes: of all kinds but "unseen", the surest first.
-        unseen: of the older visit.
+        unseen: things of the older visit of which nothing is said.
         ids_believed: whether one id means one thing in both visits.
         stayed: number of objects of the older visit that are where they were.
         tolerance: how near surfaces had to be to be one.
@@ -101,7 +111,8 @@ class ChangeDetector:
         both = all(visit.has_objects for visit in self.visits)
         found.ids_believed = both and (self._ids_agree() if self._ids is None else self._ids)
         if not both:
-            found.notes.append("a visit has no objects: changes are told by surfaces alone")
+            words = ", whatever ids are said to mean" if self._ids else ""
+            found.notes.append(f"a visit has no objects: changes are told by surfaces alone{words}")
         split = things_by_id if found.ids_believed else things_by_surface
         self.things = [split(judged, self.settings) for judged in self.judged]
         self._compare(found)
@@ -131,8 +142,8 @@ class ChangeDetector:
         return JudgedSurface(points, surface.colors[kept], surface.toward[kept], ids, other, tolerance.at(distance))
 
     def _ids_agree(self) -> bool:
-        """Whether things that stayed have the same ids in both visits."""
-        same, count = 0, 0
+        """Whether things that stayed have the same ids in both visits. Few may have taken the places of others."""
+        same, count, taken = 0, 0, 0
         old = self.judged[0]
         stayed = old.other.is_there(self.settings.min_views) & (old.ids > 0)
         for i in np.unique(old.ids[stayed]).tolist():
@@ -140,33 +151,37 @@ class ChangeDetector:
             rows = np.flatnonzero(stayed & own)
             if len(rows) < max(self.settings.min_points, self.settings.whole * own.sum()):
                 continue  # what stayed of a thing that went are the places where it touched others
-            there = self._id_at(old.points[rows])
+            there = self._id_at(1, old.points[rows])
             if there is not None:
                 count += 1
                 same += int(there == i)
-        return count > 0 and same >= self.settings.ids_alike * count
+                taken += int(there not in (0, i))
+        return same > 0 and same >= self.settings.ids_alike * (count - min(taken, int(_TAKEN * count)))
 
     # --- verdicts ----------------------------------------------------------------------------------------------------
 
     def _compare(self, found: Detection) -> None:
         gone, come = ([t for t in things if self._is_changed(t, found.ids_believed)] for things in self.things)
         doubted = {id(thing) for thing in gone if thing.changed >= self.settings.whole}
+        by_id = set[int]()
         if found.ids_believed:
             doubted |= {id(thing) for thing in self._drop_hardly_seen(gone, come)}
-            self._pair_by_id(found, gone, come)
-            self._find_replaced(gone, come)
+            doubted |= {id(thing) for thing in self._pair_by_id(found, gone, come)}
+            by_id = {id(thing) for thing in self._find_replaced(found, gone, come)}
         else:
             self._pair_by_shape(found, gone, come)
             self._find_swapped(gone, come)
-        found.changes += [Change("removed", thing, None, confidence=_confidence(thing)) for thing in gone]
-        found.changes += [Change("added", None, thing, confidence=_confidence(thing)) for thing in come]
+        found.changes += [Change("removed", t, None, confidence=_confidence(t, id(t) in by_id)) for t in gone]
+        found.changes += [Change("added", None, t, confidence=_confidence(t, id(t) in by_id)) for t in come]
         self._compare_looks(found)
         known = {id(change.old) for change in found.changes}
         for thing in self.things[0]:
             if id(thing) in known:
                 continue
-            if thing.seen < self.settings.min_seen or id(thing) in doubted:  # whether it moved or stayed cannot be told
-                found.unseen.append(Change("unseen", thing, None))
+            if thing.seen < self.settings.min_seen:
+                found.unseen.append(Change("unseen", thing, None, reason=HARDLY_SEEN))
+            elif id(thing) in doubted:
+                found.unseen.append(Change("unseen", thing, None, reason=UNCLEAR))
             else:
                 found.stayed += 1
 
@@ -189,13 +204,23 @@ class ChangeDetector:
         before, after = self._shape(0, old), self._shape(1, new)
         return fit_shapes(before, after, self.sights[0], self.sights[1], self._up, self.settings)
 
+    def _with_turn(self, old: Thing, new: Thing, fit: Fit) -> Fit:
+        """A fit, with what makes its turn doubtful."""
+        if fit.color_apart > self.settings.max_color:
+            return replace(fit, repainted=True)
+        before, after = self._shape(0, old), self._shape(1, new)
+        judge = Judge(before, after, self.sights[0], self.sights[1], self.settings)
+        toward = [judged.toward[thing.rows] for judged, thing in zip(self.judged, (old, new), strict=True)]
+        hidden = hidden_sector(toward[0], self._up), hidden_sector(toward[1], self._up)
+        return tell_turn(fit, before.sample(_TURNED, np.random.default_rng(0)), after, judge, hidden, self._up)
+
     def _motion_change(self, old: Thing, new: Thing, fit: Fit) -> Change | None:
         """The change that a fit tells, once it is placed exactly; None: it did not move by more than the maps err."""
         T = fit.T_new_old
         if not self._has_moved(old, T) or not self._has_moved(old, T := self._place(old, new, T)):
             return None
-        confidence = fit.share * min(1.0, max(0.0, 1 - fit.color_apart))
-        return Change("moved", old, new, T, replace(fit, T_new_old=T), confidence)
+        fit = replace(self._with_turn(old, new, fit), T_new_old=T)
+        return Change("moved", old, new, T, fit, fit.share * min(1.0, max(0.0, 1 - fit.color_apart)))
 
     def _place(self, old: Thing, new: Thing, T: np.ndarray) -> np.ndarray:
         """Where exactly a thing lies of which it is known that it moved, and about where to."""
@@ -214,33 +239,42 @@ class ChangeDetector:
         least_turn = max(s.least_turn_deg, float(np.degrees(error / (0.5 * judged.extent(old)))))
         return shift >= max(s.least_motion_m, error) or turn >= least_turn
 
-    def _pair_by_id(self, found: Detection, gone: list[Thing], come: list[Thing]) -> None:
-        """What has one id in both visits, and is elsewhere: takes it from `gone` and `come`."""
+    def _pair_by_id(self, found: Detection, gone: list[Thing], come: list[Thing]) -> list[Thing]:
+        """What has one id in both visits, and is elsewhere: takes it from `gone` and `come`. Returns what of the older
+        visit changed in a way that cannot be told."""
         s, ours, theirs = self.settings, *({t.label: t for t in things} for things in self.things)
         changed = {t.label for t in (*gone, *come)}
+        unclear: list[Thing] = []
         for label in sorted(label for label in ours.keys() & theirs.keys() if label < UNNAMED):
             old, new = ours[label], theirs[label]
             shifted = label not in changed and self._has_shifted(old, new)
             if label not in changed and not shifted:
                 continue
-            # What one visit saw go or come as a whole is elsewhere, also where the other place was hidden from a visit.
-            sure = any(t.seen >= s.min_seen and t.changed >= s.whole for t in (old, new))
-            unseen = min(old.seen, new.seen) < s.min_seen and not sure  # of what hardly was seen nothing is said
             for things, thing in ((gone, old), (come, new)):
                 if thing in things:
                     things.remove(thing)
-            fit = None if unseen else self._fit(old, new)
-            if shifted and fit is not None and fit.share >= s.min_fit and fit.color_apart <= s.max_color:
-                found.changes += filter(None, [self._motion_change(old, new, fit)])
+            # What one visit saw go or come as a whole is elsewhere, also where the other place was hidden from a visit.
+            sure = any(t.seen >= s.min_seen and t.changed >= s.whole for t in (old, new))
+            if min(old.seen, new.seen) < s.min_seen and not sure:  # of what hardly was seen nothing is said
                 continue
-            if fit is None:
-                continue
-            fits = fit.share >= s.min_fit
-            # Where surfaces do not fit, as of a cloth, both places have to have changed as a whole.
-            if (fits and sure) or min(old.changed, new.changed) >= (s.min_changed if fits else s.whole):
-                change = self._motion_change(old, new, fit)
-                if change is not None:
-                    found.changes.append(change)
+            change = self._change_of_pair(old, new, shifted, sure)
+            if change is not None:
+                found.changes.append(change)
+            elif sure or min(old.changed, new.changed) >= s.shifted:
+                unclear.append(old)
+        return unclear
+
+    def _change_of_pair(self, old: Thing, new: Thing, shifted: bool, sure: bool) -> Change | None:
+        """How a thing moved; `shifted`: along what it lies on; `sure`: a visit saw it go or come as a whole."""
+        s, fit = self.settings, self._fit(old, new)
+        if fit is None:
+            return None
+        fits = fit.share >= s.min_fit
+        if shifted and fits and fit.color_apart <= s.max_color:
+            return self._motion_change(old, new, fit)
+        # Where surfaces do not fit, as of a cloth, both places have to have changed as a whole.
+        enough = min(old.changed, new.changed) >= (s.min_changed if fits else s.whole)
+        return self._motion_change(old, new, fit) if (fits and sure) or enough else None
 
     def _drop_hardly_seen(self, gone: list[Thing], come: list[Thing]) -> list[Thing]:
         """What a visit has too little of to be a thing did not come or go; returns what seemed to be gone of these."""
@@ -252,17 +286,33 @@ class ChangeDetector:
         kept = set(map(id, gone))
         return [thing for thing in before if id(thing) not in kept]
 
-    def _find_replaced(self, gone: list[Thing], come: list[Thing]) -> None:
-        """What stands where something else of another id stood: that was removed, and this was added."""
+    def _find_replaced(self, found: Detection, gone: list[Thing], come: list[Thing]) -> list[Thing]:
+        """What stands where something else of another id stood: that was removed, if it is nowhere, and this was added,
+        if it was nowhere. Returns what ids alone tell, for what moved is there now, or was."""
         s, ours, theirs = self.settings, *({t.label: t for t in things} for things in self.things)
+        moved = {change.old.label for change in found.changes if change.kind == "moved" and change.old is not None}
+        by_id: list[Thing] = []
         for label, old in ours.items():
-            if label in theirs or label >= UNNAMED or old.seen < s.min_seen:
+            if label >= UNNAMED or old.seen < s.min_seen or label in theirs or self._has_any(1, label):
                 continue
             new = theirs.get(self._counterpart(old))
-            if new is not None and new.label not in ours and self._differ(old, new):
-                for things, thing in ((gone, old), (come, new)):
-                    if thing not in things:
-                        things.append(thing)
+            if new is None or not (new.label in moved or (new.label not in ours and self._differ(old, new))):
+                continue
+            for things, thing in ((gone, old), (come, new)):
+                if thing not in things and thing.label not in moved:
+                    things.append(thing)
+                    by_id += [thing] if new.label in moved else []
+        for label, new in theirs.items():
+            if label >= UNNAMED or new.seen < s.min_seen or label in ours or self._has_any(0, label) or new in come:
+                continue
+            if self._id_at(0, self.judged[1].points[new.rows]) in moved:
+                come.append(new)
+                by_id.append(new)
+        return by_id
+
+    def _has_any(self, number: int, label: int) -> bool:
+        """Whether a visit's map has anything of an object."""
+        return bool((self.visits[number].gaussians.object_id == label).any())
 
     def _differ(self, old: Thing, new: Thing) -> bool:
         """Whether things at one place have different shapes or colours."""
@@ -271,11 +321,11 @@ class ChangeDetector:
 
     def _counterpart(self, old: Thing) -> int:
         """Id of what the newer visit has where a thing of the older one stood; 0: nothing with one."""
-        return self._id_at(self.judged[0].points[old.rows]) or 0
+        return self._id_at(1, self.judged[0].points[old.rows]) or 0
 
-    def _id_at(self, points: np.ndarray) -> int | None:
-        """The id that the newer visit has most of at points [n, 3], 0 for no object; None: it has nothing there."""
-        ids = self._ids_at(1, points)
+    def _id_at(self, number: int, points: np.ndarray) -> int | None:
+        """The id that a visit has most of at points [n, 3], 0 for no object; None: it has nothing there."""
+        ids = self._ids_at(number, points)
         return int(np.bincount(ids).argmax()) if len(ids) else None
 
     def _ids_at(self, number: int, points: np.ndarray) -> np.ndarray:
@@ -344,6 +394,8 @@ class ChangeDetector:
             stays = id(old) not in known and old.seen >= s.min_seen and old.changed < s.min_changed
             if stays and old.label < UNNAMED and _or_zero(old.color_apart) > s.look:
                 new = theirs.get(self._counterpart(old))
+                if new is not None and found.ids_believed and new.label != old.label:
+                    continue  # another thing
                 if new is not None and _or_zero(new.color_apart) > s.look:
                     found.changes.append(Change("look", old, new, confidence=min(1.0, old.color_apart / (2 * s.look))))
 
@@ -352,6 +404,6 @@ def _or_zero(value: float) -> float:
     return value if np.isfinite(value) else 0.0
 
 
-def _confidence(thing: Thing) -> float:
-    """Of something that went or came."""
-    return min(1.0, 2 * thing.seen) * max(thing.changed, _or_zero(thing.color_apart))
+def _confidence(thing: Thing, by_id: bool) -> float:
+    """Of something that went or came, as its id tells, or surfaces and colours."""
+    return min(1.0, 2 * thing.seen) * (1.0 if by_id else max(thing.changed, _or_zero(thing.color_apart)))

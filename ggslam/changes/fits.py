@@ -12,14 +12,15 @@ from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
 from ggslam.changes.sightings import Evidence, Sightings, Tolerance
 from ggslam.changes.things import color_apart
-from ggslam.scene.poses import inverse
+from ggslam.scene.poses import inverse, transform_points
 
 _APART_M = 0.05
 """Metres that surfaces lie apart which count as much as all that fits."""
 _TURN_SEEN = 0.5
 """Share of the surfaces that both visits saw, from which they tell a turn: sides of a thing look alike."""
-_OVERLAP, _JUDGED = 0.6, 3000
-"""Share of the points, the nearest, that tell how far surfaces lie apart, and points that motions are judged by."""
+_OVERLAP, _JUDGED, _CLASHING = 0.6, 3000, 300
+"""Share of the points, the nearest, that tell how far surfaces lie apart, points that motions are judged by, and of
+these so many for whether many motions are possible."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,10 @@ class Fit:
         seen: share of the surfaces that both visits saw; the worse of the two ways.
         color_apart: how much the colours differ.
         apart_m: how far the surfaces lie apart, in places and colours, where they fit best; metres.
-        as_good_deg: turned by so many degrees more about the vertical it fits as well: round things and plain ones tell
-            no turn; None: it does not.
+        as_good_deg: turned by so many degrees more it fits about as well: round things and plain ones tell no turn;
+            None: it does not.
+        sides_may_differ: whether the visits may have seen different sides of it, which look alike.
+        repainted: whether its colours differ too much for them to tell a turn.
     """
 
     T_new_old: np.ndarray
@@ -42,6 +45,8 @@ class Fit:
     color_apart: float
     apart_m: float = 0.0
     as_good_deg: float | None = None
+    sides_may_differ: bool = False
+    repainted: bool = False
 
     def quality(self) -> float:
         """For choosing among fits: more is better."""
@@ -56,9 +61,13 @@ class Fit:
     def turn_reason(self) -> str | None:
         """Why the thing's turn cannot be told; None: it can."""
         if self.as_good_deg is not None:
-            return f"turned by {self.as_good_deg:g} degrees more it fits as well"
+            return f"turned by {self.as_good_deg:g} degrees more it fits about as well"
         if self.seen < _TURN_SEEN:
             return f"both visits saw only {100 * self.seen:.0f} % of it"
+        if self.sides_may_differ:
+            return "the visits may have seen different sides of it"
+        if self.repainted:
+            return "its colours differ"
         return None
 
 
@@ -92,11 +101,27 @@ class Judge:
         known = [value for value in colors if np.isfinite(value)]
         return Fit(T, min(shares), min(seen), max(known) if known else 1.0, max(apart))
 
+    def clashes(self, motions: list[np.ndarray]) -> np.ndarray:
+        """Of each motion T_new_old, float64 [m], how much of either surface lies where the other visit saw through; the
+        worse of the two ways. What is hidden there clashes with nothing."""
+        worst = np.zeros(len(motions))
+        for k, (shape, sights, _, _) in enumerate(self._sides):
+            few = shape.points[:_CLASHING]
+            moved = [transform_points(few, inverse(T) if k else T) for T in motions]
+            found = sights.look_up(np.concatenate(moved), self._within)
+            worst = np.maximum(worst, _is_gone(found).reshape(len(motions), -1).mean(1))
+        return worst
+
+
+def _is_gone(found: Evidence) -> np.ndarray:
+    """Where a visit saw through, bool [n]."""
+    return (found.through > 0) & (found.through >= found.present)
+
 
 def _share_there(found: Evidence, near: np.ndarray) -> tuple[float, float]:
     """Share of moved points that are seen where the other thing is, of those that the visit could see, and share of
     these."""
-    gone = (found.through > 0) & (found.through >= found.present)
+    gone = _is_gone(found)
     there = (found.present > 0) & ~gone
     judged = int(there.sum() + gone.sum())
     return int((there & near).sum()) / max(1, judged), judged / max(1, len(there))

@@ -62,7 +62,10 @@ class ChangeTable:
         return {
             "version": VERSION, "ids_believed": found.ids_believed, "stayed": found.stayed,
             "tolerance": asdict(found.tolerance), "changes": [self._entry(change) for change in found.changes],
-            "unseen": [{"name": self.label(c), "ids": list(c.old.ids) if c.old else []} for c in found.unseen],
+            "unseen": [
+                {"name": self.label(c), "ids": list(c.old.ids) if c.old else [], "reason": c.reason}
+                for c in found.unseen
+            ],
             "notes": found.notes,
         }  # fmt: skip
 

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ggslam.changes.fits import Fit, Judge
@@ -12,7 +10,8 @@ from ggslam.changes.motions import ALIKE, likeliest_motions
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape, Target
 from ggslam.changes.sightings import Sightings
-from ggslam.changes.upright import LEVEL, about, along_level, tilt, upright, without_tilt
+from ggslam.changes.turns import PROBED
+from ggslam.changes.upright import LEVEL, along_level, tilt, turned_about, upright, without_tilt
 from ggslam.scene.poses import transform_points, turning_angle
 
 _REFINED = 1500
@@ -28,15 +27,8 @@ _RISES_M, _RISING_COSTS = (0.01, 0.12), 0.12
 it there: of two waste baskets on the floor, of which visits share half, it was by 0.05 and 0.12."""
 _FACES_COST = 0.05
 """Worse quality that a motion may have which lays faces upon faces."""
-_PROBED = (15, -15, 30, -30, *range(45, 181, 15), *range(-165, -44, 15))
-"""Degrees that a thing is turned by to see whether it would fit as well."""
-_TURN_TELLS = (0.05, 0.25)
-"""Worse quality of other turns by which a turn is known: so much at least, and this share of what the turn itself lacks
-of a perfect fit. Of things that fit badly any turn is about as bad."""
 _BESIDE_M, _LAST_STEPS = (0.04, 0.015), 100
 """How far beside a motion others start, metres, and steps of the last refinement."""
-_SHIFTS = np.eye(6)[:, :3]
-"""Twists that turn nothing."""
 
 
 def fit_shapes(
@@ -66,9 +58,9 @@ def fit_shapes(
     chosen = min(alike, key=lambda fit: turning_angle(fit.T_new_old, np.eye(4)))
     # The space that a thing fills tells which way round it is, whichever faces were seen; its faces, where exactly.
     faces = Target(new, faces=True)
-    settled = _settle(_stand_up(chosen, fits, up), judge, faces, sample, up)
-    settled = _stay_level(settled, judge, (faces, target), sample, up)
-    return _find_turn(settled, judge, (faces, target), sample, up)
+    standing = _stand_otherwise(_stand_up(chosen, fits, up), judge, target, sample, up)
+    settled = _settle(standing, judge, faces, sample, up)
+    return _stay_level(settled, judge, (faces, target), sample, up)
 
 
 def _unlike_fits(fits: list[Fit]) -> list[Fit]:
@@ -88,6 +80,19 @@ def _stand_up(chosen: Fit, fits: list[Fit], up: np.ndarray) -> Fit:
         and fit.quality() >= chosen.quality() - _STANDING_COSTS
     ]  # fmt: skip
     return max(upright_ones, key=Fit.quality, default=chosen)
+
+
+def _stand_otherwise(chosen: Fit, judge: Judge, target: Target, sample: Shape, up: np.ndarray) -> Fit:
+    """Of a thing that seems to have fallen over, the fit about as good of all that keep it upright, if there is one."""
+    if tilt(chosen.T_new_old, up) < _STANDS:
+        return chosen
+    middle, moved = sample.points.mean(0), transform_points(sample.points, chosen.T_new_old).mean(0)
+    stands = np.eye(4)
+    stands[:3, 3] = moved - middle
+    starts = [turned_about(up, angle, moved) @ stands for angle in (0, *PROBED)]
+    ways = [target.refine(sample, T, judge.settings.fit_m, upright(up)) for T in starts]
+    best = max(map(judge.fit, ways), key=Fit.quality)
+    return best if best.quality() >= chosen.quality() - _STANDING_COSTS else chosen
 
 
 def _settle(fit: Fit, judge: Judge, target: Target, sample: Shape, up: np.ndarray) -> Fit:
@@ -127,22 +132,3 @@ def _stay_level(fit: Fit, judge: Judge, targets: tuple[Target, ...], sample: Sha
     same = level.share >= min(s.min_fit, fit.share) and level.color_apart <= max(s.max_color, fit.color_apart)
     return level if same and level.quality() >= fit.quality() - _RISING_COSTS else fit
 
-
-def _find_turn(fit: Fit, judge: Judge, targets: tuple[Target, ...], sample: Shape, up: np.ndarray) -> Fit:
-    """Whether the thing turned otherwise about the vertical fits as well."""
-    middle = transform_points(sample.points, fit.T_new_old).mean(0)
-    least, share = _TURN_TELLS
-    as_good = fit.quality() - max(least, share * (1 - fit.quality()))
-    for angle in _PROBED:
-        further = np.eye(4)
-        further[:3, :3] = about(up, angle)
-        further[:3, 3] = middle - further[:3, :3] @ middle
-        for target in targets:
-            T = target.refine(sample, further @ fit.T_new_old, judge.settings.fit_m, _SHIFTS)
-            if judge.fit(T).quality() >= as_good:
-                return replace(fit, as_good_deg=float(angle))
-            T = target.refine(sample, T, judge.settings.fit_m, upright(up))
-            turned = turning_angle(T, fit.T_new_old)
-            if turned > ALIKE and judge.fit(T).quality() >= as_good:
-                return replace(fit, as_good_deg=float(round(np.degrees(turned))))
-    return fit

@@ -47,3 +47,11 @@ def without_tilt(T: np.ndarray, up: np.ndarray, point: np.ndarray) -> np.ndarray
 def about(axis: np.ndarray, degrees: float) -> np.ndarray:
     """The rotation [3, 3] about an axis [3], a unit vector."""
     return se3_exp(np.concatenate([np.zeros(3), np.radians(degrees) * axis]))[:3, :3]
+
+
+def turned_about(axis: np.ndarray, degrees: float, point: np.ndarray) -> np.ndarray:
+    """The motion [4, 4] that turns about an axis [3], a unit vector, through a point [3]."""
+    T = np.eye(4)
+    T[:3, :3] = about(axis, degrees)
+    T[:3, 3] = point - T[:3, :3] @ point
+    return T

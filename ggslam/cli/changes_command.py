@@ -52,10 +52,10 @@ def changes(
 
     with progress_bar() as bar:
         outcome = find_changes(old, new, ids=choice_of_ids(ids), observer=ProgressObserver(bar))
-        written = [] if out is None else write_changes(outcome, out, old, new)
     print_changes(outcome.table)
     console.print(f"took {outcome.seconds:.1f} s", highlight=False)
     if out is not None:
+        written = write_changes(outcome, out, old, new)
         console.print(f"wrote {out}: {len(written)} files", highlight=False, markup=False, soft_wrap=True)
 
 
@@ -72,9 +72,9 @@ def print_changes(found: ChangeTable) -> None:
     else:
         console.print("nothing changed", highlight=False)
     lines = [f"{found.found.stayed} stayed where they were"]
-    if found.found.unseen:
-        names = ", ".join(found.label(change) for change in found.found.unseen)
-        lines.append(f"unseen in the newer run: {names}")
+    for reason in dict.fromkeys(change.reason for change in found.found.unseen):
+        names = ", ".join(found.label(change) for change in found.found.unseen if change.reason == reason)
+        lines.append(f"{reason}: {names}")
     by = "ids, surfaces and colours" if found.found.ids_believed else "surfaces and colours alone"
     lines.append(f"told by {by}")
     for line in [*lines, *(f"note: {note}" for note in found.found.notes)]:

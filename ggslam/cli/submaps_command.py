@@ -158,5 +158,5 @@ def _event_row(event: ObjectEvent) -> list[str]:
     if len(event.cells) > _CELLS:
         cells += f" and {len(event.cells) - _CELLS} more"
     moved = "" if motion is None else f"{100 * motion[0]:.1f} cm"
-    turned = "" if motion is None else "unknown" if event.turn_known is False else f"{motion[1]:.1f} deg"
+    turned = "" if motion is None else f"{motion[1]:.1f} deg" if event.turn_known else "not known"
     return [_WORDS.get(event.kind, event.kind), event.label(), moved, turned, cells]

@@ -170,7 +170,7 @@ def join_events(events: list[ObjectEvent]) -> ObjectEvent | None:
     if any(event.kind in ("added", "removed") for event in told):  # away for a while: how it lies now is not told
         return ObjectEvent("moved", last.id, last.name, cells, None, None, None, _least(told), look)
     turns = [event.turn_known for event in moves]
-    turn = None if not turns or None in turns else all(turns)
+    turn = False if False in turns else None if None in turns or not turns else True
     matrix = to_matrix(T) if moves else None
     return ObjectEvent(
         "moved" if moves else "look", last.id, last.name, cells, told[0].middle, matrix, turn, _least(told), look

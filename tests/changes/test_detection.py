@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from small_visits import Box, SmallVisit, detect
 
-from ggslam.changes.detection import Change, ChangeDetector, Detection
+from ggslam.changes.detection import UNCLEAR, Change, ChangeDetector, Detection
 from ggslam.changes.fits import Fit
 from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
@@ -101,6 +102,45 @@ def test_where_another_thing_stands_in_its_place_one_went_and_one_came() -> None
     assert kinds(found) == ["added", "removed"]
 
 
+TWIN, THIRD = Box(7, (0.35, 0.3), CUP.size, hue=3.0), Box(8, (-0.35, -0.35), hue=1.0)
+
+
+@pytest.mark.long("shapes are compared from starts all around")
+def test_what_moved_may_stand_where_something_was_taken_away() -> None:
+    """Two things of one shape: one is gone, and the other one stands in its place."""
+    here = Box(TWIN.id, CUP.at, TWIN.size, CUP.turn, TWIN.hue)
+    found, _ = detect(SmallVisit([CUP, TWIN, CRATE, THIRD]), SmallVisit([here, CRATE, THIRD]))
+    assert kinds(found) == ["moved", "removed"] and found.ids_believed
+    gone = next(change for change in found.changes if change.kind == "removed")
+    assert gone.old is not None and gone.old.ids == (CUP.id,) and gone.confidence > 0.8
+
+
+@pytest.mark.long("shapes are compared from starts all around")
+def test_where_something_moved_away_from_another_may_have_come() -> None:
+    moved, came = Box(CUP.id, TWIN.at, CUP.size, CUP.turn), Box(TWIN.id, CUP.at, CUP.size, CUP.turn, hue=3.0)
+    found, _ = detect(SmallVisit([CUP, CRATE, THIRD]), SmallVisit([moved, came, CRATE, THIRD]))
+    assert kinds(found) == ["added", "moved"] and found.ids_believed
+    new = next(change for change in found.changes if change.kind == "added").new
+    assert new is not None and new.ids == (TWIN.id,)
+
+
+@pytest.mark.long("shapes are compared from starts all around")
+def test_two_things_that_changed_places_do_not_make_ids_doubtful() -> None:
+    here, there = Box(TWIN.id, CUP.at, CUP.size, hue=3.0), Box(CUP.id, TWIN.at, CUP.size)
+    found, _ = detect(SmallVisit([Box(CUP.id, CUP.at), TWIN, CRATE, THIRD]), SmallVisit([here, there, CRATE, THIRD]))
+    assert found.ids_believed and kinds(found) == ["moved", "moved"]
+
+
+def test_a_thing_that_shrank_changed_in_a_way_that_cannot_be_told() -> None:
+    """It is the same by its id, and not by its shape: it neither moved nor stayed."""
+    less = Box(CUP.id, CUP.at, (0.06, 0.06, 0.06), CUP.turn)
+    found, detector = detect(SmallVisit([CUP, CRATE, BRICK]), SmallVisit([less, CRATE, BRICK]), True)
+    assert found.changes == []
+    assert [(c.old.ids, c.reason) for c in found.unseen if c.old is not None] == [((CUP.id,), UNCLEAR)]
+    said = ChangeTable(found, detector.judged, ({}, {})).to_dict()["unseen"]
+    assert said[0]["reason"] == UNCLEAR
+
+
 def test_a_repainted_thing_changed_its_look() -> None:
     found, _ = detect(SmallVisit([CUP, CRATE]), SmallVisit([Box(2, CUP.at, hue=2.5), CRATE]))
     assert kinds(found) == ["look"]
@@ -144,10 +184,14 @@ def test_the_turn_of_a_plain_thing_is_said_not_to_be_known() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seen", "as_good_deg", "reason"), [(0.9, None, None), (0.4, None, "only 40 %"), (0.9, 15.0, "15 degrees")]
-)
-def test_why_a_turn_is_not_known(seen: float, as_good_deg: float | None, reason: str | None) -> None:
-    fit = Fit(np.eye(4), 1.0, seen, 0.0, as_good_deg=as_good_deg)
+    ("doubts", "reason"),
+    [
+        ({}, None), ({"seen": 0.4}, "only 40 %"), ({"as_good_deg": 15.0}, "15 degrees"),
+        ({"sides_may_differ": True}, "different sides"), ({"repainted": True}, "colours"),
+    ],
+)  # fmt: skip
+def test_why_a_turn_is_not_known(doubts: dict[str, Any], reason: str | None) -> None:
+    fit = Fit(**{"T_new_old": np.eye(4), "share": 1.0, "seen": 0.9, "color_apart": 0.0, **doubts})
     assert fit.turn_known == (reason is None)
     assert reason is None or reason in str(fit.turn_reason)
 

@@ -12,9 +12,8 @@ from ggslam.changes.fits import Fit
 from ggslam.changes.motions import likeliest_motions
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape, Target
-from ggslam.changes.shapes import _find_turn, _stay_level
-from ggslam.changes.upright import about
-from ggslam.scene.poses import transform_points, turning_angle
+from ggslam.changes.shapes import _stay_level
+from ggslam.scene.poses import transform_points
 
 THICK_M = 0.02
 
@@ -100,30 +99,3 @@ def test_a_thing_of_which_one_visit_saw_the_lower_part_is_looked_for_at_its_heig
     motions = likeliest_motions(banded(0.0, 0.2, 0.0), banded(0.0, 0.6, 0.5), UP)
     upright = [T for T in motions if T[2, 2] > 0.99]
     assert min(np.linalg.norm(transform_points(np.zeros((1, 3)), T)[0] - [0.5, 0, 0]) for T in upright) < 0.02
-
-
-@pytest.mark.parametrize("share, other_share, told", [
-    (0.95, 0.75, None),  # a good fit, and the other turn's is not
-    (0.95, 0.92, 97.0),
-    (0.5, 0.4, 97.0),  # of a bad fit the other turn is about as bad
-    (0.5, 0.2, None),
-])  # fmt: skip
-def test_another_turn_between_the_probed_ones_that_fits_about_as_well(
-    share: float, other_share: float, told: float | None
-) -> None:
-    """Nothing fits but where the thing is, and turned by 97 degrees more, which is between the turns that are tried."""
-    other = np.eye(4)
-    other[:3, :3] = about(UP, 97)
-
-    def refine(sample: Shape, T: np.ndarray, fit_m: float, free: np.ndarray) -> np.ndarray:
-        turns = free[3:].any()
-        return other if turns and turning_angle(T, other) < np.radians(10) else T
-
-    def fit(T: np.ndarray) -> Fit:
-        fits = share if np.allclose(T, np.eye(4)) else other_share if np.allclose(T, other) else 0.0
-        return Fit(T, share=fits, seen=1.0, color_apart=0.0)
-
-    judge = SimpleNamespace(fit=fit, settings=ChangeSettings())
-    targets = (SimpleNamespace(refine=refine),)
-    found = _find_turn(fit(np.eye(4)), judge, targets, basket(0.0, 0.2, 0.0), UP)  # type: ignore[arg-type]
-    assert found.as_good_deg == told

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from ggslam.errors import SequenceError
 from ggslam.jobs.changes.ghosts import without_ghosts
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.scene.camera import Camera
@@ -37,6 +38,7 @@ def visit(
     color = np.zeros((30, 40, 3), np.uint8)
     frame = Frame(0, 0, 0.0, color, depth.astype(np.float32), CAMERA, mask=mask)
     source = SimpleNamespace(
+        name="tuesday",
         record=SimpleNamespace(keyframes=[SimpleNamespace(frame=f) for f in (ELSEWHERE, *range(own))]),
         sequence=SimpleNamespace(frame=lambda index, masks: frame) if recording else None,
         known=SimpleNamespace(noise=DepthNoise()), has_lasting_ids=lambda: mask is not None,
@@ -52,7 +54,7 @@ BIRTHS = [0, 0, 0, 0, 1]
 
 def test_what_the_earlier_map_shows_before_a_wall_goes() -> None:
     source, placed = visit(POINTS, BIRTHS, own=2, depth=np.full((30, 40), WALL_M))
-    kept = without_ghosts(source, placed).means.numpy()
+    kept = without_ghosts(source, placed, []).means.numpy()
     assert np.allclose(kept, np.array(POINTS[1:], np.float32)) and len(placed.gaussians) == len(POINTS)
 
 
@@ -67,7 +69,9 @@ def test_what_is_not_surely_gone_stays(case: str) -> None:
     source, placed = visit(POINTS[:1], [0], own, depth, recording=case != "no recording")
     if case == "no earlier map":
         source.record.keyframes = source.record.keyframes[1:]
-    assert len(without_ghosts(source, placed)) == 1
+    notes: list[str] = []
+    assert len(without_ghosts(source, placed, notes)) == 1
+    assert bool(notes) == (case == "no recording") and all("tuesday" in note for note in notes)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +83,7 @@ def test_an_object_in_whose_place_own_masks_show_another_has_become_it(
     """Masks show another; itself; none; another in front of it."""
     mask, depth = np.full((30, 40), shown, np.uint16), np.full((30, 40), wall_m)
     source, placed = visit([[0, 0, 1.99], [0.1, 0, 2.0], [0, 0, 2.5]], [0, 0, 0], own=2, depth=depth, mask=mask)
-    assert without_ghosts(source, placed).object_id.tolist() == [expected] * 3
+    assert without_ghosts(source, placed, []).object_id.tolist() == [expected] * 3
     assert placed.gaussians.object_id.tolist() == [7] * 3
 
 
@@ -92,4 +96,18 @@ def test_an_object_that_masks_show_elsewhere_moved_and_keeps_what_the_visit_made
     mask[20:23, 20:23] = elsewhere
     points, births = [[0, 0, 1.99], [0.1, 0, 2.0], [0.1, 0.45, 2.0]], [0, 0, 1]
     source, placed = visit(points, births, own=2, depth=np.full((30, 40), WALL_M), mask=mask)
-    assert without_ghosts(source, placed).object_id.tolist() == [29, 29, expected]
+    assert without_ghosts(source, placed, []).object_id.tolist() == [29, 29, expected]
+
+
+def test_frames_that_cannot_be_read_are_left_out_and_named() -> None:
+    source, placed = visit(POINTS, BIRTHS, own=3, depth=np.full((30, 40), WALL_M))
+    whole, notes = source.sequence.frame, list[str]()
+
+    def frame(index: int, masks: bool) -> Frame:
+        if index == 1:
+            raise SequenceError("depth/000001.png: ends too early")
+        return whole(index, masks)
+
+    source.sequence.frame = frame
+    assert len(without_ghosts(source, placed, notes)) == len(POINTS) - 1
+    assert notes == ["tuesday: left out: depth/000001.png: ends too early"]

@@ -88,10 +88,14 @@ def compare_placed(
     """Compares two visits whose maps are in one world; arguments as of `find_joint_poses` and `find_changes`."""
     start = time.perf_counter()
     counted = (range(len(placed[0].cameras)), own_keyframes(sources[1].record))
-    older, newer = map(_visit, sources, placed, poses.T_new_old, counted)
+    notes: list[str] = []
+    older, newer = (
+        _visit(*parts, notes) for parts in zip(sources, placed, poses.T_new_old, counted, strict=True)
+    )
     observer.begin("comparing surfaces", 1)
     detector = ChangeDetector(older, newer, settings, context, ids)
     found = detector.detect()
+    found.notes += notes
     observer.advance(1, 1)
     names = [{} if s.objects is None else {o.id: o.name for o in s.objects.table.objects} for s in sources]
     table = ChangeTable(found, detector.judged, (names[0], names[1]))
@@ -121,6 +125,8 @@ def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str 
         written.append(path)
     values = {"old": str(old), "new": str(new), "world": "of the old run", **values}
     write_text(out / CHANGES_FILE, json.dumps(json_ready(values), indent=1) + "\n")
+    for stale in set(out.glob("change[0-9][0-9]_*.png")) - set(written):  # of what was written there before
+        stale.unlink()
     return [*written, out / CHANGES_FILE]
 
 
@@ -135,13 +141,16 @@ def show_changes(outcome: ChangesOutcome, old: str | Path, new: str | Path, most
     return ChangesShown(record, pictures, left_out=len(found[most:]))
 
 
-def _visit(source: MergeSource, placed: PlacedRun, T_new_old: np.ndarray, counted: Sequence[int]) -> Visit:
-    """A run as its keyframes with these numbers tell of it."""
+def _visit(
+    source: MergeSource, placed: PlacedRun, T_new_old: np.ndarray, counted: Sequence[int], notes: list[str]
+) -> Visit:
+    """A run as its keyframes with these numbers tell of it; `notes` get what the user should know."""
     known = source.known
     poses = T_new_old @ known.poses
     points = [transform_points(known.points[k].astype(float), poses[k]) for k in counted]
     normals = [known.normals[k].astype(float) @ poses[k, :3, :3].T for k in counted]
+    gaussians = without_ghosts(source, placed, notes)
     return Visit(
-        without_ghosts(source, placed), [placed.cameras[k] for k in counted], placed.T_world_camera[list(counted)],
+        gaussians, [placed.cameras[k] for k in counted], placed.T_world_camera[list(counted)],
         np.concatenate(points), np.concatenate(normals), source.objects is not None,
     )  # fmt: skip

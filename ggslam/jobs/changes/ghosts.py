@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 
+from ggslam.errors import GgslamError
 from ggslam.jobs.merge.sources import MergeSource
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.merging.coverage import PlacedRun
@@ -39,7 +40,7 @@ def own_keyframes(record: KeyframesRecord) -> Sequence[int]:
     return own or range(len(record.keyframes))
 
 
-def without_ghosts(source: MergeSource, placed: PlacedRun) -> GaussianMap:
+def without_ghosts(source: MergeSource, placed: PlacedRun, notes: list[str]) -> GaussianMap:
     """The map of a run without Gaussians of the map it began with that its own keyframes look through. Objects of that
     map in whose places its own masks always show others have become these: something else stands there. The map as it
     is if the run began with none, or its recording is not there.
@@ -47,14 +48,19 @@ def without_ghosts(source: MergeSource, placed: PlacedRun) -> GaussianMap:
     Args:
         source: the run.
         placed: its map, and where its keyframes are.
+        notes: get what the user should know.
     """
     gaussians = placed.gaussians
     own = own_keyframes(source.record)
-    if source.sequence is None or len(own) == len(source.record.keyframes):
+    if len(own) == len(source.record.keyframes):
+        return gaussians
+    if source.sequence is None:
+        notes.append(f"{source.name}: its recording is not there, so the map it began with may hide what went")
         return gaussians
     began = ~np.isin(gaussians.birth_keyframe.numpy(), own)
     rows = np.flatnonzero(began)
     seen = _look(source, placed, own, rows)
+    notes += [f"{source.name}: left out: {problem}" for problem in seen.problems]
     ghosts = rows[(seen.through >= _TIMES) & (seen.through >= _TIMES * seen.there)]
     replaced = _find_replaced(gaussians.object_id.numpy()[rows], seen)
     if not len(ghosts) and not replaced:
@@ -80,6 +86,7 @@ class _Seen:
         alike, other: ...of its object, by their masks; of another one.
         latest: the other object that was seen last.
         shown: the objects that masks show anywhere.
+        problems: frames that could not be read, and why.
     """
 
     through: np.ndarray
@@ -88,6 +95,7 @@ class _Seen:
     other: np.ndarray
     latest: np.ndarray
     shown: set[int] = field(default_factory=set)
+    problems: list[str] = field(default_factory=list)
 
 
 def _find_replaced(ids: np.ndarray, seen: _Seen) -> dict[int, int]:
@@ -110,7 +118,12 @@ def _look(source: MergeSource, placed: PlacedRun, own: Sequence[int], rows: np.n
     ids = placed.gaussians.object_id.numpy()[rows].astype(int)
     found = _Seen(*np.zeros((5, len(rows)), int))
     for k in own:
-        frame = sequence.frame(source.record.keyframes[k].frame, masks=masks)
+        try:
+            frame = sequence.frame(source.record.keyframes[k].frame, masks=masks)
+            mask = frame.load_mask() if masks else None
+        except GgslamError as error:
+            found.problems.append(str(error))
+            continue
         seen = transform_points(means, inverse(placed.T_world_camera[k]))
         row, column, inside = frame.camera.project(seen)
         # Where a pixel's surroundings have no depth, or show an edge, it looks through what is nearer than all of them.
@@ -121,7 +134,6 @@ def _look(source: MergeSource, placed: PlacedRun, own: Sequence[int], rows: np.n
         there = inside & (measured > 0) & (np.abs(away - measured) <= margin)
         found.through[:] += inside & (nearest > 0) & (away < nearest - margin)
         found.there[:] += there
-        mask = frame.load_mask() if masks else None
         if mask is not None:
             found.shown.update(np.unique(mask).tolist())
             shown = mask[row, column].astype(int)

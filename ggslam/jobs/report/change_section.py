@@ -34,9 +34,9 @@ def changes_part(shown: ChangesShown) -> Html:
         parts += [p.table(_HEAD, map(_row, record.changes), text_columns=(1,)), p.tag("p", _WORDS, class_="note")]
     else:
         parts.append(p.tag("p", "Nothing was found that changed."))
-    if record.unseen:
-        names = ", ".join(u.name for u in record.unseen)
-        parts.append(p.tag("p", f"Hardly looked at by the newer visit, so that nothing is said of them: {names}."))
+    for reason in dict.fromkeys(thing.reason for thing in record.unseen):
+        names = ", ".join(thing.name for thing in record.unseen if thing.reason == reason)
+        parts.append(p.tag("p", f"{reason.capitalize()}, so that nothing is said of them: {names}."))
     if shown.pictures:
         words = "The older visit on the left, the newer one on the right; red: where it was, green: where it is."
         named = [(f"{record.changes[k].name}: {word_of_kind(record.changes[k])}", v) for k, v in shown.pictures.items()]

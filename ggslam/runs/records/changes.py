@@ -35,10 +35,11 @@ class ChangeRecord(Record):
 
 
 class UnseenRecord(Record):
-    """A thing that the newer visit hardly looked at."""
+    """A thing of which nothing is said, and why; earlier files have no reason: the newer visit hardly looked at it."""
 
     name: str
     ids: list[int]
+    reason: str = "hardly looked at by the newer visit"
 
 
 class ChangesRecord(RecordFile):
