@@ -247,6 +247,7 @@ def test_what_moved_is_placed_before_it_is_told(placed_m: float, told: bool) -> 
 
     detector = SimpleNamespace(
         _has_moved=lambda old, T: T[0, 3] > 0.01, _place=lambda old, new, T: shifted(placed_m),
+        _with_turn=lambda old, new, fit: fit,
     )  # fmt: skip
     fit = Fit(shifted(0.27), share=0.9, seen=1.0, color_apart=0.0)
     thing = Thing(2, (2,), np.arange(3), 1.0, 1.0, 0.0)
