@@ -10,8 +10,8 @@ from ggslam.changes.motions import ALIKE, likeliest_motions
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape, Target
 from ggslam.changes.sightings import Sightings
-from ggslam.changes.turns import PROBED
-from ggslam.changes.upright import LEVEL, along_level, tilt, turned_about, upright, without_tilt
+from ggslam.changes.turns import upright_starts
+from ggslam.changes.upright import LEVEL, along_level, tilt, upright, without_tilt
 from ggslam.scene.poses import transform_points, turning_angle
 
 _REFINED = 1500
@@ -86,10 +86,7 @@ def _stand_otherwise(chosen: Fit, judge: Judge, target: Target, sample: Shape, u
     """Of a thing that seems to have fallen over, the fit about as good of all that keep it upright, if there is one."""
     if tilt(chosen.T_new_old, up) < _STANDS:
         return chosen
-    middle, moved = sample.points.mean(0), transform_points(sample.points, chosen.T_new_old).mean(0)
-    stands = np.eye(4)
-    stands[:3, 3] = moved - middle
-    starts = [turned_about(up, angle, moved) @ stands for angle in (0, *PROBED)]
+    starts = upright_starts(sample, chosen.T_new_old, up)
     ways = [target.refine(sample, T, judge.settings.fit_m, upright(up)) for T in starts]
     best = max(map(judge.fit, ways), key=Fit.quality)
     return best if best.quality() >= chosen.quality() - _STANDING_COSTS else chosen

@@ -82,10 +82,15 @@ def _other_starts(fit: Fit, old: Shape, up: np.ndarray) -> list[np.ndarray]:
     starts = [turned_about(up, angle, middle) @ fit.T_new_old for angle in PROBED]
     if tilt(fit.T_new_old, up) >= LEVEL:
         starts += [turned_about(own, angle, middle) @ fit.T_new_old for angle in PROBED]
-        stands = np.eye(4)
-        stands[:3, 3] = middle - old.points.mean(0)
-        starts += [turned_about(up, angle, middle) @ stands for angle in (0, *PROBED)]
+        starts += upright_starts(old, fit.T_new_old, up)
     return starts
+
+
+def upright_starts(old: Shape, T: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
+    """Motions [4, 4] that take a thing where one takes it, upright and turned in all ways that are probed."""
+    middle, stands = transform_points(old.points, T).mean(0), np.eye(4)
+    stands[:3, 3] = middle - old.points.mean(0)
+    return [turned_about(up, angle, middle) @ stands for angle in (0, *PROBED)]
 
 
 def _others(

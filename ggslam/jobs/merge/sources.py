@@ -168,7 +168,7 @@ def read_sources(paths: ListOf[Path], context: NativeContext, unpacked: Path) ->
     resolved = [Path(path).resolve() for path in paths]
     twice = [path for k, path in enumerate(paths) if resolved[k] in resolved[:k]]
     if twice:
-        raise ConfigError(f"{twice[0]}: was given twice; name two different runs")
+        raise ConfigError(f"{twice[0]}: was given twice; a run counts once")
     sources = [_open_source(Path(path), context, unpacked / f"{k}") for k, path in enumerate(paths)]
     _check_comparable(sources)
     for before, source in zip(sources, sources[1:], strict=False):
