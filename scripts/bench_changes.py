@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ggslam.changes.detection import Change
+from ggslam.changes.change import Change
 from ggslam.changes.found import ChangeTable
 from ggslam.formats.trajectory import read_tum
 from ggslam.jobs.changes.changes import find_changes

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from ggslam.changes.change import HARDLY_SEEN, UNCLEAR, Change, Detection
 from ggslam.changes.fits import Fit, Judge
 from ggslam.changes.placing import Placing
 from ggslam.changes.settings import ChangeSettings
@@ -23,10 +23,6 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points, turning_angle
 from ggslam.volumes.upright import estimate_up
 
-Kind = Literal["moved", "removed", "added", "look", "unseen"]
-HARDLY_SEEN = "hardly looked at by the newer visit"
-UNCLEAR = "changed, and how cannot be told"
-"""Why nothing is said of a thing."""
 _SAME_PLACE = 0.03
 """Metres: points of two visits so near to each other may be one thing's."""
 _TAKEN = 0.4
@@ -35,49 +31,6 @@ _TURNED = 1500
 """Points of a thing that other turns are tried with."""
 _SAMPLE, _FAR_TOLERANCES = 20_000, 4
 """Points that usual differences are measured at, up to so many times the least tolerance."""
-
-
-@dataclass(frozen=True)
-class Change:
-    """What became of a thing.
-
-    Attributes:
-        kind: see `Kind`; "unseen": of the older visit, and the newer one did not look there, or saw too little to tell.
-        old, new: the thing in either visit; None: it is not there.
-        T_new_old: float64 [4, 4], world: what moved; None of other kinds.
-        fit: how a moved thing's surfaces lie upon each other.
-        confidence: 0 to 1.
-        reason: of what is unseen: why nothing is said of it.
-    """
-
-    kind: Kind
-    old: Thing | None
-    new: Thing | None
-    T_new_old: np.ndarray | None = None
-    fit: Fit | None = None
-    confidence: float = 1.0
-    reason: str = ""
-
-
-@dataclass
-class Detection:
-    """What was found.
-
-    Attributes:
-        changes: of all kinds but "unseen", the surest first.
-        unseen: things of the older visit of which nothing is said.
-        ids_believed: whether one id means one thing in both visits.
-        stayed: number of objects of the older visit that are where they were.
-        tolerance: how near surfaces had to be to be one.
-        notes: what the user should know.
-    """
-
-    changes: list[Change] = field(default_factory=list)
-    unseen: list[Change] = field(default_factory=list)
-    ids_believed: bool = False
-    stayed: int = 0
-    tolerance: Tolerance = field(default_factory=lambda: Tolerance(0.0, 0.0))
-    notes: list[str] = field(default_factory=list)
 
 
 class ChangeDetector:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.changes.detection import Change, Detection
+from ggslam.changes.change import Change, Detection
 from ggslam.changes.things import JudgedSurface, Thing
 from ggslam.objects.boxes import oriented_box
 from ggslam.scene.object_names import object_label

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from ggslam.changes.detection import Change, ChangeDetector, Detection
+from ggslam.changes.change import Change, Detection
+from ggslam.changes.detection import ChangeDetector
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import NEAR, Evidence
 from ggslam.changes.things import Thing

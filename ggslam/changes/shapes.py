@@ -128,4 +128,3 @@ def _stay_level(fit: Fit, judge: Judge, targets: tuple[Target, ...], sample: Sha
     s = judge.settings  # it must be the same thing as surely as before
     same = level.share >= min(s.min_fit, fit.share) and level.color_apart <= max(s.max_color, fit.color_apart)
     return level if same and level.quality() >= fit.quality() - _RISING_COSTS else fit
-

@@ -13,7 +13,7 @@ from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 
 if TYPE_CHECKING:
-    from ggslam.changes.detection import Change
+    from ggslam.changes.change import Change
     from ggslam.changes.found import ChangeTable
 
 EPILOG = """

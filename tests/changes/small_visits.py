@@ -9,7 +9,8 @@ from itertools import product
 import numpy as np
 import torch
 
-from ggslam.changes.detection import ChangeDetector, Detection
+from ggslam.changes.change import Detection
+from ggslam.changes.detection import ChangeDetector
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Visit
 from ggslam.native.loader import NativeContext

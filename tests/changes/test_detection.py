@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from small_visits import Box, SmallVisit, detect
 
-from ggslam.changes.detection import UNCLEAR, Change, ChangeDetector, Detection
+from ggslam.changes.change import UNCLEAR, Change, Detection
+from ggslam.changes.detection import ChangeDetector
 from ggslam.changes.fits import Fit
 from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings

@@ -8,7 +8,7 @@ from itertools import product
 import cv2
 import numpy as np
 
-from ggslam.changes.detection import Change
+from ggslam.changes.change import Change
 from ggslam.changes.found import ChangeTable
 from ggslam.changes.sightings import Visit
 from ggslam.native.loader import NativeContext

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.changes.detection import Detection
+from ggslam.changes.change import Detection
 from ggslam.jobs.merge.sources import MergeSource
 from ggslam.merging.objects import UnitedObjects
 from ggslam.objects.history import History, VisitRecord
