@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from ggslam.changes.change import HARDLY_SEEN, UNCLEAR, Change, Detection
 from ggslam.changes.fits import Fit, Judge
+from ggslam.changes.motions import ALIKE
 from ggslam.changes.placing import Placing
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
@@ -116,20 +117,20 @@ class ChangeDetector:
     def _compare(self, found: Detection) -> None:
         gone, come = ([t for t in things if self._is_changed(t, found.ids_believed)] for things in self.things)
         doubted = {id(thing) for thing in gone if thing.changed >= self.settings.whole}
-        by_id = set[int]()
+        by_id, swapped = set[int](), set[int]()
         if found.ids_believed:
             doubted |= {id(thing) for thing in self._drop_hardly_seen(gone, come)}
             doubted |= {id(thing) for thing in self._pair_by_id(found, gone, come)}
             by_id = {id(thing) for thing in self._find_replaced(found, gone, come)}
         else:
             self._pair_by_shape(found, gone, come)
-            self._find_swapped(gone, come)
+            swapped = {id(thing) for thing in self._find_swapped(gone, come)}
         found.changes += [Change("removed", t, None, confidence=_confidence(t, id(t) in by_id)) for t in gone]
         found.changes += [Change("added", None, t, confidence=_confidence(t, id(t) in by_id)) for t in come]
         self._compare_looks(found)
         known = {id(change.old) for change in found.changes}
         for thing in self.things[0]:
-            if id(thing) in known:
+            if id(thing) in known or id(thing) in swapped:
                 continue
             if thing.seen < self.settings.min_seen:
                 found.unseen.append(Change("unseen", thing, None, reason=HARDLY_SEEN))
@@ -172,7 +173,10 @@ class ChangeDetector:
         T = fit.T_new_old
         if not self._has_moved(old, T) or not self._has_moved(old, T := self._place(old, new, T)):
             return None
-        fit = replace(self._with_turn(old, new, fit), T_new_old=T)
+        placed, fit = turning_angle(T, fit.T_new_old), self._with_turn(old, new, fit)
+        if placed > ALIKE and fit.turn_known:  # surfaces and pictures tell two turns
+            fit = replace(fit, as_good_deg=round(float(np.degrees(placed))))
+        fit = replace(fit, T_new_old=T)
         return Change("moved", old, new, T, fit, fit.share * min(1.0, max(0.0, 1 - fit.color_apart)))
 
     def _place(self, old: Thing, new: Thing, T: np.ndarray) -> np.ndarray:
@@ -320,10 +324,11 @@ class ChangeDetector:
         for things, numbers in ((gone, {a for a, _ in taken}), (come, {b for _, b in taken})):
             things[:] = [thing for k, thing in enumerate(things) if k not in numbers]
 
-    def _find_swapped(self, gone: list[Thing], come: list[Thing]) -> None:
+    def _find_swapped(self, gone: list[Thing], come: list[Thing]) -> list[Thing]:
         """Objects that stand where others stood, of another shape and other colours: what went and what came there are
-        parts of them."""
+        parts of them. Returns these parts."""
         s, theirs = self.settings, {t.label: t for t in self.things[1]}
+        absorbed: list[Thing] = []
         for old in [t for t in self.things[0] if t.label < UNNAMED]:
             new = theirs.get(self._counterpart(old))
             if new is None or new.label >= UNNAMED or min(old.seen, new.seen) < s.min_seen:
@@ -332,6 +337,8 @@ class ChangeDetector:
             if any(parts) and max(_or_zero(old.color_apart), _or_zero(new.color_apart)) > s.swapped:
                 for things, own, whole in zip((gone, come), parts, (old, new), strict=True):
                     things[:] = [t for t in things if t not in own] + [whole]
+                absorbed += [t for own in parts for t in own]
+        return absorbed
 
     def _parts(self, number: int, things: list[Thing], whole: Thing) -> list[Thing]:
         """Those that lie in an object for the most part."""

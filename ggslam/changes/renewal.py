@@ -64,10 +64,8 @@ class Renewal:
         points = gaussians.means.numpy().astype(float)
         gone = self._is_gone(NEW, points)
         moved = np.zeros(len(points), bool)
-        for change in self.found.changes:
-            if change.old is None:
-                continue
-            own = self.rows_of(OLD, change.old, gaussians)
+        for change, own in self._rows_of_changes(gaussians):
+            assert change.old is not None
             if change.kind == "look":
                 own[own] = self._is_seen(points[own])
             if change.T_new_old is None:
@@ -80,6 +78,19 @@ class Renewal:
             unseen[own] = ~self._is_seen(transform_points(points[own], change.T_new_old))
             moved[own], gone[own] = unseen[own], ~unseen[own]
         return Fate(gone, moved)
+
+    def _rows_of_changes(self, gaussians: GaussianMap) -> list[tuple[Change, np.ndarray]]:
+        """What changed of the older visit, and its Gaussians, bool [N]; each belongs to the surest one.
+
+        They are gathered before anything moves: what is brought to another thing's old place is not that thing's.
+        """
+        taken, found = np.zeros(len(gaussians), bool), list[tuple[Change, np.ndarray]]()
+        for change in self.found.changes:
+            if change.old is not None:
+                own = self.rows_of(OLD, change.old, gaussians) & ~taken
+                taken |= own
+                found.append((change, own))
+        return found
 
     def rows_of(self, number: int, thing: Thing, gaussians: GaussianMap) -> np.ndarray:
         """bool [N]: the Gaussians of a thing of the older (0) or newer (1) visit: those of its objects, and of what

@@ -321,6 +321,8 @@ class _Measured:
     def _off(self, points: np.ndarray) -> np.ndarray:
         """Distance [n] of points from the surface that was measured near by, metres; infinite: none was."""
         measured, normals = self._visit.measured, self._visit.normals
+        if not len(measured):
+            return np.full(len(points), np.inf)
         apart, near = self._tree.query(points, _NEIGHBOURS, distance_upper_bound=self._around, workers=-1)
         near = np.minimum(near, len(measured) - 1)
         off = np.abs(((points[:, None] - measured[near]) * normals[near]).sum(2))

@@ -29,6 +29,8 @@ _SHARED = 0.5
 _CLEARLY_DEG, _ASIDE, _CLASHES = 45, (0.25, 0.5, 0.75, 1.0), 0.04
 """Least turn that sides which the visits did not share would show, shares of a thing's size that it may stand aside by
 then, and how much more of it may lie where a visit saw through."""
+_CLOSER, _BEST = (0.12, 0.06, 0.03), 8
+"""Shares of a thing's size that the best so far, so many of them, are shifted by to clash less."""
 _COLORFUL, _ALIKE_COLORS, _FITS = 0.04, 0.5, 0.9
 """How much the colours of a thing vary which tell a turn, by how much less they have to differ then, and share of its
 surface that has to fit."""
@@ -114,18 +116,32 @@ def _is_another_possible(fit: Fit, old: Shape, judge: Judge, up: np.ndarray) -> 
     for angle in (a for a in PROBED if abs(a) >= _CLEARLY_DEG):
         turned = turned_about(up, angle, middle) @ fit.T_new_old
         for shift in (np.zeros(3), *(share * reach * way for share in _ASIDE for way in around)):
-            others.append(turned.copy())
-            others[-1][:3, 3] += shift
+            others.append(_shifted(turned, shift))
     clashes = judge.clashes([fit.T_new_old, *others])
-    return bool(clashes[1:].min() <= clashes[0] + _CLASHES)
+    allowed, clashes = clashes[0] + _CLASHES, clashes[1:]
+    for step in _CLOSER:  # the best of a coarse grid may clash for lying beside where there is room
+        if clashes.min() <= allowed:
+            break
+        best = [others[k] for k in np.argsort(clashes)[:_BEST]]
+        others = best + [_shifted(T, step * reach * way) for T in best for way in around]
+        clashes = judge.clashes(others)
+    return bool(clashes.min() <= allowed)
+
+
+def _shifted(T: np.ndarray, by: np.ndarray) -> np.ndarray:
+    moved = T.copy()
+    moved[:3, 3] += by
+    return moved
 
 
 def _share_sides(hidden: tuple[float, float]) -> bool:
     """Whether both visits saw much of the same, however the thing turned."""
-    return 360 - sum(hidden) >= _SHARED * (360 - max(hidden))
+    least = 360 - max(hidden)
+    return least > 0 and 360 - sum(hidden) >= _SHARED * least
 
 
 def _is_told_by_colors(fit: Fit, old: Shape, new: Shape) -> bool:
     """Whether the colours of either surface vary, and agree far better than by chance."""
-    varies = min(float(np.abs(s.colors - np.median(s.colors, axis=0)).mean()) for s in (old, new))
+    # As `color_apart`, medians: a patch on a plain thing makes the mean large, and misplaced it leaves no median.
+    varies = min(float(np.median(np.abs(s.colors - np.median(s.colors, axis=0)), axis=0).mean()) for s in (old, new))
     return fit.share >= _FITS and varies >= _COLORFUL and fit.color_apart <= _ALIKE_COLORS * varies

@@ -48,8 +48,10 @@ def changes(
     ] = IdsName.auto,
 ) -> None:
     """List what was added, removed, moved or changed its look between two visits to one place."""
-    from ggslam.jobs.changes.changes import find_changes, write_changes
+    from ggslam.jobs.changes.changes import find_changes, make_folder_of_changes, write_changes
 
+    if out is not None:
+        make_folder_of_changes(out)  # not after minutes of work
     with progress_bar() as bar:
         outcome = find_changes(old, new, ids=choice_of_ids(ids), observer=ProgressObserver(bar))
     print_changes(outcome.table)

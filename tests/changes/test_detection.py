@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -107,6 +108,20 @@ TWIN, THIRD = Box(7, (0.35, 0.3), CUP.size, hue=3.0), Box(8, (-0.35, -0.35), hue
 
 
 @pytest.mark.long("shapes are compared from starts all around")
+def test_without_ids_what_another_stands_for_is_told_once() -> None:
+    old, new = Box(2, (0.0, 0.0), (0.16, 0.16, 0.14)), Box(3, (0.0, 0.0), (0.16, 0.16, 0.1), hue=2.5)
+    found, _ = detect(SmallVisit([old]), SmallVisit([new]), False)
+    assert kinds(found) == ["added", "removed"] and not found.unseen and found.stayed == 1  # the floor
+
+
+def test_a_visit_that_measured_nothing_is_compared() -> None:
+    visit, other = SmallVisit([CUP]).build(), SmallVisit([CUP]).build()
+    nothing = replace(other, measured=np.zeros((0, 3)), normals=np.zeros((0, 3)))
+    for pair in ((visit, nothing), (nothing, visit)):
+        assert not ChangeDetector(*pair, ChangeSettings(), NativeContext(2)).detect().changes
+
+
+@pytest.mark.long("shapes are compared from starts all around: 20 s beside others")
 def test_what_moved_may_stand_where_something_was_taken_away() -> None:
     """Two things of one shape: one is gone, and the other one stands in its place."""
     here = Box(TWIN.id, CUP.at, TWIN.size, CUP.turn, TWIN.hue)

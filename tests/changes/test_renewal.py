@@ -102,3 +102,18 @@ def test_an_object_of_another_look_is_taken_from_the_newer_visit() -> None:
     tree = cKDTree(pair.new.means.numpy()[pair.renewal.came(pair.new)])
     assert fate.gone[ids == CUP.id].mean() > 0.9 and not fate.gone[ids == CRATE.id].any()
     assert tree.query(pair.old.means.numpy()[fate.gone])[0].max() < 0.01
+
+
+@pytest.mark.long("visits to a small scene are rendered and compared")
+def test_what_was_brought_to_another_things_old_place_is_not_that_things() -> None:
+    """Told by surfaces: a thing in two pieces went, and one that moved stands a centimetre beside where it stood."""
+    cut = Box(3, (0.2, -0.1), (0.1, 0.14, 0.16), 20, 2.0, cut=4)
+    moved = Box(2, (0.055, -0.1), turn=20)
+    old, new = SmallVisit([Box(2, (-0.3, 0.1)), cut]), SmallVisit([moved], around=(100, 150, 190, 230, 270))
+    found, detector = detect(old, new, False)
+    assert [change.kind for change in found.changes] == ["moved", "removed"]
+    gaussians = detector.visits[OLD].gaussians
+    ids = gaussians.object_id.numpy().copy()
+    fate = Renewal(detector, found, ChangeSettings()).renew(gaussians)
+    assert fate.moved[ids == 2].any() and not (fate.moved & fate.gone).any()
+    assert fate.gone[np.isin(ids, (3, 4))].all()

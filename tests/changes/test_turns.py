@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,7 @@ from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
 from ggslam.changes.turns import hidden_sector, tell_turn
 from ggslam.changes.upright import about
-from ggslam.scene.poses import turning_angle
+from ggslam.scene.poses import inverse, transform_points, turning_angle
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -38,6 +39,13 @@ def directions(*degrees: float) -> np.ndarray:
     return np.concatenate([np.repeat(sides, 10, 0), UP[None]])
 
 
+def patched(*rows: int) -> Shape:
+    """A white thing with dark patches."""
+    colors = np.full((60, 3), 0.85)
+    colors[list(rows)] = 0.1
+    return thing(colors)
+
+
 @pytest.mark.parametrize("azimuths, hidden", [
     (range(0, 360, 15), 0), ((5, 15, 35, 45), 300), ((5, 95, 185, 275), 60), ((5, 185), 150), ((), 360),
 ])  # fmt: skip
@@ -51,6 +59,8 @@ def test_sides_that_a_thing_was_not_seen_from(azimuths: tuple[float, ...], hidde
     (THING, (150, 150), False, 0.0, 1.0, False),  # either may have seen another side
     (COLORFUL, (240, 240), False, 0.02, 1.0, True),  # of which the colours tell that it is one
     (COLORFUL, (240, 240), False, 0.2, 1.0, False),
+    (patched(*range(12)), (240, 240), False, 0.0, 1.0, False),  # a patch elsewhere leaves as little
+    (THING, (360, 0), False, 0.0, 1.0, False),  # seen from above alone
     (COLORFUL, (240, 240), False, 0.02, 0.85, False),
     (COLORFUL, (240, 240), True, 0.02, 1.0, False),  # few things fall over
     (COLORFUL, (60, 60), True, 0.02, 1.0, True),
@@ -144,3 +154,28 @@ def test_another_turn_between_the_probed_ones_that_fits_about_as_well(
     judge: Any = SimpleNamespace(fit=fit, settings=ChangeSettings())
     found = tell_turn(fit(np.eye(4)), THING, THING, judge, (60, 60), UP)
     assert found.as_good_deg == told and found.turn_known == (told is None)
+
+
+@dataclass(frozen=True)
+class PatchedBox(Box):
+    """White, with a dark patch low on its front and one high on its back, neither where the other one is."""
+
+    def surface(self, spacing: float = 0.008) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        points, normals, colors, ids = super().surface(spacing)
+        local, deep = transform_points(points, inverse(self.pose())), self.size[1] / 2 - 1e-4
+        colors = np.full_like(colors, 0.85)
+        colors[(local[:, 1] < -deep) & (local[:, 0] < -0.01) & (local[:, 2] < 0)] = 0.1
+        colors[(local[:, 1] > deep) & (local[:, 0] < -0.01) & (local[:, 2] > 0)] = 0.1
+        return points, normals, colors, ids
+
+
+@pytest.mark.long("shapes are compared from starts all around")
+def test_a_plain_thing_with_a_patch_that_was_seen_from_opposite_sides_tells_no_turn() -> None:
+    """Its front is laid upon its back; that is known only if it could not stand there turned otherwise."""
+    old, new = PatchedBox(2, (-0.2, 0.0), (0.2, 0.1, 0.16)), PatchedBox(2, (0.2, 0.1), (0.2, 0.1, 0.16), turn=10)
+    visits = SmallVisit([old], around=(230, 250, 270, 290, 310)), SmallVisit([new], around=(50, 70, 90, 110, 130))
+    found, _ = detect(*visits, True)
+    [change] = found.changes
+    assert change.T_new_old is not None and change.fit is not None
+    off = np.degrees(turning_angle(change.T_new_old, new.pose() @ inverse(old.pose())))
+    assert off < 5 or not change.fit.turn_known

@@ -111,12 +111,9 @@ def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str 
         old, new: the runs, as the file shall name them.
 
     Raises:
-        ConfigError: `out` is a file or cannot be made.
+        ConfigError: `out` is a file, cannot be made or cannot be written to.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be made: {error.strerror}") from None
+    make_folder_of_changes(out)
     values, written = outcome.table.to_dict(), []
     for number, change in enumerate(outcome.table.found.changes):
         path = out / f"change{number:02d}_{change.kind}.png"
@@ -125,9 +122,19 @@ def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str 
         written.append(path)
     values = {"old": str(old), "new": str(new), "world": "of the old run", **values}
     write_text(out / CHANGES_FILE, json.dumps(json_ready(values), indent=1) + "\n")
-    for stale in set(out.glob("change[0-9][0-9]_*.png")) - set(written):  # of what was written there before
+    for stale in set(out.glob("change[0-9][0-9]*_*.png")) - set(written):  # of what was written there before
         stale.unlink()
     return [*written, out / CHANGES_FILE]
+
+
+def make_folder_of_changes(out: Path) -> None:
+    """Raises `ConfigError` if `out` is a file, cannot be made or cannot be written to."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written to: {error.strerror}") from None
 
 
 def show_changes(outcome: ChangesOutcome, old: str | Path, new: str | Path, most: int = MOST_PICTURES) -> ChangesShown:
