@@ -116,19 +116,19 @@ def _is_another_possible(fit: Fit, old: Shape, judge: Judge, up: np.ndarray) -> 
     for angle in (a for a in PROBED if abs(a) >= _CLEARLY_DEG):
         turned = turned_about(up, angle, middle) @ fit.T_new_old
         for shift in (np.zeros(3), *(share * reach * way for share in _ASIDE for way in around)):
-            others.append(_shifted(turned, shift))
+            others.append(_move_by(turned, shift))
     clashes = judge.clashes([fit.T_new_old, *others])
     allowed, clashes = clashes[0] + _CLASHES, clashes[1:]
     for step in _CLOSER:  # the best of a coarse grid may clash for lying beside where there is room
         if clashes.min() <= allowed:
             break
         best = [others[k] for k in np.argsort(clashes)[:_BEST]]
-        others = best + [_shifted(T, step * reach * way) for T in best for way in around]
+        others = best + [_move_by(T, step * reach * way) for T in best for way in around]
         clashes = judge.clashes(others)
     return bool(clashes.min() <= allowed)
 
 
-def _shifted(T: np.ndarray, by: np.ndarray) -> np.ndarray:
+def _move_by(T: np.ndarray, by: np.ndarray) -> np.ndarray:
     moved = T.copy()
     moved[:3, 3] += by
     return moved
