@@ -128,9 +128,9 @@ class ChangeDetector:
         found.changes += [Change("removed", t, None, confidence=_confidence(t, id(t) in by_id)) for t in gone]
         found.changes += [Change("added", None, t, confidence=_confidence(t, id(t) in by_id)) for t in come]
         self._compare_looks(found)
-        known = {id(change.old) for change in found.changes}
+        known = swapped | {id(change.old) for change in found.changes}
         for thing in self.things[0]:
-            if id(thing) in known or id(thing) in swapped:
+            if id(thing) in known:
                 continue
             if thing.seen < self.settings.min_seen:
                 found.unseen.append(Change("unseen", thing, None, reason=HARDLY_SEEN))

@@ -14,7 +14,7 @@ import numpy as np
 from ggslam.changes.thing_views import ThingViews
 from ggslam.changes.upright import LEVEL, tilt, upright, without_tilt
 from ggslam.geometry.colored_surface import ColoredSurface
-from ggslam.scene.poses import inverse, se3_exp, transform_points
+from ggslam.scene.poses import inverse, se3_exp, transform_points, translation
 
 _SAMPLE = 400
 """Points of either surface that are looked up in pictures."""
@@ -76,13 +76,13 @@ class Placing:
     def _search(self, T: np.ndarray, free: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
         """The best motion near one, by twists [6, k] about the thing's middle, and its cost."""
         beside = np.linalg.svd(up[None])[2][1:] * _BESIDE_M
-        starts = [_shift(a * beside[0] + b * beside[1]) @ T for a in (-1, 0, 1) for b in (-1, 0, 1)]
+        starts = [translation(a * beside[0] + b * beside[1]) @ T for a in (-1, 0, 1) for b in (-1, 0, 1)]
         found = [self._refine(start, free, _COARSE_M, _COARSE_STEPS) for start in starts]
         best = min(found, key=_cost)[0]
         middle = self._middle(best)
         for angle in (-_TURNED, _TURNED):
             turn = se3_exp(angle * np.append(np.zeros(3), up))
-            start = _shift(middle) @ turn @ _shift(-middle) @ best
+            start = translation(middle) @ turn @ translation(-middle) @ best
             found.append(self._refine(start, free, _COARSE_M, _COARSE_STEPS))
         kept = sorted(found, key=_cost)[:_KEPT]
         ends = [self._refine(start, free, _FINE_M, _FINE_STEPS) for start, _ in kept]
@@ -105,7 +105,7 @@ class Placing:
             H = free.T @ terms.H @ free
             H[np.diag_indices(len(H))] += damping * np.diag(H) + 1e-9
             twist = -free @ np.linalg.solve(H, free.T @ terms.g)
-            tried = _shift(middle) @ se3_exp(twist) @ _shift(-middle) @ T
+            tried = translation(middle) @ se3_exp(twist) @ translation(-middle) @ T
             after = self._terms(tried, scale, middle)
             if after.cost < terms.cost:
                 gained = terms.cost - after.cost
@@ -138,12 +138,6 @@ class Placing:
             g += J.T @ (weight * found.off)
             cost += float((squares / (squares + scale**2)).sum() / count) / 2
         return _Terms(cost, H, g)
-
-
-def _shift(by: np.ndarray) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, 3] = by
-    return T
 
 
 def _cost(found: tuple[np.ndarray, float]) -> float:

@@ -12,7 +12,7 @@ from ggslam.changes.fits import Fit, Judge
 from ggslam.changes.motions import ALIKE
 from ggslam.changes.shape import Shape, Target
 from ggslam.changes.upright import LEVEL, tilt, turned_about, upright
-from ggslam.scene.poses import transform_points, turning_angle
+from ggslam.scene.poses import transform_points, translation, turning_angle
 
 PROBED = (15, -15, 30, -30, *range(45, 181, 15), *range(-165, -44, 15))
 """Degrees that a thing is turned by to see whether it would fit as well."""
@@ -90,8 +90,8 @@ def _other_starts(fit: Fit, old: Shape, up: np.ndarray) -> list[np.ndarray]:
 
 def upright_starts(old: Shape, T: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
     """Motions [4, 4] that take a thing where one takes it, upright and turned in all ways that are probed."""
-    middle, stands = transform_points(old.points, T).mean(0), np.eye(4)
-    stands[:3, 3] = middle - old.points.mean(0)
+    middle = transform_points(old.points, T).mean(0)
+    stands = translation(middle - old.points.mean(0))
     return [turned_about(up, angle, middle) @ stands for angle in (0, *PROBED)]
 
 
@@ -116,22 +116,16 @@ def _is_another_possible(fit: Fit, old: Shape, judge: Judge, up: np.ndarray) -> 
     for angle in (a for a in PROBED if abs(a) >= _CLEARLY_DEG):
         turned = turned_about(up, angle, middle) @ fit.T_new_old
         for shift in (np.zeros(3), *(share * reach * way for share in _ASIDE for way in around)):
-            others.append(_move_by(turned, shift))
+            others.append(translation(shift) @ turned)
     clashes = judge.clashes([fit.T_new_old, *others])
     allowed, clashes = clashes[0] + _CLASHES, clashes[1:]
     for step in _CLOSER:  # the best of a coarse grid may clash for lying beside where there is room
         if clashes.min() <= allowed:
             break
         best = [others[k] for k in np.argsort(clashes)[:_BEST]]
-        others = best + [_move_by(T, step * reach * way) for T in best for way in around]
+        others = best + [translation(step * reach * way) @ T for T in best for way in around]
         clashes = judge.clashes(others)
     return bool(clashes.min() <= allowed)
-
-
-def _move_by(T: np.ndarray, by: np.ndarray) -> np.ndarray:
-    moved = T.copy()
-    moved[:3, 3] += by
-    return moved
 
 
 def _share_sides(hidden: tuple[float, float]) -> bool:

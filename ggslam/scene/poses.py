@@ -16,6 +16,14 @@ def skew(w: np.ndarray) -> np.ndarray:
     return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 
 
+def translation(by: np.ndarray) -> np.ndarray:
+    """Transforms [..., 4, 4] of shifts [..., 3]."""
+    T = np.zeros((*np.shape(by)[:-1], 4, 4))
+    T[..., :, :] = np.eye(4)
+    T[..., :3, 3] = by
+    return T
+
+
 def se3_exp(twist: np.ndarray) -> np.ndarray:
     """Exponential of a twist (v, w) [6], translation first: a transform [4, 4]. |w| in radians."""
     v, w = np.asarray(twist[:3], float), np.asarray(twist[3:], float)

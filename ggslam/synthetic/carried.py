@@ -6,8 +6,9 @@ from __future__ import annotations
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.scene.poses import translation
 from ggslam.synthetic.changes import fill, free_motion, outline
-from ggslam.synthetic.motion import Mover, Setting, sample_window, translation, turn
+from ggslam.synthetic.motion import Mover, Setting, sample_window, turn
 from ggslam.synthetic.scene import Shape
 
 LIFT = 0.22

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.scene.poses import translation
 from ggslam.synthetic.room import furnished_room
 from ggslam.synthetic.scene import Kind, Scene, Shape
 
@@ -77,7 +78,7 @@ def room_at_two_visits(seed: int, count: int) -> tuple[Scene, Scene, list[MadeCh
         middle = _middle([shape for shape in first.shapes if shape.instance == instance])
         if len(made) % 3 == 2:
             kind: Literal["removed", "added"] = "removed" if len(made) % 2 else "added"
-            _move(second if kind == "removed" else first, instance, _shift(_AWAY))
+            _move(second if kind == "removed" else first, instance, translation(_AWAY))
             made.append(MadeChange(kind, instance, names[instance], middle))
             continue
         T = free_motion(second, instance, rng)
@@ -152,12 +153,6 @@ def _carries(shape: Shape, points: np.ndarray, bottom: float) -> bool:
     if shape.kind == Kind.FRUSTUM:
         return bool((np.linalg.norm(local[:, :2], axis=1) < shape.half[0] * shape.top).all())
     return bool((np.abs(local[:, :2]) < np.array(shape.half[:2])).all())
-
-
-def _shift(by: np.ndarray) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, 3] = by
-    return T
 
 
 def _turn_about(middle: np.ndarray, angle: float) -> np.ndarray:

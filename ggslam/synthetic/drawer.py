@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.scene.poses import translation
 from ggslam.synthetic.changes import fill, outline
-from ggslam.synthetic.motion import Mover, Setting, sample_window, translation
+from ggslam.synthetic.motion import Mover, Setting, sample_window
 from ggslam.synthetic.scene import Kind, Shape
 
 _CHESTS = {"sideboard": (3, 2), "television stand": (3, 2), "desk": (1, 3)}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.scene.camera import Camera
+from ggslam.scene.poses import translation
 from ggslam.synthetic.scene import Scene, Shape
 
 
@@ -148,14 +149,6 @@ def sample_window(rng: np.random.Generator, frames: int) -> np.ndarray:
     """A short motion somewhere well inside a recording, as of `progress_between`."""
     first = rng.uniform(0.12, 0.5)
     return progress_between(frames, first, first + rng.uniform(0.25, 0.35))
-
-
-def translation(by: np.ndarray) -> np.ndarray:
-    """Transforms [..., 4, 4] of shifts [..., 3]."""
-    T = np.zeros((*np.shape(by)[:-1], 4, 4))
-    T[..., :, :] = np.eye(4)
-    T[..., :3, 3] = by
-    return T
 
 
 def turn(angles: np.ndarray, axis: int) -> np.ndarray:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.scene.poses import translation
 from ggslam.synthetic.materials import MaterialMaker
-from ggslam.synthetic.motion import Mover, Setting, progress_between, translation, turn
+from ggslam.synthetic.motion import Mover, Setting, progress_between, turn
 from ggslam.synthetic.scene import Scene, SceneBuilder, Shape
 
 RADIUS, HEIGHT = 0.26, 1.78

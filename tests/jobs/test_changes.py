@@ -67,4 +67,4 @@ def test_what_cannot_be_compared_is_refused(visits: tuple[Path, Path], tmp_path:
     assert done.returncode == 2 and "nothing" in done.stderr
     (tmp_path / "file").write_text("")
     done = ggslam("changes", *visits, "--out", tmp_path / "file")
-    assert done.returncode == 2 and "cannot be written to" in done.stderr
+    assert done.returncode == 2 and "cannot be made" in done.stderr

@@ -16,7 +16,6 @@ from ggslam.changes.detection import ChangeDetector
 from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Visit
-from ggslam.errors import ConfigError
 from ggslam.jobs.changes.ghosts import own_keyframes, without_ghosts
 from ggslam.jobs.changes.pictures import picture_of_change
 from ggslam.jobs.changes.shown import MOST_PICTURES, ChangesShown
@@ -30,7 +29,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.records.changes import ChangesRecord
 from ggslam.scene.poses import transform_points
-from ggslam.system.atomic import write_text
+from ggslam.system.atomic import make_folder, write_failure, write_text
 from ggslam.system.json_files import json_ready
 
 CHANGES_FILE = "changes.json"
@@ -111,7 +110,7 @@ def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str 
         old, new: the runs, as the file shall name them.
 
     Raises:
-        ConfigError: `out` is a file, cannot be made or cannot be written to.
+        RunFolderError: `out` is a file, cannot be made or cannot be written to.
     """
     make_folder_of_changes(out)
     values, written = outcome.table.to_dict(), []
@@ -128,13 +127,13 @@ def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str 
 
 
 def make_folder_of_changes(out: Path) -> None:
-    """Raises `ConfigError` if `out` is a file, cannot be made or cannot be written to."""
+    """Raises `RunFolderError` if `out` is a file, cannot be made or cannot be written to."""
+    make_folder(out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out):
             pass
     except OSError as error:
-        raise ConfigError(f"{out}: cannot be written to: {error.strerror}") from None
+        raise write_failure(out, error) from None
 
 
 def show_changes(outcome: ChangesOutcome, old: str | Path, new: str | Path, most: int = MOST_PICTURES) -> ChangesShown:
