@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
+from ggslam.geometry.moved_depth import largest_shift
 from ggslam.movers.evidence import CoarseView, Margin, compare, thin_out
 from ggslam.movers.segments import Gathering, gather, grow_places
 from ggslam.movers.settings import MoverSettings
@@ -20,13 +21,15 @@ from ggslam.movers.trail import Trail
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse
 
 AGES = (1, 2, 4, 8, 16, 32, 48)
 """Each frame is compared with those so many frames before it."""
 GROWN = 1
 """Pixels of a 320 pixel wide image by which masks of movers are larger than what was found: outlines are blurred."""
 PREDICTED = 6
-"""...and the larger of what is expected to move in the next frame."""
+"""...and the larger of what is expected to move in the next frame. What was seen once is expected there if the image
+shifts by no more than twice as much from frame to frame: else most of it will be elsewhere."""
 
 
 @dataclass
@@ -42,7 +45,7 @@ class MoverDetector:
         found: small mask of what moves, or may, in the latest frame...
         small: ...and of what does, as `mask`.
         things: int32 [H, W], number of the moving thing at each pixel, 0 without one, not grown; None: nothing.
-        expected: bool [H, W], what the next frame is located without: all of `found`.
+        expected: bool [H, W], what the next frame is located without: all of `found` that will be about there.
     """
 
     settings: MoverSettings
@@ -111,15 +114,16 @@ class MoverDetector:
         found = found.keep_credible(novel, (clearly + surely >= s.min_passed) & sure, moved)
         if found is None:
             return
-        self.found, self.expected = found.small, grow(found.full > 0, PREDICTED)
-        if before is not None:
-            seen_twice = found.pixels_near(before)
-            if seen_twice is not None:
-                self.mask = grow(seen_twice, GROWN)
-                self.things = np.where(seen_twice, found.full, 0)
-                self.small = thin_out(seen_twice, factor)
-                self.segments = found.segments_on(seen_twice)
-                self.trail.add(view, self.small)
+        self.found = found.small
+        seen_twice = None if before is None else found.pixels_near(before)
+        if seen_twice is not None:
+            self.mask = grow(seen_twice, GROWN)
+            self.things = np.where(seen_twice, found.full, 0)
+            self.small = thin_out(seen_twice, factor)
+            self.segments = found.segments_on(seen_twice)
+            self.trail.add(view, self.small)
+        likely = found.full > 0 if _stays_in_place(view, earlier[-1], found.small) else seen_twice
+        self.expected = None if likely is None else grow(likely, PREDICTED)
 
     def clean(self, frame: Frame) -> Frame:
         """The frame at hand without depth where something moves, which `Frame.moving` tells."""
@@ -130,6 +134,15 @@ class MoverDetector:
     def move(self, T_new_old: np.ndarray) -> None:
         """Follows a correction [4, 4] of the world about the camera."""
         self.views = [view.move(T_new_old) for view in self.views]
+
+
+def _stays_in_place(view: CoarseView, before: CoarseView, places: np.ndarray) -> bool:
+    """Whether what a view shows at some places, bool [h, w], hardly shifts in the image from one frame to the next."""
+    seen = view.depth[places & (view.depth > 0)]
+    if not len(seen):
+        return False
+    T_new_old = inverse(view.T_world_camera) @ before.T_world_camera
+    return largest_shift(T_new_old, view.camera, float(np.median(seen))) * 320 <= 2 * PREDICTED * view.camera.width
 
 
 def coarse_factor(camera: Camera, settings: MoverSettings) -> int:

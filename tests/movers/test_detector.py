@@ -218,6 +218,18 @@ def test_a_person_entering_is_left_out_of_tracking_before_they_are_believed() ->
     assert detector.mask is None and not detector.expect(following).depth[following.depth < 2].any()
 
 
+def test_what_was_seen_once_is_not_expected_where_the_image_shifts_far() -> None:
+    """At 60 pixels a frame it will be elsewhere; what is believed is left out as before."""
+    def far(n: int) -> np.ndarray:
+        return pose(30 * n)
+
+    detector, left_out = MoverDetector(MoverSettings()), []
+    for n, at in enumerate([None] * 3 + [0.9, 1.2, 1.5]):
+        detector.look(frame(30 * n, at), far(n), margin, CONTEXT)
+        left_out.append(bool(detector.found is not None and detector.expected is None))
+    assert left_out[3] and detector.mask is not None and detector.expected is not None
+
+
 def test_what_one_clear_look_passed_is_found_though_the_rest_was_not_seen_before() -> None:
     """The camera turns: of a tall thing at the side most lies where no frame before it looked."""
     detector = MoverDetector(MoverSettings())
