@@ -204,15 +204,16 @@ class ImageGeometry:
             depth = upsample_depth(depth, resize_color(color, width, height))
         return depth if self._maps is None else cv2.remap(depth, *self._maps, interpolation=cv2.INTER_NEAREST)
 
-    def mask(self, mask: np.ndarray) -> np.ndarray:
-        """Ids uint16 [H, W] as stored, on the colour image -> image of `camera`."""
+    def mask(self, mask: np.ndarray, shared: bool = True) -> np.ndarray:
+        """Ids uint16 [H, W] as stored, on the colour image -> image of `camera`; without `shared` those of its pixels
+        have none that several things have like shares of."""
         native = (self._work.width, self._work.height)
-        mask = resize_mask(mask, *native)
+        mask = resize_mask(mask, *native, shared)
         if self._warp is not None:
             mask = cv2.warpAffine(mask, self._warp, native, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
         if self._maps is not None:
             mask = cv2.remap(mask, *self._maps, interpolation=cv2.INTER_NEAREST)
-        return resize_mask(mask, self.camera.width, self.camera.height)
+        return resize_mask(mask, self.camera.width, self.camera.height, shared)
 
 
 def _color_camera(recording: Recording, color_size: Size, color_file: ImageFile) -> Camera:

@@ -95,11 +95,32 @@ def _overlaps(size: int, new_size: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(np.minimum(at[:, k], size - 1), weights[:, k].astype(np.float32)) for k in range(count)]
 
 
-def resize_mask(mask: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Nearest pixel of an id image uint16 [H, W] on `height` x `width` pixels (ids are never mixed)."""
+def resize_mask(mask: np.ndarray, width: int, height: int, shared: bool = True) -> np.ndarray:
+    """Ids uint16 [H, W] on `height` x `width` pixels, none of them mixed.
+
+    A new pixel gets the id of the pixel at its centre; where the centre lies between pixels, the one that most of them
+    have. Where several have as many, it is the first or the last of these by turns, as squares of a chessboard are:
+    always the first would move all outlines by half a pixel against the colours. Without `shared` it is 0, none.
+    """
     if mask.shape == (height, width):
         return mask
-    return mask[_nearest(mask.shape[0], height)][:, _nearest(mask.shape[1], width)]
+    rows, columns = _nearest(mask.shape[0], height), _nearest(mask.shape[1], width)
+    first, *others = [mask[r][:, c] for r in rows for c in columns]
+    if others:
+        row, column = np.nonzero(np.any([other != first for other in others], axis=0))
+        ids = np.stack([sample[row, column] for sample in (first, *others)])
+        first[row, column] = _most_frequent(ids, (row + column) % 2 > 0, shared)
+    return first
+
+
+def _most_frequent(ids: np.ndarray, last: np.ndarray, shared: bool) -> np.ndarray:
+    """Of each column of ids [S, n] the most frequent one; of several the first, or the last where `last`, bool [n]; 0
+    without `shared`."""
+    count = (ids[:, None] == ids).sum(1)
+    begin, end = count.argmax(0), len(ids) - 1 - count[::-1].argmax(0)
+    earliest, latest = (np.take_along_axis(ids, at[None], 0)[0] for at in (begin, end))
+    found = np.where(last, latest, earliest)
+    return found if shared else np.where(earliest == latest, found, 0)
 
 
 def _samples_of(image: np.ndarray, width: int, height: int) -> list[np.ndarray]:
@@ -123,7 +144,9 @@ def _samples(size: int, new_size: int) -> list[np.ndarray | slice]:
     return [np.minimum(((start + (k + 0.5) / count) * ratio).astype(np.int64), size - 1) for k in range(count)]
 
 
-def _nearest(size: int, new_size: int) -> np.ndarray:
-    """Source index nearest to the centre of every new pixel, int64 [new_size]; ties go to the lower index."""
-    centres = np.ceil((np.arange(new_size) + 0.5) * (size / new_size) - 1.0 - 1e-9)
-    return np.clip(centres, 0, size - 1).astype(np.int64)
+def _nearest(size: int, new_size: int) -> list[np.ndarray]:
+    """Source indices nearest to the centre of every new pixel, int64 [new_size]: one of each, or two where all centres
+    lie between pixels; of other ties the lower index."""
+    centres = (np.arange(new_size) + 0.5) * (size / new_size) - 0.5
+    below = np.clip(np.ceil(centres - 0.5 - 1e-9), 0, size - 1).astype(np.int64)
+    return [below, below + 1] if size % (2 * new_size) == 0 else [below]

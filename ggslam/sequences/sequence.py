@@ -29,8 +29,9 @@ from ggslam.sequences.stream import ReadAhead
 from ggslam.sequences.valid_pixels import common_fill, fill_of
 
 OnBadFrame = Literal["error", "skip"]
-ReadMasks = bool | Literal["lazy"]
-"""True: masks are read with the frame; "lazy": when `Frame.load_mask` is called; False: never."""
+ReadMasks = bool | Literal["lazy", "unshared"]
+"""True: masks are read with the frame; "unshared": so, too, but pixels of a smaller image that several things have like
+shares of get id 0; "lazy": when `Frame.load_mask` is called; False: never."""
 
 FILL_LOOKS = 4
 """Images that are compared with the first one where that is of one colour from a corner on."""
@@ -263,7 +264,7 @@ class Sequence:
             color=self._geometry.color(color),
             depth=self._geometry.depth(self._geometry.steady(depth, files, cv2.INTER_NEAREST), color),
             camera=self.camera,
-            mask=self._mask(index) if masks is True else None,
+            mask=self._mask(index, masks is True) if masks in (True, "unshared") else None,
             T_world_camera=pose.copy() if pose is not None and np.isfinite(pose).all() else None,
             valid=self.valid,
             depth_delay=0.0 if self._recording.depth_delays is None else float(self._recording.depth_delays[source]),
@@ -303,8 +304,9 @@ class Sequence:
         else:
             yield attempt
 
-    def _mask(self, index: int) -> np.ndarray | None:
-        """Mask of a frame, uint16 [H, W]; None when it has none or, with on_bad_frame="skip", a damaged one."""
+    def _mask(self, index: int, shared: bool = True) -> np.ndarray | None:
+        """Mask of a frame, uint16 [H, W]; None when it has none or, with on_bad_frame="skip", a damaged one. `shared`:
+        see `resize_mask`."""
         path = self.files(index).mask
         if path is None:
             return None
@@ -319,7 +321,7 @@ class Sequence:
                 _log.warning("frame %d goes without its mask: %s", index, error)
             self.mask_problems[index] = str(error)
             return None
-        return self._geometry.mask(self._geometry.steady(ids, self.files(index), cv2.INTER_NEAREST))
+        return self._geometry.mask(self._geometry.steady(ids, self.files(index), cv2.INTER_NEAREST), shared)
 
     def _read(self, source: int) -> tuple[np.ndarray, np.ndarray]:
         files = self._recording.files[source]

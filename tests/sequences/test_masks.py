@@ -288,6 +288,13 @@ def test_lazy_equals_eager(make: Make, name: str) -> None:
         assert frame.mask is None and frame.mask_loader is None and frame.load_mask() is None
 
 
+def test_unshared_masks_differ_where_things_share_a_pixel_alone(make: Make) -> None:
+    sequence = open_sequence(make("replica"), scale=0.5)
+    for a, b in zip(sequence.stream(), sequence.stream(masks="unshared"), strict=True):
+        assert a.mask is not None and b.mask is not None and (b.mask == 0).any()
+        np.testing.assert_array_equal(np.where(b.mask > 0, a.mask, 0), b.mask)
+
+
 def test_lazy_without_masks(make: Make) -> None:
     assert open_sequence(make("tum")).frame(0, masks="lazy").load_mask() is None
 

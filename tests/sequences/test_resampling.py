@@ -55,10 +55,37 @@ def test_colour_is_an_area_mean() -> None:
 
 def test_masks_keep_their_ids() -> None:
     mask = np.random.default_rng(1).integers(0, 60000, (20, 30)).astype(np.uint16)
-    np.testing.assert_array_equal(resize_mask(mask, 15, 10), mask[::2, ::2])
     np.testing.assert_array_equal(resize_mask(mask, 10, 20), mask[:, 1::3])
+    small = resize_mask(mask, 15, 10)
+    four = np.stack([mask[y::2, x::2] for y in (0, 1) for x in (0, 1)])
+    assert (four == small).any(0).all()
     np.testing.assert_array_equal(resize_mask(mask, 60, 40)[1::2, ::2], mask)
     assert set(np.unique(resize_mask(mask, 17, 13))) <= set(np.unique(mask))
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4])
+def test_outlines_stay_where_they_are_in_smaller_masks(factor: int) -> None:
+    y, x = np.mgrid[0:240, 0:240] + 0.5
+    disc = ((x - 121.3) ** 2 + (y - 118.4) ** 2 < 37.7**2).astype(np.uint16)
+    small = resize_mask(disc, 240 // factor, 240 // factor)
+    rows, columns = np.nonzero(small)
+    assert np.hypot(columns.mean() + 0.5 - 121.3 / factor, rows.mean() + 0.5 - 118.4 / factor) < 0.06
+    assert small.sum() == pytest.approx(np.pi * (37.7 / factor) ** 2, rel=0.02)
+
+
+def test_a_pixel_takes_the_id_that_most_of_it_has() -> None:
+    mask = np.array([[5, 5, 7, 7, 1, 2], [5, 7, 7, 5, 3, 4]] * 3, np.uint16)
+    mask[2:4, 4:] = 9
+    assert resize_mask(mask, 3, 3).tolist() == [[5, 7, 1], [5, 7, 9], [5, 7, 1]]
+    assert resize_mask(mask, 3, 3, shared=False).tolist() == [[5, 7, 0], [5, 7, 9], [5, 7, 0]]
+
+
+def test_what_two_things_share_half_and_half_is_theirs_by_turns_or_nobodys() -> None:
+    mask = np.full((8, 8), 3, np.uint16)
+    mask[:, 3:] = 4
+    assert resize_mask(mask, 4, 4)[:, 1].tolist() == [4, 3, 4, 3]
+    assert resize_mask(mask, 4, 4, shared=False).tolist() == [[3, 0, 4, 4]] * 4
+    assert (resize_mask(mask, 8, 8, shared=False) == mask).all()
 
 
 @pytest.mark.parametrize("factor", [0.9, 0.8, 0.7, 0.6, 0.55, 0.4, 0.37, 0.33])

@@ -79,7 +79,8 @@ MEANINGS = (
     ("overlap", "Share of a frame's points that found a partner in the map. Low: little of the view is mapped, or "
      "tracking is about to fail."),
     ("fit", "Root mean square distance of the matched points from the map's surface."),
-    ("mIoU", "Mean over objects of (pixels that both masks share) / (pixels that either has)."),
+    ("mIoU", "Mean over objects of (pixels that both masks share) / (pixels that either has). Where masks were made "
+     "smaller, pixels that things have like shares of are left out."),
     ("loss", "What the optimiser makes small on the keyframes it trains after each frame: colour (mean absolute "
      "difference), 1 - SSIM and depth (metres), added up with the weights of the settings mapping.loss."),
 )  # fmt: skip

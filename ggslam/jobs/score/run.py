@@ -202,7 +202,7 @@ def _up_to(last: int, sequence: Sequence, masks: bool) -> Iterator[Frame]:
     frame that stopped it."""
     if last < 0:
         return
-    for frame in sequence.stream(masks=masks):
+    for frame in sequence.stream(masks="unshared" if masks else False):
         yield frame
         if frame.index >= last:
             return
