@@ -22,7 +22,7 @@ from ggslam.mapping.labelling import KeyframeLabels, Labeller
 from ggslam.mapping.losses import LossGradients
 from ggslam.mapping.mean_map import MeanMap
 from ggslam.mapping.pixel_grid import WHOLE, PixelGrid, grid_of_turn
-from ggslam.mapping.pruning import prune
+from ggslam.mapping.pruning import is_look_due, prune
 from ggslam.mapping.residency import Residency
 from ggslam.mapping.sampling import KeyframeSampler
 from ggslam.mapping.settings import MapperSettings
@@ -180,6 +180,8 @@ class Mapper(ABC):
         self.keyframes.append(keyframe)
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
             prune(self.map, self.settings.pruning)
+        if self._is_noisy and is_look_due(len(self.keyframes)):
+            self.drop_hidden()
         self.times.insertion += time.perf_counter() - start
         self.times.keyframes += 1
         return keyframe
@@ -258,10 +260,14 @@ class Mapper(ABC):
 
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
         """Which of a keyframe's pixels the next step looks at."""
-        noisy = self.depth_noise_px >= self.settings.sparse_noise
-        if not noisy or self.extra_loss is not None or self._is_identity_dense:
+        if not self._is_noisy or self.extra_loss is not None or self._is_identity_dense:
             return WHOLE
         return grid_of_turn(keyframe.iterations + keyframe.index, keyframe.camera)
+
+    @property
+    def _is_noisy(self) -> bool:
+        """Whether depth is, see `MapperSettings.sparse_noise`."""
+        return self.depth_noise_px >= self.settings.sparse_noise
 
     @property
     def _is_identity_dense(self) -> bool:
@@ -405,6 +411,11 @@ class Mapper(ABC):
             loss: as `_evaluate_loss` gave it.
             pose_rate: size of the pose's step, metres and radians; 0: it stays.
         """
+
+    @abstractmethod
+    def drop_hidden(self) -> None:
+        """Drops Gaussians that keyframes inserted and none of them shows, see `PruningSettings.min_weight`; but those
+        of the newest keyframe, which are hardly trained, stay."""
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None, begin: int = 0) -> None:
         """Final refinement, for each part of a map that is in memory by turns: the map becomes the mean over the last

@@ -21,6 +21,9 @@ OUTLINE = 4
 THICK_M, THICK_RELATIVE = 0.02, 0.01
 """Metres, and share of the distance, by which Gaussians of a surface may lie behind what was measured of it."""
 
+FIRST_LOOK = 10
+"""Keyframes at which one looks for the first time for what surfaces hide."""
+
 
 def prune(gaussians: GaussianMap, settings: PruningSettings) -> int:
     """Drops transparent, huge and non-finite Gaussians; returns how many.
@@ -33,6 +36,13 @@ def prune(gaussians: GaussianMap, settings: PruningSettings) -> int:
     good = (gaussians.opacity_logits > logit) & (largest < math.log(settings.max_scale_m))
     good &= torch.isfinite(gaussians.means).all(1)
     return gaussians.keep(good)
+
+
+def is_look_due(keyframes: int) -> bool:
+    """Whether one looks for what surfaces hide when there are so many keyframes: 10, 20, 40, ... As there are ever more
+    of them to look from, the looks take about twice as long as the last of them."""
+    turns, rest = divmod(keyframes, FIRST_LOOK)
+    return rest == 0 and turns.bit_count() == 1
 
 
 def drop_moved(gaussians: GaussianMap, parts: Sequence[tuple[Keyframe, np.ndarray]]) -> None:

@@ -73,6 +73,10 @@ class CpuPixelTerms:
             np.zeros(pixels, np.int32), context,
         )  # fmt: skip
 
+    def rows(self) -> np.ndarray:
+        """Rows of the Gaussians that any of the pixels show, int32 [n], some more than once."""
+        return self.gaussians[np.arange(self.gaussians.shape[1]) < self.counts[:, None]]
+
     @staticmethod
     def of_gaussians(rows: np.ndarray, capacity: int, context: NativeContext) -> CpuPixelTerms:
         """Pseudo-pixels that show one Gaussian each, with weight 1: `rows` [M]."""

@@ -214,6 +214,7 @@ class Slam:
             if steps:
                 if not begin:
                     self.color_poses.align_keyframes()
+                    self.mapper.drop_hidden()
                 self.mapper.refine(steps, note, begin)
             self.color_poses.align_last(lambda: note(steps, steps))
         finally:  # an interrupted refinement counts for what it did

@@ -12,7 +12,7 @@ from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.keyframe import PoseAdam, make_keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.mean_map import AVERAGED
-from ggslam.mapping.pruning import prune
+from ggslam.mapping.pruning import is_look_due, prune
 from ggslam.mapping.settings import InsertionSettings, MapperSettings, PruningSettings
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
@@ -219,3 +219,64 @@ def test_keyframes_keep_depth_to_a_fifth_of_a_millimetre_and_drop_what_does_not_
 def test_pose_adam_ignores_a_gradient_that_is_no_number() -> None:
     T = np.eye(4)
     assert PoseAdam().step(T, np.full(6, np.nan), 1e-3) is T
+
+
+def with_hidden(count: int, birth: int, **changes: object) -> Mapper:
+    """The wall seen twice, and Gaussians far behind it that a keyframe is said to have inserted."""
+    mapper = make_mapper(**changes)
+    mapper.add_keyframe(wall(), np.eye(4))
+    mapper.run(30)
+    mapper.add_keyframe(wall(1), se3_exp(np.array([0.02, 0, 0, 0, 0.02, 0])))
+    at = torch.tensor([[0.4, 0.3, 4.0]]).repeat(count, 1)
+    mapper.map.insert(
+        at, torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.full((count, 3), -3.0), torch.full((count,), 2.0),
+        torch.full((count, 3), 0.5), birth_keyframe=birth,
+    )  # fmt: skip
+    return mapper
+
+
+def test_what_the_wall_hides_is_dropped() -> None:
+    mapper = with_hidden(50, birth=0)
+    before = len(mapper.map)
+    shown = mapper.render_view(CAMERA, np.eye(4)).image.clone()
+    mapper.drop_hidden()
+    assert not (mapper.map.means[:, 2] > 3.5).any()
+    assert 50 <= before - len(mapper.map) < 0.3 * before
+    assert (mapper.render_view(CAMERA, np.eye(4)).image - shown).abs().mean() < 0.01
+
+
+@pytest.mark.parametrize("birth", [-1, 1])
+def test_what_no_keyframe_or_the_newest_inserted_stays(birth: int) -> None:
+    mapper = with_hidden(50, birth)
+    mapper.drop_hidden()
+    assert (mapper.map.means[:, 2] > 3.5).sum() == 50
+
+
+def test_hidden_gaussians_stay_if_so_wanted_or_if_not_all_keyframes_are_in_memory() -> None:
+    mapper = with_hidden(50, 0, pruning=PruningSettings(min_weight=0))
+    mapper.drop_hidden()
+    assert (mapper.map.means[:, 2] > 3.5).sum() == 50
+
+    class Partly:
+        def trainable(self) -> list[int]:
+            return [1]
+
+    mapper = with_hidden(50, 0)
+    mapper.residency = Partly()  # type: ignore[assignment]
+    mapper.drop_hidden()
+    assert (mapper.map.means[:, 2] > 3.5).sum() == 50
+
+
+def test_looks_for_hidden_gaussians_get_rarer() -> None:
+    assert [n for n in range(200) if is_look_due(n)] == [10, 20, 40, 80, 160]
+
+
+def test_noisy_maps_lose_what_is_hidden_while_they_grow(monkeypatch: pytest.MonkeyPatch) -> None:
+    for noise, wanted in ((0.0, 0), (10.0, 1)):
+        mapper = make_mapper()
+        mapper.depth_noise_px = noise
+        looks: list[int] = []
+        monkeypatch.setattr(mapper, "drop_hidden", lambda looks=looks: looks.append(1))
+        for n in range(11):
+            mapper.add_keyframe(wall(n), np.eye(4))
+        assert len(looks) == wanted

@@ -55,8 +55,8 @@ def run(frames: list[Frame], settings: Config, library: CudaLibrary | None) -> t
 @pytest.mark.long("the whole loop under emulation")
 def test_same_run_as_on_the_cpu(frames: list[Frame], cuda_library: CudaLibrary) -> None:
     """Without identity nothing is drawn at random: map and trajectory are the CPU's up to rounding, if its steps draw
-    pixels to the end, too, and the last ones get smaller."""
-    as_on_the_gpu = ("mapping.close_below=0", "mapping.average_last=0")
+    pixels to the end, too, the last ones get smaller, and what surfaces hide stays."""
+    as_on_the_gpu = ("mapping.close_below=0", "mapping.average_last=0", "mapping.pruning.min_weight=0")
     settings = config("identity.enabled=false", "keyframes.max_gap=2", *as_on_the_gpu)
     slam, found = run(frames, settings, cuda_library)
     expected_slam, expected = run(frames, settings, None)

@@ -18,7 +18,7 @@ from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, m
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
-from ggslam.mapping.pixel_grid import WHOLE, PixelGrid
+from ggslam.mapping.pixel_grid import WHOLE, PixelGrid, grid_of_turn
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
@@ -151,6 +151,18 @@ class CpuMapper(Mapper):
         ids, share = terms.labels(self.vote_labels())
         ids, share = ids.reshape(grid.shape), share.reshape(grid.shape) * (alpha[::stride, ::stride] > 0.5)
         return MapLabels.from_grid(ids, share, depth, stride)
+
+    def drop_hidden(self) -> None:
+        least = self.settings.pruning.min_weight
+        if not least or not self.keyframes or len(self._trainable()) < len(self.keyframes):
+            return
+        born = self.map.birth_keyframe.numpy()
+        stays = (born < 0) | (born == self.keyframes[-1].index)
+        for keyframe in self.keyframes:
+            view = self._render(keyframe, features=False, grid=grid_of_turn(keyframe.index, keyframe.camera))
+            pixels = np.arange(view.alpha.numel(), dtype=np.int32)
+            stays[self._rasterizer.pixel_terms(pixels, TERMS, least).rows()] = True
+        self.map.keep(torch.from_numpy(stays))
 
     def _render(
         self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE, close_below: float = 0.0

@@ -109,6 +109,9 @@ class CudaMapper(Mapper):
             self.iterate(self._draw(numbers), self.settings.refine_decay)
         self._totals.send()
 
+    def drop_hidden(self) -> None:
+        """Nothing: it has not been tried on a GPU."""
+
     @property
     def _averaged_share(self) -> float:
         return 0.0  # the mean has not been tried on a GPU
