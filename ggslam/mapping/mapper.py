@@ -129,6 +129,8 @@ class Mapper(ABC):
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
         self.depth_noise_px = 0.0
         """The same as it moves a point in the image, pixels; see `MapperSettings.sparse_noise`."""
+        self.is_live = False
+        """Whether frames come at a camera's pace: keyframes do not wait then while one looks for what surfaces hide."""
         self.residency: Residency | None = None
         """Keeps a part of the map on disk; None: all of it is in memory."""
         self._valid: dict[int, np.ndarray | None] = {}
@@ -180,7 +182,7 @@ class Mapper(ABC):
         self.keyframes.append(keyframe)
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
             prune(self.map, self.settings.pruning)
-        if self._is_noisy and is_look_due(len(self.keyframes)):
+        if self._is_noisy and not self.is_live and is_look_due(len(self.keyframes)):
             self.drop_hidden()
         self.times.insertion += time.perf_counter() - start
         self.times.keyframes += 1

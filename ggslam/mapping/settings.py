@@ -90,8 +90,8 @@ class PruningSettings:
     """Larger Gaussians are dropped."""
     min_weight: float = setting(0.05, 0, 1)
     """Those that have no larger share than this of any pixel in any keyframe are dropped, for surfaces hide them: on
-    the CPU before the final refinement, and where depth is noisy (see `sparse_noise`) at 10, 20, 40, ... keyframes.
-    0: none; nor are any of a map that is partly on disk."""
+    the CPU before the final refinement, and where depth is noisy (see `sparse_noise`) at 10, 20, 40, ... keyframes
+    if frames need not be kept up with. 0: none; nor are any of a map that is partly on disk."""
 
 
 @settings_class(frozen=True)

@@ -41,7 +41,7 @@ class RealtimeSlam:
         self._mapper_error: BaseException | None = None
         self._beside_mapper = slam.mapper.beside_others()
         # The kernels of one context take turns; the tracker must not wait for the mapper's.
-        slam.color_poses.live = True  # the map changes meanwhile
+        slam.mapper.is_live = slam.color_poses.live = True  # the map changes meanwhile
         slam.tracker.context = slam.movers.context = NativeContext(slam.context.threads, slam.context.instruction_set)
 
     def run(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:

@@ -272,9 +272,9 @@ def test_looks_for_hidden_gaussians_get_rarer() -> None:
 
 
 def test_noisy_maps_lose_what_is_hidden_while_they_grow(monkeypatch: pytest.MonkeyPatch) -> None:
-    for noise, wanted in ((0.0, 0), (10.0, 1)):
+    for noise, live, wanted in ((0.0, False, 0), (10.0, False, 1), (10.0, True, 0)):
         mapper = make_mapper()
-        mapper.depth_noise_px = noise
+        mapper.depth_noise_px, mapper.is_live = noise, live
         looks: list[int] = []
         monkeypatch.setattr(mapper, "drop_hidden", lambda looks=looks: looks.append(1))
         for n in range(11):
