@@ -17,6 +17,7 @@ from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
 from ggslam.jobs.score.run import score_run
+from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, open_recording_of
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.scene.frame import Frame
@@ -55,6 +56,26 @@ def own_ids(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOutcome:
 @pytest.fixture(scope="module")
 def own_scores(own_ids: RunOutcome) -> MetricsRecord:
     return scores(own_ids)
+
+
+def test_pictures_show_ids_where_scores_leave_pixels_out(own_ids: RunOutcome, room: Path, tmp_path: Path) -> None:
+    """Masks of twice the size, moved by one of their pixels: along every outline two things share pixels half and
+    half, which scores leave out and pictures do not."""
+    folder = RunFolder(Path(shutil.copytree(own_ids.folder.path, tmp_path / "run")))
+    (tmp_path / "masks").mkdir()
+    for path in sorted((room / "masks").iterdir()):
+        ids = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        moved = np.roll(ids.repeat(2, 0).repeat(2, 1), (1, 1), (0, 1))
+        cv2.imwrite(str(tmp_path / "masks" / path.name), moved)
+    recording = open_recording_of(folder, masks=tmp_path / "masks")
+    [unshared] = [frame.mask for frame in recording.stream(masks="unshared") if frame.index == 0]
+    assert unshared is not None and (unshared == 0).mean() > 0.02
+    score_run(folder, recording, SilentObserver(), lpips=False, every=4)
+    picture = cv2.imread(str(folder.path / "renders" / "compare000000.png"))[:, :, ::-1]
+    height, width = unshared.shape
+    drawn = picture[-height:, :width]
+    unlabelled = (drawn == folder.object_table().palette()[0]).all(-1)
+    assert unlabelled.mean() < 0.002
 
 
 def test_masks_with_consistent_ids_are_learned_by_name(own_ids: RunOutcome, own_scores: MetricsRecord) -> None:

@@ -55,8 +55,9 @@ class ObjectScorer:
         return self._objects.map
 
     def add(
-        self, frame: Frame, rasterizer: CpuRasterizer, view: RenderBuffers, T_camera_world: np.ndarray, pictured: bool
-    ) -> list[np.ndarray] | None:
+        self, frame: Frame, rasterizer: CpuRasterizer, view: RenderBuffers, T_camera_world: np.ndarray,
+        pictured: Frame | None,
+    ) -> list[np.ndarray] | None:  # fmt: skip
         """Counts one view in, if its frame has a mask.
 
         Args:
@@ -64,13 +65,14 @@ class ObjectScorer:
             rasterizer: which rendered `view` last.
             view: the rendered frame with features, of what `map.in_view` gave last.
             T_camera_world: [4, 4], the pose it was rendered from.
-            pictured: whether pictures are wanted.
+            pictured: the frame with the mask that pictures show, all of whose pixels have ids; None: no pictures are
+                wanted.
 
         Returns:
             Pictures of the true ids, the rendered ids and the rendered identities, uint8 [H, W, 3], if wanted. True ids
             have the colours of the objects they match in this view.
         """
-        if frame.mask is None and not pictured:
+        if frame.mask is None and pictured is None:
             return None
         scene = self._objects.in_view(frame.camera, T_camera_world)
         ids = object_ids(rasterizer, view, scene)
@@ -88,10 +90,11 @@ class ObjectScorer:
                 labels = vote_label_image(rasterizer, view, self._votes[rows], stride=VOTE_STRIDE)
                 voted.add(labels, truth[::VOTE_STRIDE, ::VOTE_STRIDE])
                 self._merge(self._voted, frame.index, voted)
-        if not pictured:
+        if pictured is None:
             return None
+        drawn = truth if pictured.mask is None else pictured.mask
         return [
-            color_of_ids(truth, self._truth_palette(counts.match())),
+            color_of_ids(drawn, self._truth_palette(counts.match())),
             color_of_ids(ids, self._palette),
             identity_picture(view, self._colors),
         ]

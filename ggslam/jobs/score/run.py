@@ -173,7 +173,7 @@ def _images(
     keyframes, held_out = sets["keyframes"], sets["held_out"]
     pictured = set(_spread(poses, PICTURES))
     make_folder(folder.path / "renders")
-    show = _shower(folder, poses, pictured, scorer, any(k.is_exposed for k in record.keyframes))
+    show = _shower(folder, sequence, poses, pictured, scorer, any(k.is_exposed for k in record.keyframes))
     rows: list[dict[str, Any]] = []
     observer.begin("score", len(sequence))
 
@@ -209,8 +209,9 @@ def _up_to(last: int, sequence: Sequence, masks: bool) -> Iterator[Frame]:
 
 
 def _shower(
-    folder: RunFolder, poses: dict[int, np.ndarray], pictured: set[int], scorer: ObjectScorer | None, exposed: bool
-) -> Callable[[Frame], RenderedView | None]:
+    folder: RunFolder, sequence: Sequence, poses: dict[int, np.ndarray], pictured: set[int],
+    scorer: ObjectScorer | None, exposed: bool,
+) -> Callable[[Frame], RenderedView | None]:  # fmt: skip
     """A function that renders the map as a frame's camera sees it, and keeps some of the pictures. If the exposure
     changed it measures that of each frame."""
     parts = folder.map_in_parts() if scorer is None else scorer.map
@@ -226,7 +227,8 @@ def _shower(
         depth = np.where(view.alpha.numpy() > 0.5, view.expected_depth.numpy(), 0)
         row = None
         if scorer is not None:
-            row = scorer.add(frame, rasterizer, view, T_camera_world, frame.index in pictured)
+            drawn = sequence.frame(frame.index) if frame.index in pictured else None
+            row = scorer.add(frame, rasterizer, view, T_camera_world, drawn)
         if frame.index in pictured:
             picture = compare_pictures(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth, row)
             write_picture(folder.path / "renders" / f"compare{frame.index:06d}.png", picture)
