@@ -21,6 +21,8 @@ _FEW = 50_000
 """Voxels that are sampled, where Gaussians come in parts, before one looks which are finished."""
 _BLOCK_EDGE = 0.25
 """Metres: how finely it is known where parts to come reach."""
+_MOST_CUBES = 1 << 16
+"""Of such blocks, that one Gaussian may reach into for it to be known which: 10 m in each direction."""
 USUAL_VOXEL = 0.01
 """Metres."""
 _MOST_SAMPLES = 250
@@ -119,7 +121,7 @@ def sample_parts(
     lows, highs = np.stack([part.low for part in parts]), np.stack([part.high for part in parts])
     axis = int((highs.max(0) - lows.min(0)).argmax())
     order = np.argsort(lows[:, axis], kind="stable").tolist()
-    sections: list[np.ndarray] = []
+    sections: list[np.ndarray | None] = []
     for number in order:
         whole = SurfaceDiscs.of(parts[number].load(), minimum_opacity)
         sections += [_cubes(discs, voxel_size) for discs in whole.cut(axis)]
@@ -161,12 +163,14 @@ def _cube_edge(voxel_size: float) -> int:
     return max(1, round(_BLOCK_EDGE / voxel_size))
 
 
-def _cubes(discs: SurfaceDiscs, voxel_size: float) -> np.ndarray:
-    """The cubes that samples may fall into, packed, sorted."""
+def _cubes(discs: SurfaceDiscs, voxel_size: float) -> np.ndarray | None:
+    """The cubes that samples may fall into, packed, sorted; None: a Gaussian is so large that they are too many."""
     # A disc reaches along an axis of the world as far as its two half axes do together, and samples are rounded.
     reach = np.sqrt(((discs.axes * discs.reach[:, None, :]) ** 2).sum(2)) + voxel_size
     edge = voxel_size * _cube_edge(voxel_size)
     low, high = (np.floor((discs.means + side * reach) / edge).astype(np.int64) for side in (-1, 1))
+    if ((high - low + 1.0).prod(1)).max(initial=0) > _MOST_CUBES:
+        return None
     few = ((high - low) <= 1).all(1)
     corners = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
     found = [np.unique(_pack(np.minimum(low[few] + corner, high[few]))) for corner in corners]
@@ -180,13 +184,14 @@ class _Blocks:
     """Tells which voxels no section to come reaches.
 
     Args:
-        of_section: the cubes that each reaches into, from `_cubes`.
+        of_section: the cubes that each reaches into, from `_cubes`; None: into any.
     """
 
-    def __init__(self, of_section: list[np.ndarray], voxel_size: float) -> None:
+    def __init__(self, of_section: list[np.ndarray | None], voxel_size: float) -> None:
         self._edge, self._of_section = _cube_edge(voxel_size), of_section
-        self._keys, self._to_come = np.unique(np.concatenate(of_section), return_counts=True)
-        self._left = len(of_section)
+        known = [cubes for cubes in of_section if cubes is not None]
+        self._keys, self._to_come = np.unique(np.concatenate([np.empty(0, np.int64), *known]), return_counts=True)
+        self._left, self._boundless = len(of_section), len(of_section) - len(known)
 
     @property
     def all_done(self) -> bool:
@@ -195,12 +200,20 @@ class _Blocks:
 
     def is_done(self, section: int) -> None:
         """A section is not to come any more."""
-        self._to_come[np.searchsorted(self._keys, self._of_section[section])] -= 1
+        cubes = self._of_section[section]
+        if cubes is None:
+            self._boundless -= 1
+        else:
+            self._to_come[np.searchsorted(self._keys, cubes)] -= 1
         self._left -= 1
 
     def are_done(self, voxels: np.ndarray) -> np.ndarray:
         """Whether voxels (packed, [N]) lie in the cubes of no section to come, bool [N]."""
         if not len(voxels) or self.all_done:
+            return np.ones(len(voxels), bool)
+        if self._boundless:
+            return np.zeros(len(voxels), bool)
+        if not len(self._keys):
             return np.ones(len(voxels), bool)
         key = _pack(_unpack(voxels) // self._edge)
         place = np.searchsorted(self._keys, key).clip(max=len(self._keys) - 1)

@@ -33,9 +33,9 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, orthonormalize
 
-COLORS_EVERY = 4
-"""Steps after which colours are bounded: free ones overshoot (13 % of a young map's Gaussians, by up to 0.4), and cut
-to bytes they cost up to 0.4 dB."""
+BOUND_EVERY = 4
+"""Iterations after which sizes and colours are bounded: free colours overshoot (13 % of a young map's Gaussians, by up
+to 0.4), and cut to bytes they cost up to 0.4 dB."""
 STEPS = 2
 """Steps of an iteration on every second pixel of every second row, each of which takes 0.57 of the time of one on
 all."""
@@ -358,12 +358,13 @@ class Mapper(ABC):
 
     def _count_iteration(self) -> None:
         self.times.iterations += 1
-        if self.times.iterations % COLORS_EVERY == 0:
-            self._bound_colors()
+        if self.times.iterations % BOUND_EVERY == 0:
+            self._bound_values()
 
-    def _bound_colors(self) -> None:
+    def _bound_values(self) -> None:
         """Colours that do not depend on the direction stay between black and white: formats with whole numbers have no
-        others."""
+        others. Gaussians stay of a size that is not dropped: what is hardly seen grows without end."""
+        self.map.bound_scales(self.settings.pruning.max_scale_m)
         if self.map.sh_degree == 0:
             self.map.bound_colors()
 
@@ -417,7 +418,8 @@ class Mapper(ABC):
     @abstractmethod
     def drop_hidden(self) -> None:
         """Drops Gaussians that keyframes inserted and none of them shows, see `PruningSettings.min_weight`; but those
-        of the newest keyframe, which are hardly trained, stay."""
+        of the newest keyframe and of others of its instant, which are hardly trained, stay, and so does what a map has
+        from before."""
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None, begin: int = 0) -> None:
         """Final refinement, for each part of a map that is in memory by turns: the map becomes the mean over the last
@@ -437,7 +439,7 @@ class Mapper(ABC):
                 if progress is not None and done > begin and (done % 20 == 0 or done == iterations):
                     progress(done, iterations)
             self._mean.move_into(self.map)
-            self._bound_colors()
+            self._bound_values()
 
     def end_refinement(self) -> None:
         """Of a refinement that was cut off the map becomes the mean over what it has made of the last steps."""

@@ -30,6 +30,8 @@ GROWN = 1
 PREDICTED = 6
 """...and the larger of what is expected to move in the next frame. What was seen once is expected there if the image
 shifts by no more than twice as much from frame to frame: else most of it will be elsewhere."""
+FEWEST_ROWS = 8
+"""Rows and columns that the smaller images have at least, if the whole ones do."""
 
 
 @dataclass
@@ -147,7 +149,7 @@ def _stays_in_place(view: CoarseView, before: CoarseView, places: np.ndarray) ->
 
 def coarse_factor(camera: Camera, settings: MoverSettings) -> int:
     """How many times smaller the images are that are compared."""
-    return max(1, round(camera.width / settings.columns))
+    return max(1, min(round(camera.width / settings.columns), min(camera.width, camera.height) // FEWEST_ROWS))
 
 
 def grow(mask: np.ndarray, pixels: int) -> np.ndarray:

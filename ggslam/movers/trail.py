@@ -53,8 +53,7 @@ class Trail:
 
 def gone_since(
     earlier: CoarseView, newest: CoarseView, trail: Trail, segments: np.ndarray | None,
-    shape: tuple[int, int], margin: Margin, settings: MoverSettings,
-    context: NativeContext,
+    shape: tuple[int, int], factor: int, margin: Margin, settings: MoverSettings, context: NativeContext,
 ) -> np.ndarray | None:  # fmt: skip
     """What an earlier view shows where a mover has been since, and the newest view looks through.
 
@@ -64,6 +63,7 @@ def gone_since(
         trail: of movers.
         segments: ids uint16 [H, W] of the earlier view, or None.
         shape: of its image, (H, W).
+        factor: how many times the views are smaller.
         margin: see there.
         settings: how much of a segment has to be gone.
         context: that it is computed in.
@@ -79,7 +79,6 @@ def gone_since(
     passed = parts_with_seeds(evidence.passed & near, evidence.passed, SEED_SHARE)
     if passed.sum() < settings.min_pixels / 4:
         return None
-    factor = shape[1] // earlier.camera.width
     rests, world = np.zeros(passed.shape, bool), evidence.same
     found = gather(
         Gathering(passed, rests, earlier.depth > 0, rests, rests, earlier.depth, world, factor, shape),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam import __version__
-from ggslam.errors import GgslamError
+from ggslam.errors import GgslamError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.trajectory import write_tum
 from ggslam.movers.point_files import POINTS_FILE, points_to_arrays
@@ -88,8 +88,9 @@ class RunToWrite:
             write_bytes(folder / PLACES_FILE, result.places)
         try:  # last and largest; `ggslam export --format points` makes them again from the map
             save_points(folder, result)
-        except (GgslamError, OSError) as failure:
-            self.failure = failure
+        except (GgslamError, OSError, MemoryError) as failure:
+            short = RunFolderError(f"{POINTS[0]}: not enough memory: {failure}")
+            self.failure = short if isinstance(failure, MemoryError) else failure
             for name in POINTS:
                 (folder / name).unlink(missing_ok=True)
         else:

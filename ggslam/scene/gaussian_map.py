@@ -176,11 +176,11 @@ class GaussianMap:
 
     def bound_colors(self) -> None:
         """Brings colours of degree 0 between black and white."""
-        colors, bound = self.sh[:, 0].detach(), 0.5 / SH_C0
-        if colors.is_cpu:  # torch's threads take longer to wake than this takes
-            np.clip(colors.numpy(), -bound, bound, out=colors.numpy())
-        else:
-            colors.clamp_(-bound, bound)
+        _clamp(self.sh[:, 0], -0.5 / SH_C0, 0.5 / SH_C0)
+
+    def bound_scales(self, largest: float) -> None:
+        """Brings standard deviations to `largest`, metres, at most."""
+        _clamp(self.log_scales, None, math.log(largest))
 
     # --- whole rows --------------------------------------------------------------------------------------------------
 
@@ -297,6 +297,15 @@ class GaussianMap:
         self.means[rows] = self.means[rows] @ T[:3, :3].T + T[:3, 3]
         self.quaternions[rows] = _multiply(_quaternion(T[:3, :3]), self.quaternions[rows])
         self.version += 1
+
+
+def _clamp(values: torch.Tensor, least: float | None, most: float) -> None:
+    """Bounds values in place."""
+    values = values.detach()
+    if values.is_cpu:  # torch's threads take longer to wake than this takes
+        np.clip(values.numpy(), least, most, out=values.numpy())
+    else:
+        values.clamp_(least, most)
 
 
 def _quaternion(R: torch.Tensor) -> torch.Tensor:

@@ -116,7 +116,7 @@ class RunMovers:
                 found.append(None)
                 continue
             old = CoarseView.of(depth, camera, factor, T_world_camera, self._margin, self.context)
-            part = gone_since(old, view, trail, segments, depth.shape, self._margin, settings, self.context)
+            part = gone_since(old, view, trail, segments, depth.shape, factor, self._margin, settings, self.context)
             found.append(None if part is None else grow(part, GROWN))
         return found
 

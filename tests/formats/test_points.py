@@ -108,6 +108,20 @@ def test_voxels_go_with_large_gaussians(size: float, voxel: float) -> None:
     assert sum(map(len, clouds)) < 20 * 250
 
 
+def test_parts_with_a_gaussian_of_a_kilometre_are_those_of_the_whole_map() -> None:
+    """Where it reaches to is not told in cubes: they would take gigabytes."""
+    sizes = (10.0, 10.0, 1000.0, 10.0)
+    parts = [one([1000.0 * i, 0, 0], [size, size, 1e-3], 0.9, [0.5] * 3) for i, size in enumerate(sizes)]
+    whole = GaussianMap()
+    for i, size in enumerate(sizes):
+        add(whole, [1000.0 * i, 0, 0], [size, size, 1e-3], 0.9, [0.5] * 3)
+    clouds = list(sample_parts([MapPart.of(part) for part in parts], voxel_size=20.0))
+    found = np.concatenate([cloud.points for cloud in clouds])
+    expected = sample_points(whole, 20.0).points
+    assert len(found) == len(expected) > 1000
+    assert {tuple(p) for p in np.rint(found / 20).tolist()} == {tuple(p) for p in np.rint(expected / 20).tolist()}
+
+
 def test_the_size_of_the_chunks_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = sample_points(random_map(), 0.02, with_object_id=True)
     monkeypatch.setattr("ggslam.formats.point_sampling._CHUNK", 500)

@@ -96,6 +96,11 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match=r"changes\.json.*confidence"):
         changes_of(folder_with(tmp_path, {"changes": [{"kind": "moved", "name": "mug"}]}))
 
+    change = {"kind": "moved", "name": "mug", "confidence": 0.5, "T_new_old": [[1, 2], [3]]}
+    (tmp_path / "other").mkdir()
+    with pytest.raises(RunFolderError, match=r"changes\.json.*T_new_old"):
+        changes_of(folder_with(tmp_path / "other", {"changes": [change]}))
+
 
 def test_the_past_of_objects_is_told_by_visit() -> None:
     moved = np.eye(4)

@@ -68,3 +68,5 @@ def test_what_cannot_be_compared_is_refused(visits: tuple[Path, Path], tmp_path:
     (tmp_path / "file").write_text("")
     done = ggslam("changes", *visits, "--out", tmp_path / "file")
     assert done.returncode == 2 and "cannot be made" in done.stderr
+    done = ggslam("changes", *visits, "--out", visits[0])
+    assert done.returncode == 2 and "is a run" in done.stderr and not (visits[0] / "changes.json").exists()

@@ -9,7 +9,7 @@ import torch
 
 from ggslam.mapping.cpu.insertion import fill_gaussians
 from ggslam.mapping.cpu.mapper import CpuMapper
-from ggslam.mapping.keyframe import PoseAdam, make_keyframe
+from ggslam.mapping.keyframe import ELSEWHERE, PoseAdam, make_keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.mean_map import AVERAGED
 from ggslam.mapping.pruning import is_look_due, prune
@@ -149,7 +149,11 @@ def test_rates_fall_unless_the_map_is_averaged(share: float, decay: float, monke
 def test_the_map_becomes_the_mean_over_the_last_steps(steps: int, counted: range) -> None:
     """Of twelve steps the last half; of more one in four of these, the last one among them."""
     averaged, left = (
-        CpuMapper(GaussianMap(1), MapperSettings(average_last=share, refine_decay=1.0), NativeContext(2))
+        CpuMapper(
+            GaussianMap(1),
+            MapperSettings(average_last=share, refine_decay=1.0, pruning=PruningSettings(max_scale_m=100)),
+            NativeContext(2),
+        )
         for share in (0.5, 0.0)
     )
     for mapper in (averaged, left):
@@ -250,6 +254,45 @@ def test_what_no_keyframe_or_the_newest_inserted_stays(birth: int) -> None:
     mapper = with_hidden(50, birth)
     mapper.drop_hidden()
     assert (mapper.map.means[:, 2] > 3.5).sum() == 50
+
+
+def test_what_an_earlier_map_has_stays() -> None:
+    mapper = with_hidden(50, birth=0)
+    mapper.keyframes[0] = dataclasses.replace(mapper.keyframes[0], frame_index=ELSEWHERE)
+    mapper.drop_hidden()
+    assert (mapper.map.means[:, 2] > 3.5).sum() == 50
+
+
+def test_what_other_cameras_of_the_newest_instant_inserted_stays() -> None:
+    mapper = with_hidden(50, birth=0)
+    for keyframe in mapper.keyframes:
+        keyframe.instant = 7
+    mapper.drop_hidden()
+    assert (mapper.map.means[:, 2] > 3.5).sum() == 50
+
+
+def test_few_keyframes_look_with_all_their_pixels() -> None:
+    """Two keyframes, and Gaussians of a third of a pixel: each pixel's own is dropped by none."""
+    mapper = make_mapper()
+    mapper.add_keyframe(wall(), np.eye(4))
+    mapper.map.log_scales -= 1.2
+    mapper.map.opacity_logits += 3
+    mapper.add_keyframe(wall(1), np.eye(4))
+    rendered = mapper.render_view(CAMERA, np.eye(4))
+    pixels = np.arange(rendered.alpha.numel(), dtype=np.int32)
+    shown = np.unique(mapper._rasterizer.pixel_terms(pixels, 32, 0.2).rows())
+    before = mapper.map.means.clone()
+    mapper.drop_hidden()
+    kept = {tuple(row) for row in mapper.map.means.tolist()}
+    assert len(shown) > 500 and all(tuple(row) in kept for row in before[shown].tolist())
+
+
+def test_sizes_are_bounded_while_maps_are_trained() -> None:
+    mapper = make_mapper()
+    mapper.add_keyframe(wall(), np.eye(4))
+    mapper.map.log_scales[:5] = 3.0
+    mapper.refine(4)
+    assert mapper.map.log_scales.max() <= np.log(mapper.settings.pruning.max_scale_m) + 1e-6
 
 
 def test_hidden_gaussians_stay_if_so_wanted_or_if_not_all_keyframes_are_in_memory() -> None:

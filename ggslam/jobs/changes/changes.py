@@ -16,6 +16,7 @@ from ggslam.changes.detection import ChangeDetector
 from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Visit
+from ggslam.errors import ConfigError
 from ggslam.jobs.changes.ghosts import own_keyframes, without_ghosts
 from ggslam.jobs.changes.pictures import picture_of_change
 from ggslam.jobs.changes.shown import MOST_PICTURES, ChangesShown
@@ -28,6 +29,7 @@ from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.records.changes import ChangesRecord
+from ggslam.runs.records.mark import RunRecord
 from ggslam.scene.poses import transform_points
 from ggslam.system.atomic import make_folder, write_failure, write_text
 from ggslam.system.json_files import json_ready
@@ -127,7 +129,10 @@ def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str 
 
 
 def make_folder_of_changes(out: Path) -> None:
-    """Raises `RunFolderError` if `out` is a file, cannot be made or cannot be written to."""
+    """Raises `RunFolderError` if `out` is a file, cannot be made or cannot be written to; `ConfigError` if it is a run.
+    """
+    if (out / RunRecord.FILE).is_file():
+        raise ConfigError(f"`out` {out}: is a run; choose another folder")
     make_folder(out)
     try:
         with tempfile.TemporaryFile(dir=out):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -14,7 +14,7 @@ from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
 from ggslam.mapping.identity import MIN_WEIGHT, TERMS
-from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, PoseAdam, make_keyframe
+from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, ELSEWHERE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
@@ -27,6 +27,12 @@ from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
+
+FEW_LOOKS = 8
+"""Where fewer keyframes look for what surfaces hide, each looks with all its pixels; else with a quarter of them by
+turns, so that what one misses another one shows."""
+TERMS_AT_ONCE = 1 << 22
+"""Shares of pixels that are looked at together; each takes eight bytes."""
 
 
 class CpuMapper(Mapper):
@@ -87,7 +93,7 @@ class CpuMapper(Mapper):
         show: Callable[[], MapLabels] | None = None
         color = keyframe.color
         if self.map.count:
-            view = self._render(keyframe, features=False)
+            view = self._render(keyframe, features=False, close_below=self.settings.close_below)
             alpha, rendered = view.alpha.numpy(), view.expected_depth.numpy()
             where = find_unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
@@ -156,12 +162,16 @@ class CpuMapper(Mapper):
         least = self.settings.pruning.min_weight
         if not least or not self.keyframes or len(self._trainable()) < len(self.keyframes):
             return
+        own, newest = [k for k in self.keyframes if k.frame_index != ELSEWHERE], self.keyframes[-1]
+        untrained = {k.index for k in own if k is newest or (k.instant is not None and k.instant == newest.instant)}
         born = self.map.birth_keyframe.numpy()
-        stays = (born < 0) | (born == self.keyframes[-1].index)
-        for keyframe in self.keyframes:
-            view = self._render(keyframe, features=False, grid=grid_of_turn(keyframe.index, keyframe.camera))
-            pixels = np.arange(view.alpha.numel(), dtype=np.int32)
-            stays[self._rasterizer.pixel_terms(pixels, TERMS, least).rows()] = True
+        stays = ~np.isin(born, [k.index for k in own if k.index not in untrained])
+        for keyframe in own:
+            grid = WHOLE if len(own) < FEW_LOOKS else grid_of_turn(keyframe.index, keyframe.camera)
+            view = self._render(keyframe, features=False, grid=grid)
+            terms = int(1 / least) + 1  # a pixel has no more of such a share
+            for pixels in _chunks(view.alpha.numel(), TERMS_AT_ONCE // terms):
+                stays[self._rasterizer.pixel_terms(pixels, terms, least).rows()] = True
         self.map.keep(torch.from_numpy(stays))
 
     def _render(
@@ -194,3 +204,9 @@ class CpuMapper(Mapper):
         self._losses.color += loss.values.color
         self._losses.ssim += loss.values.ssim
         self._losses.depth += loss.values.depth
+
+
+def _chunks(count: int, size: int) -> Iterator[np.ndarray]:
+    """The numbers 0 to `count` - 1, int32, no more than `size` at a time."""
+    for begin in range(0, count, max(1, size)):
+        yield np.arange(begin, min(count, begin + max(1, size)), dtype=np.int32)

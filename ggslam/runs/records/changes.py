@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
+from ggslam.runs.records.movers import Pose
 from ggslam.runs.records.record import Record, RecordFile
 from ggslam.scene.oriented_box import OrientedBox
 
@@ -27,7 +28,7 @@ class ChangeRecord(Record):
     confidence: float
     old: ChangedSide | None = None
     new: ChangedSide | None = None
-    T_new_old: Any = None
+    T_new_old: Pose | None = None
     turn_known: bool | None = None
     moved_m: float | None = None
     turned_deg: float | None = None
