@@ -11,7 +11,7 @@ from ggslam.geometry.colored_surface import ColoredSurface
 from ggslam.geometry.normals import estimate_normals, turn_toward
 from ggslam.scene.camera import Camera
 
-MOST = 500
+MOST = 2000
 """Points: of more they are taken at regular distances."""
 _FEWEST, _NEIGHBOURS = 12, 9
 _OUTLYING = 3.0

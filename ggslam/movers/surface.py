@@ -17,15 +17,15 @@ VOXEL = 0.006
 """Metres, of points that are kept."""
 MOST_POINTS = 6000
 """A larger surface grows no more."""
-COLOR_M, NORMAL_M = 0.08, 0.025
+COLOR_M, NORMAL_M = 0.15, 0.05
 """Metres that the distance from black to full in one channel, and of unit normals, counts as where partners are looked
 for: the inside of a thin wall is no partner of its outside."""
 REACH_M = 0.03
 """Partners are looked for up to three times as far."""
-_TANGENT, _HELD = 0.1, 1.5
+_TANGENT, _HELD = 0.3, 1.5
 """Weight of the distance along the surface, and voxels up to which it counts: what lies beyond the edge of what was
 seen so far would pull."""
-_STEER, _PAIRED, _INNER = 200, 5, 2
+_STEER, _PAIRED, _INNER = 1000, 5, 2
 """Points that steer, searches for partners, and steps after each."""
 _SMALL = 1e-4
 _MOST_SEEN = 50.0
