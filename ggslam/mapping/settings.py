@@ -50,15 +50,15 @@ class LearningRates:
 
     means: float = setting(1.8e-3, 0, 10, "m")
     """Of the means, at a Gaussian's first step."""
-    quaternions: float = setting(1.2e-2, 0, 10)
+    quaternions: float = setting(1.8e-2, 0, 10)
     """Of the quaternions, at a Gaussian's first step."""
-    log_scales: float = setting(5e-2, 0, 10)
+    log_scales: float = setting(8e-2, 0, 10)
     """Of the logarithms of the standard deviations."""
     opacity_logits: float = setting(5e-2, 0, 10)
     """Of the logits of the opacities."""
     sh_dc: float = setting(0.108, 0, 10)
     """Of the colours' coefficient of degree 0, at a Gaussian's first step."""
-    fall_updates: float = setting(32.0, 0.1, 10**4)
+    fall_updates: float = setting(64.0, 0.1, 10**4)
     """Steps of means, quaternions and `sh_dc` at a Gaussian's u-th update are shorter than its first by the root of
     1 + (u - 1) / this, at most by 20."""
     sh_rest: float = setting(5e-4, 0, 10)
