@@ -91,7 +91,8 @@ class PruningSettings:
     min_weight: float = setting(0.05, 0, 1)
     """Those that have no larger share than this of any pixel in any keyframe are dropped, for surfaces hide them: on
     the CPU before the final refinement, and where depth is noisy (see `sparse_noise`) at 10, 20, 40, ... keyframes
-    if frames need not be kept up with. 0: none; nor are any of a map that is partly on disk."""
+    if frames need not be kept up with. Eight keyframes or more look with a quarter of their pixels each. 0: none; nor
+    are any of a map that is partly on disk, or that it has from before."""
 
 
 @settings_class(frozen=True)

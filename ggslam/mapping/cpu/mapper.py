@@ -31,6 +31,8 @@ from ggslam.scene.gaussian_map import GaussianMap
 FEW_LOOKS = 8
 """Where fewer keyframes look for what surfaces hide, each looks with all its pixels; else with a quarter of them by
 turns, so that what one misses another one shows."""
+MOST_TERMS = 256
+"""Shares of a pixel that are looked at; a pixel has hardly more that count."""
 TERMS_AT_ONCE = 1 << 22
 """Shares of pixels that are looked at together; each takes eight bytes."""
 
@@ -169,7 +171,7 @@ class CpuMapper(Mapper):
         for keyframe in own:
             grid = WHOLE if len(own) < FEW_LOOKS else grid_of_turn(keyframe.index, keyframe.camera)
             view = self._render(keyframe, features=False, grid=grid)
-            terms = int(1 / least) + 1  # a pixel has no more of such a share
+            terms = min(int(1 / least) + 1, MOST_TERMS)  # a pixel has no more of such a share
             for pixels in _chunks(view.alpha.numel(), TERMS_AT_ONCE // terms):
                 stays[self._rasterizer.pixel_terms(pixels, terms, least).rows()] = True
         self.map.keep(torch.from_numpy(stays))
