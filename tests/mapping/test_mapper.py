@@ -13,7 +13,7 @@ from ggslam.mapping.keyframe import ELSEWHERE, PoseAdam, make_keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.mean_map import AVERAGED
 from ggslam.mapping.pruning import is_look_due, prune
-from ggslam.mapping.settings import InsertionSettings, MapperSettings, PruningSettings
+from ggslam.mapping.settings import InsertionSettings, LearningRates, MapperSettings, PruningSettings
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -240,12 +240,13 @@ def with_hidden(count: int, birth: int, **changes: object) -> Mapper:
 
 
 def test_what_the_wall_hides_is_dropped() -> None:
-    mapper = with_hidden(50, birth=0)
+    rates = LearningRates(log_scales=0.05, quaternions=0.012, fall_updates=32)  # with longer steps neighbours hide more
+    mapper = with_hidden(50, birth=0, rates=rates)
     before = len(mapper.map)
     shown = mapper.render_view(CAMERA, np.eye(4)).image.clone()
     mapper.drop_hidden()
     assert not (mapper.map.means[:, 2] > 3.5).any()
-    assert 50 <= before - len(mapper.map) < 0.5 * before
+    assert 50 <= before - len(mapper.map) < 0.3 * before
     assert (mapper.render_view(CAMERA, np.eye(4)).image - shown).abs().mean() < 0.01
 
 

@@ -31,7 +31,7 @@ from ggslam.slam.slam import Slam
 from ggslam.submaps.grid import GridStore
 
 PLENTY = "memory_limit_mb=100000"
-SMALL = [PLENTY, "paging.budget_mb=3.0", "paging.cell=0.5", "paging.keep_radius=0.5", "paging.view_margin=1"]
+SMALL = [PLENTY, "paging.budget_mb=2.9", "paging.cell=0.5", "paging.keep_radius=0.5", "paging.view_margin=1"]
 PLAIN = ["mapping.iterations_per_frame=1", "identity.enabled=false"]
 REFINED = "refine_iterations=20"
 BEGINNING = 26
@@ -87,7 +87,7 @@ def test_a_limit_that_is_not_reached_changes_nothing(turning: Path, unlimited: R
 def test_a_limit_that_is_reached_keeps_the_map(turning: Path, unlimited: RunOutcome, limited: RunOutcome) -> None:
     paging = json.loads((limited.folder.path / "timing.json").read_text())["paging"]
     assert paging["moved_out"] > 500
-    assert paging["most_resident"] < 0.98 * limited.result.gaussian_count
+    assert paging["most_resident"] < 0.95 * limited.result.gaussian_count
     assert held_out_psnr(limited, turning) > held_out_psnr(unlimited, turning) - 0.3
     assert limited.result.gaussian_count == pytest.approx(unlimited.result.gaussian_count, rel=0.1)
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -172,8 +172,9 @@ class CpuMapper(Mapper):
             grid = WHOLE if len(own) < FEW_LOOKS else grid_of_turn(keyframe.index, keyframe.camera)
             view = self._render(keyframe, features=False, grid=grid)
             terms = min(int(1 / least) + 1, MOST_TERMS)  # a pixel has no more of such a share
-            for pixels in _chunks(view.alpha.numel(), TERMS_AT_ONCE // terms):
-                stays[self._rasterizer.pixel_terms(pixels, terms, least).rows()] = True
+            pixels, some = np.arange(view.alpha.numel(), dtype=np.int32), TERMS_AT_ONCE // terms
+            for begin in range(0, len(pixels), some):
+                stays[self._rasterizer.pixel_terms(pixels[begin : begin + some], terms, least).rows()] = True
         self.map.keep(torch.from_numpy(stays))
 
     def _render(
@@ -206,9 +207,3 @@ class CpuMapper(Mapper):
         self._losses.color += loss.values.color
         self._losses.ssim += loss.values.ssim
         self._losses.depth += loss.values.depth
-
-
-def _chunks(count: int, size: int) -> Iterator[np.ndarray]:
-    """The numbers 0 to `count` - 1, int32, no more than `size` at a time."""
-    for begin in range(0, count, max(1, size)):
-        yield np.arange(begin, min(count, begin + max(1, size)), dtype=np.int32)
