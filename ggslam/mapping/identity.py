@@ -92,7 +92,8 @@ class MaskOnGrid:
     @staticmethod
     def of(keyframe: MaskedKeyframe, grid: PixelGrid) -> MaskOnGrid:
         """That of a keyframe."""
-        return MaskOnGrid(keyframe.index, None if keyframe.mask is None else grid.of(keyframe.mask))
+        mask = keyframe.mask
+        return MaskOnGrid(keyframe.index, None if mask is None else np.ascontiguousarray(grid.of(mask)))
 
 
 @dataclass

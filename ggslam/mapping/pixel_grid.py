@@ -39,10 +39,8 @@ class PixelGrid:
         return self.stride == 1
 
     def of(self, image: np.ndarray) -> np.ndarray:
-        """The grid's pixels [h, w, ...] of an image [H, W, ...], contiguous."""
-        if self.is_whole:
-            return image
-        return np.ascontiguousarray(image[self.row :: self.stride, self.column :: self.stride])
+        """The grid's pixels [h, w, ...] of an image [H, W, ...], where they lie in it."""
+        return image if self.is_whole else image[self.row :: self.stride, self.column :: self.stride]
 
     def camera(self, camera: Camera) -> Camera:
         """The camera whose whole image has the grid's pixels of `camera`'s, through the same rays."""

@@ -50,17 +50,19 @@ def checked_parameters(gaussians: Gaussians, device: torch.device) -> GaussianTe
         RenderError: as `check_gaussians` and `check_tensor`; or a parameter requires gradients, which autograd would
             never get from here.
     """
+    tensors = {name: getattr(gaussians, name) for name in PARAMETERS}
     if torch.is_grad_enabled():
-        for name in PARAMETERS:
-            if getattr(gaussians, name).requires_grad:
+        for name, tensor in tensors.items():
+            if tensor.requires_grad:
                 raise RenderError(
                     f"{name} requires gradients, which rasterizers do not record: call ggslam.render, or render the "
                     "detached parameters or under torch.no_grad()"
                 )
-    parameters = GaussianTensors(**{name: getattr(gaussians, name).detach() for name in PARAMETERS})
+    tensors = {name: tensor.detach() for name, tensor in tensors.items()}
+    parameters = GaussianTensors(**tensors)
     check_gaussians(parameters)
-    for name in PARAMETERS:
-        check_tensor(name, getattr(parameters, name), device)
+    for name, tensor in tensors.items():
+        check_tensor(name, tensor, device)
     return parameters
 
 

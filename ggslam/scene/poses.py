@@ -26,17 +26,23 @@ def translation(by: np.ndarray) -> np.ndarray:
 
 def se3_exp(twist: np.ndarray) -> np.ndarray:
     """Exponential of a twist (v, w) [6], translation first: a transform [4, 4]. |w| in radians."""
-    v, w = np.asarray(twist[:3], float), np.asarray(twist[3:], float)
-    angle = float(np.linalg.norm(w))
-    W = skew(w)
+    vx, vy, vz, x, y, z = map(float, twist)  # numbers: optimisation steps take many, and arrays of three cost more
+    angle2 = x * x + y * y + z * z
+    angle = math.sqrt(angle2)
     if angle < 1e-6:
-        a, b, c = 1.0 - angle**2 / 6, 0.5 - angle**2 / 24, 1.0 / 6 - angle**2 / 120
+        a, b, c = 1.0 - angle2 / 6, 0.5 - angle2 / 24, 1.0 / 6 - angle2 / 120
     else:
-        a, b, c = np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    T = np.eye(4)
-    T[:3, :3] += a * W + b * W @ W
-    T[:3, 3] = (np.eye(3) + b * W + c * W @ W) @ v
-    return T
+        a, b, c = math.sin(angle) / angle, (1 - math.cos(angle)) / angle2, (angle - math.sin(angle)) / (angle2 * angle)
+    # R = I + a W + b W W and t = (I + b W + c W W) v, with W v = w x v and W W = w w^T - |w|^2 I.
+    along, d = c * (x * vx + y * vy + z * vz), 1.0 - c * angle2
+    ax, ay, az = a * x, a * y, a * z
+    xy, xz, yz = b * x * y, b * x * z, b * y * z
+    return np.array([
+        [1.0 - b * (y * y + z * z), xy - az, xz + ay, d * vx + b * (y * vz - z * vy) + along * x],
+        [xy + az, 1.0 - b * (x * x + z * z), yz - ax, d * vy + b * (z * vx - x * vz) + along * y],
+        [xz - ay, yz + ax, 1.0 - b * (x * x + y * y), d * vz + b * (x * vy - y * vx) + along * z],
+        [0.0, 0.0, 0.0, 1.0],
+    ])  # fmt: skip
 
 
 def so3_log(R: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ struct ImageLossJob {
   float* d_alpha;
 
   int32_t height, width;
+  int32_t target_row, target_step;  // pixels from one of the target's to that below, and to the next one
   int32_t target_depth_is_float;
   int32_t normalised_depth;  // compare depth / alpha with the target instead of depth
   int32_t charbonnier;       // sqrt(r^2 + eps^2) - eps instead of |r| for colour

@@ -9,7 +9,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/mapping.hpp"
-HEADER_SHA256 = "7d1b9a44e1b4fc3f622cad80b3a3ba5fd512a7f14579b46254e12b6697954a9d"
+HEADER_SHA256 = "01f42dadc662068ed7d37011461990e34bfa7b5aeb528807a21d4a58f68b21b2"
 
 
 class ImageLossJob(Structure):
@@ -18,9 +18,10 @@ class ImageLossJob(Structure):
     _fields_ = [
         ("image", c_void_p), ("depth", c_void_p), ("alpha", c_void_p), ("target_color", c_void_p),
         ("target_depth", c_void_p), ("target_valid", c_void_p), ("d_image", c_void_p), ("d_depth", c_void_p),
-        ("d_alpha", c_void_p), ("height", c_int32), ("width", c_int32), ("target_depth_is_float", c_int32),
-        ("normalised_depth", c_int32), ("charbonnier", c_int32), ("depth_scale", c_float), ("exposure", c_float * 6),
-        ("dssim_weight", c_float), ("depth_weight", c_float), ("opacity_weight", c_float), ("no_depth_weight", c_float),
+        ("d_alpha", c_void_p), ("height", c_int32), ("width", c_int32), ("target_row", c_int32),
+        ("target_step", c_int32), ("target_depth_is_float", c_int32), ("normalised_depth", c_int32),
+        ("charbonnier", c_int32), ("depth_scale", c_float), ("exposure", c_float * 6), ("dssim_weight", c_float),
+        ("depth_weight", c_float), ("opacity_weight", c_float), ("no_depth_weight", c_float),
         ("minimum_alpha", c_float), ("charbonnier_epsilon", c_float), ("total", c_double), ("color", c_double),
         ("l1", c_double), ("ssim", c_double), ("depth_term", c_double), ("opacity_term", c_double),
         ("depth_l1_m", c_double), ("psnr", c_double), ("valid_pixels", c_double), ("exposure_gradient", c_double * 6),

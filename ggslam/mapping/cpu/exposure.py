@@ -9,6 +9,8 @@ from ggslam.errors import RenderError
 from ggslam.mapping.settings import ExposureSettings
 from ggslam.rendering.exposure import identity_exposure
 
+_IDENTITY = identity_exposure()
+
 
 class ExposureAdam:
     """Adam (Kingma and Ba 2015) on gain and offset of one keyframe.
@@ -28,7 +30,7 @@ class ExposureAdam:
     @property
     def is_anchored(self) -> bool:
         """Whether the anchor is another than the identity."""
-        return bool((self.anchor != identity_exposure()).any())
+        return bool((self.anchor != _IDENTITY).any())
 
     def step(self, exposure: np.ndarray, gradient: np.ndarray, rate_factor: float = 1.0) -> np.ndarray:
         """The exposure after one step, float64 [3, 2].

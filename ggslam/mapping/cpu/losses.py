@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import NativeCoreError, RenderError
+from ggslam.interface.arrays import address
 from ggslam.interface.core.mapping import ImageLossJob
 from ggslam.mapping.losses import LOSS_WEIGHTS, LossGradients, LossTarget, LossValues, RenderedImages
 from ggslam.mapping.settings import LossSettings
@@ -68,11 +69,15 @@ class CpuImageLoss:
         job = ImageLossJob(height=height, width=width)
         for name, shape in (("image", (3, height, width)), ("depth", (height, width)), ("alpha", (height, width))):
             setattr(job, name, _check_rendered(name, getattr(rendered, name), shape).data_ptr())
-        color, depth = np.ascontiguousarray(target.color), np.ascontiguousarray(target.depth)
-        job.target_color, job.target_depth = color.ctypes.data, depth.ctypes.data
+        color, depth, valid = target.color, target.depth, target.valid
+        pitch = _pitch(color, depth, valid)
+        if pitch is None:
+            color, depth = np.ascontiguousarray(color), np.ascontiguousarray(depth)
+            valid = None if valid is None else np.ascontiguousarray(valid)
+        job.target_row, job.target_step = pitch or (width, 1)
+        job.target_color, job.target_depth = address(color), address(depth)
         job.target_depth_is_float = depth.dtype == np.float32
-        valid = None if target.valid is None else np.ascontiguousarray(target.valid)
-        job.target_valid = None if valid is None else valid.ctypes.data
+        job.target_valid = address(valid)
         job.depth_scale = target.depth_scale
         job.exposure[:] = _exposure(target).ravel().tolist()
         job.normalised_depth = settings.depth_kind == "normalised"
@@ -114,6 +119,14 @@ def _target_size(target: LossTarget[np.ndarray]) -> tuple[int, int]:
     if not (np.isfinite(target.depth_scale) and target.depth_scale > 0):
         raise RenderError(f"depth_scale: expected a number above 0, found {target.depth_scale!r}")
     return height, width
+
+
+def _pitch(color: np.ndarray, depth: np.ndarray, valid: np.ndarray | None) -> tuple[int, int] | None:
+    """Pixels from one to that below it and to the next one, if the target's images lie in memory like one another and
+    forwards: every n-th pixel of an image does, and is read where it lies."""
+    row, step = depth.strides[0] // depth.itemsize, depth.strides[1] // depth.itemsize
+    alike = color.strides == (3 * row, 3 * step, 1) and (valid is None or valid.strides == (row, step))
+    return (row, step) if alike and 1 <= step <= row else None
 
 
 def _exposure(target: LossTarget[np.ndarray]) -> np.ndarray:

@@ -115,6 +115,8 @@ GGSLAM_EXPORT int ggslam_image_loss_evaluate(void* context, void* workspace, ggs
   ImageLossJob& all = object_of<ImageLossJob>(job);
   check_range("height", all.height, 1, kMostPixelsAlong);
   check_range("width", all.width, 1, kMostPixelsAlong);
+  check_range("target_row", all.target_row, 1, kMostPixelsAlong);
+  check_range("target_step", all.target_step, 1, all.target_row);
   const void* const images[] = {all.image,        all.depth,   all.alpha,   all.target_color,
                                 all.target_depth, all.d_image, all.d_depth, all.d_alpha};
   for (const void* image : images) check_array("images", image, 1);

@@ -236,27 +236,30 @@ class ColorBand {
   ColorAccumulators sums_;
 };
 
-// The compiler vectorises the three loops below; GCC trusts __restrict on parameters only.
-void planar_color(const uint8_t* __restrict color, float* __restrict red, float* __restrict green,
+// The compiler vectorises the loops below where pixels follow one another; GCC trusts __restrict on parameters only.
+template <int kStep>
+void planar_color(const uint8_t* __restrict color, int step, float* __restrict red, float* __restrict green,
                   float* __restrict blue, int width) {
+  const int next = 3 * (kStep > 0 ? kStep : step);
   for (int x = 0; x < width; ++x) {
-    red[x] = color[3 * x] * (1.f / 255);
-    green[x] = color[3 * x + 1] * (1.f / 255);
-    blue[x] = color[3 * x + 2] * (1.f / 255);
+    red[x] = color[next * x] * (1.f / 255);
+    green[x] = color[next * x + 1] * (1.f / 255);
+    blue[x] = color[next * x + 2] * (1.f / 255);
   }
 }
 
 inline float known_depth(uint16_t units) { return units; }
 inline float known_depth(float units) { return units > 0.f && units <= 3e38f ? units : 0.f; }  // 0 for NaN too
 
-template <typename Unit>
-void metric_depth(const Unit* __restrict units, float scale, float* __restrict depth, int width) {
-  for (int x = 0; x < width; ++x) depth[x] = known_depth(units[x]) * scale;
+template <typename Unit, int kStep>
+void metric_depth(const Unit* __restrict units, int step, float scale, float* __restrict depth, int width) {
+  const int next = kStep > 0 ? kStep : step;
+  for (int x = 0; x < width; ++x) depth[x] = known_depth(units[next * x]) * scale;
 }
 
 // What a target does not show counts for nothing.
-void drop_invalid(const uint8_t* __restrict valid, float* __restrict weight, int width) {
-  for (int x = 0; x < width; ++x) weight[x] = valid[x] != 0 ? weight[x] : 0.f;
+void drop_invalid(const uint8_t* __restrict valid, int step, float* __restrict weight, int width) {
+  for (int x = 0; x < width; ++x) weight[x] = valid[step * x] != 0 ? weight[x] : 0.f;
 }
 
 // Returns the number of pixels with depth.
@@ -269,23 +272,32 @@ int color_weight(const float* __restrict depth, float no_depth_weight, float* __
   return count;
 }
 
+// kStep: the target's pixels from one to the next, 0: as the job says.
+template <int kStep>
+long long prepare_rows(const ImageLossJob& job, const ImageLossPlanes& planes, int begin, int end) {
+  const int width = job.width, step = job.target_step;
+  long long count = 0;
+  for (int y = begin; y < end; ++y) {
+    const std::size_t in = static_cast<std::size_t>(y) * job.target_row, out = y * planes.stride;
+    float* const depth = planes.depth + out;
+    planar_color<kStep>(job.target_color + 3 * in, step, planes.color[0] + out, planes.color[1] + out,
+                        planes.color[2] + out, width);
+    if (job.target_depth_is_float) {
+      metric_depth<float, kStep>(static_cast<const float*>(job.target_depth) + in, step, job.depth_scale, depth, width);
+    } else {
+      metric_depth<uint16_t, kStep>(static_cast<const uint16_t*>(job.target_depth) + in, step, job.depth_scale, depth,
+                                    width);
+    }
+    count += color_weight(depth, job.no_depth_weight, planes.weight + out, width);
+    if (job.target_valid != nullptr) drop_invalid(job.target_valid + in, step, planes.weight + out, width);
+  }
+  return count;
+}
+
 }  // namespace
 
 long long image_loss_prepare(const ImageLossJob& job, const ImageLossPlanes& planes, int begin, int end) {
-  const int width = job.width;
-  long long count = 0;
-  for (int y = begin; y < end; ++y) {
-    const std::size_t in = static_cast<std::size_t>(y) * width, out = y * planes.stride;
-    planar_color(job.target_color + 3 * in, planes.color[0] + out, planes.color[1] + out, planes.color[2] + out, width);
-    if (job.target_depth_is_float) {
-      metric_depth(static_cast<const float*>(job.target_depth) + in, job.depth_scale, planes.depth + out, width);
-    } else {
-      metric_depth(static_cast<const uint16_t*>(job.target_depth) + in, job.depth_scale, planes.depth + out, width);
-    }
-    count += color_weight(planes.depth + out, job.no_depth_weight, planes.weight + out, width);
-    if (job.target_valid != nullptr) drop_invalid(job.target_valid + in, planes.weight + out, width);
-  }
-  return count;
+  return job.target_step == 1 ? prepare_rows<1>(job, planes, begin, end) : prepare_rows<0>(job, planes, begin, end);
 }
 
 void image_loss_color_band(const ImageLossJob& job, const ImageLossPlanes& planes, float* rows, int channel, int begin,
