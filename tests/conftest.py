@@ -108,7 +108,7 @@ def room_run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     from ggslam.runs.recordings import SequenceRequest
 
     def build(out: Path) -> None:
-        few = ["mapping.iterations_per_frame=2"]
+        few = ["mapping.iterations_per_frame=2", "refine_iterations=20"]
         execute(RunRequest(SequenceRequest(room, stop=10), out=out, overrides=few, evaluate=False))
 
     return RunFolder.open(build_once(session_folder(tmp_path_factory) / "runs" / "room", build))

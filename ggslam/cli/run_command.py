@@ -79,7 +79,7 @@ Record = Annotated[
 Iterations = Annotated[int | None, typer.Option(help="Mapping iterations per frame (default 4).")]
 Refine = Annotated[
     int | None,
-    typer.Option(help="Mapping iterations after the last frame (default: seven tenths of those before)."),
+    typer.Option(help="Mapping iterations after the last frame (default: 1.2 for each one before)."),
 ]
 Realtime = Annotated[
     float | None, typer.Option(metavar="FPS", help="Deliver frames at this rate; tracker and mapper run side by side.")

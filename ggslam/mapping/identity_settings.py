@@ -36,7 +36,7 @@ class IdentitySettings:
     schedule: Literal["sampled", "dense", "votes"] = "sampled"
     """sampled: cross-entropy on sampled pixels of the view that is rendered for its colours anyway; dense: on all
     pixels of rendered identity images, as published; votes: count only, learn nothing."""
-    every: int = setting(5, 1, 10**6)
+    every: int = setting(7, 1, 10**6)
     """An identity step in every n-th mapping iteration."""
     final_passes: int = setting(4, 0, 10**4)
     """After the last frame all keyframes are visited so many times more for identity alone, with falling steps: what

@@ -37,8 +37,13 @@ BOUND_EVERY = 4
 """Iterations after which sizes and colours are bounded: free colours overshoot (13 % of a young map's Gaussians, by up
 to 0.4), and cut to bytes they cost up to 0.4 dB."""
 STEPS = 2
-"""Steps of an iteration on every second pixel of every second row, each of which takes 0.57 of the time of one on
-all."""
+"""Steps on every second pixel of every second row in an iteration at the end of a run with noisy depth. Each takes 0.57
+of the time of one on all pixels, and moves poses by a STEPS-th."""
+END_SHARE, LIVE_END_SHARE = 1.2, 0.4
+"""Iterations at the end of a run for each one before: these are on a quarter of the pixels and those on all, and to the
+map it hardly matters when its steps are made. Where a camera sets the pace, many fit in between."""
+LEAST_VISITS = 10
+"""Iterations at the end for each keyframe at least: of few frames the map would hardly see each."""
 AVERAGE_EVERY, AVERAGED_MAPS = 4, 8
 """Steps at most from one map to the next that joins the mean, and maps at least where there are as many steps."""
 FINAL_DECAY = 0.2
@@ -246,23 +251,24 @@ class Mapper(ABC):
         """Optimisation, see `KeyframeSampler` for the order of keyframes."""
         numbers = self._trainable()
         for _ in range(iterations):
-            self._iterate_over(numbers)
-
-    def _iterate_over(self, numbers: Sequence[int], rate_factor: float = 1.0, pose_factor: float = 1.0) -> None:
-        """One iteration on some keyframes: a step on all pixels of one, or STEPS on every second pixel of as many. It
-        is the same whether identities are trained, too, or not."""
-        for step in range(STEPS):
             keyframe = self._draw(numbers)
-            learns = step == 0 and self._is_identity_due(keyframe)
-            grid = self._choose_grid(keyframe)
-            self._step(keyframe, (rate_factor, pose_factor), grid, learns)
+            self._step(keyframe, (1.0, 1.0), self._choose_grid(keyframe), self._is_identity_due(keyframe))
+            self._count_iteration()
+
+    def _iterate_at_end(self, numbers: Sequence[int], rate_factor: float, pose_factor: float) -> None:
+        """One iteration of the final refinement on some keyframes: a step on all pixels of one or, where depth is
+        noisy, STEPS on every second pixel of as many. It is the same whether identities are trained, too, or not."""
+        for step in range(STEPS if self._is_noisy else 1):
+            keyframe = self._draw(numbers)
+            grid = self._choose_grid(keyframe) if self._is_noisy else WHOLE
+            self._step(keyframe, (rate_factor, pose_factor), grid, step == 0 and self._is_identity_due(keyframe))
             if grid.is_whole:
                 break
         self._count_iteration()
 
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
-        """Which of a keyframe's pixels the next step looks at."""
-        if not self._is_noisy or self.extra_loss is not None or self._is_identity_dense:
+        """Every second pixel of every second row of a keyframe, other ones each time; all if a loss needs them all."""
+        if self.extra_loss is not None or self._is_identity_dense:
             return WHOLE
         return grid_of_turn(keyframe.iterations + keyframe.index, keyframe.camera)
 
@@ -309,6 +315,12 @@ class Mapper(ABC):
             before, done = done, done + len(numbers)
             yield numbers, steps * done // len(self.keyframes) - steps * before // len(self.keyframes)
 
+    def last_iterations(self, before: int) -> int:
+        """Iterations of the final refinement after so many, unless a user says how many there are."""
+        if self.is_live or not before:
+            return round(LIVE_END_SHARE * before)
+        return max(round(END_SHARE * before), LEAST_VISITS * len(self.keyframes))
+
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
         """One iteration on the whole images of one keyframe.
 
@@ -349,7 +361,7 @@ class Mapper(ABC):
             optimizer=self._standard_adam if rate_factor == 1 else self._adam(rate_factor),
             detach_features=identity is None or identity.settings.detach,
         )  # fmt: skip
-        share = 1 if grid.is_whole else 1 / STEPS  # an iteration moves poses as far
+        share = 1 if grid.is_whole else 1 / STEPS  # fewer pixels tell less of where the camera was
         pose_rate = 0.0 if self._is_world(keyframe) else share * pose_factor * self._pose_rate
         self._finish_step(keyframe, step.twist, loss, pose_rate)
         times.backward += watch.lap()
@@ -432,7 +444,7 @@ class Mapper(ABC):
                 done += 1
                 if done > begin:
                     falling = self.settings.refine_decay ** (i / max(1, steps - 1))
-                    self._iterate_over(numbers, 1.0 if share else falling, falling)
+                    self._iterate_at_end(numbers, 1.0 if share else falling, falling)
                     left = steps - 1 - i
                     if left < share * steps and left % every == 0:
                         self._mean.add(self.map)

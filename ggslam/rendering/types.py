@@ -129,7 +129,8 @@ def check_gaussians(gaussians: Gaussians) -> None:
     for name, shape in expected.items():
         tensor = getattr(gaussians, name)
         found = tuple(tensor.shape)
-        if found != shape and (len(found) != len(shape) or any(a not in (b, -1) for a, b in zip(shape, found))):
+        known = len(found) == len(shape) and all(a in (b, -1) for a, b in zip(shape, found, strict=True))
+        if not known:
             raise RenderError(f"{name}: expected shape {list(shape)}, found {list(tensor.shape)} (-1: any)")
         if tensor.dtype != dtype or tensor.device != device:
             raise RenderError(

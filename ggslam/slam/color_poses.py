@@ -25,7 +25,8 @@ from ggslam.tracking.tracker import TrackerState, TrackingResult, TrackingStatus
 UNDECIDED = 32
 """Of so many first frames images are kept in case frames are to be aligned, of later ones once they are."""
 KEPT_BYTES = 1 << 26
-"""Memory for coded images of frames that are aligned at the end; later ones are aligned as they come."""
+"""Memory for coded images of frames that are aligned at the end; later ones stay where the tracker found them, for to
+the map as they find it they would be laid a decibel worse."""
 KEPT_BYTES_PAGED = 1 << 23
 """The same where memory is limited."""
 JPEG_QUALITY = 90
@@ -84,17 +85,15 @@ class ColorPoses:
 
     def note(self, frame: Frame, found: TrackingResult) -> None:
         """Keeps the image of the frame that `poses` took last, and that is no keyframe, if it is to be aligned at the
-        end; aligns it now if memory for images is used up."""
+        end and there is memory for it."""
         if not self.active or found.status in (TrackingStatus.LOST, TrackingStatus.FIRST):
             return
         number, depth = len(self.poses.frames) - 1, found.median_depth_m
         if not self._tells_more(depth) and number >= UNDECIDED:
             return
-        grey, hidden = grey_of(frame.color), _find_hidden(frame.moving, frame.valid)
         if self.held_bytes >= (KEPT_BYTES if self.mapper.residency is None else KEPT_BYTES_PAGED):
-            if not self.live:
-                self.poses.frames[number] = self._align_frame(number, depth, grey, hidden)
             return
+        grey, hidden = grey_of(frame.color), _find_hidden(frame.moving, frame.valid)
         coded = cv2.imencode(".jpg", np.rint(255 * grey).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
         mask = np.zeros(0, np.uint8) if hidden is None else cv2.imencode(".png", hidden.view(np.uint8))[1]
         self.images.append((number, depth, coded.reshape(-1), mask.reshape(-1)))

@@ -30,7 +30,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.color_poses import ColorPoses
-from ggslam.slam.config import REFINE_SHARE, Config
+from ggslam.slam.config import Config
 from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.earlier_views import EarlierViews
 from ggslam.slam.frame_poses import FramePoses
@@ -197,7 +197,7 @@ class Slam:
         if not self.mapper.keyframes or not self.growing:
             return 0
         asked, before = self.config.refine_iterations, self.mapper.times.iterations - self.refine_iterations
-        return asked if asked >= 0 else round(REFINE_SHARE * before)
+        return asked if asked >= 0 else self.mapper.last_iterations(before)
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refinement_steps`), then the result. `progress(done, total)` is called now and then."""

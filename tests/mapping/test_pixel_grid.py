@@ -90,9 +90,10 @@ def steps_of(mapper: CpuMapper, iterations: int) -> list[tuple[int, int]]:
     return sizes
 
 
-def test_with_noisy_depth_an_iteration_is_two_steps_on_half_the_rows_and_columns() -> None:
-    assert steps_of(make_mapper(), 2) == 2 * [(35, 49), (35, 48), (35, 48), (35, 49)]
-    assert steps_of(make_mapper(noise_px=0.1), 2) == 4 * [(70, 97)]
+def test_steps_are_on_half_the_rows_and_columns_but_the_last_ones_only_with_noisy_depth() -> None:
+    turns = [(35, 49), (35, 48), (35, 48), (35, 49)]
+    assert steps_of(make_mapper(), 2) == turns[:2] + turns[2:] + turns[:2]  # two steps an iteration at the end
+    assert steps_of(make_mapper(noise_px=0.1), 2) == turns[:2] + 2 * [(70, 97)]
     small = Camera(60, 50, 70.0, 70.0, 29.5, 24.5)
     assert steps_of(make_mapper(camera=small), 2) == 4 * [(50, 60)]
 
@@ -128,7 +129,7 @@ def test_votes_on_grids_are_those_of_their_pixels() -> None:
     columns = (mapper.map.means[:, 0] / mapper.map.means[:, 2] * CAMERA.fx + CAMERA.cx).numpy()
     far = np.abs(columns - 39.5) > 3
     assert (np.where(columns < 39.5, 5, 9) == ids)[far].all() and set(ids) == {5, 9}
-    assert mapper.identity is not None and mapper.identity.times.count == 12
+    assert mapper.identity is not None and mapper.identity.times.count == 60 // 7
     assert not mapper.identity._pools  # the next step has another grid: none are drawn ahead
 
 

@@ -160,15 +160,11 @@ def test_at_the_end_frames_are_laid_onto_the_map_where_depth_is_noisy(
     assert error < 0.85 * without
     keyframes = {keyframe.frame_index for keyframe in slam.mapper.keyframes}
     assert [number for number, *_ in slam.color_poses.images] == [n for n in range(24) if n not in keyframes]
-    monkeypatch.setattr(color_poses, "KEPT_BYTES", 0)  # no memory for images: each as it comes
-    at_once, error = tracked(room, drift=False)
-    assert not at_once.color_poses.images
-    moved = [
-        not np.array_equal(a.T_keyframe_camera, b.T_keyframe_camera)
-        for a, b in zip(at_once.frames, tracked_only.frames, strict=True)
-    ]
-    assert sum(moved) > 0.8 * (24 - len(keyframes))
-    assert error < 1.05 * without  # the map has hardly been trained by then
+    monkeypatch.setattr(color_poses, "KEPT_BYTES", 0)  # no memory for images: frames stay where they were found
+    stayed, error = tracked(room, drift=False)
+    assert not stayed.color_poses.images and error == without
+    for a, b in zip(stayed.frames, tracked_only.frames, strict=True):
+        assert np.array_equal(a.T_keyframe_camera, b.T_keyframe_camera)
 
 
 def test_what_hides_the_map_is_not_compared(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,8 +17,10 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError, DeviceError
 from ggslam.formats.trajectory import read_tum
 from ggslam.jobs.run.pipeline import RunRequest, execute
+from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper
+from ggslam.mapping.pixel_grid import WHOLE
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.records.sequence import OpenRecord, SequenceRecord
@@ -53,10 +55,14 @@ def run(frames: list[Frame], settings: Config, library: CudaLibrary | None) -> t
 
 
 @pytest.mark.long("the whole loop under emulation")
-def test_same_run_as_on_the_cpu(frames: list[Frame], cuda_library: CudaLibrary) -> None:
+def test_same_run_as_on_the_cpu(
+    frames: list[Frame], cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without identity nothing is drawn at random: map and trajectory are the CPU's up to rounding, if its steps draw
-    pixels to the end, too, the last ones get smaller, and what surfaces hide stays."""
-    as_on_the_gpu = ("mapping.close_below=0", "mapping.average_last=0", "mapping.pruning.min_weight=0")
+    all pixels and those to the end, too, the last ones get smaller, and what surfaces hide stays."""
+    monkeypatch.setattr(CpuMapper, "_choose_grid", lambda mapper, keyframe: WHOLE)
+    as_on_the_gpu = ["mapping.close_below=0", "mapping.average_last=0", "mapping.pruning.min_weight=0"]
+    as_on_the_gpu.append("refine_iterations=10")
     settings = config("identity.enabled=false", "keyframes.max_gap=2", *as_on_the_gpu)
     slam, found = run(frames, settings, cuda_library)
     expected_slam, expected = run(frames, settings, None)

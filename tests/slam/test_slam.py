@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def test_five_lines_of_python(room: Path) -> None:
     assert result.trajectory().shape == (6, 4, 4) and len(result.gaussians) > 1000 and len(result.keyframes) >= 1
 
 
-@pytest.mark.parametrize(("asked", "steps"), [(-1, 15), (0, 0), (7, 7)])
+@pytest.mark.parametrize(("asked", "steps"), [(-1, 50), (0, 0), (7, 7)])
 def test_a_run_ends_with_some_more_steps(frames: list[Frame], asked: int, steps: int) -> None:
     slam = new_slam(frames, f"refine_iterations={asked}")
     for frame in frames:
@@ -50,12 +51,23 @@ def test_a_run_ends_with_some_more_steps(frames: list[Frame], asked: int, steps:
     assert told[-1:] == ([(steps, steps)] if steps else [])
 
 
-def test_with_noisy_depth_steps_are_on_every_second_pixel(frames: list[Frame]) -> None:
+def test_with_noisy_depth_the_last_iterations_are_two_steps(frames: list[Frame]) -> None:
     for setting, steps in (("mapping.sparse_noise=0.2", 2), ("mapping.sparse_noise=1000", 1)):
-        slam = new_slam(frames, setting, "identity.enabled=false")
+        slam = new_slam(frames, setting, "identity.enabled=false", "refine_iterations=5")
         for frame in frames[:3]:
             slam.step(frame)
-        assert slam.mapper.times.steps == steps * slam.mapper.times.iterations == steps * 12
+        assert slam.mapper.times.steps == slam.mapper.times.iterations == 12
+        slam.finish()
+        assert slam.mapper.times.steps == 12 + steps * 5
+
+
+def test_the_end_has_more_steps_than_the_frames_had_and_some_for_each_keyframe(frames: list[Frame]) -> None:
+    mapper = new_slam(frames).mapper
+    assert mapper.last_iterations(0) == 0 and mapper.last_iterations(1000) == 1200
+    mapper.keyframes = 200 * [Mock()]
+    assert mapper.last_iterations(0) == 0 and mapper.last_iterations(1000) == 2000
+    mapper.is_live = True
+    assert mapper.last_iterations(1000) == 400
 
 
 def test_a_frame_without_depth_is_lost_and_the_next_one_is_found(frames: list[Frame]) -> None:
