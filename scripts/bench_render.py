@@ -164,9 +164,11 @@ class Ours:
     """ggslam's rasterizer on one workload."""
 
     def __init__(
-        self, instruction_set: str, threads: int, workload: tuple[GaussianMap, Camera, np.ndarray], detach: bool
-    ) -> None:
+        self, instruction_set: str, threads: int, workload: tuple[GaussianMap, Camera, np.ndarray],
+        detach: bool = False, close_below: float = 0.0,
+    ) -> None:  # fmt: skip
         self.map, self.camera, self.T_camera_world = workload
+        self.close_below = close_below
         self.rasterizer = CpuRasterizer(threads, instruction_set, low_pass=LOW_PASS)
         self.forward()
         self.gradients = [torch.randn_like(self.buffers.image), torch.randn_like(self.buffers.depth)]
@@ -177,7 +179,8 @@ class Ours:
         self.optimizer = AdamSettings({})  # all rates zero: the scene stays as it is
 
     def forward(self) -> None:
-        self.buffers = self.rasterizer.forward(self.map, self.camera, self.T_camera_world)
+        view = (self.map, self.camera, self.T_camera_world)
+        self.buffers = self.rasterizer.forward(*view, close_below=self.close_below)
 
     def backward(self) -> None:
         self.rasterizer.backward(*self.gradients, detach_features=self.detach)
@@ -215,17 +218,17 @@ def compare(
 ) -> None:
     """Prints one line of the table."""
     workload = make_workload(name, features, options.coherent)
-    candidates: dict[str, Prototype | Ours] = {"ours": Ours(instruction_set, threads, workload, options.detach)}
+    ours = Ours(instruction_set, threads, workload, options.detach, options.close_below)
+    candidates: dict[str, Prototype | Ours] = {"ours": ours}
     if library is not None:
         candidates["prototype"] = Prototype(library, threads, workload)
     best = {key: Best() for key in candidates}
     for _ in range(options.repeat):
         for key, candidate in candidates.items():
             best[key].measure(candidate)
-    ours = best["ours"]
     line = f"{name:5} {4 + features:3} {instruction_set:8} {threads:2} "
     for part in ("forward", "backward", "step"):
-        mine, text = getattr(ours, part), "       -      -"
+        mine, text = getattr(best["ours"], part), "       -      -"
         if "prototype" in best:
             theirs = getattr(best["prototype"], part)
             text = f"{theirs:8.2f} {theirs / mine:6.2f}"
@@ -238,7 +241,7 @@ def compare_with_reference() -> None:
     gaussians, camera, T_camera_world = make_workload("small", 0)
     leaves = {name: getattr(gaussians, name).clone().requires_grad_() for name in PARAMETERS}
     pose = torch.as_tensor(T_camera_world, dtype=torch.float32)
-    ours, best = Ours(available_instruction_sets()[-1], 2, (gaussians, camera, T_camera_world), False), Best()
+    ours, best = Ours(available_instruction_sets()[-1], 2, (gaussians, camera, T_camera_world)), Best()
     for _ in range(3):
         best.measure(ours)
     start = time.perf_counter()
@@ -262,6 +265,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=10)
     parser.add_argument("--coherent", action="store_true", help="Gaussians in the order of their pixels")
     parser.add_argument("--detach", action="store_true", help="features' gradients do not reach geometry (ggslam only)")
+    parser.add_argument("--close-below", type=float, default=0.0, help="end pixels so, as training does (ggslam only)")
     parser.add_argument("--no-reference", action="store_true", help="leave the torch reference out")
     arguments = parser.parse_args()
     torch.manual_seed(0)
