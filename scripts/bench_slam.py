@@ -77,7 +77,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--data", type=Path, default=default, help="folder with the recordings (or GGSLAM_DATA)")
     parser.add_argument("--only", nargs="*", default=RECORDINGS[:2], help="recordings")
     parser.add_argument("--iterations", nargs="*", type=int, default=[1, 2, 4, 8], help="k, iterations a frame")
-    parser.add_argument("--refine", type=int, default=0)
+    parser.add_argument("--refine", type=int, default=-1, help="steps at the end; -1: as by default")
     parser.add_argument("--realtime", type=float, default=0)
     parser.add_argument("--scale", type=float, default=0.5)
     parser.add_argument("--set", nargs="*", default=[], help="settings, name=value")
@@ -96,7 +96,7 @@ def main() -> None:
         for k in arguments.iterations:
             outcome = run(arguments.data / name, k, arguments, arguments.refine, arguments.realtime)
             outcomes.append({"recording": name, "k": k, **outcome})
-            label = str(k) + (f" + {arguments.refine}" if arguments.refine else "")
+            label = str(k) + (f" + {arguments.refine}" if arguments.refine >= 0 else "")
             label += f" realtime {arguments.realtime:g}" if arguments.realtime else ""
             print(line(name, label, cells(outcome)), flush=True)
             for frame in outcome["lost"]:

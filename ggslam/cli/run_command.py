@@ -30,7 +30,7 @@ EPILOG = """
 
   ggslam run data/redkitchen --scale 0.5
 
-  ggslam run data/redkitchen --scale 0.5 --iterations 8 --refine 1000 --out runs/kitchen
+  ggslam run data/redkitchen --scale 0.5 --iterations 8 --out runs/kitchen
 
   ggslam run data/redkitchen --scale 0.5 --realtime 10
 
@@ -79,7 +79,7 @@ Record = Annotated[
 Iterations = Annotated[int | None, typer.Option(help="Mapping iterations per frame (default 4).")]
 Refine = Annotated[
     int | None,
-    typer.Option(help="Mapping iterations after the last frame (default: 1.2 for each one before)."),
+    typer.Option(help="Mapping iterations after the last frame (default: 1.2 for each before, more of few frames)."),
 ]
 Realtime = Annotated[
     float | None, typer.Option(metavar="FPS", help="Deliver frames at this rate; tracker and mapper run side by side.")

@@ -39,11 +39,12 @@ to 0.4), and cut to bytes they cost up to 0.4 dB."""
 STEPS = 2
 """Steps on every second pixel of every second row in an iteration at the end of a run with noisy depth. Each takes 0.57
 of the time of one on all pixels, and moves poses by a STEPS-th."""
-END_SHARE, LIVE_END_SHARE = 1.2, 0.4
+END_SHARE, LIVE_END_SHARE, WHOLE_END_SHARE = 1.2, 0.4, 0.7
 """Iterations at the end of a run for each one before: these are on a quarter of the pixels and those on all, and to the
-map it hardly matters when its steps are made. Where a camera sets the pace, many fit in between."""
+map it hardly matters when its steps are made. Where a camera sets the pace, many fit in between; and where those before
+are on all pixels, too, fewer follow."""
 LEAST_VISITS = 10
-"""Iterations at the end for each keyframe at least: of few frames the map would hardly see each."""
+"""Iterations at the end for each keyframe of the recording at least: of few frames the map would hardly see each."""
 AVERAGE_EVERY, AVERAGED_MAPS = 4, 8
 """Steps at most from one map to the next that joins the mean, and maps at least where there are as many steps."""
 FINAL_DECAY = 0.2
@@ -251,11 +252,14 @@ class Mapper(ABC):
         """Optimisation, see `KeyframeSampler` for the order of keyframes."""
         numbers = self._trainable()
         for _ in range(iterations):
+            if self.residency is not None:  # a part on disk comes late to the last steps, and for short
+                self._iterate_wholly(numbers)
+                continue
             keyframe = self._draw(numbers)
             self._step(keyframe, (1.0, 1.0), self._choose_grid(keyframe), self._is_identity_due(keyframe))
             self._count_iteration()
 
-    def _iterate_at_end(self, numbers: Sequence[int], rate_factor: float, pose_factor: float) -> None:
+    def _iterate_wholly(self, numbers: Sequence[int], rate_factor: float = 1.0, pose_factor: float = 1.0) -> None:
         """One iteration of the final refinement on some keyframes: a step on all pixels of one or, where depth is
         noisy, STEPS on every second pixel of as many. It is the same whether identities are trained, too, or not."""
         for step in range(STEPS if self._is_noisy else 1):
@@ -317,9 +321,11 @@ class Mapper(ABC):
 
     def last_iterations(self, before: int) -> int:
         """Iterations of the final refinement after so many, unless a user says how many there are."""
+        if self.residency is not None:
+            return round(WHOLE_END_SHARE * before)
         if self.is_live or not before:
             return round(LIVE_END_SHARE * before)
-        return max(round(END_SHARE * before), LEAST_VISITS * len(self.keyframes))
+        return max(round(END_SHARE * before), LEAST_VISITS * sum(k.frame_index != ELSEWHERE for k in self.keyframes))
 
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
         """One iteration on the whole images of one keyframe.
@@ -444,7 +450,7 @@ class Mapper(ABC):
                 done += 1
                 if done > begin:
                     falling = self.settings.refine_decay ** (i / max(1, steps - 1))
-                    self._iterate_at_end(numbers, 1.0 if share else falling, falling)
+                    self._iterate_wholly(numbers, 1.0 if share else falling, falling)
                     left = steps - 1 - i
                     if left < share * steps and left % every == 0:
                         self._mean.add(self.map)

@@ -192,7 +192,7 @@ class MapperSettings:
 
     iterations_per_frame: int = setting(4, 0, 1000, basic=True)
     """Optimisation steps after each frame (synchronous runs); on the CPU each is on every second pixel of every second
-    row of a keyframe, other ones each time, in 0.57 of the time of a step on all."""
+    row of a keyframe, other ones each time, in 0.57 of the time of a step on all, unless memory is limited."""
     sparse_noise: float = setting(0.2, 0, 1e6, "px")
     """Where the noise of depth is as wide as this in the image, an iteration after the last frame is two steps on two
     keyframes, each on every second pixel of every second row, instead of one step on all pixels of one: there that is

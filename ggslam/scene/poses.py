@@ -25,9 +25,11 @@ def translation(by: np.ndarray) -> np.ndarray:
 
 
 def se3_exp(twist: np.ndarray) -> np.ndarray:
-    """Exponential of a twist (v, w) [6], translation first: a transform [4, 4]. |w| in radians."""
+    """Exponential of a twist (v, w) [6], translation first: a transform [4, 4], or NaN. |w| in radians."""
     vx, vy, vz, x, y, z = map(float, twist)  # numbers: optimisation steps take many, and arrays of three cost more
     angle2 = x * x + y * y + z * z
+    if not math.isfinite(angle2):
+        return np.full((4, 4), np.nan)
     angle = math.sqrt(angle2)
     if angle < 1e-6:
         a, b, c = 1.0 - angle2 / 6, 0.5 - angle2 / 24, 1.0 / 6 - angle2 / 120

@@ -70,7 +70,8 @@ class Config:
     """0: synchronous. Otherwise frames arrive at this rate like from a camera; tracker and mapper run side by side."""
     refine_iterations: int = setting(-1, -1, 10**7, basic=True)
     """Optimisation steps after the last frame, see `mapping.average_last`; 0: none; -1: 1.2 for each one before and
-    ten for each keyframe at least, which gains two decibels (0.4 at a camera's pace; 0.7 on a GPU)."""
+    ten for each keyframe at least, which gains two decibels (0.4 at a camera's pace; 0.7 on a GPU and where memory is
+    limited)."""
     memory_limit_mb: float = setting(0.0, 0, 1e9, "MB", basic=True)
     """Resident memory of the run: what does not fit of map and keyframes is kept on disk; 0: no limit."""
     tracking: TrackerSettings = field(default_factory=TrackerSettings)

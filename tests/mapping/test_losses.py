@@ -108,6 +108,40 @@ def test_kinds_of_input(float_depth: bool, exposure: np.ndarray | None) -> None:
     assert_agrees(loss.evaluate(view, target, SETTINGS["all"]), view, target, SETTINGS["all"])
 
 
+def laid_out(array: np.ndarray, how: str) -> np.ndarray:
+    """The same numbers, lying otherwise in memory."""
+    height, width, more = *array.shape[:2], array.shape[2:]
+    if how in ("every second", "every third", "far apart"):
+        n, room = (2 if how == "every second" else 3), 40_000 if how == "far apart" else 3 * width
+        image = np.zeros((n * height, room, *more), array.dtype)
+        view = image[1 : 1 + n * height : n, 1 : 1 + n * width : n]
+        view[...] = array
+        return view
+    if how == "packed with others":
+        rows = np.zeros((height, width), [("value", array.dtype, more), ("other", np.uint8)])
+        rows["value"] = array
+        return rows["value"]
+    return np.asfortranarray(array) if how == "by columns" else np.ascontiguousarray(array[::-1])[::-1]
+
+
+@pytest.mark.parametrize("float_depth", [False, True])
+@pytest.mark.parametrize(
+    "how", ["every second", "every third", "far apart", "packed with others", "by columns", "upside down"]
+)
+def test_targets_are_read_however_they_lie_in_memory(how: str, float_depth: bool) -> None:
+    view, target = make_case(21, 34, float_depth=float_depth)
+    valid = np.random.default_rng(1).random((21, 34)) < 0.9
+    target, loss = replace(target, valid=valid), CpuImageLoss(NativeContext(2))
+    expected = loss.evaluate(view, target, SETTINGS["all"])
+    gradients = [g.clone() for g in (expected.d_image, expected.d_depth, expected.d_alpha)]
+    for names in (("color", "depth", "valid"), ("depth",), ("color",)):
+        other = replace(target, **{name: laid_out(getattr(target, name), how) for name in names})
+        found = loss.evaluate(view, other, SETTINGS["all"])
+        assert found.values == expected.values
+        for a, b in zip(gradients, (found.d_image, found.d_depth, found.d_alpha), strict=True):
+            assert torch.equal(a, b)
+
+
 @pytest.mark.parametrize("name", SETTINGS)
 def test_no_depth_anywhere(name: str) -> None:
     view, target = make_case(37, 53)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -96,6 +97,12 @@ def test_steps_are_on_half_the_rows_and_columns_but_the_last_ones_only_with_nois
     assert steps_of(make_mapper(noise_px=0.1), 2) == turns[:2] + 2 * [(70, 97)]
     small = Camera(60, 50, 70.0, 70.0, 29.5, 24.5)
     assert steps_of(make_mapper(camera=small), 2) == 4 * [(50, 60)]
+
+
+def test_steps_on_a_map_that_is_partly_on_disk_are_on_all_pixels() -> None:
+    mapper = make_mapper(noise_px=0.1)
+    mapper.residency = Mock(trainable=lambda: [0], stages=lambda: [[0]])
+    assert steps_of(mapper, 2) == 4 * [(70, 97)]
 
 
 def test_a_loss_of_ones_own_and_a_dense_identity_image_see_all_pixels() -> None:

@@ -46,6 +46,11 @@ def test_exponential_is_the_series(angle: float) -> None:
         np.testing.assert_allclose(se3_exp(twist(angle, seed)), exponential_series(twist(angle, seed)), atol=1e-9)
 
 
+def test_exponential_of_what_is_not_finite() -> None:
+    for number in (np.inf, np.nan, 1e200):
+        assert np.isnan(se3_exp(np.array([0.1, 0.2, 0.3, number, 0.0, 0.0]))).all()
+
+
 @pytest.mark.parametrize("angle", ANGLES)
 def test_logarithm_undoes_the_exponential(angle: float) -> None:
     for seed in range(5):

@@ -124,9 +124,14 @@ def _target_size(target: LossTarget[np.ndarray]) -> tuple[int, int]:
 def _pitch(color: np.ndarray, depth: np.ndarray, valid: np.ndarray | None) -> tuple[int, int] | None:
     """Pixels from one to that below it and to the next one, if the target's images lie in memory like one another and
     forwards: every n-th pixel of an image does, and is read where it lies."""
-    row, step = depth.strides[0] // depth.itemsize, depth.strides[1] // depth.itemsize
-    alike = color.strides == (3 * row, 3 * step, 1) and (valid is None or valid.strides == (row, step))
-    return (row, step) if alike and 1 <= step <= row else None
+    row, step = color.strides[0] // 3, color.strides[1] // 3
+    alike = color.strides == (3 * row, 3 * step, 1) and depth.strides == (depth.itemsize * row, depth.itemsize * step)
+    alike = alike and (valid is None or valid.strides == (row, step))
+    return (row, step) if alike and 1 <= step <= row <= _LONGEST_ROW else None
+
+
+_LONGEST_ROW = 1 << 15
+"""Pixels from row to row that the compiled core takes."""
 
 
 def _exposure(target: LossTarget[np.ndarray]) -> np.ndarray:

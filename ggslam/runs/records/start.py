@@ -11,7 +11,7 @@ from ggslam.runs.records.record import RecordFile
 from ggslam.runs.records.sequence import OpenRecord
 from ggslam.system.json_files import json_ready
 
-VERSION = 2
+VERSION = 3
 """Of the format of checkpoints."""
 
 
