@@ -121,20 +121,19 @@ class Gradients(ParameterGradients):
 def check_gaussians(gaussians: Gaussians) -> None:
     """Raises RenderError unless the shapes in `Gaussians` hold and all arrays share one dtype and device."""
     means = gaussians.means
-    count, dtype, device = means.shape[0] if means.ndim else -1, means.dtype, means.device
+    count = means.shape[0] if means.ndim else -1
     expected: dict[str, tuple[int, ...]] = {
         "means": (count, 3), "quaternions": (count, 4), "log_scales": (count, 3), "opacity_logits": (count,),
         "sh": (count, -1, 3), "features": (count, -1),
     }  # fmt: skip
     for name, shape in expected.items():
         tensor = getattr(gaussians, name)
-        found = tuple(tensor.shape)
-        known = len(found) == len(shape) and all(a in (b, -1) for a, b in zip(shape, found, strict=True))
-        if not known:
+        agrees = tensor.ndim == len(shape) and all(a in (b, -1) for a, b in zip(shape, tensor.shape, strict=True))
+        if not agrees:
             raise RenderError(f"{name}: expected shape {list(shape)}, found {list(tensor.shape)} (-1: any)")
-        if tensor.dtype != dtype or tensor.device != device:
+        if tensor.dtype != means.dtype or tensor.device != means.device:
             raise RenderError(
-                f"{name}: expected {dtype} on {device} like means, found {tensor.dtype} on {tensor.device}"
+                f"{name}: expected {means.dtype} on {means.device} like means, found {tensor.dtype} on {tensor.device}"
             )
     if gaussians.sh.shape[1] not in (1, 4, 9, 16):
         raise RenderError(f"sh: expected 1, 4, 9 or 16 coefficients, found {gaussians.sh.shape[1]}")

@@ -25,8 +25,8 @@ from ggslam.tracking.tracker import TrackerState, TrackingResult, TrackingStatus
 UNDECIDED = 32
 """Of so many first frames images are kept in case frames are to be aligned, of later ones once they are."""
 KEPT_BYTES = 1 << 26
-"""Memory for coded images of frames that are aligned at the end; later ones stay where the tracker found them, for to
-the map as they find it they would be laid a decibel worse."""
+"""Memory for coded images of frames that are aligned at the end; later ones stay where the tracker found them: laid
+onto the young map of their moment they would be a decibel worse."""
 KEPT_BYTES_PAGED = 1 << 23
 """The same where memory is limited."""
 JPEG_QUALITY = 90
