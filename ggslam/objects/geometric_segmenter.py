@@ -91,13 +91,14 @@ class GeometricSegmenter:
         groups = Groups(int(regions.max()) + 1)
         alike = ~_is_convex(borders) & (borders.contrast < _ALIKE * settings.color_contrast)
         parts = _is_hollow(borders, len(planes)) | self._is_flat(borders, alike, regions, planes, surface)
-        bodies = _is_convex(borders) & ~_is_painted(borders, settings.color_contrast)
+        lies = _lies_on_plane(borders, regions, planes, surface, settings)
+        bodies = _is_convex(borders) & ~_is_painted(borders, settings.color_contrast) & ~lies
         for k in np.flatnonzero(bodies | (alike & parts)):
             groups.join(*borders.pairs[k].tolist())
         pairs = np.column_stack([borders.pairs, borders.length])
         join_insides(groups, regions, len(planes), surface, pairs)
         joined = groups.roots().astype(np.int32)[regions]
-        joined = _without_flakes(joined, len(planes), borders, groups, self._settings.min_area)
+        joined = _without_flakes(joined, len(planes), borders, groups, self._settings.min_area, lies)
         join_overhangs(groups, regions, surface, pairs)
         return joined, groups.roots().astype(np.int32)
 
@@ -113,7 +114,7 @@ class GeometricSegmenter:
         return flat
 
 
-def _without_flakes(regions: np.ndarray, planes: int, borders: Borders, groups: Groups, min_area: float) -> np.ndarray:
+def _without_flakes(regions: np.ndarray, planes: int, borders: Borders, groups: Groups, min_area: float, lies: np.ndarray) -> np.ndarray:
     """Small regions that lie on one neighbour without a gap for most of their rim join it: noise that rose above the
     tolerance of a plane."""
     area = np.bincount(regions.ravel(), minlength=int(regions.max()) + 1)
@@ -122,13 +123,13 @@ def _without_flakes(regions: np.ndarray, planes: int, borders: Borders, groups: 
     rim = np.zeros(len(roots), np.int64)
     best: dict[int, tuple[int, int]] = {}
     outer = ends[:, 0] != ends[:, 1]
-    for (a, b), length, closed, concave in zip(
+    for (a, b), length, closed, concave, lie in zip(
         ends[outer].tolist(), borders.length[outer].tolist(), borders.closed[outer].tolist(),
-        borders.concave[outer].tolist(), strict=True,
+        borders.concave[outer].tolist(), lies[outer].tolist(), strict=True,
     ):  # fmt: skip
         for flake, other in ((a, b), (b, a)):
             rim[flake] += length
-            if closed - concave > best.get(flake, (0, 0))[0]:
+            if not lie and closed - concave > best.get(flake, (0, 0))[0]:
                 best[flake] = (closed - concave, other)
     for flake in sorted(best, key=lambda k: area[k]):
         joined, other = best[flake]
@@ -150,6 +151,26 @@ def _is_painted(borders: Borders, color_contrast: float) -> np.ndarray:
     hangs before a window, by less than the noise of its depth. A picture in its frame is one thing."""
     even = (borders.bent <= _EVEN * borders.judged) & (borders.length < _ENCLOSED * _shorter_outline(borders))
     return even & (borders.contrast >= _PAINTED * color_contrast) & (color_contrast > 0)
+
+
+def _lies_on_plane(
+    borders: Borders, regions: np.ndarray, planes: np.ndarray, surface: DepthSurface, settings: GeometricSettings
+) -> np.ndarray:
+    """bool [n]: borders of small things on a large plane, of another colour."""
+    import os
+    F=float(os.environ.get('RELIEF','1.5'))
+    area = np.bincount(regions.ravel(), minlength=int(borders.pairs.max(initial=0)) + 1)
+    first, second = borders.pairs.T
+    asked = (first <= len(planes)) & (second > len(planes))
+    asked &= (area[first] >= 0.04 * regions.size) & (area[second] < 0.05 * area[first])
+    asked &= (borders.length >= 0.5 * _shorter_outline(borders)) & (settings.color_contrast > 0)
+    asked &= borders.contrast >= _PAINTED * settings.color_contrast
+    for k in np.flatnonzero(asked):
+        points = surface.points[regions == second[k]]
+        off = np.abs(points @ planes[first[k] - 1] - 1) / points[:, 2]
+        tolerance = settings.tolerance_sigmas * surface.sigma + settings.tolerance_m / points[:, 2] ** 2
+        asked[k] = np.median(off / tolerance) > F
+    return asked
 
 
 def _is_hollow(borders: Borders, planes: int) -> np.ndarray:

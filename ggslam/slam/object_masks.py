@@ -45,7 +45,7 @@ class MaskSettings:
     min_repeat: float = setting(0.35, 0, 1)
     """Objects that a segmenter or association found on a smaller share of the segmented keyframes that show their place
     are noise, too."""
-    min_gaussians: int = setting(20, 0, 10**9)
+    min_gaussians: int = setting(8, 0, 10**9)
     """Objects with fewer Gaussians that a segmenter or association found are noise, too."""
     cleaning: CleaningSettings = field(default_factory=CleaningSettings)
     association: AssociationSettings = field(default_factory=AssociationSettings)
@@ -185,9 +185,11 @@ class ObjectMasks:
             return []
         views = {i: seen[i].views if i in seen else 0 for i in object_ids.tolist()}
         enough, share = min(self.settings.min_views, 1 + keyframes // 10), self.settings.min_repeat
+        least = self.settings.min_gaussians
+        new = {i for i, count in views.items() if 1 <= chances.get(i, 0) <= count and sizes[i] >= 20 * least}
         return [
             i for i, count in views.items()
-            if count < max(enough, share * chances.get(i, 0)) or sizes[i] < self.settings.min_gaussians
+            if (count < max(enough, share * chances.get(i, 0)) and i not in new) or sizes[i] < least
         ]  # fmt: skip
 
 
