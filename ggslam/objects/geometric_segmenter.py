@@ -12,6 +12,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from ggslam.objects.border_kinds import is_convex, is_hollow, is_painted, lies_on
 from ggslam.objects.depth_surface import DepthSurface
 from ggslam.objects.depth_surfaces import surface_of
 from ggslam.objects.hollows import join_insides, join_panes
@@ -24,16 +25,12 @@ from ggslam.objects.regions import Borders, Groups, find_borders
 from ggslam.objects.settings import GeometricSettings
 from ggslam.scene.camera import Camera
 
-_CONVEX_CLOSED = 0.6
-_CONVEX_BENT = 0.25
 _FLAKE = 6
 _FLAKE_CLOSED = 0.6
 _GROWTH = 4
 _FLAT_BORDER = 12
 _FLAT_SHARE = 0.9
 _ALIKE = 0.75
-_HOLLOW = 0.3
-_EVEN, _PAINTED, _ENCLOSED = 0.25, 1.5, 0.7
 _SQUARE = np.ones((3, 3), np.uint8)
 
 
@@ -89,10 +86,10 @@ class GeometricSegmenter:
         settings = self._settings
         borders = find_borders(regions, surface, plane_of, planes, colors_to_compare(color), surface.step + 1, settings)
         groups = Groups(int(regions.max()) + 1)
-        alike = ~_is_convex(borders) & (borders.contrast < _ALIKE * settings.color_contrast)
-        parts = _is_hollow(borders, len(planes)) | self._is_flat(borders, alike, regions, planes, surface)
-        lies = _lies_on_plane(borders, regions, planes, surface, settings)
-        bodies = _is_convex(borders) & ~_is_painted(borders, settings.color_contrast) & ~lies
+        alike = ~is_convex(borders) & (borders.contrast < _ALIKE * settings.color_contrast)
+        parts = is_hollow(borders, len(planes)) | self._is_flat(borders, alike, regions, planes, surface)
+        lies = lies_on(borders, regions, planes, surface, settings)
+        bodies = is_convex(borders) & ~is_painted(borders, settings.color_contrast) & ~lies
         for k in np.flatnonzero(bodies | (alike & parts)):
             groups.join(*borders.pairs[k].tolist())
         pairs = np.column_stack([borders.pairs, borders.length])
@@ -114,22 +111,24 @@ class GeometricSegmenter:
         return flat
 
 
-def _without_flakes(regions: np.ndarray, planes: int, borders: Borders, groups: Groups, min_area: float, lies: np.ndarray) -> np.ndarray:
+def _without_flakes(
+    regions: np.ndarray, planes: int, borders: Borders, groups: Groups, min_area: float, things: np.ndarray
+) -> np.ndarray:
     """Small regions that lie on one neighbour without a gap for most of their rim join it: noise that rose above the
-    tolerance of a plane."""
+    tolerance of a plane. Not across borders of `things`, bool [n]."""
     area = np.bincount(regions.ravel(), minlength=int(regions.max()) + 1)
     roots = groups.roots()
     ends = roots[borders.pairs]
     rim = np.zeros(len(roots), np.int64)
     best: dict[int, tuple[int, int]] = {}
     outer = ends[:, 0] != ends[:, 1]
-    for (a, b), length, closed, concave, lie in zip(
+    for (a, b), length, closed, concave, thing in zip(
         ends[outer].tolist(), borders.length[outer].tolist(), borders.closed[outer].tolist(),
-        borders.concave[outer].tolist(), lies[outer].tolist(), strict=True,
+        borders.concave[outer].tolist(), things[outer].tolist(), strict=True,
     ):  # fmt: skip
         for flake, other in ((a, b), (b, a)):
             rim[flake] += length
-            if not lie and closed - concave > best.get(flake, (0, 0))[0]:
+            if not thing and closed - concave > best.get(flake, (0, 0))[0]:
                 best[flake] = (closed - concave, other)
     for flake in sorted(best, key=lambda k: area[k]):
         joined, other = best[flake]
@@ -137,52 +136,6 @@ def _without_flakes(regions: np.ndarray, planes: int, borders: Borders, groups: 
         if small and joined >= _FLAKE_CLOSED * rim[flake]:
             groups.join(flake, other)
     return groups.roots().astype(np.int32)[regions]
-
-
-def _is_convex(borders: Borders) -> np.ndarray:
-    """bool [n]: borders mostly without a gap and hardly anywhere concave."""
-    closed = borders.closed >= _CONVEX_CLOSED * borders.length
-    judged = (borders.judged >= 3) & (borders.judged >= 0.3 * borders.length)
-    return closed & judged & (borders.concave <= _CONVEX_BENT * borders.judged)
-
-
-def _is_painted(borders: Borders, color_contrast: float) -> np.ndarray:
-    """bool [n]: borders that are no edge, at which the colour changes: smooth, but not for being one body. A curtain
-    hangs before a window, by less than the noise of its depth. A picture in its frame is one thing."""
-    even = (borders.bent <= _EVEN * borders.judged) & (borders.length < _ENCLOSED * _shorter_outline(borders))
-    return even & (borders.contrast >= _PAINTED * color_contrast) & (color_contrast > 0)
-
-
-def _lies_on_plane(
-    borders: Borders, regions: np.ndarray, planes: np.ndarray, surface: DepthSurface, settings: GeometricSettings
-) -> np.ndarray:
-    """bool [n]: borders of small things on a large plane, of another colour."""
-    import os
-    F=float(os.environ.get('RELIEF','1.5'))
-    area = np.bincount(regions.ravel(), minlength=int(borders.pairs.max(initial=0)) + 1)
-    first, second = borders.pairs.T
-    asked = (first <= len(planes)) & (second > len(planes))
-    asked &= (area[first] >= 0.04 * regions.size) & (area[second] < 0.05 * area[first])
-    asked &= (borders.length >= 0.5 * _shorter_outline(borders)) & (settings.color_contrast > 0)
-    asked &= borders.contrast >= _PAINTED * settings.color_contrast
-    for k in np.flatnonzero(asked):
-        points = surface.points[regions == second[k]]
-        off = np.abs(points @ planes[first[k] - 1] - 1) / points[:, 2]
-        tolerance = settings.tolerance_sigmas * surface.sigma + settings.tolerance_m / points[:, 2] ** 2
-        asked[k] = np.median(off / tolerance) > F
-    return asked
-
-
-def _is_hollow(borders: Borders, planes: int) -> np.ndarray:
-    """bool [n]: borders between two things, none of them a plane, that make up much of the outline of one: perhaps the
-    inside and the outside of a bowl."""
-    return (borders.pairs[:, 0] > planes) & (borders.length >= _HOLLOW * _shorter_outline(borders))
-
-
-def _shorter_outline(borders: Borders) -> np.ndarray:
-    """Of each border, links about the region that has fewer, [n]."""
-    rim = np.bincount(borders.pairs.ravel(), np.repeat(borders.length, 2), int(borders.pairs.max(initial=0)) + 1)
-    return rim[borders.pairs].min(1)
 
 
 def _by_size(regions: np.ndarray, valid: np.ndarray, min_area: float) -> np.ndarray:

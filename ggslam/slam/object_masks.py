@@ -25,6 +25,8 @@ from ggslam.objects.uniting import LabelledVoxels, find_counterparts
 from ggslam.scene.frame import Frame
 from ggslam.system.settings import Conflict, setting, settings_class
 
+_LARGE = 20
+"""Times `MaskSettings.min_gaussians` that an object has which one look is enough for, if it had no chance of more."""
 Source = Literal["auto", "recording", "geometry", "model", "none"]
 
 
@@ -40,8 +42,8 @@ class MaskSettings:
     """Frames that a segmenter lets pass at least: a fast camera's keyframes come sooner, and all the map gets labels
     from those that are segmented."""
     min_views: int = setting(3, 1, 10**6)
-    """Objects that a segmenter or association found on fewer keyframes are noise. Runs of less than ten keyframes for
-    each of these views ask for less."""
+    """Objects that a segmenter or association found on fewer keyframes are noise, but for large ones that were found
+    whenever they could be. Runs of less than ten keyframes for each of these views ask for less."""
     min_repeat: float = setting(0.35, 0, 1)
     """Objects that a segmenter or association found on a smaller share of the segmented keyframes that show their place
     are noise, too."""
@@ -186,11 +188,9 @@ class ObjectMasks:
         views = {i: seen[i].views if i in seen else 0 for i in object_ids.tolist()}
         enough, share = min(self.settings.min_views, 1 + keyframes // 10), self.settings.min_repeat
         least = self.settings.min_gaussians
-        new = {i for i, count in views.items() if 1 <= chances.get(i, 0) <= count and sizes[i] >= 20 * least}
-        return [
-            i for i, count in views.items()
-            if (count < max(enough, share * chances.get(i, 0)) and i not in new) or sizes[i] < least
-        ]  # fmt: skip
+        always = {i for i, count in views.items() if 1 <= chances.get(i, 0) <= count and sizes[i] >= _LARGE * least}
+        seldom = {i for i, count in views.items() if count < max(enough, share * chances.get(i, 0))} - always
+        return [i for i in views if i in seldom or sizes[i] < least]
 
 
 def _choose(settings: MaskSettings, has_masks: bool | None) -> Source | None:

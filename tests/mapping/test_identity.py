@@ -174,6 +174,7 @@ def test_forgotten_objects_leave_nothing() -> None:
     mapper.finish_identity()
     assert not (mapper.map.object_id == 300).any() and 300 not in mapper.identity.classifier.class_ids
     assert not (mapper.map.vote_ids == 300).any()
+    assert np.isin(shown(mapper)[20:30, 55:65], (0, 1)).mean() > 0.9  # nothing or what is around, not any other one
 
 
 def test_the_map_shows_its_labels_to_the_next_keyframe() -> None:

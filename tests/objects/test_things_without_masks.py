@@ -4,6 +4,7 @@ of one body, colours that a plane has nowhere else, floors that furniture divide
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -211,3 +212,32 @@ def test_a_slight_bend_parts_what_has_two_colours(painted: bool) -> None:
     assert (segments[119, 60] != segments[119, 260]) == painted
     blind = GeometricSegmenter(GeometricSettings(color_contrast=0)).segment(color, depth, CAMERA)
     assert blind[119, 60] == blind[119, 260]
+
+
+def small_thing(height: float) -> Scene:
+    """A table in the middle of a room and something of 8 cm on it, 1.4 m away: some 100 pixels."""
+    scene = Scene()
+    scene.box((-9, 1.4, -9), (9, 1.5, 9), 1)
+    scene.box((-0.7, 0.7, 0.5), (0.7, 0.75, 2.2), 2)
+    scene.box((0.1, 0.7 - height, 1.2), (0.18, 0.7, 1.26), 3)
+    return scene
+
+
+def test_a_small_thing_of_another_colour_on_a_table_is_a_thing_and_a_spot_is_none() -> None:
+    scene = small_thing(0.012)
+    color = np.where((scene.ids == 3)[..., None], (190, 60, 40), (150, 150, 150)).astype(np.uint8)
+    assert 60 < (scene.ids == 3).sum() < 160
+    assert scene.share(scene.segments(color), 3) > 0.8
+    spot = small_thing(0.0005)
+    assert spot.share(spot.segments(color), 3) < 0.1
+
+
+def test_coloured_bumps_of_the_noise_of_a_table_are_no_things() -> None:
+    scene = small_thing(0.001)
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=scene.depth.shape), (0, 0), 4.0)
+    noise /= noise.std()
+    depth = np.where(np.isfinite(scene.depth), scene.depth, 0)
+    depth += 0.003 * depth**2 * noise  # some bumps rise above what planes tolerate
+    color = np.where((noise > 1)[..., None], (190, 60, 40), (150, 150, 150)).astype(np.uint8)
+    segments = GeometricSegmenter().segment(color, depth.astype(np.float32), CAMERA)
+    assert len(np.unique(segments[scene.ids == 2])) == 1

@@ -52,3 +52,12 @@ def test_what_is_found_seldom_where_it_could_be_seen_is_noise() -> None:
     assert masks.noise(ids, seen, 40, sizes, {}) == []
     everything = ObjectMasks(MaskSettings(source="geometry", min_repeat=0))
     assert everything.noise(ids, seen, 40, sizes, {2: 20}) == []
+
+
+def test_large_things_that_were_found_whenever_in_view_need_no_second_look() -> None:
+    masks = ObjectMasks(MaskSettings(source="geometry"))
+    sizes = np.zeros(65536, int)
+    sizes[1:6] = 300, 300, 300, 30, 30
+    seen = {i: Observation(0, 0, views) for i, views in {1: 1, 2: 1, 3: 1, 4: 1, 5: 9}.items()}
+    noise = masks.noise(np.array([1, 2, 3, 4, 5]), seen, 40, sizes, {1: 1, 2: 2, 3: 0, 4: 1, 5: 9})
+    assert noise == [2, 3, 4]  # not found again; where it was is not known; small
