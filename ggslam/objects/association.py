@@ -195,6 +195,8 @@ class Associator:
             if k in planes and ids[k]:
                 self._planes.note(int(ids[k]), planes[k])
             if k in parts:
+                if not parts[k].object_id:
+                    self._evidence.take_over(parts[k].parent, int(ids[k]), parts[k].together, parts[k].apart)
                 parts[k].object_id = int(ids[k])
                 covered[k] = False
         image = ids[overlap.row]

@@ -80,6 +80,12 @@ class PairEvidence:
         weight = np.minimum(1.0, visible / np.maximum(_FULLY_VISIBLE * largest, 1))
         return np.where(visible >= self._settings.min_visible * pixels, weight, 0.0)
 
+    def take_over(self, whole: int, part: int, together: int, apart: int) -> None:
+        """A part has become an object: in so many keyframes it lay in one segment with the rest, and in so many not."""
+        pair = self._pairs.setdefault((min(whole, part), max(whole, part)), _Pair())
+        pair.together += together
+        pair.apart += apart
+
     def merges(self) -> list[tuple[int, int]]:
         """Pairs (kept, dropped) that the evidence makes one; the larger object keeps its id. They are merged here."""
         done: list[tuple[int, int]] = []

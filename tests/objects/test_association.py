@@ -172,6 +172,17 @@ def test_a_part_that_comes_back_at_its_place_becomes_an_object() -> None:
     assert results[3].splits == [(2, 13)]
 
 
+def test_what_made_a_part_an_object_counts_when_it_lies_with_the_rest_again() -> None:
+    associator = started(scene(1, 2, 2))
+    for _ in range(4):
+        associator.associate(scene(11, 12, 13), shown(scene(1, 2, 2)), DEPTH, CAMERA, np.eye(4))
+    merges = [
+        associator.associate(scene(11, 12, 12), shown(scene(1, 2, 13)), DEPTH, CAMERA, np.eye(4)).merges
+        for _ in range(6)
+    ]  # fmt: skip
+    assert not any(merges[:3]) and [(2, 13)] in merges[3:]
+
+
 def test_pieces_cut_off_at_random_do_not_become_objects() -> None:
     known = scene(1, 2, 2)
     associator = started(known)
