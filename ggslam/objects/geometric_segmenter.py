@@ -86,10 +86,10 @@ class GeometricSegmenter:
         settings = self._settings
         borders = find_borders(regions, surface, plane_of, planes, colors_to_compare(color), surface.step + 1, settings)
         groups = Groups(int(regions.max()) + 1)
-        alike = ~is_convex(borders) & (borders.contrast < _ALIKE * settings.color_contrast)
+        convex, lies = is_convex(borders), lies_on(borders, regions, planes, surface, settings)
+        alike = ~convex & (borders.contrast < _ALIKE * settings.color_contrast)
         parts = is_hollow(borders, len(planes)) | self._is_flat(borders, alike, regions, planes, surface)
-        lies = lies_on(borders, regions, planes, surface, settings)
-        bodies = is_convex(borders) & ~is_painted(borders, settings.color_contrast) & ~lies
+        bodies = convex & ~is_painted(borders, settings.color_contrast) & ~lies
         for k in np.flatnonzero(bodies | (alike & parts)):
             groups.join(*borders.pairs[k].tolist())
         pairs = np.column_stack([borders.pairs, borders.length])
