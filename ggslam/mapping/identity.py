@@ -139,10 +139,12 @@ class IdentityLearner(ABC):
     # --- a map that is partly on disk ---------------------------------------------------------------------------------
 
     def catch_up(self, gaussians: GaussianMap) -> None:
-        """The votes of Gaussians that were on disk follow the merges and removals of objects since; their identity
-        vectors are left to further steps."""
+        """The votes and identity vectors of Gaussians that were on disk follow the merges and removals of objects
+        since."""
         if (self._alias != np.arange(IDS)).any():
+            before = vote_labels(gaussians)
             self._merge_votes(gaussians)
+            self._follow_votes(gaussians, before)
 
     def catch_up_and_label(self, gaussians: GaussianMap) -> None:
         """The end for a part of the map that was on disk, see `label`."""
@@ -325,6 +327,11 @@ class IdentityLearner(ABC):
     @abstractmethod
     def _merge_votes(self, gaussians: GaussianMap) -> None:
         """The votes follow `_alias`."""
+
+    @abstractmethod
+    def _follow_votes(self, gaussians: GaussianMap, before: torch.Tensor) -> None:
+        """Gaussians whose votes named an object before (int32 [N]) that is another one by now, or none, get the code of
+        what their votes name."""
 
     @abstractmethod
     def _dissolve(self, gaussians: GaussianMap, dropped: Sequence[int]) -> None:

@@ -278,6 +278,11 @@ def test_merges_removals_and_labels_are_those_of_the_cpu(cuda_library: CudaLibra
         learner.label(gaussians)
     both.check()
     assert set(both.map.object_id.unique().tolist()) == {0, 1}
+    for learner, gaussians in ((both.cpu, both.map), (both.cuda, both.device_map)):
+        gaussians.vote_ids[:9, 0], gaussians.vote_weights[:9, 0] = 2, 50.0  # as they were on disk meanwhile
+        learner.catch_up(gaussians)
+    both.check()
+    assert not both.map.features[:9].any()
     both.cpu.merge(both.map, [(7, 7)])
     both.cuda.merge(both.device_map, [(7, 7)])
     both.check()

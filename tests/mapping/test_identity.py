@@ -177,6 +177,22 @@ def test_forgotten_objects_leave_nothing() -> None:
     assert np.isin(shown(mapper)[20:30, 55:65], (0, 1)).mean() > 0.9  # nothing or what is around, not any other one
 
 
+@pytest.mark.parametrize("merged", [True, False])
+def test_gaussians_that_were_on_disk_follow_what_became_of_their_objects(merged: bool) -> None:
+    mapper = trained(pictures())
+    assert mapper.identity is not None
+    kept = {name: getattr(mapper.map, name).clone() for name in ("features", "vote_ids", "vote_weights")}
+    if merged:
+        mapper.identity.merge(mapper.map, [(2, 300)])
+    else:
+        mapper.identity.forget(mapper.map, [300])
+    for name, values in kept.items():
+        getattr(mapper.map, name).copy_(values)
+    mapper.identity.catch_up_and_label(mapper.map)
+    assert np.isin(shown(mapper)[22:28, 57:63], (2,) if merged else (0, 1)).mean() > 0.95
+    assert not (mapper.map.object_id == 300).any()
+
+
 def test_the_map_shows_its_labels_to_the_next_keyframe() -> None:
     mapper = trained(pictures())
     seen = []

@@ -51,6 +51,10 @@ class CpuIdentityLearner(IdentityLearner):
     def _merge_votes(self, gaussians: GaussianMap) -> None:
         merge_votes(gaussians, torch.from_numpy(self._alias.astype(np.int32)))
 
+    def _follow_votes(self, gaussians: GaussianMap, before: torch.Tensor) -> None:
+        rows = np.flatnonzero(self._alias[before.numpy()] != before.numpy())
+        gaussians.features.numpy()[rows] = self.table.codes(vote_labels(gaussians).numpy()[rows])
+
     def _dissolve(self, gaussians: GaussianMap, dropped: Sequence[int]) -> None:
         features, voted = gaussians.features.numpy(), vote_labels(gaussians).numpy()
         rows, were = self.table.members(features, np.array(dropped), voted)

@@ -112,6 +112,11 @@ class CudaIdentityLearner(IdentityLearner):
     def _merge_votes(self, gaussians: GaussianMap) -> None:
         merge_votes(gaussians, self._device_alias)
 
+    def _follow_votes(self, gaussians: GaussianMap, before: torch.Tensor) -> None:
+        other = self._device_alias[before.long()] != before
+        codes = self.table.codes(vote_labels(gaussians))
+        gaussians.features.copy_(torch.where(other[:, None], codes, gaussians.features))
+
     def _dissolve(self, gaussians: GaussianMap, dropped: Sequence[int]) -> None:
         voted = vote_labels(gaussians)
         member, were = self.table.members(gaussians.features, np.array(dropped), voted)
