@@ -189,13 +189,13 @@ class IdentityLearner(ABC):
     def forget(self, gaussians: GaussianMap, object_ids: Sequence[int]) -> None:
         """Objects that were none: their class goes, their Gaussians become what else they look like."""
         for object_id in object_ids:
+            self.table.remove(object_id)
             self._alias[self._alias == object_id] = 0
         self._whole_of[list(object_ids)] = 0
+        before = vote_labels(gaussians)
         self._ids_changed()
         self._merge_votes(gaussians)
-        gone = [i for i in object_ids if self.table.classes(np.array([i]))[0] >= 0]
-        if gone:
-            self._dissolve(gaussians, gone)
+        self._follow_votes(gaussians, before)
 
     def _shown_labels(self, gaussians: GaussianMap) -> torch.Tensor:
         """The map's labels by votes as of the newest keyframe, int32 [N]."""

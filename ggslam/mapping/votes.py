@@ -21,10 +21,20 @@ def vote_shares(gaussians: GaussianMap) -> tuple[torch.Tensor, torch.Tensor]:
     """Object with the most votes of each Gaussian, int32 [N], and its share of all votes there, float32 [N]; 0 where
     there are none."""
     ids, weights = gaussians.vote_ids, gaussians.vote_weights
-    most, best = weights.max(1)
-    labels = torch.where(most > 0, ids.gather(1, best[:, None])[:, 0], 0)
+    labels, most = _winners(ids, weights)
     total = sum(weights.unbind(1), torch.zeros_like(most))  # in this order on every device
     return labels, most / total.clamp_min(1e-12)
+
+
+def vote_labels_of(gaussians: GaussianMap, rows: torch.Tensor) -> torch.Tensor:
+    """As `vote_labels`, of some rows (int64 [M])."""
+    return _winners(gaussians.vote_ids[rows], gaussians.vote_weights[rows])[0]
+
+
+def _winners(ids: torch.Tensor, weights: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Id with the most weight of each row, 0 where there is none, and that weight."""
+    most, best = weights.max(1)
+    return torch.where(most > 0, ids.gather(1, best[:, None])[:, 0], 0), most
 
 
 def merge_votes(gaussians: GaussianMap, alias: torch.Tensor) -> None:

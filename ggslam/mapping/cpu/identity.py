@@ -15,7 +15,7 @@ from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
 from ggslam.mapping.cpu.pixel_pool import draw_pool
 from ggslam.mapping.identity import BIRTH_VOTE, MIN_WEIGHT, SPLIT_STRIDE, TERMS, IdentityLearner, MaskedKeyframe
 from ggslam.mapping.pixel_pool import PixelPool
-from ggslam.mapping.votes import merge_votes, vote_labels
+from ggslam.mapping.votes import merge_votes, vote_labels, vote_labels_of
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.pixel_terms import CpuPixelTerms, FeatureAdamSettings
 from ggslam.rendering.types import RenderBuffers
@@ -53,7 +53,8 @@ class CpuIdentityLearner(IdentityLearner):
 
     def _follow_votes(self, gaussians: GaussianMap, before: torch.Tensor) -> None:
         rows = np.flatnonzero(self._alias[before.numpy()] != before.numpy())
-        gaussians.features.numpy()[rows] = self.table.codes(vote_labels(gaussians).numpy()[rows])
+        now = vote_labels_of(gaussians, torch.from_numpy(rows)).numpy()
+        gaussians.features.numpy()[rows] = self.table.codes(now)
 
     def _dissolve(self, gaussians: GaussianMap, dropped: Sequence[int]) -> None:
         features, voted = gaussians.features.numpy(), vote_labels(gaussians).numpy()
