@@ -84,7 +84,8 @@ class GeometricSettings:
     """Difference of colour (CIELAB, each channel scaled to 0 to 255) from which what lies flat on a plane is something
     else than the plane. 0: colour is not looked at."""
     min_area: float = setting(4e-4, 0, 0.5)
-    """Segments below this share of the image are joined to a neighbour on the same surface, or left unlabelled."""
+    """Segments below this share of the image are joined to a neighbour on the same surface, or left unlabelled; of
+    six times this share they are joined, too, if they look like noise of a plane."""
     max_depth_m: float = setting(8.0, 0.05, 1e4, "m")
     """Farther measurements are left unlabelled."""
 

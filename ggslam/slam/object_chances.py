@@ -25,7 +25,7 @@ def typical_points(means: np.ndarray, labels: np.ndarray) -> dict[int, np.ndarra
     rows = rows[np.argsort(labels[rows], kind="stable")]
     ids, starts = np.unique(labels[rows], return_index=True)
     found = {}
-    for object_id, own in zip(ids.tolist(), np.split(rows, starts[1:]), strict=True):
+    for object_id, own in zip(ids.tolist(), np.split(rows, starts)[1:], strict=True):
         points = means[own]
         away = points - np.median(points, 0)
         found[object_id] = points[np.einsum("ij,ij->i", away, away).argmin()]

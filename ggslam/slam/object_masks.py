@@ -6,7 +6,7 @@ cleaned and, unless their ids prove consistent over time, matched with the objec
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import field, replace
 from typing import Literal
 
@@ -25,8 +25,8 @@ from ggslam.objects.uniting import LabelledVoxels, find_counterparts
 from ggslam.scene.frame import Frame
 from ggslam.system.settings import Conflict, setting, settings_class
 
-_LARGE = 20
-"""Times `MaskSettings.min_gaussians` that an object has which one look is enough for, if it had no chance of more."""
+_LARGE = 160
+"""Gaussians of an object that one look is enough for, if it had no chance of more."""
 Source = Literal["auto", "recording", "geometry", "model", "none"]
 
 
@@ -42,8 +42,9 @@ class MaskSettings:
     """Frames that a segmenter lets pass at least: a fast camera's keyframes come sooner, and all the map gets labels
     from those that are segmented."""
     min_views: int = setting(3, 1, 10**6)
-    """Objects that a segmenter or association found on fewer keyframes are noise, but for large ones that were found
-    whenever they could be. Runs of less than ten keyframes for each of these views ask for less."""
+    """Objects that a segmenter or association found on fewer keyframes are noise, but for those of 160 Gaussians
+    or more that were found whenever they could be. Runs of less than ten keyframes for each of these views ask for
+    less."""
     min_repeat: float = setting(0.35, 0, 1)
     """Objects that a segmenter or association found on a smaller share of the segmented keyframes that show their place
     are noise, too."""
@@ -174,22 +175,24 @@ class ObjectMasks:
 
     def noise(
         self, object_ids: np.ndarray, seen: dict[int, Observation], keyframes: int, sizes: np.ndarray,
-        chances: Mapping[int, int],
+        chances: Mapping[int, int], known: Collection[int] = (),
     ) -> list[int]:  # fmt: skip
         """Of `object_ids`, those that are too small or were seen too rarely, in so many keyframes, to be believed.
 
         Args:
             sizes: number of Gaussians by id, [65536].
             chances: number of keyframes by id in which an object could have been seen; where it is not known, the
-                object is not doubted for it.
+                object needs `MaskSettings.min_views` and is not doubted for more.
+            known: objects of the map that the run began with: only their size counts.
         """
         if self.supervision == "masks":
             return []
         views = {i: seen[i].views if i in seen else 0 for i in object_ids.tolist()}
         enough, share = min(self.settings.min_views, 1 + keyframes // 10), self.settings.min_repeat
         least = self.settings.min_gaussians
-        always = {i for i, count in views.items() if 1 <= chances.get(i, 0) <= count and sizes[i] >= _LARGE * least}
+        always = {i for i, count in views.items() if 1 <= chances.get(i, 0) <= count and sizes[i] >= _LARGE}
         seldom = {i for i, count in views.items() if count < max(enough, share * chances.get(i, 0))} - always
+        seldom -= set(known)
         return [i for i in views if i in seldom or sizes[i] < least]
 
 

@@ -48,7 +48,8 @@ class RunObjects:
             points = typical_points(mapper.map.means.cpu().numpy(), labels)
             since = {i: observation.first_frame for i, observation in seen.items()}
             chances = count_chances(points, since, mapper.keyframes)
-        noise = self._masks.noise(identity.classifier.class_ids, seen, len(mapper.keyframes), sizes, chances)
+        ids, known = identity.classifier.class_ids, earlier or {}
+        noise = self._masks.noise(ids, seen, len(mapper.keyframes), sizes, chances, known)
         identity.forget(mapper.map, noise)
         mapper.finish_identity()
         kept = {i: observation for i, observation in seen.items() if i not in noise}

@@ -61,3 +61,18 @@ def test_large_things_that_were_found_whenever_in_view_need_no_second_look() -> 
     seen = {i: Observation(0, 0, views) for i, views in {1: 1, 2: 1, 3: 1, 4: 1, 5: 9}.items()}
     noise = masks.noise(np.array([1, 2, 3, 4, 5]), seen, 40, sizes, {1: 1, 2: 2, 3: 0, 4: 1, 5: 9})
     assert noise == [2, 3, 4]  # not found again; where it was is not known; small
+    every = ObjectMasks(MaskSettings(source="geometry", min_gaussians=0))
+    assert every.noise(np.array([1, 4]), seen, 40, sizes, {1: 1, 4: 1}) == [4]
+
+
+def test_objects_of_an_earlier_map_are_judged_by_their_size_alone() -> None:
+    masks = ObjectMasks(MaskSettings(source="geometry"))
+    sizes = np.zeros(65536, int)
+    sizes[1:4] = 300, 300, 3
+    seen = {i: Observation(103, 109, 2) for i in (1, 2, 3)}
+    assert masks.noise(np.array([1, 2, 3]), seen, 34, sizes, {1: 0, 2: 0, 3: 0}, known=(1, 3)) == [2, 3]
+
+
+def test_a_map_without_objects_has_no_typical_points() -> None:
+    for count in (0, 5):
+        assert typical_points(np.zeros((count, 3)), np.zeros(count, int)) == {}
