@@ -200,7 +200,8 @@ def make_kitchen(assets: Path, seed: int, out: Path, frames: int) -> None:
             renderer.update_scene(data, "camera", options)
             color = renderer.render().copy()
             renderer.enable_depth_rendering()
-            depth = np.where(renderer.render() > 20, 0, renderer.render())
+            depth = renderer.render().copy()
+            depth[depth > 20] = 0
             renderer.disable_depth_rendering()
             renderer.enable_segmentation_rendering()
             shown = renderer.render()

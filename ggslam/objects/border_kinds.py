@@ -30,7 +30,7 @@ def is_convex(borders: Borders) -> np.ndarray:
 def is_painted(borders: Borders, color_contrast: float) -> np.ndarray:
     """bool [n]: borders that are no edge, at which the colour changes: smooth, but not for being one body. A curtain
     hangs before a window, by less than the noise of its depth. A picture in its frame is one thing."""
-    even = (borders.bent <= _EVEN * borders.judged) & (borders.length < _ENCLOSED * shorter_outline(borders))
+    even = (borders.bent <= _EVEN * borders.judged) & (borders.length < _ENCLOSED * _shorter_outline(borders))
     return even & (borders.contrast >= _PAINTED * color_contrast) & (color_contrast > 0)
 
 
@@ -45,7 +45,7 @@ def lies_on(
     first, second = borders.pairs.T
     asked = (first <= len(planes)) & (second > len(planes)) & (borders.contrast >= _PAINTED * settings.color_contrast)
     asked &= (area[first] >= _GROUND * regions.size) & (area[second] < _ON_GROUND * area[first])
-    asked &= borders.length >= 0.5 * shorter_outline(borders)
+    asked &= borders.length >= 0.5 * _shorter_outline(borders)
     wanted = np.zeros(len(area), bool)
     wanted[second[asked]] = True
     inside = np.flatnonzero(wanted[regions.ravel()])
@@ -61,10 +61,10 @@ def lies_on(
 def is_hollow(borders: Borders, planes: int) -> np.ndarray:
     """bool [n]: borders between two things, none of them a plane, that make up much of the outline of one: perhaps the
     inside and the outside of a bowl."""
-    return (borders.pairs[:, 0] > planes) & (borders.length >= _HOLLOW * shorter_outline(borders))
+    return (borders.pairs[:, 0] > planes) & (borders.length >= _HOLLOW * _shorter_outline(borders))
 
 
-def shorter_outline(borders: Borders) -> np.ndarray:
+def _shorter_outline(borders: Borders) -> np.ndarray:
     """Of each border, links about the region that has fewer, [n]."""
     rim = np.bincount(borders.pairs.ravel(), np.repeat(borders.length, 2), int(borders.pairs.max(initial=0)) + 1)
     return rim[borders.pairs].min(1)
