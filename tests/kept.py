@@ -62,11 +62,10 @@ def cached_folder(name: str, *sources: Path) -> Path:
 @contextmanager
 def points_in_voxels_of(size: float) -> Iterator[None]:
     """Runs that are saved, also after edits, sample their clouds in voxels of this size, metres, not of 0.01."""
-    from ggslam.formats.point_sampling import sample_parts
+    from ggslam.runs.map_points import map_points
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("runs.saving_parts", "jobs.edit.edited_run"):
-            patch.setattr(f"ggslam.{module}.sample_parts", partial(sample_parts, voxel_size=size))
+        patch.setattr("ggslam.runs.saving_parts.map_points", partial(map_points, voxel_size=size))
         yield
 
 

@@ -63,7 +63,14 @@ Voxel = Annotated[
     typer.Option(help="Metres between points (points, pcd, colmap, nerfstudio; default 0.01), or the edge of a mesh's "
                  "voxels (default: volumes.tsdf.voxel of the run, 0.02)."),
 ]  # fmt: skip
-MinOpacity = Annotated[float, typer.Option(help="Leave out fainter Gaussians (not for trajectory, mesh).")]
+MinOpacity = Annotated[
+    float, typer.Option(help="Leave out fainter Gaussians (not for trajectory, mesh; points, pcd: with --discs).")
+]
+Discs = Annotated[
+    bool,
+    typer.Option("--discs", help="points, pcd: sample the discs of all Gaussians. Default: the surface that the "
+                 "keyframes see, rendered and fused, one point a voxel."),
+]  # fmt: skip
 Objects = Annotated[
     str | None,
     typer.Option(help="Objects by name or id (mug,7), or all. ply: a file for each (of one, --out may be the "
@@ -107,6 +114,7 @@ def export(
     objects: Objects = None,
     movers: Movers = False,
     plain: Plain = False,
+    discs: Discs = False,
     keyframes: Keyframes = False,
     sequence: options.MovedSequence = None,
     rendered: Rendered = False,
@@ -119,7 +127,7 @@ def export(
     with progress_bar() as bar:
         message = export_run(
             run, out, asked, voxel=voxel, objects=objects, movers=movers, min_opacity=min_opacity, plain=plain,
-            keyframes=keyframes,
-            recording=sequence, rendered=rendered, zoom=zoom, observer=ProgressObserver(bar),
+            discs=discs, keyframes=keyframes, recording=sequence, rendered=rendered, zoom=zoom,
+            observer=ProgressObserver(bar),
         )  # fmt: skip
     console.print(message, highlight=False, markup=False)

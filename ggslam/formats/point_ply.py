@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coloured voxel clouds as PLY files: in metres for viewers, as whole grid coordinates for the G-PCC coder.
 
-Both files hold the same points in the same order; header comments tie them together:
-metres = origin + voxel_size * (grid coordinate).
+Both files hold the same points in the same order; header comments tie them together: a grid coordinate denotes the
+centre of its voxel, metres = origin + voxel_size * (grid coordinate). The file in metres has each point where it is
+within its voxel; rounded, its coordinates are those of the other file.
 """
 
 from __future__ import annotations
@@ -27,6 +28,10 @@ METRIC_FILE, GRID_FILE = "points.ply", "points_grid.ply"
 _COLORS = ("red", "green", "blue")
 _METRIC, _GRID = "x y z are metres", "x y z are grid coordinates; metres = origin + voxel_size * (x, y, z)"
 _ROWS_AT_ONCE = 1 << 15
+_OFFSETS = ("offset_x", "offset_y", "offset_z")
+"""Fields of the rows that wait in the temporary file."""
+_AT_CENTRE = 0.01
+"""Voxels: a point that is no farther from the centre of its voxel may be off it by single precision alone."""
 
 
 def write_points(folder: str | Path, cloud: VoxelCloud) -> None:
@@ -75,7 +80,7 @@ def _gather_rows(raw: IO[bytes], clouds: Iterable[VoxelCloud]) -> tuple[VoxelClo
         size, ids = cloud.voxel_size, None if cloud.object_id is None else cloud.object_id[:0]
         grid = cloud.grid + np.rint(cloud.origin / size).astype(np.int64)
         corner = np.minimum(corner, grid.min(0))
-        rows = _vertices(grid, "i4", cloud)
+        rows = _vertices(grid, "i4", cloud, with_offsets=True)
         raw.write(rows.tobytes())
         count, dtype = count + len(rows), rows.dtype
     corner = corner if count else np.zeros(3, np.int64)
@@ -90,7 +95,8 @@ def _read_back(raw: IO[bytes], whole: VoxelCloud, dtype: np.dtype) -> Iterator[V
         grid = np.stack([rows[name] for name in "xyz"], 1).astype(np.int64) - corner
         colors = np.stack([rows[name] for name in _COLORS], 1)
         ids = None if whole.object_id is None else rows["object_id"]
-        yield VoxelCloud(grid.astype(np.int32), colors, ids, whole.voxel_size, whole.origin)
+        offsets = np.stack([rows[name] for name in _OFFSETS], 1)
+        yield VoxelCloud(grid.astype(np.int32), colors, ids, whole.voxel_size, whole.origin, offsets)
 
 
 def write_metric_points(path: str | Path, cloud: VoxelCloud) -> None:
@@ -114,10 +120,14 @@ def read_points(path: str | Path) -> VoxelCloud:
     vertex = ply.elements.get("vertex")
     if vertex is None or not {"x", "y", "z", *_COLORS} <= set(vertex.dtype.names or ()):
         raise FormatError(f"{path}: expected a 'vertex' element with x y z red green blue")
-    grid, voxel_size, origin = grid_positions(path, ply.comments, np.stack([vertex[name] for name in "xyz"], 1))
+    position = np.stack([vertex[name] for name in "xyz"], 1)
+    grid, voxel_size, origin = grid_positions(path, ply.comments, position)
     colors = np.stack([vertex[name] for name in _COLORS], 1).astype(np.uint8)
     object_id = vertex["object_id"].astype(np.int32) if "object_id" in (vertex.dtype.names or ()) else None
-    return VoxelCloud(grid, colors, object_id, voxel_size, origin)
+    offsets = None if _is_grid(ply.comments, position) else ((position - origin) / voxel_size - grid).astype(np.float32)
+    if offsets is not None and np.abs(offsets).max(initial=0) < _AT_CENTRE:
+        offsets = None
+    return VoxelCloud(grid, colors, object_id, voxel_size, origin, offsets)
 
 
 def grid_positions(path: str | Path, comments: list[str], position: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
@@ -133,13 +143,19 @@ def grid_positions(path: str | Path, comments: list[str], position: np.ndarray) 
     """
     voxel_size = float(_comment(path, comments, "voxel_size", 1)[0])
     origin = _comment(path, comments, "origin", 3)
-    if position.dtype.kind == "f" and _GRID not in comments:
+    if not _is_grid(comments, position):
         position = (position - origin) / voxel_size
     return np.rint(position).astype(np.int32), voxel_size, origin
 
 
-def _vertices(position: np.ndarray, code: str, cloud: VoxelCloud) -> np.ndarray:
+def _is_grid(comments: list[str], position: np.ndarray) -> bool:
+    """Whether positions as stored are grid coordinates."""
+    return position.dtype.kind != "f" or _GRID in comments
+
+
+def _vertices(position: np.ndarray, code: str, cloud: VoxelCloud, with_offsets: bool = False) -> np.ndarray:
     fields = [(name, code) for name in "xyz"] + [(name, "u1") for name in _COLORS]
+    fields += [(name, "f4") for name in _OFFSETS] if with_offsets else []
     if cloud.object_id is not None:
         fields.append(("object_id", "i4"))
     rows = np.empty(len(position), fields)
@@ -147,6 +163,8 @@ def _vertices(position: np.ndarray, code: str, cloud: VoxelCloud) -> np.ndarray:
         rows[name] = position[:, axis]
     for channel, name in enumerate(_COLORS):
         rows[name] = cloud.colors[:, channel]
+    for axis, name in enumerate(_OFFSETS if with_offsets else ()):
+        rows[name] = 0 if cloud.offsets is None else cloud.offsets[:, axis]
     if cloud.object_id is not None:
         rows["object_id"] = cloud.object_id
     return rows

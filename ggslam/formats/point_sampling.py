@@ -10,7 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.errors import InputError
+from ggslam.formats.cubes_to_come import CubesToCome
 from ggslam.formats.surface_discs import SurfaceDiscs, disc_samples
+from ggslam.formats.voxel_cloud import BITS, VoxelCloud, VoxelSums, cloud_of_sums, pack, unpack
 from ggslam.scene.gaussian_map import GaussianMap
 
 _CHUNK = 300_000
@@ -27,35 +29,6 @@ USUAL_VOXEL = 0.01
 """Metres."""
 _MOST_SAMPLES = 250
 """Of a Gaussian, on average, in voxels that go with the map; a room's has 40 to 120 in voxels of 1 cm."""
-_BITS = 21
-"""Bits per axis of the packed voxel number."""
-
-
-@dataclass(frozen=True)
-class VoxelCloud:
-    """Coloured points on a regular grid, at most one per voxel, sorted by grid coordinate (z fastest).
-
-    Attributes:
-        grid: int32 [N, 3] grid coordinates, none negative.
-        colors: uint8 [N, 3] RGB.
-        object_id: int32 [N], 0 = unlabelled, or None.
-        voxel_size: metres.
-        origin: float64 [3], metres: where grid coordinate (0, 0, 0) lies; a whole multiple of the voxel size.
-    """
-
-    grid: np.ndarray
-    colors: np.ndarray
-    object_id: np.ndarray | None
-    voxel_size: float
-    origin: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.grid)
-
-    @property
-    def points(self) -> np.ndarray:
-        """Positions in metres, float64 [N, 3]: origin + voxel_size * grid."""
-        return self.origin + self.voxel_size * self.grid
 
 
 def sample_points(
@@ -81,8 +54,8 @@ def sample_points(
     if not voxel_size > 0 or not 0 < minimum_opacity < 1:
         raise InputError(f"impossible voxel size {voxel_size} or minimum opacity {minimum_opacity}")
     discs = SurfaceDiscs.of(gaussians, minimum_opacity)
-    merged = _add_samples(_Sums.empty(), gaussians, discs, voxel_size, with_object_id)
-    return _cloud(merged, voxel_size, with_object_id)
+    merged = _add_samples(VoxelSums.empty(), gaussians, discs, voxel_size, with_object_id)
+    return cloud_of_sums(merged, voxel_size, with_object_id)
 
 
 @dataclass(frozen=True)
@@ -125,20 +98,20 @@ def sample_parts(
     for number in order:
         whole = SurfaceDiscs.of(parts[number].load(), minimum_opacity)
         sections += [_cubes(discs, voxel_size) for discs in whole.cut(axis)]
-    blocks, done = _Blocks(sections, voxel_size), 0
-    waiting, pending, sampled = _Sums.empty(), [], 0
+    to_come, done = CubesToCome(sections), 0
+    waiting, pending, sampled = VoxelSums.empty(), [], 0
     for number in order:
         part = parts[number].load()
         for discs in SurfaceDiscs.of(part, minimum_opacity).cut(axis):
-            pending.append(_add_samples(_Sums.empty(), part, discs, voxel_size, with_object_id, _SMALL_CHUNK))
-            blocks.is_done(done)
+            pending.append(_add_samples(VoxelSums.empty(), part, discs, voxel_size, with_object_id, _SMALL_CHUNK))
+            to_come.is_done(done)
             done, sampled = done + 1, sampled + len(pending[-1].key)
-            if sampled < max(_FEW, len(waiting.key)) and not blocks.all_done:  # joining costs as much as what waits
+            if sampled < max(_FEW, len(waiting.key)) and not to_come.all_done:  # joining costs as much as what waits
                 continue
-            waiting, pending, sampled = _Sums.of([waiting, *pending]), [], 0
-            finished = blocks.are_done(waiting.key)
+            waiting, pending, sampled = VoxelSums.of([waiting, *pending]), [], 0
+            finished = to_come.are_done(pack(unpack(waiting.key) // _cube_edge(voxel_size)))
             if finished.any():
-                yield _cloud(waiting.of_rows(finished), voxel_size, with_object_id)
+                yield cloud_of_sums(waiting.of_rows(finished), voxel_size, with_object_id)
                 waiting = waiting.of_rows(~finished)
 
 
@@ -173,136 +146,27 @@ def _cubes(discs: SurfaceDiscs, voxel_size: float) -> np.ndarray | None:
         return None
     few = ((high - low) <= 1).all(1)
     corners = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
-    found = [np.unique(_pack(np.minimum(low[few] + corner, high[few]))) for corner in corners]
+    found = [np.unique(pack(np.minimum(low[few] + corner, high[few]))) for corner in corners]
     for a, b in zip(low[~few], high[~few], strict=True):
         axes = [np.arange(start, stop + 1) for start, stop in zip(a, b, strict=True)]
-        found.append(_pack(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)))
+        found.append(pack(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)))
     return np.unique(np.concatenate(found))
 
 
-class _Blocks:
-    """Tells which voxels no section to come reaches.
-
-    Args:
-        of_section: the cubes that each reaches into, from `_cubes`; None: into any.
-    """
-
-    def __init__(self, of_section: list[np.ndarray | None], voxel_size: float) -> None:
-        self._edge, self._of_section = _cube_edge(voxel_size), of_section
-        known = [cubes for cubes in of_section if cubes is not None]
-        self._keys, self._to_come = np.unique(np.concatenate([np.empty(0, np.int64), *known]), return_counts=True)
-        self._left, self._boundless = len(of_section), len(of_section) - len(known)
-
-    @property
-    def all_done(self) -> bool:
-        """Whether no section is to come."""
-        return self._left == 0
-
-    def is_done(self, section: int) -> None:
-        """A section is not to come any more."""
-        cubes = self._of_section[section]
-        if cubes is None:
-            self._boundless -= 1
-        else:
-            self._to_come[np.searchsorted(self._keys, cubes)] -= 1
-        self._left -= 1
-
-    def are_done(self, voxels: np.ndarray) -> np.ndarray:
-        """Whether voxels (packed, [N]) lie in the cubes of no section to come, bool [N]."""
-        if not len(voxels) or self.all_done:
-            return np.ones(len(voxels), bool)
-        if self._boundless:
-            return np.zeros(len(voxels), bool)
-        if not len(self._keys):
-            return np.ones(len(voxels), bool)
-        key = _pack(_unpack(voxels) // self._edge)
-        place = np.searchsorted(self._keys, key).clip(max=len(self._keys) - 1)
-        return (self._keys[place] != key) | (self._to_come[place] == 0)
-
-
 def _add_samples(
-    merged: _Sums, gaussians: GaussianMap, discs: SurfaceDiscs, voxel_size: float, with_object_id: bool,
+    merged: VoxelSums, gaussians: GaussianMap, discs: SurfaceDiscs, voxel_size: float, with_object_id: bool,
     chunk: int = _CHUNK,
-) -> _Sums:  # fmt: skip
+) -> VoxelSums:  # fmt: skip
     """The sums with those of samples of a map, of which `chunk` are in memory at a time."""
     pending, waiting = [], 0
     for position, weight, color, object_id in disc_samples(gaussians, discs, voxel_size, chunk):
         lattice = np.rint(position / voxel_size)
-        if np.abs(lattice).max(initial=0) >= 1 << (_BITS - 1):
-            raise InputError(f"the map spans more than 2^{_BITS} voxels of {voxel_size} m")
+        if np.abs(lattice).max(initial=0) >= 1 << (BITS - 1):
+            raise InputError(f"the map spans more than 2^{BITS} voxels of {voxel_size} m")
         labels = object_id if with_object_id else np.zeros_like(object_id)
-        part = _Sums.of([_Sums(_pack(lattice.astype(np.int64)), labels, weight, weight[:, None] * color)])
+        part = VoxelSums.of([VoxelSums(pack(lattice.astype(np.int64)), labels, weight, weight[:, None] * color)])
         pending.append(part)
         waiting += len(part.key)
         if waiting > len(merged.key):  # rarely, so that all merging together costs about as much as one sort
-            merged, pending, waiting = _Sums.of([merged, *pending]), [], 0
-    return _Sums.of([merged, *pending])
-
-
-def _pack(lattice: np.ndarray) -> np.ndarray:
-    """One int64 per voxel from signed coordinates [N, 3]."""
-    x, y, z = (lattice + (1 << (_BITS - 1))).T
-    return (x << 2 * _BITS) | (y << _BITS) | z
-
-
-def _unpack(key: np.ndarray) -> np.ndarray:
-    limit = (1 << _BITS) - 1
-    return np.stack([key >> 2 * _BITS, (key >> _BITS) & limit, key & limit], 1) - (1 << (_BITS - 1))
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """Weighted sums per voxel and object: key and label [N] (sorted, unique pairs once joined), weight, colour."""
-
-    key: np.ndarray
-    label: np.ndarray
-    weight: np.ndarray
-    color: np.ndarray
-
-    @staticmethod
-    def empty() -> _Sums:
-        return _Sums(np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0), np.empty((0, 3)))
-
-    def of_rows(self, chosen: np.ndarray) -> _Sums:
-        """Some rows, bool [N]."""
-        return _Sums(self.key[chosen], self.label[chosen], self.weight[chosen], self.color[chosen])
-
-    @staticmethod
-    def of(parts: list[_Sums]) -> _Sums:
-        """All parts together, one row per (voxel, label)."""
-        key, label = np.concatenate([p.key for p in parts]), np.concatenate([p.label for p in parts])
-        order = np.lexsort((label, key)) if label.any() else np.argsort(key, kind="stable")
-        key, label = key[order], label[order]
-        starts = np.nonzero(_first_of_runs(key) | _first_of_runs(label))[0]
-        if not len(starts):
-            return parts[0]
-        weight = np.concatenate([p.weight for p in parts])[order]
-        color = np.concatenate([p.color for p in parts])[order]
-        return _Sums(key[starts], label[starts], np.add.reduceat(weight, starts), np.add.reduceat(color, starts))
-
-
-def _first_of_runs(values: np.ndarray) -> np.ndarray:
-    first = np.ones(len(values), bool)
-    first[1:] = values[1:] != values[:-1]
-    return first
-
-
-def _cloud(sums: _Sums, voxel_size: float, with_object_id: bool) -> VoxelCloud:
-    if not len(sums.key):
-        nothing = np.empty((0, 3), np.int32)
-        ids = np.empty(0, np.int32) if with_object_id else None
-        return VoxelCloud(nothing, nothing.astype(np.uint8), ids, voxel_size, np.zeros(3))
-    # Heaviest label first within each voxel, the smaller id at a tie: the first row of each run then names the object.
-    order = np.lexsort((sums.label, -sums.weight, sums.key))
-    key, label = sums.key[order], sums.label[order]
-    starts = np.nonzero(_first_of_runs(key))[0]
-    color = np.add.reduceat(sums.color[order], starts) / np.add.reduceat(sums.weight[order], starts)[:, None]
-    lattice = _unpack(key[starts])
-    corner = lattice.min(0)
-    return VoxelCloud(
-        grid=(lattice - corner).astype(np.int32),
-        colors=np.rint(255 * color).astype(np.uint8),
-        object_id=label[starts] if with_object_id else None,
-        voxel_size=voxel_size,
-        origin=corner * voxel_size,
-    )
+            merged, pending, waiting = VoxelSums.of([merged, *pending]), [], 0
+    return VoxelSums.of([merged, *pending])

@@ -36,7 +36,7 @@ from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.checkpoints import has_checkpoints
 from ggslam.runs.manifest import refuse_mixed
-from ggslam.runs.map_index import MAP_INDEX, MapIndex, MapInParts
+from ggslam.runs.map_index import MapInParts
 from ggslam.runs.publishing import change_files, publish_run
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
@@ -277,8 +277,7 @@ class RunFolder:
         Raises:
             FormatError: map or index are damaged or do not belong together.
         """
-        index = self.path / MAP_INDEX
-        return MapInParts(self.path / "map.ply", MapIndex.read(index) if index.is_file() else None)
+        return MapInParts.of_folder(self.path)
 
     def trajectory(self) -> Trajectory:
         """Camera poses of all frames."""

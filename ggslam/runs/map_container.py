@@ -46,7 +46,7 @@ from ggslam.runs.records.mark import FileRecord, RunRecord
 from ggslam.runs.records.movers import MOVER_FILES
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
-from ggslam.runs.saving_parts import save_points_of_map
+from ggslam.runs.saving_parts import save_points
 from ggslam.runs.writing import RUN_FILES, TRUTH_FILE
 from ggslam.scene.arrays import arrays_of, arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
@@ -232,7 +232,7 @@ def _write_run(path: Path, members: dict[str, bytes], staged: Path, threads: int
     arrays = arrays_of(held, f"{path}: {PLACES_FILE}: damaged", lambda found: {n: found[n] for n in found.files})
     births = gaussians.birth_keyframe.numpy().astype(np.int32)
     write_bytes(staged / PLACES_FILE, arrays_to_bytes(**{**arrays, "birth": births}))
-    save_points_of_map(staged, gaussians, with_objects)
+    save_points(staged)
     write_bytes(staged / RunRecord.FILE, members[RunRecord.FILE])  # the mark of the new run takes its place
     mark = RunRecord.read(staged)
     lossy = f"coded for sending ({path.name}) and decoded: places and colours are rounded"

@@ -114,6 +114,16 @@ class MapInParts:
         self._shown: tuple[int, ...] | None = None
         self._map: GaussianMap | None = None
 
+    @staticmethod
+    def of_folder(folder: Path) -> MapInParts:
+        """That of a run: to be read in blocks of rows, or as far as a view needs it if it was written cell by cell.
+
+        Raises:
+            FormatError: map or index are damaged or do not belong together.
+        """
+        index = folder / MAP_INDEX
+        return MapInParts(folder / "map.ply", MapIndex.read(index) if index.is_file() else None)
+
     def __len__(self) -> int:
         return len(self.rows)
 

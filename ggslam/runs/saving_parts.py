@@ -5,18 +5,16 @@ during the run."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from ggslam.formats.gaussian_ply import write_gaussian_parts
 from ggslam.formats.point_ply import write_points_in_parts
-from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.objects.segmented_map import ObjectVotes
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.map_index import MAP_INDEX, write_map_index
-from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.runs.map_points import map_points
 from ggslam.slam.result import SlamResult
 from ggslam.system.atomic import write_bytes
 
@@ -43,16 +41,6 @@ def save_map_in_parts(folder: Path, result: SlamResult, names: Mapping[int, str]
     table.save(folder / "objects.json")
 
 
-def save_points(folder: Path, result: SlamResult) -> None:
-    """Writes points.ply and points_grid.ply; of the cloud, which may be many times the map, a part at a time."""
-    cells = result.cells
-    if cells is None:
-        parts = [MapPart.of(result.gaussians)]
-    else:
-        parts = [MapPart(*cells.box(key), partial(cells.read, key)) for key in cells.sorted_keys()]
-    write_points_in_parts(folder, sample_parts(parts, with_object_id=result.objects is not None))
-
-
-def save_points_of_map(folder: Path, gaussians: GaussianMap, with_object_id: bool) -> None:
-    """Writes the same two files of a map that is in memory."""
-    write_points_in_parts(folder, sample_parts([MapPart.of(gaussians)], with_object_id=with_object_id))
+def save_points(folder: Path) -> None:
+    """Writes points.ply and points_grid.ply of the map in a folder, beside it; a part at a time."""
+    write_points_in_parts(folder, map_points(folder))

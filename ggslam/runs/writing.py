@@ -87,7 +87,7 @@ class RunToWrite:
         if result.places is not None:
             write_bytes(folder / PLACES_FILE, result.places)
         try:  # last and largest; `ggslam export --format points` makes them again from the map
-            save_points(folder, result)
+            save_points(folder)
         except (GgslamError, OSError, MemoryError) as failure:
             short = RunFolderError(f"{POINTS[0]}: not enough memory: {failure}")
             self.failure = short if isinstance(failure, MemoryError) else failure

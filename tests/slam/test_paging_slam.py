@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from pathlib import Path
 
@@ -15,13 +16,14 @@ from kept import generated_recording
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.point_ply import read_points
-from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.trajectory import read_tum
+from ggslam.formats.voxel_cloud import join_clouds
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
 from ggslam.jobs.score.run import score_run
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.runs.map_points import map_points
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, se3_exp
@@ -102,12 +104,15 @@ def test_the_run_folder_is_complete_and_nothing_else_is_left(limited: RunOutcome
     assert not [path.name for path in folder.iterdir() if path.name.startswith(".")]
 
 
-def test_points_are_those_of_the_whole_map(limited: RunOutcome) -> None:
+def test_points_are_those_of_the_whole_map(limited: RunOutcome, tmp_path: Path) -> None:
     written = read_points(limited.folder.path / "points.ply")
-    whole = sample_points(read_gaussian_ply(limited.folder.path / "map.ply"), written.voxel_size)
-    order = [np.lexsort(cloud.grid.T[::-1]) for cloud in (written, whole)]
-    assert np.array_equal(written.grid[order[0]], whole.grid[order[1]])
-    difference = written.colors[order[0]].astype(int) - whole.colors[order[1]]
+    copy = Path(shutil.copytree(limited.folder.path, tmp_path / "whole"))
+    (copy / "map_cells.json").unlink()
+    whole = join_clouds(map_points(copy, written.voxel_size))
+    order = np.lexsort(written.grid.T[::-1])
+    assert len(whole) > 1000 and np.array_equal(written.grid[order], whole.grid)
+    assert np.abs(written.points[order] - whole.points).max() < 1e-5
+    difference = written.colors[order].astype(int) - whole.colors
     assert np.abs(difference).max() <= 1 and np.allclose(written.origin, whole.origin)
 
 

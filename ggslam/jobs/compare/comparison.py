@@ -14,7 +14,6 @@ from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.evaluation.geometry import THRESHOLDS_M, CloudScores, score_cloud
 from ggslam.evaluation.trajectory import TrajectoryScores, score_trajectory
 from ggslam.formats.point_cloud import read_point_cloud
-from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.trajectory import read_tum
 from ggslam.formats.triangle_mesh import read_mesh
 from ggslam.geometry.clouds import Cloud, Overlap, overlap
@@ -29,6 +28,7 @@ from ggslam.jobs.compare.alignment import (
     common_poses,
 )
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.map_points import map_points
 from ggslam.runs.writing import TRUTH_FILE
 from ggslam.scene.poses import inverse
 from ggslam.system.json_files import json_ready
@@ -163,7 +163,8 @@ def read_side(path: Path, seed: int = 0) -> Side:
 def _read_run(path: Path) -> Side:
     folder = RunFolder.open(path)
     cloud = path / "points.ply"
-    points = read_point_cloud(cloud).points if cloud.is_file() else sample_points(folder.gaussians()).points
+    made = [] if cloud.is_file() else [part.points for part in map_points(path)]
+    points = read_point_cloud(cloud).points if cloud.is_file() else np.concatenate([np.empty((0, 3)), *made])
     if not len(points):
         raise RunFolderError(f"{path}: the map has no points to compare")
     truth = read_tum(path / TRUTH_FILE) if (path / TRUTH_FILE).is_file() else None

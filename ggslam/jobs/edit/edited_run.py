@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.formats.point_ply import write_points_in_parts
-from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
@@ -19,6 +17,7 @@ from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.publishing import publish_run
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.movers import MOVER_FILES
+from ggslam.runs.saving_parts import save_points
 from ggslam.runs.writing import OBJECT_FILES, POINTS, REPORT_FILE, TRAJECTORIES, TRUTH_FILE, write_objects
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
@@ -85,7 +84,6 @@ def _stage(
     source.timing().model_copy(update={"gaussians": len(scene.gaussians)}).write(staged)
     for name, picture in pictures.items():
         write_picture(staged / "renders" / name, picture)
-    if not named_only:
-        parts = [MapPart.of(scene.gaussians)]
-        write_points_in_parts(staged, sample_parts(parts, with_object_id=True))
     write_objects(staged, scene)
+    if not named_only:
+        save_points(staged)

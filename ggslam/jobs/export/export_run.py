@@ -43,6 +43,7 @@ def export_run(
     movers: bool = False,
     min_opacity: float = 0.0,
     plain: bool = False,
+    discs: bool = False,
     keyframes: bool = False,
     recording: str | Path | None = None,
     rendered: bool = False,
@@ -63,7 +64,10 @@ def export_run(
             settings say).
         objects: names or ids, "mug,7", or "all", for ply, segmented, mesh, sog, streamed-sog, gltf, usd: only these.
         movers: instead of the map, the points of each thing that moved, as a PLY file for each in the folder `out`.
-        min_opacity: leave out fainter Gaussians (not of trajectory, mesh, colmap, nerfstudio).
+        min_opacity: leave out fainter Gaussians (not of trajectory, mesh, colmap, nerfstudio; of points and pcd only
+            with `discs`).
+        discs: points, pcd: the discs of all Gaussians, seen by a keyframe or not, instead of the surface that the
+            keyframes see.
         plain: ply, segmented, sog, streamed-sog, gltf, usd: only the fields of 3DGS.
         keyframes: colmap, nerfstudio: only keyframes and held-out frames.
         recording: where the recording is now, if it was moved (colmap, nerfstudio, mesh).
@@ -81,10 +85,13 @@ def export_run(
     """
     place = Path(out)
     if movers:
-        _refuse_beside_movers(place, format, voxel, objects, plain, keyframes, recording, rendered, zoom, min_opacity)
+        _refuse_beside_movers(
+            place, format, voxel, objects, plain, discs, keyframes, recording, rendered, zoom, min_opacity
+        )
         return export_movers(run if isinstance(run, RunFolder) else RunFolder.open(Path(run)), place)
     kind = choose_format(None if format is None else _format_named(format), place, objects)
     _refuse_ignored(kind, objects, keyframes, recording, rendered, zoom)
+    _check_discs(kind, discs, min_opacity)
     if not isinstance(run, RunFolder) and is_store(Path(run)):
         return _export_store(Path(run), place, kind, objects, min_opacity, zoom, observer)
     folder = run if isinstance(run, RunFolder) else RunFolder.open(Path(run))
@@ -106,9 +113,9 @@ def export_run(
     if kind is ExportFormat.ply:
         return export_splats(folder, place, min_opacity, plain, prepare)
     if kind is ExportFormat.points:
-        return export_points(folder, place, points, min_opacity)
+        return export_points(folder, place, points, discs, min_opacity)
     if kind is ExportFormat.pcd:
-        return export_pcd(folder, place, points, min_opacity)
+        return export_pcd(folder, place, points, discs, min_opacity)
     if kind is ExportFormat.trajectory:
         return export_trajectory(folder, place)
     return export_packed(folder, place, kind.value, min_opacity, prepare)
@@ -149,6 +156,15 @@ def _refuse_beside_movers(place: Path, *others: object) -> None:
         raise ConfigError("`movers` writes points of movers as they were seen: of other arguments it takes only `out`")
     if place.suffix:
         raise ConfigError(f"`out` {place}: `movers` writes a folder, with a file for each")
+
+
+def _check_discs(kind: ExportFormat, discs: bool, min_opacity: float) -> None:
+    """Raises ConfigError for a choice of discs, or of their opacity, that has no effect."""
+    of_points = kind in (ExportFormat.points, ExportFormat.pcd)
+    if discs and not of_points:
+        raise ConfigError(f"`discs` goes with `format` points or pcd, not {kind.value}")
+    if of_points and min_opacity > 0 and not discs:
+        raise ConfigError(f"`min_opacity` goes with `format` {kind.value} only with `discs`")
 
 
 def _refuse_ignored(

@@ -5,19 +5,20 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
 import torch
 
-from ggslam.errors import ConfigError, RunFolderError
+from ggslam.errors import ConfigError, InputError, RunFolderError
 from ggslam.formats.point_ply import write_points_in_parts
-from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.formats.trajectory import write_tum
+from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.jobs.export.chosen import ChosenGaussians, Prepare
 from ggslam.objects.table import ObjectRecord
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.map_index import MapInParts
+from ggslam.runs.map_points import map_points
 from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.scene.gaussian_map import GaussianMap, rgb_to_sh
 from ggslam.scene.identity import IdentityClassifier
@@ -136,27 +137,42 @@ def object_file_name(record: ObjectRecord) -> str:
     return f"{record.id}_{name}.ply" if name else f"{record.id}.ply"
 
 
-def export_points(folder: RunFolder, path: Path, voxel_size: float, min_opacity: float = 0.0) -> str:
-    """Writes points.ply (metres) and points_grid.ply (integer cells) into the folder `path`."""
-    opacity, parts = min_opacity if min_opacity > 0 else 0.3, folder.map_in_parts()
-    if not voxel_size > 0 or not 0 < opacity < 1:
-        raise ConfigError(f"impossible voxel size {voxel_size} or minimum opacity {opacity}")
+def export_points(
+    folder: RunFolder, path: Path, voxel_size: float, discs: bool = False, min_opacity: float = 0.0
+) -> str:
+    """Writes points.ply (metres) and points_grid.ply (integer cells) into the folder `path`; see `points_to_export`."""
+    clouds = points_to_export(folder, voxel_size, discs, min_opacity)
     make_folder(path)
-    try:
-        count = _sample(folder, parts, path, voxel_size, opacity)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
+    count = write_points_in_parts(path, clouds)
     return f"wrote {path}/points.ply and points_grid.ply: {count} points on a {voxel_size} m grid"
 
 
-def _sample(folder: RunFolder, parts: MapInParts, path: Path, voxel_size: float, opacity: float) -> int:
-    """Writes the points of a map, cell by cell if it has cells; returns how many."""
-    with_object_id = folder.has_objects()
-    pieces = parts.parts() if parts.in_cells else [MapPart.of(folder.gaussians())]
-    clouds = sample_parts(pieces, voxel_size, opacity, with_object_id)
-    if (first := next(clouds, None)) is not None:
-        return write_points_in_parts(path, chain([first], clouds))
-    raise RunFolderError(f"{folder.path}: the map has no points to export")
+def points_to_export(
+    folder: RunFolder, voxel_size: float, discs: bool = False, min_opacity: float = 0.0
+) -> Iterator[VoxelCloud]:
+    """The points of a run's surface in clouds, at least one that is not empty.
+
+    Args:
+        folder: of the run.
+        voxel_size: metres.
+        discs: take the discs of the Gaussians instead, whether a keyframe sees them or not...
+        min_opacity: ...that are at least this opaque; 0: 0.3.
+
+    Raises:
+        ConfigError: impossible voxel size or opacity.
+        RunFolderError: the map has no points.
+    """
+    opacity = min_opacity if min_opacity > 0 else 0.3
+    if not voxel_size > 0 or not 0 < opacity < 1:
+        raise ConfigError(f"impossible voxel size {voxel_size} or minimum opacity {opacity}")
+    try:
+        clouds = map_points(folder.path, voxel_size, discs, opacity)
+        first = next(clouds, None)
+    except InputError as error:
+        raise ConfigError(str(error)) from None
+    if first is None:
+        raise RunFolderError(f"{folder.path}: the map has no points to export")
+    return chain([first], clouds)
 
 
 def export_trajectory(folder: RunFolder, path: Path) -> str:

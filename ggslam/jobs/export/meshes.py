@@ -15,23 +15,13 @@ from ggslam.jobs.export.map_files import object_file_name
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.volumes.frames import PosedFrame, frames_of_run
 from ggslam.jobs.volumes.outputs import SMALLEST_PIECE
-from ggslam.mapping.keyframe import ELSEWHERE
-from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.table import ObjectTable
-from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.reporting.pictures import color_to_uint8
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.map_index import MapInParts
-from ggslam.runs.objects_in_parts import ObjectsInParts
-from ggslam.runs.records.keyframes import KeyframeRecord
+from ggslam.runs.rendered_views import RenderedViews
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse
 from ggslam.system.atomic import make_folder
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import Mesh, extract_mesh
-
-MIN_ALPHA = 0.5
-"""Where the map covers less of a pixel than this, the pixel has no rendered depth."""
 
 
 @dataclass(frozen=True)
@@ -142,27 +132,18 @@ def _views(folder: RunFolder, request: MeshRequest) -> _Views:
 
 def _map_views(folder: RunFolder) -> _Views:
     """The map as the keyframes see it."""
-    keyframes = folder.keyframes().keyframes
-    if not keyframes:
+    views = RenderedViews.of_files(folder.path)
+    if not len(views):
         raise RunFolderError(f"{folder.path}: no frame of this run was located")
-    return _Views(_renders(folder, keyframes), len(keyframes), f"depth rendered at {len(keyframes)} keyframes")
+    return _Views(_renders(views), len(views), f"depth rendered at {len(views)} keyframes")
 
 
-def _renders(folder: RunFolder, keyframes: list[KeyframeRecord]) -> Iterator[PosedFrame]:
-    recording, rasterizer = folder.sequence(), CpuRasterizer()
-    objects = ObjectsInParts.of(folder) if folder.has_objects() else None
-    parts: MapInParts = folder.map_in_parts() if objects is None else objects.map
-    for index, keyframe in enumerate(keyframes):
-        T = keyframe.T_world_camera
-        camera = recording.camera if keyframe.frame == ELSEWHERE else recording.camera_of(keyframe.frame)
-        gaussians = parts.in_view(camera, inverse(T))
-        view = rasterizer.forward(gaussians, camera, inverse(T), features=objects is not None)
-        alpha = view.alpha.numpy()
-        depth = np.where(alpha >= MIN_ALPHA, view.expected_depth.numpy(), 0).astype(np.float32)
-        color = color_to_uint8(view.image.numpy() / np.maximum(alpha, MIN_ALPHA))  # rendered over black
-        labels = None if objects is None else object_ids(rasterizer, view, objects.around(gaussians))
-        frame = Frame(index, index, float(index), color, depth, camera)
-        yield PosedFrame(frame, T, labels)
+def _renders(views: RenderedViews) -> Iterator[PosedFrame]:
+    for k in range(len(views)):
+        view = views.view(k)
+        assert view.color is not None
+        frame = Frame(k, k, float(k), view.color, view.depth, view.camera)
+        yield PosedFrame(frame, view.T_world_camera, view.labels)
 
 
 # --- files -----------------------------------------------------------------------------------------------------------

@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-from ggslam.errors import ConfigError, FormatError, RunFolderError
+from ggslam.errors import FormatError, RunFolderError
 from ggslam.formats.compressed_ply import write_compressed_ply
 from ggslam.formats.packed_splats import spz_packages, write_spz
 from ggslam.formats.point_cloud import write_point_cloud
-from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.splat_file import write_splat
+from ggslam.formats.voxel_cloud import join_clouds
 from ggslam.jobs.export.chosen import Prepare
+from ggslam.jobs.export.map_files import points_to_export
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import make_folder
@@ -56,8 +57,10 @@ def export_packed(
     return f"wrote {path}: {count} Gaussians, {path.stat().st_size / 1e6:.1f} MB"
 
 
-def export_pcd(folder: RunFolder, path: Path, voxel_size: float, min_opacity: float = 0.0) -> str:
-    """Writes a coloured cloud sampled from the map, in metres, with object ids if there are any, as PCD.
+def export_pcd(
+    folder: RunFolder, path: Path, voxel_size: float, discs: bool = False, min_opacity: float = 0.0
+) -> str:
+    """Writes the points of the surface, in metres, with colours, and with object ids if there are any, as PCD.
 
     Raises:
         ConfigError: impossible voxel size or opacity.
@@ -65,13 +68,7 @@ def export_pcd(folder: RunFolder, path: Path, voxel_size: float, min_opacity: fl
         RunFolderError: nothing to write, or the file cannot be written.
     """
     _check_ending(path, "pcd")
-    try:
-        opacity = min_opacity if min_opacity > 0 else 0.3
-        cloud = sample_points(folder.gaussians(), voxel_size, opacity, with_object_id=folder.has_objects())
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
-    if not len(cloud):
-        raise RunFolderError(f"{folder.path}: the map has no points to export")
+    cloud = join_clouds(points_to_export(folder, voxel_size, discs, min_opacity))
     attributes = {"color": cloud.colors}
     if cloud.object_id is not None:
         attributes["object_id"] = cloud.object_id

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import ConfigError, RunFolderError
+from ggslam.errors import RunFolderError
 from ggslam.formats.colmap import write_colmap_model
 from ggslam.formats.nerfstudio import TransformsFrame, millimetres, write_transforms
-from ggslam.formats.point_ply import VoxelCloud, sample_points, write_metric_points
+from ggslam.formats.point_ply import write_metric_points
+from ggslam.formats.voxel_cloud import join_clouds
+from ggslam.jobs.export.map_files import points_to_export
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
@@ -69,7 +71,7 @@ def export_colmap(
         RunFolderError: no frame was located, the map has no points, or the folder cannot be written.
         SequenceError: the recording cannot be read.
     """
-    views, cloud = _views(folder, keyframes_only, recording), _cloud(folder, voxel_size)
+    views, cloud = _views(folder, keyframes_only, recording), join_clouds(points_to_export(folder, voxel_size))
     make_empty_folder(out)
     make_folder(out / MODEL)
     written = list(_write_images(views, out, with_depth=False))
@@ -86,7 +88,7 @@ def export_nerfstudio(
 ) -> str:
     """Writes `images/`, `depth/` (16 bit, millimetres), `points.ply` and `transforms.json`, which names the images to
     train on and those that were held out; returns a line that says so. Arguments and errors as in `export_colmap`."""
-    views, cloud = _views(folder, keyframes_only, recording), _cloud(folder, voxel_size)
+    views, cloud = _views(folder, keyframes_only, recording), join_clouds(points_to_export(folder, voxel_size))
     make_empty_folder(out)
     written = list(_write_images(views, out, with_depth=True))
     write_metric_points(out / "points.ply", cloud)
@@ -109,16 +111,6 @@ def _views(folder: RunFolder, keyframes_only: bool, recording: Path | None) -> _
     if not views:
         raise RunFolderError(f"{folder.path}: no frame of this run was located")
     return _Views(open_recording_of(folder, recording), views)
-
-
-def _cloud(folder: RunFolder, voxel_size: float) -> VoxelCloud:
-    try:
-        cloud = sample_points(folder.gaussians(), voxel_size)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
-    if not len(cloud):
-        raise RunFolderError(f"{folder.path}: the map has no points to export")
-    return cloud
 
 
 def _write_images(views: _Views, out: Path, with_depth: bool) -> Iterator[_View]:

@@ -29,7 +29,7 @@ from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.mark import MergedRecord, RunRecord
 from ggslam.runs.records.sequence import PartRecord, SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
-from ggslam.runs.saving_parts import save_points_of_map
+from ggslam.runs.saving_parts import save_points
 from ggslam.runs.writing import RUN_FILES, TRUTH_FILE, write_objects
 from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
@@ -100,7 +100,7 @@ class MergedRun:
             moving = MovingPixels.concatenate((s.first_frame, read_moving(s.folder.path)) for s in self.sources)
             if len(moving):
                 write_bytes(staged / MOVERS_FILE, arrays_to_bytes(**moving.to_arrays()))
-            save_points_of_map(staged, self.gaussians, self.objects.supervision is not None)
+            save_points(staged)
             more(staged)
             return self._mark()
 

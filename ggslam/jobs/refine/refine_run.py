@@ -24,7 +24,7 @@ from ggslam.runs.publishing import publish_run
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.movers import MOVER_FILES
-from ggslam.runs.saving_parts import save_points_of_map
+from ggslam.runs.saving_parts import save_points
 from ggslam.runs.writing import RUN_FILES, TRAJECTORIES, TRUTH_FILE, write_objects
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
@@ -160,7 +160,7 @@ def _save(
             write_gaussian_ply(staged / "map.ply", gaussians)
         else:
             write_objects(staged, scene)
-        save_points_of_map(staged, gaussians, scene is not None)
+        save_points(staged)
         return source.mark()
 
     publish_run(target.path, write, RUN_FILES, f"{target.path}: the refined run cannot be written")

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The coloured points of a run's map: what points.ply, exports and comparisons have."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from ggslam.formats.point_sampling import MapPart, sample_parts, voxel_size_for
+from ggslam.formats.voxel_cloud import VoxelCloud
+from ggslam.runs.map_index import MapInParts
+from ggslam.runs.rendered_views import RenderedViews
+from ggslam.volumes.surface_points import MOST_BLOCKS
+
+_FEW_BLOCKS = 8_000
+"""Of the surface, held where a map is read cell by cell because memory is scarce."""
+
+
+def map_points(
+    folder: Path, voxel_size: float | None = None, discs: bool = False, min_opacity: float = 0.3
+) -> Iterator[VoxelCloud]:
+    """The surface that a run's keyframes see of its map, in clouds one after the other, each with an origin of its own.
+
+    Of a map without keyframes, and on request, they are the discs of its Gaussians, whether a keyframe sees them or
+    not (see `formats.point_sampling`).
+
+    Args:
+        folder: of the run, whether it is complete yet or not.
+        voxel_size: metres; None: as goes with the map.
+        discs: take discs...
+        min_opacity: ...of Gaussians that are at least this opaque.
+
+    Raises:
+        InputError: an impossible voxel size or opacity.
+        RunFolderError, FormatError: a file is missing or damaged.
+    """
+    stored, views = MapInParts.of_folder(folder), RenderedViews.of_files(folder)
+    if not stored.in_cells:
+        whole = stored.read(stored.cells())
+        parts, views.in_view = [MapPart.of(whole)], lambda camera, T_camera_world: whole
+    else:
+        parts, views.in_view = stored.parts(), stored.in_view
+    if discs or not len(views):
+        return sample_parts(parts, voxel_size, min_opacity, views.segmented is not None)
+    voxel_size = voxel_size_for(parts) if voxel_size is None else voxel_size
+    return views.points(voxel_size, _FEW_BLOCKS if stored.in_cells else MOST_BLOCKS)

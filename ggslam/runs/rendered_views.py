@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run's map as its keyframes see it: rendered depth, colour and object ids, without the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import InputError
+from ggslam.formats.voxel_cloud import VoxelCloud
+from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.objects.rendered_ids import object_ids
+from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.objects.table import ObjectTable
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.reporting.pictures import color_to_uint8
+from ggslam.runs.map_index import MapInParts
+from ggslam.runs.records.keyframes import KeyframesRecord
+from ggslam.runs.records.sequence import SequenceRecord
+from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IdentityClassifier
+from ggslam.scene.poses import inverse
+from ggslam.volumes.surface_points import MOST_BLOCKS, SurfaceView, surface_points
+
+MIN_ALPHA = 0.5
+"""Where the map covers less of a pixel than this, the pixel has no rendered depth."""
+SPREAD = 0.02
+"""A pixel has no rendered depth where mean and median of what it is blended of differ by more than this share: along
+outlines it is blended of two surfaces, and its mean lies between them."""
+_COARSE = 0.25
+"""Size of views that only tell how far they reach."""
+_FINEST = 4.0
+"""Views are rendered at most at so many times the training views' size, for voxels small against their pixels."""
+_PIXELS_A_VOXEL = 1.5
+"""A pixel spans no more voxels than this at the usual depth."""
+
+
+@dataclass
+class RenderedViews:
+    """The map from the places of the keyframes.
+
+    Attributes:
+        cameras, poses: of each keyframe: its camera, and T_world_camera float64 [4, 4].
+        in_view: the Gaussians that a camera at a pose T_camera_world may see.
+        segmented: those Gaussians with their objects; None: views have no object ids.
+    """
+
+    cameras: Sequence[Camera]
+    poses: Sequence[np.ndarray]
+    in_view: Callable[[Camera, np.ndarray], GaussianMap]
+    segmented: Callable[[GaussianMap], SegmentedMap] | None = None
+    _rasterizer: CpuRasterizer = field(default_factory=CpuRasterizer)
+
+    @staticmethod
+    def of_files(folder: Path) -> RenderedViews:
+        """Those of the files of a run, whether it is complete yet or not.
+
+        Raises:
+            RunFolderError, FormatError: one is missing or damaged.
+        """
+        recording, keyframes = SequenceRecord.read(folder), KeyframesRecord.read(folder).keyframes
+        cameras = [recording.camera if k.frame == ELSEWHERE else recording.camera_of(k.frame) for k in keyframes]
+        views = RenderedViews(cameras, [k.T_world_camera for k in keyframes], MapInParts.of_folder(folder).in_view)
+        if (folder / "objects.json").is_file():
+            table = ObjectTable.load(folder / "objects.json")
+            classifier = IdentityClassifier.from_file(folder / "classifier.npz")
+            views.segmented = lambda gaussians: SegmentedMap(gaussians, classifier, table)
+        return views
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def in_order(self) -> RenderedViews:
+        """The same in the order of their places along the longest side of the map."""
+        if not len(self):
+            return self
+        places = np.stack([T[:3, 3] for T in self.poses])
+        order = np.argsort(places[:, np.ptp(places, axis=0).argmax()], kind="stable")
+        cameras, poses = [self.cameras[i] for i in order], [self.poses[i] for i in order]
+        return RenderedViews(cameras, poses, self.in_view, self.segmented, self._rasterizer)
+
+    def view(self, number: int, zoom: float = 1.0, only_depth: bool = False) -> SurfaceView:
+        """What a keyframe sees of the map.
+
+        Args:
+            number: of the keyframe.
+            zoom: how many times larger than the keyframe's images.
+            only_depth: leave out colour and object ids.
+        """
+        camera, T = self.cameras[number].scale(zoom), self.poses[number]
+        gaussians, rasterizer = self.in_view(self.cameras[number], inverse(T)), self._rasterizer
+        low_pass = rasterizer.low_pass * zoom**2  # Gaussians are as wide as they were trained
+        with_ids = self.segmented is not None and not only_depth
+        drawn = rasterizer.forward(
+            gaussians, camera, inverse(T), features=with_ids, median_depth=True, low_pass=low_pass
+        )
+        assert drawn.median_depth is not None
+        alpha, mean, median = drawn.alpha.numpy(), drawn.expected_depth.numpy(), drawn.median_depth.numpy()
+        sure = (alpha >= MIN_ALPHA) & (np.abs(mean - median) <= SPREAD * median)
+        depth = np.where(sure, mean, 0).astype(np.float32)
+        if only_depth:
+            return SurfaceView(depth, camera, T)
+        color = color_to_uint8(drawn.image.numpy() / np.maximum(alpha, MIN_ALPHA))  # rendered over black
+        ids = None if self.segmented is None else object_ids(rasterizer, drawn, self.segmented(gaussians))
+        return SurfaceView(depth, camera, T, color, ids)
+
+    def zoom_for(self, voxel_size: float) -> float:
+        """How many times larger than the keyframes' images views have to be for voxels of this size, metres."""
+        spacings = []
+        for number in np.linspace(0, len(self) - 1, min(len(self), 8)).astype(int):
+            view = self.view(number, _COARSE, only_depth=True)
+            if (view.depth > 0).any():
+                spacings.append(float(np.median(view.depth[view.depth > 0])) / self.cameras[number].fx)
+        wanted = float(np.median(spacings)) / (_PIXELS_A_VOXEL * voxel_size) if spacings else 1.0
+        return float(np.clip(wanted, 1, _FINEST))
+
+    def points(self, voxel_size: float, most_blocks: int = MOST_BLOCKS) -> Iterator[VoxelCloud]:
+        """The surface that the keyframes see, one point for each voxel of a grid; see
+        `volumes.surface_points.surface_points`.
+
+        Raises:
+            InputError: an impossible voxel size.
+        """
+        if not 1e-3 <= voxel_size <= 1:
+            raise InputError(f"voxel size: expected 0.001 to 1 m, found {voxel_size:g}")
+        views = self.in_order()
+        zoom = views.zoom_for(voxel_size)
+
+        def look(number: int, coarse: bool) -> SurfaceView:
+            return views.view(number, _COARSE if coarse else zoom, only_depth=coarse)
+
+        return surface_points(look, len(views), voxel_size, self.segmented is not None, most_blocks)
+

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of a surface that depth images show: one for each voxel of a grid that the surface crosses.
+
+The images are fused into a TSDF whose voxel centres are the corners of the grid's voxels. Where it changes its sign
+marching cubes cut a grid voxel in triangles, and the point is the centroid of their area: errors of single images
+average out, a surface that many views show gives one layer of points, and a point lies on the surface instead of in
+the middle of its voxel (B. Curless and M. Levoy, 1996; W. Lorensen and H. Cline, 1987).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ggslam.formats.cubes_to_come import CubesToCome
+from ggslam.formats.voxel_cloud import VoxelCloud, VoxelSums, cloud_of_sums, pack
+from ggslam.geometry.voxels import neighbour_step, voxel_keys
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import transform_points
+from ggslam.volumes.mesh import Mesh, extract_mesh
+from ggslam.volumes.settings import TsdfSettings
+from ggslam.volumes.tsdf import SIDE, TsdfMap
+
+_TRUNCATION = 3.0
+"""Voxels on either side of the surface that a view tells about."""
+_FARTHEST = 1000.0
+"""Metres."""
+_LEAST_AREA = 0.1
+"""Squared voxels: where the surface only cuts off a corner of a voxel, its neighbours have the point."""
+_CUBE_BLOCKS = 4
+"""Edge of the cubes that finished space is counted in, blocks."""
+_NEIGHBOURS = np.array([neighbour_step(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
+_CHUNK = 200_000
+"""Triangles whose points are held in memory at a time."""
+MOST_BLOCKS = 40_000
+"""Blocks held before finished ones are handed out; 5 KB each."""
+
+
+@dataclass(frozen=True)
+class SurfaceView:
+    """What a camera sees of a surface.
+
+    Attributes:
+        depth: float32 [H, W], metres; 0: none.
+        camera: of the images.
+        T_world_camera: float64 [4, 4].
+        color: uint8 [H, W, 3], or None.
+        labels: uint16 [H, W], object ids, or None.
+    """
+
+    depth: np.ndarray
+    camera: Camera
+    T_world_camera: np.ndarray
+    color: np.ndarray | None = None
+    labels: np.ndarray | None = None
+
+    def points(self) -> np.ndarray:
+        """Where its pixels with depth lie, float64 [n, 3], world frame."""
+        seen = self.camera.back_project(self.depth)[self.depth > 0]
+        return transform_points(seen.astype(np.float64), self.T_world_camera)
+
+
+Look = Callable[[int, bool], SurfaceView]
+"""Gives a view by its number; if coarse, at a fraction of the size, without colour and labels."""
+
+
+def surface_points(
+    look: Look, count: int, voxel_size: float, with_object_id: bool = False, most_blocks: int = MOST_BLOCKS,
+    context: NativeContext | None = None,
+) -> Iterator[VoxelCloud]:  # fmt: skip
+    """The points of a surface, in clouds one after the other that have no voxel in common.
+
+    Each view is looked at twice: coarsely, to see how far it reaches, and to be fused. What no view to come reaches is
+    handed out and forgotten as soon as there are more than `most_blocks`; it pays to sort the views by where they are.
+
+    Args:
+        look: gives the views.
+        count: their number.
+        voxel_size: metres.
+        with_object_id: whether the points carry object ids.
+        most_blocks: see `MOST_BLOCKS`.
+        context: threads to work on.
+    """
+    settings = TsdfSettings(voxel=voxel_size, truncation_voxels=_TRUNCATION, max_depth=_FARTHEST)
+    sweep = _Sweep(TsdfMap(settings, context), [_cubes(look(k, True), voxel_size) for k in range(count)])
+    for number in range(count):
+        view = look(number, False)
+        sweep.add(number, view)
+        if sweep.blocks > most_blocks or number == count - 1:
+            cloud = sweep.take_finished(with_object_id)
+            if len(cloud):
+                yield cloud
+
+
+def _cubes(view: SurfaceView, voxel_size: float) -> np.ndarray:
+    """The cubes that a view's surfaces lie in, keys, each once."""
+    return np.unique(voxel_keys(view.points(), voxel_size * SIDE * _CUBE_BLOCKS))
+
+
+class _Sweep:
+    """A TSDF that forgets what no view to come reaches."""
+
+    def __init__(self, tsdf: TsdfMap, of_view: list[np.ndarray]) -> None:
+        self._tsdf, self._to_come = tsdf, CubesToCome(of_view)
+        self._handed_out = np.empty(0, np.int64)
+        self._voxel = tsdf.settings.voxel
+
+    @property
+    def blocks(self) -> int:
+        """With voxels."""
+        return self._tsdf.dense_blocks
+
+    def add(self, number: int, view: SurfaceView) -> None:
+        """Fuses a view."""
+        self._tsdf.integrate(view.depth, view.camera, view.T_world_camera, view.color, view.labels)
+        self._to_come.is_done(number)
+
+    def take_finished(self, with_object_id: bool) -> VoxelCloud:
+        """The points of what is finished, which is forgotten."""
+        cloud = _points_of(extract_mesh(self._tsdf), self._voxel, with_object_id)
+        edge = SIDE * _CUBE_BLOCKS
+        of_point = voxel_keys(cloud.grid + np.rint(cloud.origin / self._voxel), edge)
+        present = np.unique(of_point)
+        ripe = present[self._all_around(present, self._to_come.are_done)]
+        new = np.setdiff1d(ripe, self._handed_out, assume_unique=True)
+        self._handed_out = np.union1d(self._handed_out, new)
+        self._forget()
+        return _of_rows(cloud, np.isin(of_point, new))
+
+    def _all_around(self, cubes: np.ndarray, holds: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Whether something holds of cubes and of all their neighbours: a voxel's surface is made of voxels beside
+        it."""
+        return np.all([holds(cubes + step) for step in _NEIGHBOURS], axis=0)
+
+    def _forget(self) -> None:
+        """Blocks that no cube to be handed out needs go."""
+        at = self._tsdf.blocks().coordinates
+        cubes = voxel_keys(at, _CUBE_BLOCKS)
+        present = np.unique(cubes)
+        needless = self._all_around(present, lambda keys: self._to_come.are_done(keys) & self._is_out(keys, present))
+        self._tsdf.erase(at[np.isin(cubes, present[needless])])
+
+    def _is_out(self, cubes: np.ndarray, present: np.ndarray) -> np.ndarray:
+        return np.isin(cubes, self._handed_out) | ~np.isin(cubes, present)
+
+
+def _points_of(mesh: Mesh, voxel: float, with_object_id: bool) -> VoxelCloud:
+    """One point for each voxel of the grid that triangles lie in. Triangles of marching cubes lie in one each."""
+    sums = [VoxelSums.empty()] if not len(mesh.triangles) else []
+    labels = mesh.triangle_labels().astype(np.int32) if with_object_id else np.zeros(len(mesh.triangles), np.int32)
+    for start in range(0, len(mesh.triangles), _CHUNK):
+        triangles = mesh.triangles[start : start + _CHUNK]
+        corners = mesh.vertices[triangles].astype(np.float64)
+        centroid, (first, second) = corners.mean(1), np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)
+        area = np.linalg.norm(np.cross(first, second), axis=1) / 2
+        color = mesh.colors[triangles].mean(1) / 255
+        keys, weight = pack(np.rint(centroid / voxel).astype(np.int64)), area[:, None]
+        sums.append(
+            VoxelSums.of([VoxelSums(keys, labels[start : start + _CHUNK], area, weight * color, weight * centroid)])
+        )
+    return cloud_of_sums(VoxelSums.of(sums), voxel, with_object_id, _LEAST_AREA * voxel**2)
+
+
+def _of_rows(cloud: VoxelCloud, chosen: np.ndarray) -> VoxelCloud:
+    """Some of the points, bool [N], on the same grid."""
+    ids = None if cloud.object_id is None else cloud.object_id[chosen]
+    offsets = None if cloud.offsets is None else cloud.offsets[chosen]
+    return replace(cloud, grid=cloud.grid[chosen], colors=cloud.colors[chosen], object_id=ids, offsets=offsets)
