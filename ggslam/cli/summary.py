@@ -12,6 +12,7 @@ if TYPE_CHECKING:
         CameraScoresRecord,
         MetricsRecord,
         SegmentationRecord,
+        SurfaceScoresRecord,
         TrajectoryScoresRecord,
     )
     from ggslam.runs.records.record import Record
@@ -54,6 +55,8 @@ def print_scores(metrics: MetricsRecord) -> None:
     if metrics.segmentation is not None:
         _print_segmentation(metrics.segmentation)
     console.print(_trajectory_line(metrics.trajectory), highlight=False)
+    if metrics.surface is not None:
+        console.print(_surface_line(metrics.surface), highlight=False)
     console.print(_speed_line(metrics), highlight=False)
     for note in metrics.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
@@ -98,6 +101,15 @@ def _trajectory_line(t: TrajectoryScoresRecord | None) -> str:
     ate, mean, raw, rpe = (f"{_text(length, 100, '.2f')} cm" for length in lengths)
     turn = _text(t.rpe_rot_deg, 1, ".3f")
     return f"trajectory: ATE RMSE {ate}, mean {mean} (aligned), raw {raw}; RPE {rpe}, {turn} deg"
+
+
+def _surface_line(s: SurfaceScoresRecord) -> str:
+    half, most = (f"{_text(length, 100, '.2f')} cm" for length in (s.median_m, s.p95_m))
+    near, far = (
+        f"F1 {_text(f1, 100, '.1f')} % at {at} cm (precision {_text(p, 100, '.1f')}, recall {_text(r, 100, '.1f')})"
+        for at, f1, p, r in ((1, s.f1_1cm, s.precision_1cm, s.recall_1cm), (2, s.f1_2cm, s.precision_2cm, s.recall_2cm))
+    )
+    return f"points: {s.points}, half within {half} of the measured surface, 95 % within {most}; {near}; {far}"
 
 
 def _speed_line(metrics: MetricsRecord) -> str:

@@ -77,12 +77,13 @@ def score_cloud(
         accuracy_median_m=float(np.median(to_reference)),
         completeness_m=float(to_estimate.mean()),
         completeness_median_m=float(np.median(to_estimate)),
-        thresholds=tuple(_at(t, to_reference, to_estimate) for t in wanted),
+        thresholds=tuple(threshold_score(t, to_reference, to_estimate) for t in wanted),
         normal_consistency=consistency,
     )
 
 
-def _at(threshold: float, to_reference: np.ndarray, to_estimate: np.ndarray) -> ThresholdScore:
+def threshold_score(threshold: float, to_reference: np.ndarray, to_estimate: np.ndarray) -> ThresholdScore:
+    """Shares of distances [n] that are no larger: of the estimate to the reference, and back."""
     precision, recall = float((to_reference <= threshold).mean()), float((to_estimate <= threshold).mean())
     total = precision + recall
     return ThresholdScore(threshold, precision, recall, 2 * precision * recall / total if total else 0.0)

@@ -14,7 +14,6 @@ from typer.testing import CliRunner, Result
 
 from ggslam.cli.main import app
 from ggslam.errors import GgslamError, RunFolderError
-from ggslam.jobs.edit import edited_run
 from ggslam.runs.folder import RunFolder
 
 
@@ -116,7 +115,7 @@ def test_a_disk_that_fills_up_costs_nothing(run: Path, tmp_path: Path, monkeypat
         raise RunFolderError(f"cannot write {path}: no space left")
 
     before = contents(run)
-    monkeypatch.setattr(edited_run, "write_points_in_parts", full)
+    monkeypatch.setattr("ggslam.runs.saving_parts.write_points_in_parts", full)
     for target in (["--in-place"], ["--out", tmp_path / "new"]):
         one_error(ggslam("edit", run, "--remove", "sofa", *target), "no space left")
     assert contents(run) == before and not (tmp_path / "new").exists()

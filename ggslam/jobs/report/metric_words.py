@@ -47,6 +47,8 @@ METRICS = (
     Metric("SSIM, held out", ("images", "held_out", "ssim"), 1, ".3f", "", "higher"),
     Metric("LPIPS, held out", ("images", "held_out", "lpips"), 1, ".3f", "", "lower"),
     Metric("depth L1, held out", ("images", "held_out", "depth_l1_m"), 100, ".2f", "cm", "lower"),
+    Metric("points off the surface, median", ("surface", "median_m"), 100, ".2f", "cm", "lower"),
+    Metric("F1 of points at 1 cm", ("surface", "f1_1cm"), 100, ".1f", "%", "higher"),
     Metric("PSNR, all frames", ("images", "all", "psnr"), 1, ".2f", "dB", "higher"),
     Metric("ATE RMSE", ("trajectory", "ate_rmse_m"), 100, ".2f", "cm", "lower"),
     Metric("RPE, translation", ("trajectory", "rpe_trans_m"), 100, ".2f", "cm", "lower"),
@@ -70,6 +72,9 @@ MEANINGS = (
     ("LPIPS", "Distance of the images in the features of a neural network (AlexNet), 0 for equal ones; nearest to what "
      "people notice, blur above all."),
     ("depth L1", "Mean distance of rendered and measured depth, where both are known."),
+    ("points, F1", "points.ply against the recording's depth, fused at the run's poses: how far the points lie from "
+     "that surface; precision is the share of them so near to it, recall the share of it so near to a point, F1 their "
+     "harmonic mean. Points whose depth no frame measured are left out."),
     ("keyframes, held out, all", "Keyframes were trained on. Held-out frames never were: their scores tell what the "
      "map looks like from new poses. All: every frame of the recording."),
     ("masked, unmasked", "Plain names count the pixels with measured depth; unmasked counts all of them."),

@@ -18,7 +18,7 @@ from ggslam.jobs.report.run_plots import (
 )
 from ggslam.reporting import page as p
 from ggslam.reporting.page import Html
-from ggslam.runs.records.metrics import SETS, MetricsRecord, SegmentationRecord
+from ggslam.runs.records.metrics import SETS, MetricsRecord, SegmentationRecord, SurfaceScoresRecord
 from ggslam.runs.records.record import Record
 
 FOOTER = "Written by ggslam. The page needs nothing but itself: no network, no other files."
@@ -70,6 +70,8 @@ def _scores(run: RunData) -> Html:
     if run.metrics is None:
         return p.tag("p", "This run was not scored; ggslam eval does that, and writes this page anew.")
     parts = [_image_scores(run.metrics), *_camera_scores(run.metrics), _trajectory_scores(run, run.metrics)]
+    if run.metrics.surface is not None:
+        parts.append(_surface_scores(run.metrics.surface))
     if run.metrics.segmentation is not None:
         parts.append(_object_scores(run.metrics.segmentation))
     return p.join(parts)
@@ -108,6 +110,18 @@ def _trajectory_scores(run: RunData, metrics: MetricsRecord) -> Html:
         ("RPE, deg", "rpe_rot_deg", 1.0, ".3f"), ("frames", "frames_compared", 1.0, ".0f"),
     )  # fmt: skip
     return p.table(["", *(title for title, *_ in columns)], [["trajectory", *_numbers(scores, columns)]])
+
+
+def _surface_scores(scores: SurfaceScoresRecord) -> Html:
+    """Of the points against the measured surface."""
+    columns = (
+        ("number", "points", 1.0, ".0f"), ("median off, cm", "median_m", 100.0, ".2f"),
+        ("95 % within, cm", "p95_m", 100.0, ".2f"), ("F1 at 1 cm, %", "f1_1cm", 100.0, ".1f"),
+        ("precision", "precision_1cm", 100.0, ".1f"), ("recall", "recall_1cm", 100.0, ".1f"),
+        ("F1 at 2 cm, %", "f1_2cm", 100.0, ".1f"), ("precision", "precision_2cm", 100.0, ".1f"),
+        ("recall", "recall_2cm", 100.0, ".1f"),
+    )  # fmt: skip
+    return p.table(["", *(title for title, *_ in columns)], [["points", *_numbers(scores, columns)]])
 
 
 def _object_scores(scores: SegmentationRecord) -> Html:

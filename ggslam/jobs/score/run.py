@@ -21,6 +21,7 @@ from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.score.objects import ObjectScorer
 from ggslam.jobs.score.rig import RigScores, shows_anything
+from ggslam.jobs.score.surface import SurfaceScorer
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.exposure import identity_exposure, measure_exposure
 from ggslam.rendering.types import RenderBuffers
@@ -77,11 +78,13 @@ def _score(
     asked = sets if rig is None else {**sets, **rig.sets()}
     looked_at = _spread(poses, LOOKED_AT if rig is None else 0)
     fixtures = find_fixtures((sequence.frame(i) for i in looked_at), poses)
-    images = _images(folder, record, sequence, asked, scorer, metric, observer, fixtures)
+    surface = SurfaceScorer(folder)
+    images = _images(folder, record, sequence, asked, scorer, metric, observer, fixtures, surface)
     metrics = MetricsRecord.of({
         "trajectory": _trajectory(sequence, poses) if rig is None else rig.trajectory(poses),
         "images": {name: images[name] for name in sets},
         "segmentation": None if scorer is None else scorer.to_dict(),
+        "surface": surface.scores(),
         "tracking": dict(Counter(f.status for f in record.frames)),
         **_performance(folder.timing()),
         "scored_every": every,
@@ -90,6 +93,7 @@ def _score(
     })  # fmt: skip
     if metrics.images.held_out is None or not metrics.images.held_out.frames:
         notes.append("no frame was held out; every score is over frames that the map was or could be trained on")
+    notes.extend([surface.reason] if surface.reason else [])
     if len(poses) and max(poses) + 1 < len(sequence):
         notes.append(f"the run ends at frame {max(poses)} of {len(sequence)}; scores are of its part")
     if fixtures.mask is not None:
@@ -168,6 +172,7 @@ def _segmentation_notes(folder: RunFolder, scored: bool, masks: Path | None) -> 
 def _images(
     folder: RunFolder, record: KeyframesRecord, sequence: Sequence, sets: dict[str, set[int]],
     scorer: ObjectScorer | None, lpips: Lpips | None, observer: Observer, fixtures: CameraFixtures,
+    surface: SurfaceScorer,
 ) -> dict[str, Any]:  # fmt: skip
     poses = record.poses()
     keyframes, held_out = sets["keyframes"], sets["held_out"]
@@ -179,6 +184,8 @@ def _images(
 
     def note(frame: Frame, scores: ImageScores | None) -> None:
         observer.advance(frame.index + 1, len(sequence))
+        if frame.index in poses:
+            surface.add(frame, poses[frame.index])
         kind = "keyframe" if frame.index in keyframes else "held_out" if frame.index in held_out else "other"
         rows.append({"frame": frame.index, "kind": kind, **(scores or ImageScores()).to_dict()})
 

@@ -108,6 +108,28 @@ class SegmentationRecord(Record):
         return {name: scores for name in SETS if (scores := getattr(self, name)) is not None}
 
 
+class SurfaceScoresRecord(Record):
+    """Of points.ply against the depth of the recording, fused at the run's poses; see `evaluation.surface`.
+
+    Attributes:
+        points: that were scored...
+        measured: ...and their share of all: the depth of the others was measured by no frame.
+        median_m, p95_m: how far half and 95 % of the points lie from the surface at most.
+        precision_1cm, ...: share of the points so near to the surface; recall: of the surface, so near to a point.
+    """
+
+    points: int = 0
+    measured: NumberOrNone = None
+    median_m: NumberOrNone = None
+    p95_m: NumberOrNone = None
+    precision_1cm: NumberOrNone = None
+    recall_1cm: NumberOrNone = None
+    f1_1cm: NumberOrNone = None
+    precision_2cm: NumberOrNone = None
+    recall_2cm: NumberOrNone = None
+    f1_2cm: NumberOrNone = None
+
+
 class SpeedRecord(Record):
     """How fast the run was; see `records.timing`."""
 
@@ -146,6 +168,7 @@ class MetricsRecord(RecordFile):
         trajectory: None without ground truth.
         images: plain names count pixels with measured depth, `_unmasked` all pixels.
         segmentation: None without objects or without masks.
+        surface: of the points; None if they were not scored.
         tracking: number of frames of each status.
         speed, map, memory: of the run.
         scored_every: the images of every n-th frame were scored.
@@ -158,6 +181,7 @@ class MetricsRecord(RecordFile):
     trajectory: TrajectoryScoresRecord | None = None
     images: ImagesRecord = ImagesRecord()
     segmentation: SegmentationRecord | None = None
+    surface: SurfaceScoresRecord | None = None
     tracking: dict[str, int] = {}
     speed: SpeedRecord = SpeedRecord()
     map: MapRecord = MapRecord()
