@@ -41,6 +41,12 @@ class DeviceError(RenderError):
     exit_code = 1
 
 
+class OpenCvError(GgslamError):
+    """OpenCV refused an image on the way through ggslam: a fault of ggslam, which should have looked at it before."""
+
+    exit_code = 1
+
+
 class MissingDependency(GgslamError):
     """An optional package or file is needed for what was asked; the message says how to get it."""
 

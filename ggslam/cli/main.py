@@ -121,12 +121,25 @@ def main() -> None:
     except OSError as error:
         errors.print(f"error: {error}", highlight=False, soft_wrap=True, markup=False)
         sys.exit(1)
-    except RuntimeError as error:
-        if type(error).__name__ != "OutOfMemoryError":  # torch's, of a GPU; by its name, for torch is loaded late
+    except Exception as error:
+        text = _in_words(error)
+        if text is None:
             raise
-        text = f"the GPU's memory is full: {error}; smaller images (--scale 0.5) take less, --device cpu takes none"
         errors.print(f"error: {text}", highlight=False, soft_wrap=True, markup=False)
         sys.exit(1)
+
+
+def _in_words(error: Exception) -> str | None:
+    """What an error of a library means for people, by its name, for torch and OpenCV are loaded late; None: nobody
+    foresaw it."""
+    kind = type(error)
+    if isinstance(error, RuntimeError) and kind.__name__ == "OutOfMemoryError":  # torch's, of a GPU
+        return f"the GPU's memory is full: {error}; smaller images (--scale 0.5) take less, --device cpu takes none"
+    if (kind.__module__, kind.__name__) == ("cv2", "error"):
+        from ggslam.system.opencv import opencv_reason
+
+        return f"OpenCV: {opencv_reason(error)}; this is a fault of ggslam, please report the command"
+    return None
 
 
 if __name__ == "__main__":

@@ -15,6 +15,9 @@ from ggslam.scene.camera import Camera
 class Frame:
     """One RGB-D image pair with what is known about it.
 
+    Its arrays may be read-only, for a reader may hand out views of what it read: nobody writes into them. What needs
+    other pixels makes a new array and a new frame of it (`dataclasses.replace`).
+
     Attributes:
         index: position in the sequence that it was read from (0, 1, 2, ...); of a slice it counts from 0 again.
         source_index: position in the whole recording, before start/stop/stride and slices.

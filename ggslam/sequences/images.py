@@ -15,8 +15,9 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.arrays import read_array
-from ggslam.sequences.recording import ImageFile
+from ggslam.sequences.recording import ImageFile, ImageSource
 from ggslam.system.foreign import MAX_IMAGE_BYTES, read_foreign
+from ggslam.system.opencv import opencv_errors
 
 MAX_PIXELS = 100_000_000
 """Of one image: more than any camera of a recording has, and 300 MB in memory."""
@@ -24,12 +25,12 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def read_color(file: ImageFile) -> np.ndarray:
-    """Colour image, uint8 [H, W, 3] RGB (grey images are spread over the three channels).
+    """Colour image, uint8 [H, W, 3] RGB (grey images are spread over the three channels); may be read-only.
 
     Raises:
         SequenceError: missing, truncated, or not an image.
     """
-    return decode_color(file, read_content(file)) if isinstance(file, Path) else file.read()
+    return decode_color(file, read_content(file)) if isinstance(file, Path) else _read_source(file)
 
 
 def decode_color(name: object, content: bytes) -> np.ndarray:
@@ -40,7 +41,7 @@ def decode_color(name: object, content: bytes) -> np.ndarray:
 
 
 def read_depth(file: ImageFile, depth_scale: float, invalid: int | None = None) -> np.ndarray:
-    """Depth image, float32 [H, W], metres, 0 where nothing was measured.
+    """Depth image, float32 [H, W], metres, 0 where nothing was measured; may be read-only.
 
     Args:
         file: single-channel 16-bit PNG, or .npy of uint16 or floating-point numbers, or a source of either.
@@ -51,7 +52,7 @@ def read_depth(file: ImageFile, depth_scale: float, invalid: int | None = None) 
         SequenceError: missing, truncated, not an image, or not 16-bit or floating-point with one channel.
     """
     if not isinstance(file, Path):
-        raw = file.read()
+        raw = _read_source(file)
     elif file.suffix.lower() == ".npy":
         raw = _read_array(file)
     else:
@@ -67,15 +68,21 @@ def read_depth(file: ImageFile, depth_scale: float, invalid: int | None = None) 
 
 
 def read_confidence(file: ImageFile) -> np.ndarray:
-    """Confidence levels uint8 [H, W]: 0 low, 1 medium, 2 high.
+    """Confidence levels uint8 [H, W]: 0 low, 1 medium, 2 high; may be read-only.
 
     Raises:
         SequenceError: missing, damaged, or not 8-bit with one channel.
     """
-    image = decode(file, read_content(file), cv2.IMREAD_UNCHANGED) if isinstance(file, Path) else file.read()
+    image = decode(file, read_content(file), cv2.IMREAD_UNCHANGED) if isinstance(file, Path) else _read_source(file)
     if image.ndim != 2 or image.dtype != np.uint8:
         raise SequenceError(f"{file}: expected an 8-bit confidence image, found {describe_channels(image)}")
     return image
+
+
+def _read_source(source: ImageSource) -> np.ndarray:
+    """What a source gives. Pixels that OpenCV cannot convert are a fault of the recording."""
+    with opencv_errors(source, SequenceError):
+        return source.read()
 
 
 def _read_array(path: Path) -> np.ndarray:
@@ -114,10 +121,8 @@ def decode(path: object, content: bytes, flags: int) -> np.ndarray:
     size = claimed_size(content)
     if size is not None and size[0] * size[1] > MAX_PIXELS:
         raise SequenceError(f"{path}: claims {size[0]}x{size[1]} pixels; at most {MAX_PIXELS:,} are read")
-    try:
+    with opencv_errors(path, SequenceError):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    except cv2.error as error:
-        raise SequenceError(f"{path}: cannot be decoded: {error}") from None
     if image is None:
         raise SequenceError(f"{path}: cannot be decoded as an image ({len(content)} bytes)")
     return image

@@ -27,6 +27,7 @@ from ggslam.sequences.pixel_grid import ImageGeometry, image_size
 from ggslam.sequences.recording import FrameFiles, Recording
 from ggslam.sequences.stream import ReadAhead
 from ggslam.sequences.valid_pixels import common_fill, fill_of
+from ggslam.system.opencv import opencv_errors
 
 OnBadFrame = Literal["error", "skip"]
 ReadMasks = bool | Literal["lazy", "unshared"]
@@ -249,10 +250,13 @@ class Sequence:
         """
         if self._process != os.getpid():  # a fork shares open files and their positions with its parent
             self._open_again()
-        files = self.files(index)
-        source = self._selection[index]
+        files, source = self.files(index), self._selection[index]
         if source in self._recording.problems:
             raise SequenceError(self._recording.problems[source])
+        with opencv_errors(f"{self.path}, frame {source}", SequenceError):
+            return self._frame(index, source, files, masks)
+
+    def _frame(self, index: int, source: int, files: FrameFiles, masks: ReadMasks) -> Frame:
         color, depth = self._read(source)
         self._geometry.check(color, depth, files)
         color = self._geometry.steady(color, files, cv2.INTER_LINEAR)
@@ -331,7 +335,7 @@ class Sequence:
             if confidence.shape != depth.shape:
                 found, expected = (f"{a.shape[1]}x{a.shape[0]}" for a in (confidence, depth))
                 raise SequenceError(f"{files.confidence}: expected confidence of {expected} like depth, found {found}")
-            depth[confidence < self._recording.min_confidence] = 0
+            depth = np.where(confidence < self._recording.min_confidence, np.float32(0), depth)
         return read_color(files.color), depth
 
     def _look_for_fill(self, geometry: ImageGeometry, color: np.ndarray) -> None:
@@ -363,7 +367,8 @@ class Sequence:
                 first_error = first_error or error
                 continue
             files = self._recording.files[source]
-            geometry = ImageGeometry(self._recording, files, image_size(color), image_size(depth), scale)
+            with opencv_errors(f"{self.path}, frame {source}", SequenceError):
+                geometry = ImageGeometry(self._recording, files, image_size(color), image_size(depth), scale)
             self._look_for_fill(geometry, color)
             return geometry
         reason = first_error or self._recording.problems[self._selection[0]]

@@ -29,7 +29,7 @@ def fill_of(color: np.ndarray) -> np.ndarray | None:
     height, width = color.shape[:2]
     found = np.zeros((height + 2, width + 2), np.uint8)
     flags = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | 1 << 8
-    image = np.ascontiguousarray(color)
+    image = np.array(color, order="C")  # OpenCV takes no read-only array here, though with this flag it writes nothing
     for corner in ((0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)):
         cv2.floodFill(image, found, corner, 0, (ALIKE,) * 3, (ALIKE,) * 3, flags)
     fill = found[1:-1, 1:-1] > 0

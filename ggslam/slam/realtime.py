@@ -19,6 +19,7 @@ from ggslam.scene.frame import Frame
 from ggslam.slam.frame_clock import FrameClock
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
+from ggslam.system.opencv import opencv_errors
 from ggslam.tracking.tracker import TrackingResult
 
 MAX_WAITING = 8
@@ -61,10 +62,11 @@ class RealtimeSlam:
     def _track(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
         slam, clock = self.slam, FrameClock(self.period, self.live)
         for frame in clock.pace(frames, lambda late: slam.dropped_frames.append(late.index)):
-            if not slam.frames:
-                self._first(frame, report)
-            else:
-                report(frame, self._step(frame))
+            with opencv_errors(f"frame {frame.index}"):
+                if not slam.frames:
+                    self._first(frame, report)
+                else:
+                    report(frame, self._step(frame))
             if self._mapper_error is not None:
                 return
 
@@ -111,6 +113,7 @@ class RealtimeSlam:
             return True
         if job is None:
             return False
-        slam.insert(*job)
+        with opencv_errors(f"frame {job[0].index}"):
+            slam.insert(*job)
         self._jobs.task_done()
         return True

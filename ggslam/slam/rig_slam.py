@@ -23,6 +23,7 @@ from ggslam.slam.result import StepReport
 from ggslam.slam.rig_clock import RigClock
 from ggslam.slam.shutter_times import ShutterTimes
 from ggslam.slam.slam import TRIM_EVERY, Slam
+from ggslam.system.opencv import opencv_errors
 from ggslam.system.process_memory import trim
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.noise import estimate_noise
@@ -85,7 +86,12 @@ class RigSlam(Slam):
 
         Raises:
             SequenceError: a frame is of another camera, or not what `Frame` says.
+            OpenCvError: OpenCV refused its images.
         """
+        with opencv_errors(f"frame {frames[0].index}"):
+            return self._step_together(frames)
+
+    def _step_together(self, frames: Sequence[Frame]) -> list[StepReport]:
         start = time.perf_counter()
         self.times.start()
         found = self._track_together([self.receive(frame) for frame in frames])

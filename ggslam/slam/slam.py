@@ -43,6 +43,7 @@ from ggslam.slam.saved_places import saved_places_to_bytes
 from ggslam.slam.shutter_times import ShutterTimes
 from ggslam.slam.step_log import StepLog
 from ggslam.submaps.gaussian_cells import GaussianCells
+from ggslam.system.opencv import opencv_errors
 from ggslam.system.process_memory import trim
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.scale import scale_settings, scene_scale
@@ -136,7 +137,12 @@ class Slam:
 
         Raises:
             SequenceError: the frame is of another camera, or not what `Frame` says.
+        OpenCvError: OpenCV refused its images.
         """
+        with opencv_errors(f"frame {frame.index}"):
+            return self._step(frame)
+
+    def _step(self, frame: Frame) -> StepReport:
         start = time.perf_counter()
         self.times.start()
         frame = self.receive(frame)
