@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -119,7 +118,7 @@ def open_sequence(
         raise SequenceError(f"{path}: expected {RIG_LAYOUT}")
     read = partial(
         _read_recording, given_path(path), format, None if masks is None else given_path(masks),
-        depth_scale, _options(depth_camera, min_confidence, topics, camera, intrinsics), pose_convention,
+        _options(depth_camera, min_confidence, topics, camera, intrinsics, depth_scale), pose_convention,
     )  # fmt: skip
     recording = read()
     selection = select(recording.path, len(recording.files), start, stop, stride)
@@ -150,8 +149,7 @@ def _open_rig(
 
 
 def _read_recording(
-    folder: Path, format: str | None, masks: Path | None, depth_scale: float | None, options: ReadOptions,
-    pose_convention: str | None,
+    folder: Path, format: str | None, masks: Path | None, options: ReadOptions, pose_convention: str | None,
 ) -> Recording:  # fmt: skip
     """Reads a recording's description and applies the user's options; arguments and errors as in `open_sequence`."""
     if not os.path.exists(folder):  # noqa: PTH110 (Path's raises for impossible names)
@@ -174,15 +172,15 @@ def _read_recording(
         recording.min_confidence = options.min_confidence
     if masks is not None:
         _use_masks(recording, masks)
-    if depth_scale is not None:
-        recording.depth_scale = depth_scale
+    if options.depth_scale is not None:
+        recording.depth_scale = options.depth_scale
     if pose_convention is not None:
         if recording.poses is None:
             raise SequenceError(f"{folder}: tells no poses, so there are none to convert from {pose_convention}")
         recording.poses = convert_poses(recording.poses, pose_convention)
     if not SMALLEST_SCALE <= recording.depth_scale <= 1 / SMALLEST_SCALE:
-        told = "none" if math.isnan(recording.depth_scale) and depth_scale is None else f"{recording.depth_scale}"
-        raise SequenceError(f"{folder}: depth scale must be a positive number of usual size, found {told}")
+        found_scale = f"found {recording.depth_scale}"
+        raise SequenceError(f"{folder}: depth scale must be a positive number of usual size, {found_scale}")
     return recording
 
 
@@ -214,7 +212,7 @@ def _use_masks(recording: Recording, folder: Path) -> None:
 
 def _options(
     depth_camera: str | Path | None, min_confidence: int | None, topics: Iterable[str], camera: str | Path | None,
-    intrinsics: str | None,
+    intrinsics: str | None, depth_scale: float | None,
 ) -> ReadOptions:  # fmt: skip
     if min_confidence is not None and min_confidence not in (0, 1, 2):
         raise SequenceError(f"min_confidence: expected 0, 1 or 2, found {min_confidence}")
@@ -225,7 +223,8 @@ def _options(
             raise SequenceError(f"topic: expected ROLE=TOPIC with a role of {', '.join(ROLES)}, found '{text}'")
         by_role[role] = topic
     own = read_own_camera(None if camera is None else given_path(camera), intrinsics)
-    return ReadOptions(None if depth_camera is None else given_path(depth_camera), by_role, min_confidence, own)
+    beside = None if depth_camera is None else given_path(depth_camera)
+    return ReadOptions(beside, by_role, min_confidence, own, depth_scale)
 
 
 def recognise_format(path: str | Path) -> str | None:
@@ -233,7 +232,14 @@ def recognise_format(path: str | Path) -> str | None:
     place = Path(path)
     if find_rig_file(place) is not None:
         return RIG
-    return next((f.name for f in FORMATS if os.path.exists(place) and f.matches(place)), None)  # noqa: PTH110
+    found = _recognised(place) if os.path.exists(place) else None  # noqa: PTH110
+    return None if found is None else found.name
+
+
+def _recognised(place: Path) -> RecordingFormat | None:
+    plain = FolderFormat()
+    found = next((f for f in FORMATS if f.matches(place)), None)
+    return plain if found is None and plain.lacks_camera_only(place) else found
 
 
 def _find_format(folder: Path, name: str | None) -> RecordingFormat:
@@ -242,7 +248,7 @@ def _find_format(folder: Path, name: str | None) -> RecordingFormat:
         if named is None:
             raise SequenceError(f"unknown format '{name}'; known: {', '.join([*(f.name for f in FORMATS), RIG])}")
         return named
-    recognised = next((f for f in FORMATS if f.matches(folder)), None)
+    recognised = _recognised(folder)
     if recognised is None:
         looked_for = "\n".join([*(f"  {f.name}: {f.layout}" for f in FORMATS), f"  {RIG}: {RIG_LAYOUT}"])
         if folder.is_file():

@@ -5,16 +5,18 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.system.foreign import read_foreign_text
+
+T = TypeVar("T")
 
 NOMINAL_RATE = 30.0
 """Frames per second assumed when a recording tells no time."""
@@ -41,6 +43,8 @@ class ImageSource(Protocol):
 
     def read(self) -> np.ndarray:
         """Colour uint8 [H, W, 3] RGB; depth uint16 [H, W] or float32 [H, W], in depth units; confidence uint8 [H, W].
+
+        The array may be read-only (a view of a message or of a mapped file), so nobody writes into it; see `Frame`.
 
         Raises:
             SequenceError: damaged; the message names container and reason.
@@ -130,12 +134,48 @@ class ReadOptions:
         topics: of a bag: role (color, depth, color_info, depth_info, pose) -> topic.
         min_confidence: depth less sure than this (0 to 2) is dropped; None: `DEFAULT_CONFIDENCE`.
         own_camera: of colour, instead of what the recording tells.
+        depth_scale: units of the depth images per metre, instead of what the recording tells.
     """
 
     depth_camera: Path | None = None
     topics: Mapping[str, str] = field(default_factory=dict)
     min_confidence: int | None = None
     own_camera: OwnCamera | None = None
+    depth_scale: float | None = None
+
+    def recorded_camera(self, read: Callable[[], T]) -> T | None:
+        """What `read` finds in the recording about its colour camera; None where a user tells the camera: then nobody
+        looks, for it may be missing.
+
+        Raises:
+            SequenceError: of `read`; it names the arguments that would tell the camera.
+        """
+        return None if self.own_camera is not None else _told(read, "`camera` or `intrinsics` tell the camera instead")
+
+    def recorded_scale(self, read: Callable[[], float]) -> float:
+        """Units of depth images per metre: what a user tells, else what `read` finds.
+
+        Raises:
+            SequenceError: of `read`; it names the argument that would tell the scale.
+        """
+        of_camera = None if self.own_camera is None else self.own_camera.depth_scale
+        told = of_camera if self.depth_scale is None else self.depth_scale
+        return _told(read, "`depth_scale` tells it instead") if told is None else told
+
+    def recorded_depth_camera(self, read: Callable[[], T]) -> T | None:
+        """What `read` finds about a depth camera beside the colour camera; None where a user tells it.
+
+        Raises:
+            SequenceError: of `read`; it names the argument that would tell the camera.
+        """
+        return None if self.depth_camera is not None else _told(read, "`depth_camera` tells it instead")
+
+
+def _told(read: Callable[[], T], instead: str) -> T:
+    try:
+        return read()
+    except SequenceError as error:
+        raise SequenceError(f"{error} ({instead})") from None
 
 
 NO_OPTIONS = ReadOptions()

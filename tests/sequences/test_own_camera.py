@@ -75,7 +75,7 @@ def test_intrinsics_need_no_file_of_the_recording(make: Callable[[str], Path]) -
     (folder / "camera.yaml").unlink()
     sequence = open_sequence(folder, format="folder", intrinsics="30 31 15 11", depth_scale=5000)
     assert sequence.camera == Camera(32, 24, 30, 31, 15, 11)
-    with pytest.raises(SequenceError, match="depth scale must be a positive number of usual size, found none"):
+    with pytest.raises(SequenceError, match="entry 'depth_scale' is missing .`depth_scale` tells it instead"):
         open_sequence(folder, format="folder", intrinsics="30 31 15 11")
     scans = make("scannet")
     (scans / "frames" / "intrinsic" / "intrinsic_color.txt").unlink()

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +54,9 @@ class FolderFormat:
         return (folder / "camera.yaml").is_file()
 
     def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
-        path, own = folder / "camera.yaml", options.own_camera
-        settings = {} if own is not None and not path.exists() else read_calibration(path)
+        path = folder / "camera.yaml"
+        read = partial(read_calibration, path)
+        settings = read() if path.exists() else options.recorded_camera(read) or {}
         colors = image_files(folder / "rgb")
         if not colors:
             raise SequenceError(f"{folder / 'rgb'}: no images")
@@ -63,21 +64,26 @@ class FolderFormat:
         if (folder / "masks").is_dir():
             masks = find_masks(folder / "masks", colors)
         files = [FrameFiles(*pair) for pair in zip(colors, _depth_files(folder, colors), masks, strict=True)]
-        camera = camera_entry(path, settings) if own is None else None
-        distortion, fisheye = distortion_entry(path, settings) if own is None else (None, False)
-        unknown = own is not None and "depth_scale" not in settings  # then a user has to tell it
-        depth_camera = depth_camera_entry(path, settings["depth_camera"]) if "depth_camera" in settings else None
+        camera = options.recorded_camera(lambda: camera_entry(path, settings))
+        distortion, fisheye = options.recorded_camera(lambda: distortion_entry(path, settings)) or (None, False)
+        depth_camera = None
+        if "depth_camera" in settings:
+            depth_camera = options.recorded_depth_camera(lambda: depth_camera_entry(path, settings["depth_camera"]))
         timestamps, time_source = _timestamps(folder, colors, settings)
         left_out = _without_color(folder, files)
         recording = Recording(
-            self.name, folder, files, timestamps, math.nan if unknown else number_entry(path, settings, "depth_scale"),
-            camera, distortion=distortion, fisheye=fisheye, depth_camera=depth_camera,
-            time_source=time_source, instance_names=_instances(path, settings), problems=missing_depth_problems(files),
-            warnings=left_out,
+            self.name, folder, files, timestamps,
+            options.recorded_scale(lambda: number_entry(path, settings, "depth_scale")), camera, distortion=distortion,
+            fisheye=fisheye, depth_camera=depth_camera, time_source=time_source, problems=missing_depth_problems(files),
+            instance_names=_instances(path, settings), warnings=left_out,
         )  # fmt: skip
         if (folder / "poses.txt").is_file():
             _add_poses(recording, folder / "poses.txt")
         return recording
+
+    def lacks_camera_only(self, folder: Path) -> bool:
+        """Whether all but camera.yaml is there, which a user may give instead."""
+        return all((folder / name).is_dir() for name in ("rgb", "depth"))
 
 
 class SyntheticFormat(FolderFormat):

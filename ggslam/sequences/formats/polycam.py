@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.scene.camera import Camera
 from ggslam.sequences.images import read_confidence
 from ggslam.sequences.json_files import OPENCV_FROM_OPENGL, camera_of, number_of, read_object
 from ggslam.sequences.pose_files import invalid_pose_reason
@@ -72,11 +73,8 @@ class PolycamFormat:
         if not (root / "depth").is_dir():
             raise SequenceError(f"{root / 'depth'}: folder is missing; export the raw data of a LiDAR capture")
         paths = [root / f"{prefix}cameras" / f"{color.stem}.json" for color in colors]
-        described = [read_object(path) for path in paths]
-        cameras = [
-            camera_of(path, *(number_of(path, values, key) for key in ("width", "height", "fx", "fy", "cx", "cy")))
-            for path, values in zip(paths, described, strict=True)
-        ]
+        described = [_described(path, options) for path in paths]
+        cameras = options.recorded_camera(lambda: _cameras(paths, described)) or [None] * len(paths)
         files = [
             FrameFiles(color, root / "depth" / f"{color.stem}.png", None, _confidence(root, color), camera)
             for color, camera in zip(colors, cameras, strict=True)
@@ -89,14 +87,30 @@ class PolycamFormat:
         return recording
 
 
+def _described(path: Path, options: ReadOptions) -> dict[str, Any] | None:
+    """A camera file; None: it is missing, and a user tells the camera, so that the frame lacks its pose alone."""
+    return read_object(path) if path.is_file() else options.recorded_camera(lambda: read_object(path))
+
+
+def _cameras(paths: list[Path], described: list[dict[str, Any] | None]) -> list[Camera | None]:
+    return [
+        camera_of(path, *(number_of(path, values or {}, key) for key in ("width", "height", "fx", "fy", "cx", "cy")))
+        for path, values in zip(paths, described, strict=True)
+    ]
+
+
 def _confidence(root: Path, color: Path) -> PolycamConfidence | None:
     path = root / "confidence" / f"{color.stem}.png"
     return PolycamConfidence(path) if path.is_file() else None
 
 
-def _add_poses(recording: Recording, paths: list[Path], described: list[dict[str, Any]]) -> None:
+def _add_poses(recording: Recording, paths: list[Path], described: list[dict[str, Any] | None]) -> None:
+    if not any(described):
+        return
     poses = np.full((len(paths), 4, 4), np.nan)
     for i, (path, values) in enumerate(zip(paths, described, strict=True)):
+        if values is None:
+            continue
         T = np.eye(4)
         T[:3] = [[number_of(path, values, f"t_{row}{column}") for column in range(4)] for row in range(3)]
         reason = invalid_pose_reason(T)

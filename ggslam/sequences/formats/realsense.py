@@ -43,8 +43,9 @@ class Device:
     """
 
     def __init__(
-        self, path: Path | None = None, serial: str = "", size: tuple[int, int] = (640, 480), rate: int = 30
-    ) -> None:
+        self, path: Path | None = None, serial: str = "", size: tuple[int, int] = (640, 480), rate: int = 30,
+        options: ReadOptions = NO_OPTIONS,
+    ) -> None:  # fmt: skip
         """Starts the recording `path`, or else the camera with this serial number (empty: the first one found).
 
         Raises:
@@ -68,21 +69,23 @@ class Device:
                 device.as_playback().set_real_time(False)
             self.depth_scale = 1.0 / device.first_depth_sensor().get_depth_scale()
             color, depth = profile.get_stream(rs.stream.color), profile.get_stream(rs.stream.depth)
-            self.calibration = self._calibration(color, depth)
+            self.calibration = self._calibration(color, depth, options)
         except RuntimeError as error:  # what librealsense raises for everything
             raise SequenceError(f"{self._place}: {' '.join(str(error).split())}") from None
 
-    def _calibration(self, color: Any, depth: Any) -> Recording:
+    def _calibration(self, color: Any, depth: Any, options: ReadOptions) -> Recording:
         color_lens, depth_lens = (s.as_video_stream_profile().get_intrinsics() for s in (color, depth))
         extrinsics = depth.get_extrinsics_to(color)
         T = np.eye(4)
         T[:3, :3] = np.asarray(extrinsics.rotation, float).reshape(3, 3).T  # written column by column
         T[:3, 3] = extrinsics.translation
-        distortion, fisheye = self._distortion(color_lens)
+        distortion, fisheye = options.recorded_camera(lambda: self._distortion(color_lens)) or (None, False)
+        beside = options.recorded_depth_camera(
+            lambda: DepthCamera(_camera(depth_lens), T, *self._distortion(depth_lens))
+        )
         return Recording(
             "realsense", Path(self._place), [], np.zeros(0), self.depth_scale, _camera(color_lens),
-            depth_camera=DepthCamera(_camera(depth_lens), T, *self._distortion(depth_lens)), distortion=distortion,
-            fisheye=fisheye, time_source="the camera's clock",
+            depth_camera=beside, distortion=distortion, fisheye=fisheye, time_source="the camera's clock",
         )  # fmt: skip
 
     def _distortion(self, lens: Any) -> tuple[np.ndarray | None, bool]:
@@ -150,10 +153,11 @@ def _invert_distortion(coefficients: np.ndarray, camera: Camera) -> np.ndarray:
 class Playback:
     """A recording, played as often as it takes. Frames in order are quick; going back starts it anew."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, options: ReadOptions = NO_OPTIONS) -> None:
         self.path = path
         self._lock = threading.Lock()
-        device = Device(path)
+        self._options = options
+        device = Device(path, options=options)
         self.calibration = device.calibration
         self.times = np.array([time for time, _, _ in device.pairs()])
         device.close()
@@ -168,7 +172,7 @@ class Playback:
             if self._last is None or self._last[0] > wanted:
                 if self._device is not None:
                     self._device.close()
-                self._device = Device(self.path)
+                self._device = Device(self.path, options=self._options)
                 self._pairs, self._last = self._device.pairs(), (-np.inf, np.zeros(0), np.zeros(0))
             while self._last is not None and self._last[0] < wanted:
                 self._last = next(self._pairs, None)
@@ -205,7 +209,7 @@ class RealSenseFormat:
             return b"/device_0/sensor_" in file.read(SNIFFED)
 
     def read(self, path: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
-        playback = Playback(path)
+        playback = Playback(path, options)
         recording = playback.calibration
         recording.path, recording.timestamps = path, playback.times
         recording.files = [

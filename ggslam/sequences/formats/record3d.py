@@ -56,7 +56,7 @@ class Record3DFormat:
         if not any(name.endswith(".depth") for name in archive.names):
             raise SequenceError(f"{path}: holds no rgbd/*.depth: a recording without depth cannot be used")
         lzfse_decompress()
-        cameras = _cameras(place, metadata, len(colors))
+        cameras = options.recorded_camera(lambda: _cameras(place, metadata, len(colors))) or [None] * len(colors)
         size = _depth_size(archive, metadata, place, colors)
         files = [_frame(archive, size, name, camera) for name, camera in zip(colors, cameras, strict=True)]
         times, source = _times(place, metadata, len(colors))
@@ -98,7 +98,7 @@ def _is_plain(content: bytes) -> bool:
     return not content.startswith(b"bvx")
 
 
-def _frame(archive: Archive, size: tuple[int, int], color: str, camera: Camera) -> FrameFiles:
+def _frame(archive: Archive, size: tuple[int, int], color: str, camera: Camera | None) -> FrameFiles:
     base = color.removesuffix(".jpg")
     confidence = f"{base}.conf"
     return FrameFiles(
@@ -149,7 +149,7 @@ def _decompress(place: str, content: bytes) -> bytes:
         raise SequenceError(f"{place}: LZFSE stream is damaged: {error}") from None
 
 
-def _cameras(place: str, metadata: dict[str, Any], count: int) -> list[Camera]:
+def _cameras(place: str, metadata: dict[str, Any], count: int) -> list[Camera | None]:
     width, height = number_of(place, metadata, "w"), number_of(place, metadata, "h")
     own = metadata.get("perFrameIntrinsicCoeffs")
     if isinstance(own, list) and len(own) >= count:

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
+from ggslam.sequences.json_files import camera_of, number_of, read_object
 from ggslam.sequences.pose_files import add_row_poses
 from ggslam.sequences.recording import (
     NO_OPTIONS,
@@ -19,7 +19,6 @@ from ggslam.sequences.recording import (
     last_number,
     missing_depth_problems,
     nominal_timestamps,
-    read_text,
 )
 
 DEFAULT_CAMERA = Camera(1200, 680, 600.0, 600.0, 599.5, 339.5)
@@ -40,7 +39,7 @@ class ReplicaFormat:
         if not colors:
             raise SequenceError(f"{folder / 'results'}: no frame*.jpg or frame*.png")
         files = [self._files(folder, color) for color in colors]
-        camera, depth_scale, names = self._parameters(folder)
+        camera, depth_scale, names = self._parameters(folder, options)
         recording = Recording(
             self.name, folder, files, nominal_timestamps(len(files)), depth_scale, camera,
             instance_names=names, problems=missing_depth_problems(files),
@@ -53,18 +52,19 @@ class ReplicaFormat:
         mask = folder / "semantic_instance" / f"semantic_instance_{last_number(color.stem)}.png"
         return FrameFiles(color, folder / "results" / f"depth{digits}.png", mask if mask.is_file() else None)
 
-    def _parameters(self, folder: Path) -> tuple[Camera, float, dict[int, str]]:
+    def _parameters(self, folder: Path, options: ReadOptions) -> tuple[Camera | None, float, dict[int, str]]:
         path = next((p for p in (folder / "cam_params.json", folder.parent / "cam_params.json") if p.is_file()), None)
         if path is None:
             return DEFAULT_CAMERA, DEFAULT_DEPTH_SCALE, {}
+        content = read_object(path)
+        values = content.get("camera")
+        entries: dict[str, Any] = values if isinstance(values, dict) else {}
+        place = f"{path}, camera"
+        keys = ("w", "h", "fx", "fy", "cx", "cy")
+        camera = options.recorded_camera(lambda: camera_of(place, *(number_of(place, entries, key) for key in keys)))
+        scale = options.recorded_scale(lambda: number_of(place, entries, "scale"))
         try:
-            content: dict[str, Any] = json.loads(read_text(path))
-            c = content["camera"]
-            camera = Camera(int(c["w"]), int(c["h"]), float(c["fx"]), float(c["fy"]), float(c["cx"]), float(c["cy"]))
             names = {int(key): str(value) for key, value in content.get("instances", {}).items()}
-            depth_scale = float(c["scale"])
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-            raise SequenceError(
-                f'{path}: expected {{"camera": {{w, h, fx, fy, cx, cy, scale}}}} with numbers; problem: {error!r}'
-            ) from None
-        return camera, depth_scale, names
+        except (TypeError, ValueError, AttributeError) as error:
+            raise SequenceError(f"{path}: expected 'instances' to map ids to names; problem: {error!r}") from None
+        return camera, scale, names

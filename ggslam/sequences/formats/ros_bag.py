@@ -7,6 +7,7 @@ their frame comes. Depth of a camera beside the colour camera is registered by /
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,14 @@ from ggslam.sequences.association import pair_images, poses_at
 from ggslam.sequences.formats.ros_images import color_image, depth_image, in_metres
 from ggslam.sequences.formats.ros_messages import Bag, BagImage
 from ggslam.sequences.formats.ros_topics import REGISTERED, Topics, find_topics, poses_of, static_transform
+from ggslam.sequences.images import read_color
 from ggslam.sequences.json_files import camera_of
+from ggslam.sequences.pixel_grid import image_size
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     DepthCamera,
     FrameFiles,
+    OwnCamera,
     ReadOptions,
     Recording,
 )
@@ -75,19 +79,15 @@ def _read(name: str, path: Path, bag: Bag, options: ReadOptions) -> Recording:
         )
         for i, j in pairs
     ]
-    info = bag.message(topics.color_info, 0)
-    rectified = "rect" in topics.color
-    camera = _camera(f"{path}, {topics.color_info}", info, rectified)
+    lens = options.recorded_camera(lambda: _color_lens(bag, topics)) or _Lens(None)
     recording = Recording(
         name, path, files, color_times[[i for i, _ in pairs]],
-        1.0 if in_metres(bag.message(topics.depth, 0)) else 1000.0, camera,
+        1.0 if in_metres(bag.message(topics.depth, 0)) else 1000.0, lens.camera,
         time_source=f"headers of {topics.color}", warnings=warnings,
         depth_delays=np.array([depth_times[j] - color_times[i] for i, j in pairs]),
+        distortion=lens.distortion, fisheye=lens.fisheye,
     )  # fmt: skip
-    if not rectified:
-        recording.distortion, recording.fisheye = _distortion(f"{path}, {topics.color_info}", info)
-    if options.depth_camera is None:
-        _place_depth(recording, bag, topics, camera)
+    options.recorded_depth_camera(lambda: _place_depth(recording, bag, topics, options.own_camera))
     if topics.pose is not None:
         _add_poses(recording, bag, topics.pose)
     return recording
@@ -96,6 +96,37 @@ def _read(name: str, path: Path, bag: Bag, options: ReadOptions) -> Recording:
 def _value(info: Any, name: str) -> Any:
     """Field of a camera_info: ROS 1 writes K, D, P in capitals."""
     return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """What a camera_info tells."""
+
+    camera: Camera | None
+    distortion: np.ndarray | None = None
+    fisheye: bool = False
+
+
+def _color_lens(bag: Bag, topics: Topics) -> _Lens:
+    if topics.color_info is None:
+        raise SequenceError(f"{bag.path}: no camera_info belongs to {topics.color}; `topics` color_info=TOPIC names it")
+    info, rectified = bag.message(topics.color_info, 0), "rect" in topics.color
+    place = f"{bag.path}, {topics.color_info}"
+    camera = _camera(place, info, rectified)
+    return _Lens(camera) if rectified else _Lens(camera, *_distortion(place, info))
+
+
+def _color_camera(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera | None) -> Camera | None:
+    """The camera that depth is compared with: as the bag tells it, else the user; None: neither tells it."""
+    if topics.color_info is not None:
+        try:
+            return _color_lens(bag, topics).camera
+        except SequenceError:  # what a user tells stands for it
+            pass
+    if own is None or own.camera is not None:
+        return None if own is None else own.camera
+    width, height = image_size(read_color(recording.files[0].color))
+    return None if own.calibration is None else Camera(width, height, *own.calibration)
 
 
 def _camera(place: str, info: Any, rectified: bool) -> Camera:
@@ -113,9 +144,12 @@ def _distortion(place: str, info: Any) -> tuple[np.ndarray | None, bool]:
     return values, fisheye
 
 
-def _place_depth(recording: Recording, bag: Bag, topics: Topics, camera: Camera) -> None:
+def _place_depth(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera | None) -> None:
     """Tells whether depth is registered, or how the depth camera stands to the colour camera, or warns."""
     if topics.depth_info is None or any(word in topics.depth for word in REGISTERED):
+        return
+    camera = _color_camera(recording, bag, topics, own)
+    if camera is None:
         return
     place = f"{bag.path}, {topics.depth_info}"
     info = bag.message(topics.depth_info, 0)

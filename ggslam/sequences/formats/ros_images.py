@@ -26,25 +26,32 @@ DEPTH: dict[str, Any] = {"16uc1": np.dtype(np.uint16), "mono16": np.dtype(np.uin
 """Encoding -> numbers; uint16 are millimetres, float32 metres (REP 118)."""
 
 
+def encoding_of(message: Any) -> str:
+    """How an image message says that its pixels are stored."""
+    return str(message.encoding if hasattr(message, "encoding") else message.format)
+
+
 def is_depth(message: Any) -> bool | None:
     """Whether an image message holds depth; None: neither depth nor colour that is known."""
+    encoding = encoding_of(message).lower()
     if hasattr(message, "encoding"):
-        encoding = message.encoding.lower()
         return True if encoding in DEPTH else False if encoding in COLOR else None
-    form = message.format.lower()
-    if "compresseddepth" in form:
-        return True
-    return None if any(encoding in form for encoding in DEPTH) else False
+    if not any(depth in encoding for depth in (*DEPTH, "compresseddepth")):
+        return False
+    return True if any(way in encoding for way in ("compresseddepth", "png")) else None  # JPEG has 8 bits
 
 
 def in_metres(message: Any) -> bool:
     """Whether a depth message holds metres (else millimetres)."""
-    name = message.encoding if hasattr(message, "encoding") else message.format
-    return "32fc1" in name.lower()
+    return "32fc1" in encoding_of(message).lower()
 
 
 def color_image(place: str, message: Any) -> np.ndarray:
-    """Colour uint8 [H, W, 3] RGB of an image message. Raises SequenceError if it is damaged or not colour."""
+    """Colour uint8 [H, W, 3] RGB of an image message, read-only where it is a view of it.
+
+    Raises:
+        SequenceError: it is damaged or not colour.
+    """
     if not hasattr(message, "encoding"):
         content = bytes(message.data)
         damage = find_damage(content)
@@ -54,6 +61,8 @@ def color_image(place: str, message: Any) -> np.ndarray:
     encoding = message.encoding.lower()
     if encoding not in COLOR:
         raise SequenceError(f"{place}: encoding {message.encoding} is no colour that is known ({', '.join(COLOR)})")
+    if COLOR[encoding][0] == 2 and message.width % 2:
+        raise SequenceError(f"{place}: {message.encoding} needs images of even width, found {message.width}")
     channels, conversion = COLOR[encoding]
     image = _rows(place, message, np.dtype(np.uint8), channels)
     if conversion is None:
@@ -62,7 +71,7 @@ def color_image(place: str, message: Any) -> np.ndarray:
 
 
 def depth_image(place: str, message: Any) -> np.ndarray:
-    """Depth of an image message, uint16 (millimetres) or float32 (metres) [H, W].
+    """Depth of an image message, uint16 (millimetres) or float32 (metres) [H, W], read-only where it is a view of it.
 
     Raises:
         SequenceError: it is damaged or not depth.
@@ -91,19 +100,21 @@ def _rows(place: str, message: Any, dtype: np.dtype, channels: int) -> np.ndarra
 
 
 def _compressed_depth(place: str, message: Any) -> np.ndarray:
-    """The 12 bytes before the PNG tell how float32 depth was turned into 16 bits: A / depth + B."""
+    """Of compressed_depth_image_transport, whose 12 bytes before the PNG tell how float32 depth was turned into 16
+    bits, A / depth + B; or of compressed_image_transport, a PNG of millimetres alone."""
     form, content = message.format.lower(), bytes(message.data)
     if "rvl" in form:
-        raise SequenceError(f"{place}: depth compressed with RVL is not supported; republish it as PNG")
-    if len(content) <= 12:
+        raise SequenceError(f"{place}: depth as '{message.format}' (RVL) is not supported; republish it as PNG")
+    head = 12 if "compresseddepth" in form else 0
+    if len(content) <= head:
         raise SequenceError(f"{place}: compressed depth of {len(content)} bytes is truncated")
-    damage = find_damage(content[12:])
+    damage = find_damage(content[head:])
     if damage:
         raise SequenceError(f"{place}: {damage}")
-    raw = decode(place, content[12:], cv2.IMREAD_UNCHANGED)
+    raw = decode(place, content[head:], cv2.IMREAD_UNCHANGED)
     if raw.ndim != 2 or raw.dtype != np.uint16:
         raise SequenceError(f"{place}: expected a 16-bit image in compressed depth")
-    if "32fc1" not in form:
+    if "32fc1" not in form or not head:
         return raw
     a, b = struct.unpack("<ff", content[4:12])
     depth = np.zeros(raw.shape, np.float32)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.poses import inverse, quaternion_to_matrix
-from ggslam.sequences.formats.ros_images import is_depth
+from ggslam.sequences.formats.ros_images import COLOR, DEPTH, encoding_of, is_depth
 from ggslam.sequences.formats.ros_messages import Bag
 
 ROLES = ("color", "depth", "color_info", "depth_info", "pose")
@@ -19,17 +19,18 @@ ROLES = ("color", "depth", "color_info", "depth_info", "pose")
 IMAGE_TYPES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
 INFO_TYPE = "sensor_msgs/CameraInfo"
 STATIC_FRAMES = "/tf_static"
+UNKNOWN = ", which is not supported"
 REGISTERED = ("aligned_depth", "depth_registered", "depth_to_color", "depth_to_rgb")
 """Parts of names of topics whose depth images are registered to colour already."""
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Topics by role; `depth_info` and `pose` may be absent."""
+    """Topics by role; `color_info`, `depth_info` and `pose` may be absent."""
 
     color: str
     depth: str
-    color_info: str
+    color_info: str | None
     depth_info: str | None
     pose: str | None
 
@@ -43,24 +44,26 @@ def find_topics(bag: Bag, given: Mapping[str, str]) -> Topics:
     for role, topic in given.items():
         if topic not in bag.types:
             raise SequenceError(f"{bag.path}: no topic {topic} (for {role}); it holds {', '.join(sorted(bag.types))}")
-    kinds = {}
+    kinds: dict[str, tuple[bool | None, str]] = {}
     if not {"color", "depth"} <= set(given):
         kinds = {topic: _kind(bag, topic) for topic, name in bag.types.items() if name in IMAGE_TYPES}
-    colors = {topic: _color_score(topic) for topic, holds_depth in kinds.items() if holds_depth is False}
-    depths = {topic: _depth_score(topic) for topic, holds_depth in kinds.items() if holds_depth}
-    color = given.get("color") or _best(bag, "color", colors)
-    depth = given.get("depth") or _best(bag, "depth", depths)
+    colors = {topic: _color_score(topic) for topic, (holds_depth, _) in kinds.items() if holds_depth is False}
+    depths = {topic: _depth_score(topic) for topic, (holds_depth, _) in kinds.items() if holds_depth}
+    held = {topic: kind for topic, (_, kind) in kinds.items()}
+    color = given.get("color") or _best(bag, "color", colors, held)
+    depth = given.get("depth") or _best(bag, "depth", depths, held)
     color_info = given.get("color_info") or _info(bag, color)
-    if color_info is None:
-        raise SequenceError(f"{bag.path}: no camera_info belongs to {color}; give it with `topics` color_info=TOPIC")
     return Topics(color, depth, color_info, given.get("depth_info") or _info(bag, depth), given.get("pose"))
 
 
-def _kind(bag: Bag, topic: str) -> bool | None:
+def _kind(bag: Bag, topic: str) -> tuple[bool | None, str]:
+    """Whether images are depth (None: neither depth nor colour that is known), and what is in the topic, in words."""
     try:
-        return is_depth(bag.message(topic, 0))
+        message = bag.message(topic, 0)
     except SequenceError:
-        return None  # an empty or damaged topic is none to choose
+        return None, "empty or damaged"  # none to choose
+    holds_depth = is_depth(message)
+    return holds_depth, f"encoding '{encoding_of(message)}'{UNKNOWN if holds_depth is None else ''}"
 
 
 def _color_score(topic: str) -> float:
@@ -75,10 +78,13 @@ def _depth_score(topic: str) -> float:
     return score - 4.0 * ("confidence" in topic or "infra" in topic) - 0.25 * topic.endswith("compressedDepth")
 
 
-def _best(bag: Bag, role: str, scores: dict[str, float]) -> str:
+def _best(bag: Bag, role: str, scores: dict[str, float], kinds: dict[str, str]) -> str:
+    """The topic that suits a role best; `kinds` tells for messages what is in each topic of images."""
     if not scores:
-        held = ", ".join(f"{topic} ({name})" for topic, name in sorted(bag.types.items()))
-        raise SequenceError(f"{bag.path}: no topic of {role} images; it holds {held}")
+        held = ", ".join(f"{topic} ({kinds.get(topic, name)})" for topic, name in sorted(bag.types.items()))
+        known = ", ".join(COLOR if role == "color" else DEPTH)
+        read = f"; {role} is read as {known}, JPEG or PNG" if UNKNOWN in held else ""
+        raise SequenceError(f"{bag.path}: no topic of {role} images; it holds {held}{read}")
     ranked = sorted(scores, key=lambda topic: (-scores[topic], topic))
     if len(ranked) > 1 and scores[ranked[0]] == scores[ranked[1]]:
         raise SequenceError(

@@ -51,7 +51,8 @@ class ScannerAppFormat:
             )
         paths = [files["json"][number] for number in whole]
         described = [read_object(path) for path in paths]
-        cameras = _cameras(files["color"][whole[0]], paths, described)
+        cameras = options.recorded_camera(lambda: _cameras(files["color"][whole[0]], paths, described))
+        cameras = cameras or [None] * len(whole)
         frames = [
             FrameFiles(files["color"][n], files["depth"][n], None, files["confidence"].get(n), camera)
             for n, camera in zip(whole, cameras, strict=True)
@@ -97,9 +98,9 @@ def _warnings(files: dict[str, dict[int, Path]], used: int) -> list[str]:
     return [f"{used} of {every} frames are whole, as the app writes it; left out: {words}"]
 
 
-def _cameras(color: Path, paths: list[Path], described: list[dict[str, Any]]) -> list[Camera]:
+def _cameras(color: Path, paths: list[Path], described: list[dict[str, Any]]) -> list[Camera | None]:
     height, width = read_color(color).shape[:2]
-    cameras = []
+    cameras: list[Camera | None] = []
     for path, values in zip(paths, described, strict=True):
         K = numbers_of(path, values, "intrinsics", 9).reshape(3, 3)
         cameras.append(camera_of(path, width, height, *(float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))))

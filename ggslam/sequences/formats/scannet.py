@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,8 @@ class ScanNetFormat:
             raise SequenceError(f"{root / 'color'}: no images")
         masks = self._masks(folder, root, colors)
         files = [FrameFiles(c, root / "depth" / f"{c.stem}.png", m) for c, m in zip(colors, masks, strict=True)]
-        calibration, depth_calibration, warnings = self._calibrations(root, options.own_camera is not None)
+        calibration = options.recorded_camera(partial(read_intrinsics, root / "intrinsic" / "intrinsic_color.txt"))
+        depth_calibration, warnings = self._depth_calibration(root, calibration is None)
         recording = Recording(
             self.name, folder, files, nominal_timestamps(len(files)), 1000.0, calibration=calibration,
             depth_calibration=depth_calibration, problems=missing_depth_problems(files), warnings=warnings,
@@ -56,20 +58,12 @@ class ScanNetFormat:
                     return find_masks(place, colors)
         return [None] * len(colors)
 
-    def _calibrations(self, root: Path, own: bool) -> tuple[Calibration | None, Calibration | None, list[str]]:
-        """Of colour and of depth; `own`: a user tells that of colour."""
-        color, depth = root / "intrinsic" / "intrinsic_color.txt", root / "intrinsic" / "intrinsic_depth.txt"
-        if own:
-            return None, read_intrinsics(depth) if depth.is_file() else None, []
-        if not color.is_file():
-            raise SequenceError(f"{color}: file is missing; ScanNet's intrinsics of the colour camera are needed")
+    def _depth_calibration(self, root: Path, own: bool) -> tuple[Calibration | None, list[str]]:
+        """Of depth, and a warning where only colour has one; `own`: a user tells that of colour."""
+        depth = root / "intrinsic" / "intrinsic_depth.txt"
         if depth.is_file():
-            return read_intrinsics(color), read_intrinsics(depth), []
-        return (
-            read_intrinsics(color),
-            None,
-            [f"{depth} is missing: the depth image is taken to be the same view as colour"],
-        )
+            return read_intrinsics(depth), []
+        return None, [] if own else [f"{depth} is missing: the depth image is taken to be the same view as colour"]
 
     def _add_poses(self, recording: Recording, folder: Path, colors: list[Path]) -> None:
         paths = [folder / f"{color.stem}.txt" for color in colors]

@@ -52,12 +52,12 @@ class ScanNetPlusFormat:
     def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
         dslr, iphone = _dslr(folder), _iphone(folder)
         if dslr is not None and ((dslr / "undistorted_depths").is_dir() or iphone is None):
-            return self._read_dslr(folder, dslr)
+            return self._read_dslr(folder, dslr, options)
         if iphone is None:
             raise SequenceError(f"{folder}: expected {self.layout}")
-        return self._read_iphone(folder, iphone)
+        return self._read_iphone(folder, iphone, options)
 
-    def _read_dslr(self, folder: Path, root: Path) -> Recording:
+    def _read_dslr(self, folder: Path, root: Path, options: ReadOptions) -> Recording:
         path = root / DSLR_FILE
         content = read_object(path)
         frames = frames_of(path, content)
@@ -71,9 +71,9 @@ class ScanNetPlusFormat:
         depths = root / "undistorted_depths"
         if not depths.is_dir():
             raise SequenceError(f"{depths}: folder is missing; render the depth images with the data set's own tools")
-        return read_transforms(self.name, path, content, frames, folder, images, depths)
+        return read_transforms(self.name, path, content, frames, folder, images, options, depths)
 
-    def _read_iphone(self, folder: Path, root: Path) -> Recording:
+    def _read_iphone(self, folder: Path, root: Path, options: ReadOptions) -> Recording:
         path = root / IPHONE_FILE
         content = read_object(path)
         names = sorted((name for name in content if isinstance(content[name], dict)), key=natural_key)
@@ -84,7 +84,8 @@ class ScanNetPlusFormat:
         if not numbered:
             raise SequenceError(f"{depths}: no image has the name of a frame in {path.name}")
         colors = _iphone_colors(root)
-        cameras = [_iphone_camera(path, name, content[name]) for _, name in numbered]
+        cameras = options.recorded_camera(lambda: _iphone_cameras(path, content, [name for _, name in numbered]))
+        cameras = cameras or [None] * len(numbered)
         files = [
             FrameFiles(colors(i, name), depths / f"{name}.png", camera=camera)
             for (i, name), camera in zip(numbered, cameras, strict=True)
@@ -110,9 +111,12 @@ def _iphone_colors(root: Path) -> Any:
     return frame
 
 
-def _iphone_camera(path: Path, name: str, frame: dict[str, Any]) -> Camera:
-    K = numbers_of(f"{path}, {name}", frame, "intrinsic", 9)
-    return camera_of(f"{path}, {name}", *IPHONE_SIZE, K[0], K[4], K[2], K[5])
+def _iphone_cameras(path: Path, content: dict[str, Any], names: list[str]) -> list[Camera | None]:
+    cameras: list[Camera | None] = []
+    for name in names:
+        K = numbers_of(f"{path}, {name}", content[name], "intrinsic", 9)
+        cameras.append(camera_of(f"{path}, {name}", *IPHONE_SIZE, K[0], K[4], K[2], K[5]))
+    return cameras
 
 
 def _add_iphone_poses(recording: Recording, path: Path, frames: list[tuple[str, dict[str, Any]]]) -> None:

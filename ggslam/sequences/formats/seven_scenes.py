@@ -46,9 +46,8 @@ class SevenScenesFormat:
         registered = bool(bases) and not raw and all(Path(f"{base}.depth.proj.png").is_file() for base in bases)
         suffix = ".depth.proj.png" if registered else ".depth.png"
         files = [self._files(color, base, suffix) for color, base in zip(colors, bases, strict=True)]
-        calibration, source, warnings = DEPTH_CALIBRATION, "", list[str]()
-        if options.own_camera is None:
-            calibration, source = self._calibration(folder, frames, registered, options.depth_camera)
+        told = options.recorded_camera(lambda: self._calibration(folder, frames, registered, options.depth_camera))
+        (calibration, source), warnings = told or (DEPTH_CALIBRATION, ""), list[str]()
         if not (registered or raw) and (options.own_camera is not None or source.startswith("published")):
             warnings.append(
                 "plain 7-Scenes depth is not registered to the colour image (two cameras, several centimetres apart): "

@@ -68,7 +68,7 @@ class StrayFormat:
         if not rows:
             raise SequenceError(f"{folder}: no depth image has the number of a frame in odometry.csv")
         table, numbers = {name: values[rows] for name, values in table.items()}, numbers[rows]
-        cameras = _cameras(folder, table, video)
+        cameras = options.recorded_camera(lambda: _cameras(folder, table, video)) or [None] * len(rows)
         files = []
         for number, camera in zip(numbers, cameras, strict=True):
             confidence = folder / "confidence" / f"{number:06d}.png"
@@ -153,7 +153,7 @@ def _read_table(path: Path) -> dict[str, np.ndarray]:
     return table
 
 
-def _cameras(folder: Path, table: dict[str, np.ndarray], video: Video) -> list[Camera]:
+def _cameras(folder: Path, table: dict[str, np.ndarray], video: Video) -> list[Camera | None]:
     """Intrinsics of every frame at the size of the video."""
     height, width = video.frame(0).shape[:2]
     if all(name in table for name in INTRINSICS):

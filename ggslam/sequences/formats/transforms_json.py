@@ -10,6 +10,7 @@ counts from the corner of the image, half a pixel further than ours.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ class TransformsFormat:
     def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
         path = folder / FILE
         content = read_object(path)
-        return read_transforms(self.name, path, content, frames_of(path, content), folder, folder)
+        return read_transforms(self.name, path, content, frames_of(path, content), folder, folder, options)
 
 
 def frames_of(path: Path, content: dict[str, Any], key: str = "frames") -> list[dict[str, Any]]:
@@ -73,7 +74,7 @@ def frames_of(path: Path, content: dict[str, Any], key: str = "frames") -> list[
 
 def read_transforms(
     name: str, path: Path, content: dict[str, Any], frames: list[dict[str, Any]], folder: Path, images: Path,
-    depths: Path | None = None,
+    options: ReadOptions = NO_OPTIONS, depths: Path | None = None,
 ) -> Recording:  # fmt: skip
     """The recording that a transforms file describes.
 
@@ -83,35 +84,49 @@ def read_transforms(
         frames: the frames of it to take, in order.
         folder: of the recording.
         images: folder that the paths of images start from.
+        options: of the user.
         depths: folder with a depth image of the name of each colour image; None: the frames tell their depth images.
 
     Raises:
         SequenceError: an entry is missing or wrong.
     """
-    own = [_own_camera(path, content, frame) for frame in frames]
-    common = own[0] if frames and own[0] is not None else _camera(path, content)
-    distortion, fisheye = _distortion(path, content)
-    changing = any(camera is not None and camera != common for camera in own)
-    if changing and distortion is not None:
-        raise SequenceError(f"{path}: intrinsics change from frame to frame and there is distortion: not supported")
+    lens = options.recorded_camera(lambda: _lens(path, content, frames)) or _Lens(None, [None] * len(frames))
     files = [
-        FrameFiles(
-            _image(images / frame["file_path"]), _depth(path, frame, images, depths), None, None,
-            camera if changing else None,
-        )
-        for frame, camera in zip(frames, own, strict=True)
-    ]  # fmt: skip
+        FrameFiles(_image(images / frame["file_path"]), _depth(path, frame, images, depths), None, None, camera)
+        for frame, camera in zip(frames, lens.changing, strict=True)
+    ]
     times = [frame.get("timestamp") for frame in frames]
     told = bool(times) and all(isinstance(t, (int, float)) for t in times)
     recording = Recording(
         name, folder, files, np.array(times, float) if told else nominal_timestamps(len(files)),
-        _depth_scale(path, content, depths is None), common, distortion=distortion, fisheye=fisheye,
+        options.recorded_scale(lambda: _depth_scale(path, content, depths is None)), lens.common,
+        distortion=lens.distortion, fisheye=lens.fisheye,
         problems=missing_depth_problems(files), pose_source=f"{path.name} (OpenGL axes)",
     )  # fmt: skip
     if told:
         recording.time_source = path.name
     _add_poses(recording, path, frames)
     return recording
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """The camera of all frames, that of each frame where it changes, and the distortion."""
+
+    common: Camera | None
+    changing: list[Camera | None]
+    distortion: np.ndarray | None = None
+    fisheye: bool = False
+
+
+def _lens(path: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> _Lens:
+    own = [_own_camera(path, content, frame) for frame in frames]
+    common = own[0] if frames and own[0] is not None else _camera(path, content)
+    distortion, fisheye = _distortion(path, content)
+    changing = any(camera is not None and camera != common for camera in own)
+    if changing and distortion is not None:
+        raise SequenceError(f"{path}: intrinsics change from frame to frame and there is distortion: not supported")
+    return _Lens(common, own if changing else [None] * len(frames), distortion, fisheye)
 
 
 def _image(path: Path) -> Path:
