@@ -91,7 +91,7 @@ class Download:
 def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:
     """A copy of an array on the device, for which the host does not wait: it goes by way of page-locked memory, which
     torch keeps for the next one."""
-    tensor = torch.from_numpy(np.ascontiguousarray(array))
+    tensor = torch.from_numpy(np.require(array, requirements=["C", "W"]))  # torch warns of arrays that are read-only
     if device.type != "cuda":
         return tensor.clone()
     return tensor.pin_memory().to(device, non_blocking=True)

@@ -80,5 +80,5 @@ class Lpips:
 
 def _to_signed(image: np.ndarray) -> torch.Tensor:
     """Image as float32 in [-1, 1]."""
-    x = torch.from_numpy(np.ascontiguousarray(image))
+    x = torch.tensor(np.ascontiguousarray(image))
     return x.float() / 127.5 - 1.0 if x.dtype == torch.uint8 else x.float() * 2.0 - 1.0

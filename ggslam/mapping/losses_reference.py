@@ -22,7 +22,7 @@ def reference_loss(
         alpha: [H, W].
         exposure: [3, 2]; stands in for `target.exposure`.
     """
-    y = torch.from_numpy(target.color).permute(2, 0, 1).to(image.dtype) / 255
+    y = torch.tensor(target.color).permute(2, 0, 1).to(image.dtype) / 255
     target_depth = torch.from_numpy(target.depth.astype("float64")).to(image.dtype) * target.depth_scale
     valid = torch.isfinite(target_depth) & (target_depth > 0)
 

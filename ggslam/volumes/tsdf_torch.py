@@ -98,7 +98,7 @@ class TorchTsdf:
         limit = min(MOST_VOXELS, 0.5 * _OFFSET * SIDE) * s.voxel
         checked = FusionView(depth, camera, T_world_camera, color, labels, limit)
         T = torch.from_numpy(checked.T_camera_world).to(self.device)
-        depth_image = torch.from_numpy(checked.depth).to(self.device)
+        depth_image = torch.tensor(checked.depth).to(self.device)
         in_range = (depth_image >= s.min_depth) & (depth_image <= s.max_depth)
         view = DeviceView(torch.where(in_range, depth_image, 0), camera, T[:3, :3], T[:3, 3])
         found = find_candidates(view, SIDE * s.voxel, s.truncation, s.free_share)
@@ -113,7 +113,7 @@ class TorchTsdf:
         known = free_row >= 0
         weight[known] = self._free_weight[free_row[known]]
         voxels = self._voxels[dense_row[old]].join(Voxels.free(weight[new]))
-        color_image = None if checked.color is None else torch.from_numpy(checked.color).to(self.device)
+        color_image = None if checked.color is None else torch.tensor(checked.color).to(self.device)
         label_image = None if checked.labels is None else torch.from_numpy(checked.labels.astype(np.int32))
         at = torch.cat([found.coordinates[old], found.coordinates[new]])
         in_band = _fuse(voxels, at, view, s, color_image, None if label_image is None else label_image.to(self.device))

@@ -186,7 +186,7 @@ class CellMapper(StillMapper):
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> CpuLossResult:
         shown = torch.from_numpy(self._views[keyframe.index].shown)
         gain, offset = torch.from_numpy(keyframe.exposure.astype(np.float32)).T[:, :, None, None]
-        measured = torch.from_numpy(keyframe.color).permute(2, 0, 1) / 255.0
+        measured = torch.tensor(keyframe.color).permute(2, 0, 1) / 255.0
         self._own_psnr = _psnr((view.image * gain + offset)[:, shown], measured[:, shown])
         behind = (~shown).float()
         color = (measured - offset) / gain * behind

@@ -59,7 +59,7 @@ class DepthImageFeatures:
         expected = (self.camera.height, self.camera.width)
         if depth.shape != expected:
             raise ValueError(f"depth is {depth.shape}, expected {expected} of the camera")
-        image = self._depth.copy_(torch.from_numpy(np.ascontiguousarray(depth, np.float32)))
+        image = self._depth.copy_(torch.tensor(np.ascontiguousarray(depth, np.float32)))
         edges, planes = self._lines.pick(image, noise)
         planes, normals, z = self._patches(planes, noise)
         edge_z = torch.take(image, edges)
