@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ggslam.errors import FormatError
+from ggslam.formats.linear_light import vertex_colors
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.system.atomic import atomic_write
@@ -147,9 +148,9 @@ def _columns(path: str | Path, gaussians: GaussianMap, with_objects: bool) -> di
     scales = np.exp(columns.log_scales.astype(np.float64))
     if scales.max() > np.finfo(np.float32).max:
         raise FormatError(f"{path}: a Gaussian is larger than float32 can say")
-    rgb = _linear((0.5 + SH_C0 * columns.sh[:, 0].astype(np.float64)).clip(0, 1))
+    rgb = (0.5 + SH_C0 * columns.sh[:, 0].astype(np.float64)).clip(0, 1)
     out = {
-        "POSITION": columns.means, "COLOR_0": np.rint(65535 * np.column_stack([rgb, opacity])),
+        "POSITION": columns.means, "COLOR_0": vertex_colors(rgb, opacity),
         f"{_EXTENSION}:ROTATION": np.roll(columns.quaternions, -1, axis=1), f"{_EXTENSION}:SCALE": scales,
         f"{_EXTENSION}:OPACITY": opacity,
     }  # fmt: skip
@@ -160,11 +161,6 @@ def _columns(path: str | Path, gaussians: GaussianMap, with_objects: bool) -> di
             raise FormatError(f"{path}: object ids are 0 to {_LARGEST_ID} in glTF, found {ids.min()} to {ids.max()}")
         out["_FEATURE_ID_0"] = ids
     return out
-
-
-def _linear(encoded: np.ndarray) -> np.ndarray:
-    """Light of sRGB numbers, 0 to 1 both."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def _put(

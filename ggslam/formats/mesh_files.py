@@ -1,7 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes meshes with normals, colours and objects: PLY by itself, OBJ and GLB (glTF 2.0) through trimesh.
 
-Coordinates are written as they are: metres, in the map's frame. glTF viewers take y for upwards.
+Coordinates are written as they are: metres, in the map's frame or a frame with z upwards. glTF viewers take y for
+upwards, and colours at vertices for linear light, see `linear_light`.
+
+The material of a GLB is unlit (KHR_materials_unlit): colours of a scan were photographed and hold the room's light, so
+a viewer that lights them again shows them darker, and how dark depends on its lamps. Programs without the extension
+fall back to a surface that is no metal and wholly rough, as Khronos advises; glTF's default is a polished metal, black
+where nothing is to be mirrored. Triangles show their front alone: from outside, one looks through the near wall into
+the room.
 """
 
 from __future__ import annotations
@@ -9,10 +16,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from ggslam.errors import FormatError
+from ggslam.formats.linear_light import vertex_colors
 from ggslam.formats.optional_package import package_for
 from ggslam.formats.ply import write_ply
 from ggslam.formats.triangle_mesh import majority_labels
@@ -20,6 +29,15 @@ from ggslam.system.atomic import write_bytes
 
 GLTF_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the map's axes, those of the first camera (y down, z forward), to glTF's (y up, z towards the viewer)."""
+GLTF_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From axes with z up to glTF's."""
+MATERIAL: dict[str, Any] = {
+    "name": "scan", "extensions": {"KHR_materials_unlit": {}},
+    "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
+}  # fmt: skip
+"""Of all triangles of a GLB."""
+_CUSTOM = "_COLOR_0"
+"""As trimesh calls an attribute that it hands on as it is; its own colours have 8 bits."""
 ENDINGS = (".ply", ".obj", ".glb")
 
 
@@ -40,13 +58,14 @@ def check_mesh_path(path: str | Path) -> None:
 def write_mesh(
     path: str | Path, vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray | None = None,
     colors: np.ndarray | None = None, labels: np.ndarray | None = None, names: Mapping[int, str] | None = None,
+    z_up: bool = False,
 ) -> None:  # fmt: skip
     """Writes a mesh in the format that the file's ending names, whole or not at all.
 
     PLY: binary; x y z, and what is given of nx ny nz, red green blue, object_id (ushort). OBJ: one object with normals
     and colours (behind each vertex' position, as most programs read them), no object ids. GLB: with labels a node
     for each object, called "ID NAME" or "object ID" ("unlabelled" for 0), else a single one; vertices are stored as
-    given, and the nodes turn them, see `GLTF_AXES`.
+    given, and the nodes turn them, see `GLTF_AXES`; colours are in linear light, 16 bits.
 
     Args:
         path: ends in one of `ENDINGS`.
@@ -56,6 +75,7 @@ def write_mesh(
         colors: uint8 [V, 3].
         labels: uint16 [V], object of each vertex; a triangle belongs to that of most of its vertices.
         names: of objects, for GLB.
+        z_up: whether z is upwards, not -y about as in the map's frame; of GLB alone this turns the nodes.
 
     Raises:
         FormatError: another ending; or an empty mesh, which OBJ and GLB files cannot hold.
@@ -68,7 +88,8 @@ def write_mesh(
         return
     if not len(triangles):
         raise FormatError(f"{path}: the mesh has no triangles, and OBJ and GLB files cannot be empty; PLY files can")
-    _write_trimesh(path, vertices, triangles, normals, colors, labels, names or {})
+    data = _of_trimesh(path, vertices, triangles, normals, colors, labels, names or {}, z_up)
+    write_bytes(path, data)
 
 
 def _write_ply(
@@ -94,33 +115,46 @@ def _trimesh(path: str | Path) -> ModuleType:
     return package_for(path, "trimesh", "mesh", otherwise="write a .ply")
 
 
-def _write_trimesh(
+def _of_trimesh(
     path: str | Path, vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray | None,
-    colors: np.ndarray | None, labels: np.ndarray | None, names: Mapping[int, str],
-) -> None:  # fmt: skip
-    trimesh = _trimesh(path)
+    colors: np.ndarray | None, labels: np.ndarray | None, names: Mapping[int, str], z_up: bool,
+) -> bytes:  # fmt: skip
+    trimesh, is_glb = _trimesh(path), Path(path).suffix.lower() == ".glb"
 
-    def geometry(chosen: np.ndarray) -> object:
+    def geometry(chosen: np.ndarray) -> Any:
         used, corners = np.unique(chosen, return_inverse=True)
+        own = None if colors is None else colors[used]
         return trimesh.Trimesh(
             vertices=vertices[used], faces=corners.reshape(-1, 3), process=False,
-            vertex_normals=None if normals is None else normals[used],
-            vertex_colors=None if colors is None else colors[used],
+            vertex_normals=None if normals is None else normals[used], vertex_colors=None if is_glb else own,
+            vertex_attributes={_CUSTOM: vertex_colors(own / 255)} if is_glb and own is not None else None,
         )  # fmt: skip
 
-    ending = Path(path).suffix.lower()[1:]
-    if ending == "obj":
-        data = geometry(triangles).export(file_type="obj", include_normals=normals is not None)  # type: ignore[attr-defined]
-        write_bytes(path, data.encode("utf-8"))
-        return
+    if not is_glb:
+        text: str = geometry(triangles).export(file_type="obj", include_normals=normals is not None)
+        return text.encode("utf-8")
     scene, of_triangle = trimesh.Scene(), np.zeros(len(triangles), np.uint16)
     if labels is not None:
         of_triangle = majority_labels(labels, triangles)
     for label in np.unique(of_triangle).tolist():
         name = _node_name(label, names) if labels is not None else "mesh"
         part = geometry(triangles[of_triangle == label])
-        scene.add_geometry(part, node_name=name, geom_name=name, transform=GLTF_AXES)
-    write_bytes(path, scene.export(file_type="glb", include_normals=normals is not None))
+        T_gltf_mesh = GLTF_FROM_Z_UP if z_up else GLTF_AXES
+        scene.add_geometry(part, node_name=name, geom_name=name, transform=T_gltf_mesh)
+    data: bytes = scene.export(file_type="glb", include_normals=normals is not None, tree_postprocessor=_finish_gltf)
+    return data
+
+
+def _finish_gltf(tree: dict[str, Any]) -> None:
+    """Names the colours as glTF does, and gives all triangles their material."""
+    tree["materials"] = [MATERIAL]
+    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), *MATERIAL["extensions"]})
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            primitive["material"] = 0
+            if _CUSTOM in primitive["attributes"]:
+                number = primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop(_CUSTOM)
+                tree["accessors"][number]["normalized"] = True
 
 
 def _node_name(label: int, names: Mapping[int, str]) -> str:

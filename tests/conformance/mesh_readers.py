@@ -46,8 +46,13 @@ def from_obj(path: Path) -> Mesh:
     return Mesh(vertices[:, :3], triangles, 255 * vertices[:, 3:6], normals, np.empty(0, str))
 
 
+def on_screen(light: np.ndarray) -> np.ndarray:
+    """sRGB numbers of linear light, 0 to 1 both, by IEC 61966-2-1."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
 def from_glb(path: Path) -> Mesh:
-    """glTF 2.0: the triangles of all nodes, turned as their nodes say."""
+    """glTF 2.0: the triangles of all nodes, turned as their nodes say; their colours as a screen gets them."""
     gltf, binary = glb_parts(path)
 
     def column(number: int) -> np.ndarray:
@@ -73,6 +78,9 @@ def from_glb(path: Path) -> Mesh:
             vertices = column(at["POSITION"]) @ T[:3, :3].T + T[:3, 3]
             triangles = column(primitive["indices"]).reshape(-1, 3).astype(np.int64) + count
             names = np.full(len(vertices), node.get("name", ""))
-            parts.append([vertices, triangles, column(at["COLOR_0"])[:, :3], column(at["NORMAL"]) @ T[:3, :3].T, names])
+            accessor = gltf["accessors"][at["COLOR_0"]]
+            assert accessor["normalized"] and accessor["componentType"] == 5123
+            colors = 255 * on_screen(column(at["COLOR_0"])[:, :3] / 65535)
+            parts.append([vertices, triangles, colors, column(at["NORMAL"]) @ T[:3, :3].T, names])
             count += len(vertices)
     return Mesh(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

@@ -156,7 +156,7 @@ def test_meshes_of_all_kinds_are_the_same(meshes: dict[str, Path], measured: np.
     assert (far < 0.12).mean() > 0.9
     assert np.abs(corners(obj) - corners(ply)).max() < 0.003  # eight digits; colours in steps of 1/255
     upright = Mesh(glb.vertices * [1, -1, -1], glb.triangles, glb.colors, glb.normals, glb.names)
-    assert np.abs(corners(upright) - corners(ply)).max() < 1e-5
+    assert np.abs(corners(upright) - corners(ply)).max() < 1e-4  # metres, and a fortieth of a grey value
     for mesh in (ply, obj, glb):
         sides = mesh.vertices[mesh.triangles]
         faces = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])
