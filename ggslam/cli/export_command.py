@@ -11,6 +11,7 @@ import typer
 from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar
 from ggslam.jobs.export.formats import ExportFormat
+from ggslam.volumes.output_frame import OutputFrame
 
 EPILOG = """
 [bold]Examples[/]
@@ -91,6 +92,12 @@ Rendered = Annotated[
                  "default where the recording is gone or the run was edited."),
 ]  # fmt: skip
 
+Frame = Annotated[
+    OutputFrame,
+    typer.Option(help="mesh: its frame: map, that of the run; floor: z up, z = 0 on the floor, with a file floor.yaml "
+                 "beside it that tells where that is."),
+]  # fmt: skip
+
 Zoom = Annotated[
     float,
     typer.Option(help="Formats of Gaussians: how many times larger than the run's images they will be drawn (of a map "
@@ -119,6 +126,7 @@ def export(
     sequence: options.MovedSequence = None,
     rendered: Rendered = False,
     zoom: Zoom = 1.0,
+    frame: Frame = OutputFrame.map,
 ) -> None:
     """Write a run's map, trajectory or images in a format that other programs read."""
     from ggslam.cli.observer import ProgressObserver
@@ -127,7 +135,7 @@ def export(
     with progress_bar() as bar:
         message = export_run(
             run, out, asked, voxel=voxel, objects=objects, movers=movers, min_opacity=min_opacity, plain=plain,
-            discs=discs, keyframes=keyframes, recording=sequence, rendered=rendered, zoom=zoom,
+            discs=discs, keyframes=keyframes, recording=sequence, rendered=rendered, zoom=zoom, frame=frame.value,
             observer=ProgressObserver(bar),
         )  # fmt: skip
     console.print(message, highlight=False, markup=False)

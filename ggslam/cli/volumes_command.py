@@ -12,6 +12,7 @@ from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
+from ggslam.volumes.output_frame import OutputFrame
 
 if TYPE_CHECKING:
     from ggslam.jobs.volumes.fuse import VolumesOutcome, VolumesRequest
@@ -69,6 +70,11 @@ Band = Annotated[
     str, typer.Option(metavar="LOW,HIGH", help="Heights, metres above the floor, between which the ROS map looks for "
                       "obstacles."),
 ]  # fmt: skip
+Frame = Annotated[
+    OutputFrame,
+    typer.Option(help="Frame of meshes and occupancy: map, that of the run; floor: z up, z = 0 on the floor, in which "
+                 "the ROS map is in any case. floor.yaml tells where the one is in the other."),
+]  # fmt: skip
 Driving = Annotated[bool, typer.Option("--driving", help="Print how fast a robot may drive with these maps.")]
 Speeds = Annotated[str, typer.Option(help="With --driving: speeds to list, m/s.")]
 Friction = Annotated[float, typer.Option(help="With --driving: friction between wheels and ground.")]
@@ -100,6 +106,7 @@ def volumes(
     onto: Onto = None,
     slice_height: SliceHeight = None,
     band: Band = "0.1,1.5",
+    frame: Frame = OutputFrame.map,
     driving: Driving = False,
     speeds: Speeds = "0.5,1,2,4",
     friction: Friction = 0.5,
@@ -140,18 +147,12 @@ def volumes(
     request = VolumesRequest(
         source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,
         occupancy=occupancy, mesh=mesh, object_meshes=object_meshes, objects=objects, live=live, realtime=realtime,
-        onto=onto, slice_height=slice_height, band=_band(band), latency=driving, device=device, config=config,
-        overrides=settings or [], overwrite=overwrite,
+        onto=onto, slice_height=slice_height, band=_band(band), frame=frame.value, latency=driving, device=device,
+        config=config, overrides=settings or [], overwrite=overwrite,
     )  # fmt: skip
     if is_store(source):
         return _make_of_store(request, engine, workers, address)
-    _refuse_workers(engine, workers, address)
-    return _make_and_show(request, _numbers("--speeds", speeds), braking)
-
-
-def _refuse_workers(engine: options.EngineName, workers: int | None, address: str | None) -> None:
-    if (engine, workers, address) != (options.EngineName.local, None, None):
-        raise ConfigError("--engine, --workers and --address are for grid stores, and this is none")
+    return _make_and_show(request, _numbers("--speeds", speeds), braking, (engine, workers, address))
 
 
 def _make_braking(sensor_ms: float, plan_ms: float, network_ms: float, friction: float) -> Braking:
@@ -198,10 +199,13 @@ def _make_of_store(
         raise typer.Exit(1)
 
 
-def _make_and_show(request: VolumesRequest, speeds: list[float], braking: Braking) -> None:
-    """Makes the maps and prints times, files and, where it was asked for, how fast a robot may drive."""
+def _make_and_show(request: VolumesRequest, speeds: list[float], braking: Braking, cells: tuple[object, ...]) -> None:
+    """Makes the maps and prints times, files and, where it was asked for, how fast a robot may drive; `cells` are
+    options that are for stores."""
     from ggslam.jobs.volumes.fuse import make_volumes
 
+    if cells != (options.EngineName.local, None, None):
+        raise ConfigError("--engine, --workers and --address are for grid stores, and this is none")
     with progress_bar() as bar:
         outcome = make_volumes(request, ProgressObserver(bar))
     _print(outcome)

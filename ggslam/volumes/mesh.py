@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from ggslam.formats.triangle_mesh import TriangleMesh, majority_labels
 from ggslam.interface.core.volumes import MeshArrays
 from ggslam.native.loader import load_library
+from ggslam.scene.poses import transform_points
 from ggslam.volumes.surface_cells import surface_cells
 from ggslam.volumes.tsdf import TsdfMap
 
@@ -57,6 +58,12 @@ class Mesh:
         used[triangles] = True
         number = np.cumsum(used, dtype=np.int32) - 1
         return Mesh(self.vertices[used], self.normals[used], self.colors[used], self.labels[used], number[triangles])
+
+    def moved(self, T: np.ndarray) -> Mesh:
+        """The mesh in another frame, T_new_old float64 [4, 4], rigid."""
+        vertices = transform_points(self.vertices.astype(np.float64), T)
+        normals = self.normals.astype(np.float64) @ T[:3, :3].T
+        return replace(self, vertices=vertices.astype(np.float32), normals=normals.astype(np.float32))
 
     def geometry(self) -> TriangleMesh:
         """Vertices and triangles alone, for sampling and areas."""

@@ -16,6 +16,7 @@ import numpy as np
 from ggslam.errors import InputError
 from ggslam.system.atomic import write_bytes, write_text
 from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.floor_frame import level_axes
 from ggslam.volumes.tsdf import SIDE
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
@@ -73,13 +74,9 @@ def plane_at_height(field: DistanceField, up: np.ndarray, height: float) -> Slic
         height: metres along `up`.
 
     Returns:
-        Seen from above; x is the world's x axis as far as it is horizontal (if `up` is almost that axis: its z axis).
+        Seen from above, with the axes of `level_axes`.
     """
-    z = np.asarray(up, np.float64) / np.linalg.norm(up)
-    x = np.eye(3)[0 if abs(z[0]) < 0.9 else 2]
-    x = x - (x @ z) * z
-    x /= np.linalg.norm(x)
-    y = np.cross(z, x)
+    x, y, z = level_axes(up)
     edge = SIDE * field.voxel
     corners = np.concatenate([field.coordinates() + shift for shift in np.ndindex(2, 2, 2)]) * edge
     if not len(corners):

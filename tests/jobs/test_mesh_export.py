@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 from ggslam.cli.main import app
 from ggslam.errors import ConfigError, FormatError, GgslamError, SequenceError
+from ggslam.jobs.export.export_run import export_run
 from ggslam.jobs.export.meshes import MeshRequest, export_mesh
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.poses import transform_points
@@ -103,6 +105,33 @@ def test_without_the_recording_depth_is_rendered_and_one_is_told(
             export_mesh(run, tmp_path / "x.ply", MeshRequest(recording=Path("nowhere")))
     finally:
         away.rename(recording)
+
+
+@pytest.mark.parametrize("ending", ["obj", "glb", "ply"])
+def test_on_the_floor(run: RunFolder, recording: Path, tmp_path: Path, ending: str) -> None:
+    """The synthetic floor, z = 0 of the recording's poses, is z = 0 of the file (y of glTF) within 5 mm, at the places
+    of the mesh in the map's frame, and floor.yaml tells where that is."""
+    out = tmp_path / f"room.{ending}"
+    said = ggslam("export", run.path, *MESH, "--frame", "floor", "--out", out)
+    assert f"{tmp_path / 'floor.yaml'}: ros2 run tf2_ros static_transform_publisher --x" in said
+    told = yaml.safe_load((tmp_path / "floor.yaml").read_text())
+    T_floor_map = np.array(told["T_floor_map"]).reshape(4, 4)
+    found = trimesh.load(out, process=False)
+    points = np.asarray(found.to_geometry().vertices if ending == "glb" else found.vertices)
+    if ending == "glb":
+        points = points @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).T  # y up to z up
+    ggslam("export", run.path, *MESH, "--out", tmp_path / "map.ply")
+    of_map = transform_points(np.asarray(trimesh.load(tmp_path / "map.ply", process=False).vertices), T_floor_map)
+    assert cKDTree(points).query(of_map)[0].max() < 1e-4
+    first = open_sequence(recording).frame(0).T_world_camera  # where the map begins; z = 0 of the scene is its floor
+    assert first is not None
+    T_scene_file = first @ np.linalg.inv(T_floor_map)
+    floor = points[np.abs(transform_points(points, T_scene_file)[:, 2]) < 0.03]
+    assert len(floor) > 300 and abs(np.median(floor[:, 2])) < 0.005
+    with pytest.raises(ConfigError, match="`frame` goes with `format` mesh, not points"):
+        export_run(run, tmp_path / "points", "points", frame="floor")
+    with pytest.raises(ConfigError, match="`frame`: expected map or floor, found 'roof'"):
+        export_run(run, out, "mesh", frame="roof")
 
 
 def test_single_objects(run: RunFolder, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.stores import is_store
 from ggslam.rendering.zoom import ZoomWidening
 from ggslam.runs.folder import RunFolder
+from ggslam.volumes.output_frame import OutputFrame, output_frame
 
 _SCENES = (ExportFormat.gltf, ExportFormat.sog, ExportFormat.usd)
 _WITH_OBJECTS = (ExportFormat.ply, ExportFormat.segmented, ExportFormat.mesh, ExportFormat.streamed_sog, *_SCENES)
@@ -48,6 +49,7 @@ def export_run(
     recording: str | Path | None = None,
     rendered: bool = False,
     zoom: float = 1.0,
+    frame: str = "map",
     observer: Observer | None = None,
 ) -> str:
     """Writes a run in a form that other programs take, as `ggslam export` does; returns a line that says what was
@@ -75,6 +77,7 @@ def export_run(
         zoom: formats of Gaussians: how many times larger than the training views they will be drawn (of a map trained
             at 320x240, 4 for a window of 1280x960). Widens them as far as renderers will then widen them less: seen at
             that size they are sharper and without seams, at the training views' size softer.
+        frame: mesh: "map", or "floor" (z up, 0 on the floor; floor.yaml beside it tells where that is in the map).
         observer: receives progress updates of meshes and streamed SOG.
 
     Raises:
@@ -86,11 +89,12 @@ def export_run(
     place = Path(out)
     if movers:
         _refuse_beside_movers(
-            place, format, voxel, objects, plain, discs, keyframes, recording, rendered, zoom, min_opacity
+            place, format, voxel, objects, plain, discs, keyframes, recording, rendered, zoom, min_opacity, frame != "map"
         )
         return export_movers(run if isinstance(run, RunFolder) else RunFolder.open(Path(run)), place)
     kind = choose_format(None if format is None else _format_named(format), place, objects)
-    _refuse_ignored(kind, objects, keyframes, recording, rendered, zoom)
+    wanted = output_frame(frame)
+    _refuse_ignored(kind, objects, keyframes, recording, rendered, zoom, wanted)
     _check_discs(kind, discs, min_opacity)
     if not isinstance(run, RunFolder) and is_store(Path(run)):
         return _export_store(Path(run), place, kind, objects, min_opacity, zoom, observer)
@@ -98,7 +102,7 @@ def export_run(
     images, points = None if recording is None else Path(recording), 0.01 if voxel is None else voxel
     prepare = None if zoom == 1 else _widen_for(folder, zoom)
     if kind is ExportFormat.mesh:
-        return export_mesh(folder, place, MeshRequest(voxel, objects, rendered, images), observer)
+        return export_mesh(folder, place, MeshRequest(voxel, objects, rendered, images, wanted), observer)
     if kind in _WITH_VIEWS:
         write = export_colmap if kind is ExportFormat.colmap else export_nerfstudio
         return write(folder, place, points, keyframes, images)
@@ -168,8 +172,9 @@ def _check_discs(kind: ExportFormat, discs: bool, min_opacity: float) -> None:
 
 
 def _refuse_ignored(
-    kind: ExportFormat, objects: str | None, keyframes: bool, recording: str | Path | None, rendered: bool, zoom: float
-) -> None:
+    kind: ExportFormat, objects: str | None, keyframes: bool, recording: str | Path | None, rendered: bool, zoom: float,
+    frame: OutputFrame,
+) -> None:  # fmt: skip
     """Raises ConfigError for an argument that this format leaves without effect."""
     if objects is not None and kind not in _WITH_OBJECTS:
         with_objects = ", ".join(kind.value for kind in _WITH_OBJECTS)
@@ -180,5 +185,7 @@ def _refuse_ignored(
         raise ConfigError(f"`recording` goes with `format` colmap, nerfstudio or mesh, not {kind.value}")
     if zoom != 1 and kind in _WITHOUT_GAUSSIANS:
         raise ConfigError(f"`zoom` goes with formats of Gaussians, not {kind.value}")
+    if frame is not OutputFrame.map and kind is not ExportFormat.mesh:
+        raise ConfigError(f"`frame` goes with `format` mesh, not {kind.value}")
     if rendered and kind is not ExportFormat.mesh:
         raise ConfigError(f"`rendered` goes with `format` mesh, not {kind.value}")

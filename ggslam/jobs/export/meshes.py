@@ -14,14 +14,16 @@ from ggslam.formats.mesh_files import check_mesh_path, write_mesh
 from ggslam.jobs.export.map_files import object_file_name
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.volumes.frames import PosedFrame, frames_of_run
-from ggslam.jobs.volumes.outputs import SMALLEST_PIECE
+from ggslam.jobs.volumes.outputs import Surface
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.rendered_views import RenderedViews
 from ggslam.scene.frame import Frame
 from ggslam.system.atomic import make_folder
+from ggslam.volumes.floor_frame import BELOW_CAMERAS, FLOOR_FILE, write_floor_file
 from ggslam.volumes.maps import VolumeMaps
-from ggslam.volumes.mesh import Mesh, extract_mesh
+from ggslam.volumes.mesh import Mesh
+from ggslam.volumes.output_frame import OutputFrame
 
 
 @dataclass(frozen=True)
@@ -33,12 +35,14 @@ class MeshRequest:
         objects: names or ids, "mug,7", or "all": only these; None: the whole surface.
         rendered: take depth from the map in any case.
         recording: where the recording is now, if it was moved.
+        frame: of the mesh, see `volumes.floor_frame`; with the floor's, FLOOR_FILE is written beside it.
     """
 
     voxel: float | None = None
     objects: str | None = None
     rendered: bool = False
     recording: Path | None = None
+    frame: OutputFrame = OutputFrame.map
 
 
 @dataclass
@@ -80,33 +84,39 @@ def export_mesh(
     views = _views(folder, request)
     for note in views.notes:
         observer.note(note)
-    mesh = _fuse(folder, views, request.voxel, observer)
+    surface = _fuse(folder, views, request.voxel, observer)
+    is_level = request.frame is OutputFrame.floor
+    mesh = surface.mesh.moved(surface.T_floor_map) if is_level else surface.mesh
     names = {} if table is None else {o.id: o.name for o in table.objects if o.name}
+    place = out if into_folder else out.parent
     if ids is None:
-        return _write(out, mesh, names, views.origin)
+        return _write(out, mesh, names, views.origin, is_level) + _write_floor(place, surface, is_level)
     labels = mesh.triangle_labels()
     if not np.isin(labels, ids).any():
         raise RunFolderError(f"{folder.path}: no surface of {request.objects} was found; smaller voxels may help")
     if into_folder:
         assert table is not None
-        return _write_each(out, mesh, labels, table, ids, views.origin)
-    return _write(out, mesh.part(np.isin(labels, ids)), names, views.origin)
+        return _write_each(out, mesh, labels, table, ids, views.origin) + _write_floor(place, surface, is_level)
+    part = mesh.part(np.isin(labels, ids))
+    return _write(out, part, names, views.origin, is_level) + _write_floor(place, surface, is_level)
 
 
-def _fuse(folder: RunFolder, views: _Views, voxel: float | None, observer: Observer) -> Mesh:
+def _fuse(folder: RunFolder, views: _Views, voxel: float | None, observer: Observer) -> Surface:
     settings = folder.config().volumes
     if voxel is not None:
         settings = replace(settings, tsdf=replace(settings.tsdf, voxel=voxel))
     maps = VolumeMaps(settings)
     observer.begin("fuse", views.count)
+    poses: list[np.ndarray] = []
     for done, view in enumerate(views.frames):
         maps.add(view.frame, view.T_world_camera, view.labels)
+        poses.append(view.T_world_camera)
         observer.advance(done + 1, views.count)
     maps.finish()
-    mesh = extract_mesh(maps.tsdf, min_triangles=SMALLEST_PIECE)
-    if not len(mesh.triangles):
+    surface = Surface.of(maps, poses)
+    if not len(surface.mesh.triangles):
         raise RunFolderError(f"{folder.path}: no surface was found; voxels may be too large, or depth seen too rarely")
-    return mesh
+    return surface
 
 
 # --- depth and colour ------------------------------------------------------------------------------------------------
@@ -149,12 +159,22 @@ def _renders(views: RenderedViews) -> Iterator[PosedFrame]:
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
-def _write(path: Path, mesh: Mesh, names: dict[int, str], origin: str) -> str:
+def _write(path: Path, mesh: Mesh, names: dict[int, str], origin: str, z_up: bool) -> str:
     make_folder(path.parent)
     objects = mesh.objects()
     labels = mesh.labels if objects else None
-    write_mesh(path, mesh.vertices, mesh.triangles, mesh.normals, mesh.colors, labels, names)
+    write_mesh(path, mesh.vertices, mesh.triangles, mesh.normals, mesh.colors, labels, names, z_up)
     return f"wrote {path}: {_size(mesh)}, {len(objects)} objects, from {origin}"
+
+
+def _write_floor(folder: Path, surface: Surface, is_level: bool) -> str:
+    """Where the floor is, in a file; a second line for people. Nothing, if the mesh is in the map's frame."""
+    if not is_level:
+        return ""
+    seen = surface.upright.floor is not None
+    command = write_floor_file(folder / FLOOR_FILE, surface.T_floor_map, OutputFrame.floor, seen)
+    guess = "" if seen else f" (no floor was found: z = 0 is {BELOW_CAMERAS:g} m below the lowest camera)"
+    return f"\n{folder / FLOOR_FILE}{guess}: {command}"
 
 
 def _write_each(out: Path, mesh: Mesh, labels: np.ndarray, table: ObjectTable, ids: list[int], origin: str) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.volumes.frames import FrameSource, frames_of_recording, frames_of_run
 from ggslam.jobs.volumes.live import LiveVolumes
-from ggslam.jobs.volumes.outputs import RECORD, OutputRequest, Outputs, prepare_folder, write_outputs
+from ggslam.jobs.volumes.outputs import RECORD, OutputRequest, Outputs, Surface, prepare_folder, write_outputs
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.scene.frame import Frame
@@ -23,6 +24,8 @@ from ggslam.slam.config import Config, config_to_dict, load_config
 from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
 from ggslam.volumes.maps import WINDOW, VolumeMaps
+from ggslam.volumes.occupancy import OccupancyMap
+from ggslam.volumes.output_frame import OutputFrame, output_frame
 from ggslam.volumes.tsdf_file import load_tsdf
 from ggslam.volumes.volume_settings import VolumeSettings
 
@@ -48,6 +51,7 @@ class VolumesRequest:
         onto: file of a TSDF to go on in.
         slice_height: metres above the floor of the slice through the distance field; None: as high as the camera was.
         band: lowest and highest obstacle of the ROS map, metres above the floor.
+        frame: of meshes and occupancy: "map", or "floor" (z up, 0 on the floor); see `volumes.floor_frame`.
         latency: whether it is to be known how long all maps take with a frame.
         device: of torch, for the TSDF, e.g. cuda; None: the compiled core.
         config, overrides: settings, as for a run; for volumes their part `volumes` counts.
@@ -70,6 +74,7 @@ class VolumesRequest:
     onto: Path | None = None
     slice_height: float | None = None
     band: tuple[float, float] = (0.1, 1.5)
+    frame: str = "map"
     latency: bool = False
     device: str | None = None
     config: str | None = None
@@ -144,6 +149,7 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
     config = _config(request)
     onto = None if request.onto is None else load_tsdf(request.onto)
     maps = VolumeMaps(_set_pace(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
+    source: FrameSource | None = None
     if request.live:
         fused = _live(request, maps, observer)
         out = Path(fused.name) / "volumes"
@@ -164,11 +170,13 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
             raise SequenceError(
                 f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
             )
-        outputs = write_outputs(
-            maps, out, OutputRequest(
-                request.mesh, request.object_meshes, request.slice_height, request.band, fused.names
-            ), fused.poses, _record(request, config, fused), observer,
-        )  # fmt: skip
+        surface, frame = Surface.of(maps, fused.poses), output_frame(request.frame)
+        if frame is OutputFrame.floor and source is not None:
+            _level_occupancy(maps, source, len(fused.poses), surface.T_floor_map, observer)
+        wanted = OutputRequest(
+            request.mesh, request.object_meshes, request.slice_height, request.band, fused.names, frame
+        )
+        outputs = write_outputs(maps, surface, out, wanted, _record(request, config, fused), observer)
     return _outcome(out, fused, outputs)
 
 
@@ -194,6 +202,11 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
         raise ConfigError(f"`live` tracks a recording, and {request.source} is a run: leave `live` out")
     if request.live and request.onto is not None:
         raise ConfigError("`onto` needs poses in the frame of that file: of a run or recording, not of `live`")
+    if output_frame(request.frame) is OutputFrame.floor and request.live and request.occupancy is not None:
+        raise ConfigError(
+            "`frame` floor: with `live` the floor is known after the last frame, too late for `occupancy`; make the "
+            "volumes of the run afterwards"
+        )
     if request.realtime is not None and not request.live:
         raise ConfigError("`realtime` needs `live`")
     if request.overwrite and not request.live:
@@ -257,6 +270,22 @@ def _fuse(source: FrameSource, maps: VolumeMaps, observer: Observer) -> _Fused:
     except (Exception, KeyboardInterrupt) as stopped:  # what was fused is written, then it is raised
         fused.error = stopped
     return fused
+
+
+def _level_occupancy(
+    maps: VolumeMaps, source: FrameSource, count: int, T_floor_map: np.ndarray, observer: Observer
+) -> None:
+    """Makes the occupancy map anew in the floor's frame of the first `count` frames: its voxels cannot be turned, for
+    OctoMap's lie along the axes of their frame."""
+    if maps.occupancy is None:
+        return
+    level = OccupancyMap(maps.occupancy.resolution, maps.settings.occupancy, maps.context)
+    observer.begin("occupancy on the floor", count)
+    bare = replace(source, label=None)
+    for done, posed in enumerate(islice(bare, count)):
+        level.insert_depth(posed.frame.depth, posed.frame.camera, T_floor_map @ posed.T_world_camera)
+        observer.advance(done + 1, count)
+    maps.occupancy = level
 
 
 def _live(request: VolumesRequest, maps: VolumeMaps, observer: Observer) -> _Fused:

@@ -5,9 +5,12 @@
     mesh.ply, mesh.png         the surface, with colours and object ids; the picture from where the camera was and above
     objects.png, object_*.ply  the same in colours of objects; a mesh of each of them
     esdf.png                   the distance field at one height
-    map.pgm, map.yaml          obstacles between two heights, as ROS's map_server reads them
+    map.pgm, map.yaml          obstacles between two heights, as ROS's map_server reads them, in the floor's frame
     occupancy.bt, .ot, .png    the occupancy map, as OctoMap reads it
+    floor.yaml                 where the floor's frame is in the map's
     volumes.json               where all this is from, sizes and times
+
+Meshes and the occupancy map are in the frame that is asked for, the map's or the floor's; tsdf.npz is in the map's.
 """
 
 from __future__ import annotations
@@ -34,10 +37,18 @@ from ggslam.system.foreign import is_plain_name
 from ggslam.system.json_files import write_json
 from ggslam.system.staging import finish_saving, new_staging, publish
 from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.floor_frame import (
+    BELOW_CAMERAS,
+    FLOOR_FILE,
+    floor_from_map,
+    floor_height,
+    write_floor_file,
+)
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.octomap_files import write_octomap
+from ggslam.volumes.output_frame import OutputFrame
 from ggslam.volumes.slices import FieldSlice, plane_at_height, slice_field, slice_picture, write_ros_map
 from ggslam.volumes.tsdf import SIDE
 from ggslam.volumes.tsdf_file import save_tsdf
@@ -47,7 +58,7 @@ RECORD = VolumesRecord.FILE
 """Is there if and only if a folder holds volumes."""
 _FILES = (
     "tsdf.npz", "mesh.ply", "mesh.png", "objects.png", "esdf.png", "map.pgm", "map.yaml", "occupancy.bt",
-    "occupancy.ot", "occupancy.png",
+    "occupancy.ot", "occupancy.png", FLOOR_FILE,
 )  # fmt: skip
 MOST_CELLS = 20_000_000
 """Of a slice."""
@@ -65,6 +76,7 @@ class OutputRequest:
         slice_height: metres above the floor; None: as high as the camera was.
         band: lowest and highest obstacle of the ROS map, metres above the floor.
         names: of object ids.
+        frame: of meshes and occupancy.
     """
 
     mesh: Path | None
@@ -72,6 +84,32 @@ class OutputRequest:
     slice_height: float | None
     band: tuple[float, float]
     names: dict[int, str]
+    frame: OutputFrame = OutputFrame.map
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What there is to see, and how it lies.
+
+    Attributes:
+        mesh: in the map's frame.
+        upright: which way is up, and where the floor is.
+        poses: T_map_camera [N, 4, 4] of the frames that were fused.
+        T_floor_map: float64 [4, 4], see `floor_frame`.
+    """
+
+    mesh: Mesh
+    upright: Upright
+    poses: np.ndarray
+    T_floor_map: np.ndarray
+
+    @staticmethod
+    def of(maps: VolumeMaps, poses: Sequence[np.ndarray]) -> Surface:
+        """The surface of finished maps."""
+        mesh, stacked = extract_mesh(maps.tsdf, min_triangles=SMALLEST_PIECE), np.array(poses)
+        # Marching cubes' vertices are spread evenly enough over surfaces to stand for their area.
+        upright = estimate_up(stacked, mesh.vertices, mesh.normals)
+        return Surface(mesh, upright, stacked, floor_from_map(upright, stacked))
 
 
 @dataclass
@@ -92,8 +130,9 @@ class Outputs:
 class _Writer:
     """Writes into a hidden folder, from which all files go to `out` together."""
 
-    def __init__(self, out: Path, request: OutputRequest, poses: np.ndarray) -> None:
-        self.out, self.request, self.poses = out, request, poses
+    def __init__(self, out: Path, request: OutputRequest, surface: Surface) -> None:
+        self.out, self.request, self.surface, self.poses = out, request, surface, surface.poses
+        self.T_out_map = surface.T_floor_map if request.frame is OutputFrame.floor else np.eye(4)
         self.staged = new_staging(out)
         self.outputs = Outputs()
         make_folder(self.staged)
@@ -120,22 +159,23 @@ class _Writer:
             tsdf={"blocks": len(tsdf), "dense_blocks": tsdf.dense_blocks, "memory_mb": held},
         )
 
-    def mesh(self, maps: VolumeMaps) -> Mesh:
+    def mesh(self) -> None:
         """The surface."""
-        mesh = extract_mesh(maps.tsdf, min_triangles=SMALLEST_PIECE)
+        mesh = self.surface.mesh
+        if self.request.frame is OutputFrame.floor:
+            mesh = mesh.moved(self.T_out_map)
         path = self.request.mesh or self.path("mesh.ply")
         if self.request.mesh is not None:
             self.outputs.files.append(path)
         objects = mesh.objects()
         labels = mesh.labels if objects else None
         arrays = (mesh.vertices, mesh.triangles, mesh.normals, mesh.colors)
-        write_mesh(path, *arrays, labels, self.request.names)
+        write_mesh(path, *arrays, labels, self.request.names, self.request.frame is OutputFrame.floor)
         facts = {"vertices": len(mesh.vertices), "triangles": len(mesh.triangles), "objects": objects}
         none = "" if facts["triangles"] else "; no surface was found: voxels may be too large, or depth seen too rarely"
         self.tell(f"mesh: {facts['vertices']} vertices, {facts['triangles']} triangles{none}", mesh=facts)
         if self.request.object_meshes:
             self._object_meshes(mesh, objects)
-        return mesh
 
     def _object_meshes(self, mesh: Mesh, objects: list[int]) -> None:
         labels = mesh.triangle_labels()
@@ -146,21 +186,26 @@ class _Writer:
             write_mesh(path, part.vertices, part.triangles, part.normals, part.colors, part.labels)
         self.tell(f"{len(objects)} objects have a mesh of their own: {self.out / 'object_*.ply'}")
 
-    def upright(self, mesh: Mesh) -> Upright:
+    def floor(self) -> None:
         """Which way is up, and where the floor is."""
-        # Marching cubes' vertices are spread evenly enough over surfaces to stand for their area.
-        found = estimate_up(self.poses, mesh.vertices, mesh.normals)
+        found = self.surface.upright
         floor = "no floor was found" if found.floor is None else f"the floor is at {found.floor:.2f} m along it"
         self.tell(
             f"up is ({', '.join(f'{v:.3f}' for v in found.up)}) in the world's frame, {found.support:.0%} of the "
             f"surfaces agree; {floor}", up=asdict(found)
         )  # fmt: skip
-        return found
+        frame, seen = self.request.frame, found.floor is not None
+        command = write_floor_file(self.path(FLOOR_FILE), self.surface.T_floor_map, frame, seen)
+        lying = "all ROS files are in the floor's frame"
+        if frame is OutputFrame.map:
+            lying = "mesh and occupancy are in the map's frame, map.pgm is in the floor's"
+        guess = "" if seen else f" (z = 0 is {BELOW_CAMERAS:g} m below the lowest camera)"
+        self.tell(f"{lying}{guess}: {command}", frame=frame.value, T_floor_map=self.surface.T_floor_map)
 
-    def field(self, field_: DistanceField, upright: Upright, seconds: float) -> None:
+    def field(self, field_: DistanceField, seconds: float) -> None:
         """A slice of the distance field, whose last update took `seconds`, and the ROS map."""
-        heights = self.poses[:, :3, 3] @ upright.up
-        base = upright.floor if upright.floor is not None else float(heights.min()) - 1.0
+        upright = self.surface.upright
+        heights, base = self.poses[:, :3, 3] @ upright.up, floor_height(upright, self.poses)
         wanted = self.request.slice_height
         height = float(np.median(heights)) if wanted is None else base + wanted
         cut = _slice(field_, upright.up, height, field_.voxel)
@@ -185,11 +230,12 @@ class _Writer:
                   "slice_height": height - base, "band": [low, high], "map_frame": axes},
         )  # fmt: skip
 
-    def occupancy(self, occupancy: OccupancyMap, upright: Upright) -> None:
-        """The occupancy map."""
+    def occupancy(self, occupancy: OccupancyMap) -> None:
+        """The occupancy map, which is in the frame that is asked for already."""
         for ending in (".bt", ".ot"):
             write_octomap(occupancy, self.path("occupancy" + ending))
-        write_picture(self.path("occupancy.png"), occupancy_picture(occupancy, self.poses, upright.up))
+        up = self.T_out_map[:3, :3] @ self.surface.upright.up
+        write_picture(self.path("occupancy.png"), occupancy_picture(occupancy, self.T_out_map @ self.poses, up))
         found = occupancy.summary()
         self.tell(
             f"occupancy: {found.occupied} occupied and {found.free} free voxels of {100 * occupancy.resolution:g} cm, "
@@ -213,21 +259,20 @@ def _full_scale(distances: np.ndarray) -> float:
 
 
 def write_outputs(
-    maps: VolumeMaps, out: Path, request: OutputRequest, poses: Sequence[np.ndarray], record: dict[str, Any],
-    observer: Observer,
+    maps: VolumeMaps, surface: Surface, out: Path, request: OutputRequest, record: dict[str, Any], observer: Observer
 ) -> Outputs:  # fmt: skip
     """Writes everything; when all of it is on the disk, it takes the place of earlier volumes in the folder.
 
     Args:
-        maps: what was made.
+        maps: what was made; the occupancy map in the frame that is asked for.
+        surface: of the maps.
         out: the folder, see `prepare_folder`.
         request: what is wanted.
-        poses: T_world_camera of the frames that were fused.
         record: for volumes.json, where the volumes are from.
         observer: receives progress updates.
     """
     earlier = _earlier_files(out)
-    writer = _Writer(out, request, np.array(poses))
+    writer = _Writer(out, request, surface)
     try:
         _write_all(writer, maps, record, observer)
     except BaseException:
@@ -265,18 +310,19 @@ def _write_all(writer: _Writer, maps: VolumeMaps, record: dict[str, Any], observ
     observer.begin("mesh, pictures, files", 4)
     writer.tsdf(maps)
     observer.advance(1, 4)
-    mesh = writer.mesh(maps)
-    upright = writer.upright(mesh)
+    writer.mesh()
+    writer.floor()
+    mesh, upright = writer.surface.mesh, writer.surface.upright
     if len(mesh.triangles):
         write_picture(writer.path("mesh.png"), mesh_picture(mesh, writer.poses, upright.up))
         if writer.outputs.record["mesh"]["objects"]:
             write_picture(writer.path("objects.png"), mesh_picture(mesh, writer.poses, upright.up, by_object=True))
     observer.advance(2, 4)
     if maps.field is not None:
-        writer.field(maps.field, upright, maps.times.last_update)
+        writer.field(maps.field, maps.times.last_update)
     observer.advance(3, 4)
     if maps.occupancy is not None:
-        writer.occupancy(maps.occupancy, upright)
+        writer.occupancy(maps.occupancy)
     observer.advance(4, 4)
     names = [path.name for path in writer.outputs.files if path.parent == writer.out]
     writer.outputs.record = {"complete": True, **record, **writer.outputs.record, "files": names}
