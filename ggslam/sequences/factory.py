@@ -232,11 +232,11 @@ def recognise_format(path: str | Path) -> str | None:
     place = Path(path)
     if find_rig_file(place) is not None:
         return RIG
-    found = _recognised(place) if os.path.exists(place) else None  # noqa: PTH110
+    found = _matching_format(place) if os.path.exists(place) else None  # noqa: PTH110
     return None if found is None else found.name
 
 
-def _recognised(place: Path) -> RecordingFormat | None:
+def _matching_format(place: Path) -> RecordingFormat | None:
     plain = FolderFormat()
     found = next((f for f in FORMATS if f.matches(place)), None)
     return plain if found is None and plain.lacks_camera_only(place) else found
@@ -248,7 +248,7 @@ def _find_format(folder: Path, name: str | None) -> RecordingFormat:
         if named is None:
             raise SequenceError(f"unknown format '{name}'; known: {', '.join([*(f.name for f in FORMATS), RIG])}")
         return named
-    recognised = _recognised(folder)
+    recognised = _matching_format(folder)
     if recognised is None:
         looked_for = "\n".join([*(f"  {f.name}: {f.layout}" for f in FORMATS), f"  {RIG}: {RIG_LAYOUT}"])
         if folder.is_file():

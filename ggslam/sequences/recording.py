@@ -150,7 +150,7 @@ class ReadOptions:
         Raises:
             SequenceError: of `read`; it names the arguments that would tell the camera.
         """
-        return None if self.own_camera is not None else _told(read, "`camera` or `intrinsics` tell the camera instead")
+        return None if self.own_camera is not None else _read_with_hint(read, "`camera` or `intrinsics` tell the camera instead")
 
     def recorded_scale(self, read: Callable[[], float]) -> float:
         """Units of depth images per metre: what a user tells, else what `read` finds.
@@ -160,7 +160,7 @@ class ReadOptions:
         """
         of_camera = None if self.own_camera is None else self.own_camera.depth_scale
         told = of_camera if self.depth_scale is None else self.depth_scale
-        return _told(read, "`depth_scale` tells it instead") if told is None else told
+        return _read_with_hint(read, "`depth_scale` tells it instead") if told is None else told
 
     def recorded_depth_camera(self, read: Callable[[], T]) -> T | None:
         """What `read` finds about a depth camera beside the colour camera; None where a user tells it.
@@ -168,10 +168,10 @@ class ReadOptions:
         Raises:
             SequenceError: of `read`; it names the argument that would tell the camera.
         """
-        return None if self.depth_camera is not None else _told(read, "`depth_camera` tells it instead")
+        return None if self.depth_camera is not None else _read_with_hint(read, "`depth_camera` tells it instead")
 
 
-def _told(read: Callable[[], T], instead: str) -> T:
+def _read_with_hint(read: Callable[[], T], instead: str) -> T:
     try:
         return read()
     except SequenceError as error:

@@ -59,7 +59,7 @@ class Mesh:
         number = np.cumsum(used, dtype=np.int32) - 1
         return Mesh(self.vertices[used], self.normals[used], self.colors[used], self.labels[used], number[triangles])
 
-    def moved(self, T: np.ndarray) -> Mesh:
+    def in_frame(self, T: np.ndarray) -> Mesh:
         """The mesh in another frame, T_new_old float64 [4, 4], rigid."""
         vertices = transform_points(self.vertices.astype(np.float64), T)
         normals = self.normals.astype(np.float64) @ T[:3, :3].T

@@ -86,7 +86,7 @@ def export_mesh(
         observer.note(note)
     surface = _fuse(folder, views, request.voxel, observer)
     is_level = request.frame is OutputFrame.floor
-    mesh = surface.mesh.moved(surface.T_floor_map) if is_level else surface.mesh
+    mesh = surface.mesh.in_frame(surface.T_floor_map) if is_level else surface.mesh
     names = {} if table is None else {o.id: o.name for o in table.objects if o.name}
     place = out if into_folder else out.parent
     if ids is None:

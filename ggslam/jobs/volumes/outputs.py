@@ -163,7 +163,7 @@ class _Writer:
         """The surface."""
         mesh = self.surface.mesh
         if self.request.frame is OutputFrame.floor:
-            mesh = mesh.moved(self.T_out_map)
+            mesh = mesh.in_frame(self.T_out_map)
         path = self.request.mesh or self.path("mesh.ply")
         if self.request.mesh is not None:
             self.outputs.files.append(path)

@@ -73,7 +73,7 @@ class PolycamFormat:
         if not (root / "depth").is_dir():
             raise SequenceError(f"{root / 'depth'}: folder is missing; export the raw data of a LiDAR capture")
         paths = [root / f"{prefix}cameras" / f"{color.stem}.json" for color in colors]
-        described = [_described(path, options) for path in paths]
+        described = [_read_description(path, options) for path in paths]
         cameras = options.recorded_camera(lambda: _cameras(paths, described)) or [None] * len(paths)
         files = [
             FrameFiles(color, root / "depth" / f"{color.stem}.png", None, _confidence(root, color), camera)
@@ -87,7 +87,7 @@ class PolycamFormat:
         return recording
 
 
-def _described(path: Path, options: ReadOptions) -> dict[str, Any] | None:
+def _read_description(path: Path, options: ReadOptions) -> dict[str, Any] | None:
     """A camera file; None: it is missing, and a user tells the camera, so that the frame lacks its pose alone."""
     return read_object(path) if path.is_file() else options.recorded_camera(lambda: read_object(path))
 

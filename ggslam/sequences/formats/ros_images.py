@@ -26,14 +26,14 @@ DEPTH: dict[str, Any] = {"16uc1": np.dtype(np.uint16), "mono16": np.dtype(np.uin
 """Encoding -> numbers; uint16 are millimetres, float32 metres (REP 118)."""
 
 
-def encoding_of(message: Any) -> str:
+def pixel_encoding(message: Any) -> str:
     """How an image message says that its pixels are stored."""
     return str(message.encoding if hasattr(message, "encoding") else message.format)
 
 
 def is_depth(message: Any) -> bool | None:
     """Whether an image message holds depth; None: neither depth nor colour that is known."""
-    encoding = encoding_of(message).lower()
+    encoding = pixel_encoding(message).lower()
     if hasattr(message, "encoding"):
         return True if encoding in DEPTH else False if encoding in COLOR else None
     if not any(depth in encoding for depth in (*DEPTH, "compresseddepth")):
@@ -43,7 +43,7 @@ def is_depth(message: Any) -> bool | None:
 
 def in_metres(message: Any) -> bool:
     """Whether a depth message holds metres (else millimetres)."""
-    return "32fc1" in encoding_of(message).lower()
+    return "32fc1" in pixel_encoding(message).lower()
 
 
 def color_image(place: str, message: Any) -> np.ndarray:

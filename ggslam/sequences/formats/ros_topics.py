@@ -11,7 +11,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.poses import inverse, quaternion_to_matrix
-from ggslam.sequences.formats.ros_images import COLOR, DEPTH, encoding_of, is_depth
+from ggslam.sequences.formats.ros_images import COLOR, DEPTH, pixel_encoding, is_depth
 from ggslam.sequences.formats.ros_messages import Bag
 
 ROLES = ("color", "depth", "color_info", "depth_info", "pose")
@@ -63,7 +63,7 @@ def _kind(bag: Bag, topic: str) -> tuple[bool | None, str]:
     except SequenceError:
         return None, "empty or damaged"  # none to choose
     holds_depth = is_depth(message)
-    return holds_depth, f"encoding '{encoding_of(message)}'{UNKNOWN if holds_depth is None else ''}"
+    return holds_depth, f"encoding '{pixel_encoding(message)}'{UNKNOWN if holds_depth is None else ''}"
 
 
 def _color_score(topic: str) -> float:
