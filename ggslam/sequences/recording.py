@@ -150,7 +150,9 @@ class ReadOptions:
         Raises:
             SequenceError: of `read`; it names the arguments that would tell the camera.
         """
-        return None if self.own_camera is not None else _read_with_hint(read, "`camera` or `intrinsics` tell the camera instead")
+        if self.own_camera is not None:
+            return None
+        return _read_with_hint(read, "`camera` or `intrinsics` tell the camera instead")
 
     def recorded_scale(self, read: Callable[[], float]) -> float:
         """Units of depth images per metre: what a user tells, else what `read` finds.

@@ -75,6 +75,20 @@ def test_every_storage(tmp_path: Path, storage: str) -> None:
     assert all((depth[:2] == 0).all() for depth in depths)
 
 
+@pytest.mark.parametrize("storage", [storage for storage in STORAGES if not storage.startswith("ros1")])
+def test_the_one_file_of_a_bag(tmp_path: Path, storage: str) -> None:
+    """In its folder it is the bag; alone it is, unless metadata.yaml has to tell how it is compressed."""
+    folder = write_image_bag(tmp_path, storage, color_in("rgb8"), depth_in("16UC1"))
+    (file,) = (path for path in folder.iterdir() if path.name != "metadata.yaml")
+    assert off(frames_of(file)[0], picture) == 0
+    (folder / "metadata.yaml").unlink()
+    if storage.endswith(("file", "message")):
+        with pytest.raises(SequenceError, match=f"{file.name}: .* compressed.*: open the bag's folder"):
+            open_sequence(file)
+    else:
+        assert off(frames_of(file)[0], picture) == 0
+
+
 @pytest.mark.parametrize("padding", [0, 6])
 @pytest.mark.parametrize("encoding", LOSSLESS)
 def test_colour_without_loss(tmp_path: Path, encoding: str, padding: int) -> None:

@@ -33,6 +33,8 @@ from ggslam.sequences.recording import (
 )
 
 FISHEYE = ("equidistant", "fisheye")
+STORAGES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+"""Ends of the names of files that ROS 2 stores messages in."""
 BAG_START = b"#ROSBAG V2.0"
 
 
@@ -60,11 +62,22 @@ class Ros2Format:
 
     def matches(self, path: Path) -> bool:
         if path.is_file():
-            return path.suffix.lower() in (".mcap", ".db3")
-        return (path / "metadata.yaml").is_file() and (any(path.glob("*.db3*")) or any(path.glob("*.mcap*")))
+            return _is_storage(path)
+        return (path / "metadata.yaml").is_file() and any(map(_is_storage, path.iterdir()))
 
     def read(self, path: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
-        return _read(self.name, path, Bag(path), options)
+        return _read(self.name, path, Bag(_whole_bag(path)), options)
+
+
+def _is_storage(path: Path) -> bool:
+    return path.name.lower().endswith(STORAGES)
+
+
+def _whole_bag(path: Path) -> Path:
+    """The folder of a bag whose only file this is, for metadata.yaml tells how it is compressed; else the path."""
+    if not path.is_file() or not (path.parent / "metadata.yaml").is_file():
+        return path
+    return path.parent if sum(map(_is_storage, path.parent.iterdir())) == 1 else path
 
 
 def _read(name: str, path: Path, bag: Bag, options: ReadOptions) -> Recording:

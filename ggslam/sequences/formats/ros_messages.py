@@ -14,6 +14,9 @@ import numpy as np
 
 from ggslam.errors import GgslamError, MissingDependency, SequenceError
 
+ZSTD_START = b"\x28\xb5\x2f\xfd"
+"""First bytes of what zstd compressed."""
+
 
 class Bag:
     """A bag, open for as long as this object lives. May be used from several threads.
@@ -30,6 +33,8 @@ class Bag:
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
             raise MissingDependency(f"reading ROS bags needs rosbags: pip install 'ggslam[ros]' ({error})") from None
+        if path.suffix.lower() == ".zstd":
+            raise SequenceError(f"{path}: a compressed file of a bag cannot be read alone: open the bag's folder")
         self.path = path
         self._lock = threading.RLock()
         self._cursors: dict[str, tuple[int, Iterator[Any]]] = {}
@@ -40,7 +45,18 @@ class Bag:
             self._reader.open()
         except Exception as error:  # the package raises many types for files that are no whole bag
             raise SequenceError(f"{path}: not a whole bag (truncated, or not indexed?): {_text(error)}") from None
+        if path.is_file() and self._reader.is2:
+            self._check_uncompressed()
         self.types = {c.topic: c.msgtype.replace("/msg/", "/") for c in self._reader.connections}
+
+    def _check_uncompressed(self) -> None:
+        """Of one file of a bag nothing tells that each message is compressed."""
+        with _told(str(self.path)):
+            first = next(iter(self._reader.messages()), None)
+        if first is not None and bytes(first[2][:4]) == ZSTD_START:
+            raise SequenceError(
+                f"{self.path}: its messages are compressed, which metadata.yaml has to tell: open the bag's folder"
+            )
 
     def stamps(self, topic: str) -> np.ndarray:
         """Times in the headers of a topic's messages, float64 [n], seconds, in the order of the bag.

@@ -11,7 +11,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.poses import inverse, quaternion_to_matrix
-from ggslam.sequences.formats.ros_images import COLOR, DEPTH, pixel_encoding, is_depth
+from ggslam.sequences.formats.ros_images import COLOR, DEPTH, is_depth, pixel_encoding
 from ggslam.sequences.formats.ros_messages import Bag
 
 ROLES = ("color", "depth", "color_info", "depth_info", "pose")
