@@ -51,8 +51,9 @@ def floor_from_map(upright: Upright, poses: np.ndarray) -> np.ndarray:
 
 def static_transform(T_map_floor: np.ndarray) -> str:
     """The command that publishes a floor [4, 4] in ROS 2, as a frame `floor` below a frame `map`."""
-    words = " ".join(f"--{name} {value}" for name, value in _numbers(T_map_floor).items())
-    return f"ros2 run tf2_ros static_transform_publisher {words} --frame-id map --child-frame-id floor"
+    options = {**_numbers(T_map_floor), "frame-id": "map", "child-frame-id": "floor"}
+    words = " ".join(f"--{name} {value}" for name, value in options.items())
+    return f"ros2 run tf2_ros static_transform_publisher {words}"
 
 
 def _numbers(T: np.ndarray) -> dict[str, str]:
