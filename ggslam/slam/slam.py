@@ -205,6 +205,7 @@ class Slam:
         asked, before = self.config.refine_iterations, self.mapper.times.iterations - self.refine_iterations
         return asked if asked >= 0 else self.mapper.last_iterations(before)
 
+    @opencv_errors("after the last frame")
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refinement_steps`), then the result. `progress(done, total)` is called now and then."""
         start, before = time.perf_counter() - self.times.refinement, self.mapper.times.iterations

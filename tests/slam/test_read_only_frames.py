@@ -67,6 +67,10 @@ def test_what_opencv_refuses(room: Path, monkeypatch: pytest.MonkeyPatch, tmp_pa
         done = ggslam("run", room, "--stop", 3, "--out", tmp_path / "run")
         assert done.returncode == 1 and done.stderr.startswith(f"error: frame 0: {reason}")
     with monkeypatch.context() as patch:
+        patch.setattr("ggslam.slam.color_poses.ColorPoses.align_last", refuse)
+        done = ggslam("run", room, "--stop", 3, "--iterations", 1, "--refine", 0, "--out", tmp_path / "end")
+        assert done.returncode == 1 and done.stderr.startswith(f"error: after the last frame: {reason}")
+    with monkeypatch.context() as patch:
         patch.setattr("ggslam.sequences.inspection.inspect_sequence", refuse)
         done = ggslam("inspect", room)
         assert done.returncode == 1 and "this is a fault of ggslam" in done.stderr

@@ -23,6 +23,7 @@ from ggslam.scene.frame import Frame
 from ggslam.slam.config import Config, config_to_dict, load_config
 from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
+from ggslam.system.opencv import opencv_errors
 from ggslam.volumes.maps import WINDOW, VolumeMaps
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.output_frame import OutputFrame, output_frame
@@ -136,6 +137,7 @@ class _Fused:
         return (float(np.percentile(whole, 95)) if len(whole) else 0.0) + wait
 
 
+@opencv_errors("volumes")
 def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> VolumesOutcome:
     """Makes volumes of a run or a recording. If it stops in the middle (damaged frame, interrupt), what was fused is
     written all the same and the outcome carries the error.
