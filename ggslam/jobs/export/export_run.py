@@ -89,8 +89,9 @@ def export_run(
     place = Path(out)
     if movers:
         _refuse_beside_movers(
-            place, format, voxel, objects, plain, discs, keyframes, recording, rendered, zoom, min_opacity, frame != "map"
-        )
+            place, format, voxel, objects, plain, discs, keyframes, recording, rendered, zoom, min_opacity,
+            frame != "map",
+        )  # fmt: skip
         return export_movers(run if isinstance(run, RunFolder) else RunFolder.open(Path(run)), place)
     kind = choose_format(None if format is None else _format_named(format), place, objects)
     wanted = output_frame(frame)
