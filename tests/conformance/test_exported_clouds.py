@@ -97,7 +97,7 @@ def test_points_lie_on_what_was_seen_and_carry_its_objects(
     assert set(ids) <= {0, *room_run.object_table().ids()}
 
 
-def test_metres_are_the_origin_and_whole_cells(points: Path) -> None:
+def test_metres_are_in_the_cells_of_the_grid(points: Path) -> None:
     metric, colors, ids = own_cloud(points / "points.ply")
     grid, same_colors, same_ids = own_cloud(points / "points_grid.ply")
     np.testing.assert_array_equal(grid, np.rint(grid))
@@ -105,7 +105,8 @@ def test_metres_are_the_origin_and_whole_cells(points: Path) -> None:
     words = dict(line.split(maxsplit=1) for line in ply_comments(points / "points_grid.ply"))
     origin, size = np.array(words["origin"].split(), float), float(words["voxel_size"])
     assert size == VOXEL
-    np.testing.assert_allclose(metric, origin + size * grid, atol=1e-6)
+    within = (metric - origin) / size - grid
+    assert np.abs(within).max() < 0.5 and within.std() > 0.1  # where the surface is in a cell, not the cell's middle
     np.testing.assert_array_equal(colors, same_colors)
     np.testing.assert_array_equal(ids, same_ids)
 

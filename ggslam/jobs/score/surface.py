@@ -10,6 +10,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.evaluation.surface import SurfaceScores, score_surface
 from ggslam.formats.point_ply import METRIC_FILE, read_points
+from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points
@@ -31,27 +32,34 @@ class SurfaceScorer:
 
     Args:
         folder: of the run.
+        cloud: score this one instead of the run's.
     """
 
-    def __init__(self, folder: RunFolder) -> None:
+    def __init__(self, folder: RunFolder, cloud: VoxelCloud | None = None) -> None:
         self.reason = ""
         """Why there are no scores, or why they are of a part."""
         self._tsdf: TsdfMap | None = None
-        path = folder.path / METRIC_FILE
-        if not path.is_file():
-            self.reason = f"there is no {METRIC_FILE}; its points are not scored"
-            return
-        if folder.map_in_parts().in_cells:
-            self.reason = f"memory was limited; {METRIC_FILE} is not scored"
-            return
-        try:
-            cloud = read_points(path)
-        except FormatError as error:
-            self.reason = f"its points are not scored: {error}"
+        cloud = self._cloud_of(folder) if cloud is None else cloud
+        if cloud is None or not len(cloud):
             return
         self._points, self._voxel = cloud.points, cloud.voxel_size
         self._measured = np.zeros(len(self._points), bool)
-        self._tsdf = TsdfMap(TsdfSettings(voxel=self._voxel, max_depth=_FARTHEST)) if len(cloud) else None
+        self._tsdf = TsdfMap(TsdfSettings(voxel=self._voxel, max_depth=_FARTHEST))
+
+    def _cloud_of(self, folder: RunFolder) -> VoxelCloud | None:
+        """The points of a run; None, and a reason, where they are not scored."""
+        path = folder.path / METRIC_FILE
+        if not path.is_file():
+            self.reason = f"there is no {METRIC_FILE}; its points are not scored"
+            return None
+        if folder.map_in_parts().in_cells:
+            self.reason = f"memory was limited; {METRIC_FILE} is not scored"
+            return None
+        try:
+            return read_points(path)
+        except FormatError as error:
+            self.reason = f"its points are not scored: {error}"
+            return None
 
     def add(self, frame: Frame, T_world_camera: np.ndarray) -> None:
         """Counts a frame in."""
@@ -68,13 +76,17 @@ class SurfaceScorer:
 
     def scores(self) -> dict[str, Any] | None:
         """For metrics.json; None if nothing was measured."""
+        found = self.surface_scores()
+        return None if found is None else _row(found, float(self._measured.mean()))
+
+    def surface_scores(self) -> SurfaceScores | None:
+        """Of the points whose depth was measured; None if that are none."""
         if self._tsdf is None or not self._measured.any():
             return None
         mesh = extract_mesh(self._tsdf)
         if not len(mesh.vertices):
             return None
-        found = score_surface(self._points[self._measured], mesh.vertices, mesh.normals, self._voxel)
-        return _row(found, float(self._measured.mean()))
+        return score_surface(self._points[self._measured], mesh.vertices, mesh.normals, self._voxel)
 
 
 def _row(found: SurfaceScores, measured: float) -> dict[str, Any]:
