@@ -12,9 +12,10 @@ import torch
 
 from ggslam.errors import FormatError
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.harmonics import harmonic_rotations
 
-_ODD_IN_Y_AND_Z = (1, 2, 4, 7, 9, 11, 12, 14)
-"""Spherical harmonics, in the order of 3DGS, that change sign when y and z do."""
+UPRIGHT = np.diag([1.0, -1.0, -1.0])
+"""Rotation from x right, y down, z forward to y up, z backwards; its own inverse."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,9 @@ class SplatColumns:
         return SplatColumns(*(getattr(self, f.name)[rows] for f in fields(SplatColumns)))
 
     def turn_upright(self) -> None:
-        """Turns everything by 180 degrees about x: from x right, y down, z forward to y up, z backwards."""
+        """Turns everything by 180 degrees about x: from x right, y down, z forward to y up, z backwards, or back."""
         self.means[:, 1:] *= -1
         self.quaternions[:, 2:] *= -1  # D R D with D = diag(1, -1, -1): the same ellipsoid as D R
-        self.sh[:, [index for index in _ODD_IN_Y_AND_Z if index < self.sh.shape[1]]] *= -1
+        if self.sh.shape[1] > 1:
+            signs = np.diag(harmonic_rotations(UPRIGHT, self.sh.shape[1]))  # it is diagonal, of 1 and -1
+            self.sh[:] *= signs.astype(np.float32)[:, None]

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.harmonics import harmonic_rotations
 from ggslam.scene.poses import matrix_to_quaternion
 
 _BLOCK = 1 << 16
@@ -16,9 +17,9 @@ _BLOCK = 1 << 16
 def move_with_keyframes(gaussians: GaussianMap, T_new_old: np.ndarray) -> None:
     """Moves Gaussians after their keyframes were corrected.
 
-    Means and rotations move rigidly. Adam's first moments, which are averages of gradients, turn along; of the second
-    moments, averages of squared gradients, the diagonal is turned as if the components were uncorrelated. Colours keep
-    their coefficients: exact for degree 0, for higher degrees only as long as the rotation is small.
+    Means and rotations move rigidly, and colours that depend on the viewing direction turn along. So do Adam's first
+    moments, which are averages of gradients; of the second moments, averages of squared gradients, the diagonal is
+    turned as if the components were uncorrelated.
 
     Args:
         gaussians: the map. Gaussians of unknown birth (-1) stay where they are.
@@ -29,6 +30,7 @@ def move_with_keyframes(gaussians: GaussianMap, T_new_old: np.ndarray) -> None:
     t = torch.as_tensor(T_new_old[:, :3, 3], dtype=torch.float32).to(gaussians.device)
     quaternions = torch.as_tensor(np.stack([matrix_to_quaternion(r) for r in T_new_old[:, :3, :3]]))
     turn = left_multiplication(quaternions).to(gaussians.device)
+    harmonics = _harmonic_turns(T_new_old, gaussians)
     moved = torch.as_tensor(np.abs(T_new_old - np.eye(4)).max((1, 2)) > 0).to(gaussians.device)
     rows = torch.nonzero((birth >= 0) & moved[birth.clamp(min=0)], as_tuple=True)[0]
     for block in rows.split(_BLOCK):
@@ -40,7 +42,26 @@ def move_with_keyframes(gaussians: GaussianMap, T_new_old: np.ndarray) -> None:
                 first, second = gaussians.moments[name]
                 first[block] = _times(matrices, first[block])
                 second[block] = _times(matrices**2, second[block])
+        if harmonics is not None:
+            _turn_colors(gaussians, block, harmonics[own])
     gaussians.version += 1
+
+
+def _harmonic_turns(T_new_old: np.ndarray, gaussians: GaussianMap) -> torch.Tensor | None:
+    """Matrices float32 [K, C, C] for the C colour coefficients of each keyframe's Gaussians; None: there is but one."""
+    count = gaussians.sh.shape[1]
+    if count == 1:
+        return None
+    return torch.from_numpy(harmonic_rotations(T_new_old[:, :3, :3], count).astype(np.float32)).to(gaussians.device)
+
+
+def _turn_colors(gaussians: GaussianMap, rows: torch.Tensor, turns: torch.Tensor) -> None:
+    """Turns the coefficients of rows [M], and their moments, by a matrix each, [M, C, C]."""
+    gaussians.sh[rows] = turns @ gaussians.sh[rows]
+    if gaussians.with_moments:
+        first, second = gaussians.moments["sh"]
+        first[rows] = turns @ first[rows]
+        second[rows] = turns**2 @ second[rows]
 
 
 def left_multiplication(q: torch.Tensor) -> torch.Tensor:

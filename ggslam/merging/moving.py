@@ -7,11 +7,7 @@ import numpy as np
 import torch
 
 from ggslam.mapping.deformation import move_with_keyframes
-from ggslam.rendering.reference import spherical_harmonics
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import orthonormalize
-
-_DIRECTIONS = 200
 
 
 def move_map(gaussians: GaussianMap, T_new_old: np.ndarray) -> None:
@@ -26,27 +22,6 @@ def move_map(gaussians: GaussianMap, T_new_old: np.ndarray) -> None:
     gaussians.birth_keyframe[unknown] = 0
     move_with_keyframes(gaussians, T_new_old)
     gaussians.birth_keyframe[unknown] = -1
-    if gaussians.sh_degree > 0:
-        turn_colors(gaussians, mean_rotation(T_new_old))
-
-
-def mean_rotation(T_new_old: np.ndarray) -> np.ndarray:
-    """The rotation [3, 3] nearest to all of them."""
-    mean = np.eye(4)
-    mean[:3, :3] = T_new_old[:, :3, :3].mean(0)
-    return orthonormalize(mean)[:3, :3]
-
-
-def turn_colors(gaussians: GaussianMap, R_new_old: np.ndarray) -> None:
-    """Turns what colours depend on, the direction of view, with the map; exact up to rounding."""
-    count = gaussians.sh.shape[1]
-    directions = torch.nn.functional.normalize(
-        torch.from_numpy(np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))), dim=1
-    )
-    turned = directions @ torch.from_numpy(R_new_old).T
-    before, after = spherical_harmonics(directions, count), spherical_harmonics(turned, count)
-    matrix = torch.linalg.lstsq(after, before).solution.to(gaussians.sh)  # [count, count]
-    gaussians.sh[:] = torch.einsum("kl,nlc->nkc", matrix, gaussians.sh)
 
 
 def with_channels(gaussians: GaussianMap, sh_degree: int, feature_channels: int) -> GaussianMap:

@@ -25,13 +25,13 @@ This file is the contract; the other backends are tested against it.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
 
 from ggslam.rendering.types import LOW_PASS, Gaussians, RenderBuffers, active_coefficients, check_gaussians
 from ggslam.scene.camera import Camera
+from ggslam.scene.harmonics import spherical_harmonics
 
 MIN_ALPHA = 1.0 / 255.0
 MAX_ALPHA = 0.999
@@ -192,31 +192,3 @@ def view_colours(sh: torch.Tensor, means: torch.Tensor, T_camera_world: torch.Te
     centre = -T_camera_world[:3, :3].T @ T_camera_world[:3, 3]
     basis = spherical_harmonics(torch.nn.functional.normalize(means - centre, dim=-1), sh.shape[1])
     return _CutAtBlack.apply(0.5 + (basis[:, :, None] * sh).sum(1))
-
-
-def spherical_harmonics(directions: torch.Tensor, count: int) -> torch.Tensor:
-    """Real spherical harmonics [N, count] of unit directions [N, 3], count = 1, 4, 9 or 16, in the order and with the
-    signs of 3D Gaussian Splatting."""
-    x, y, z = directions.unbind(-1)
-    pi = math.pi
-    basis = [torch.full_like(x, math.sqrt(1 / (4 * pi)))]
-    if count >= 4:
-        c = math.sqrt(3 / (4 * pi))
-        basis += [-c * y, c * z, -c * x]
-    if count >= 9:
-        c = math.sqrt(15 / (4 * pi))
-        zonal = math.sqrt(5 / (16 * pi)) * (2 * z * z - x * x - y * y)
-        basis += [c * x * y, -c * y * z, zonal, -c * x * z, c / 2 * (x * x - y * y)]
-    if count >= 16:
-        a, b = math.sqrt(35 / (32 * pi)), math.sqrt(105 / (4 * pi))
-        c, d = math.sqrt(21 / (32 * pi)), math.sqrt(7 / (16 * pi))
-        basis += [
-            -a * y * (3 * x * x - y * y),
-            b * x * y * z,
-            -c * y * (4 * z * z - x * x - y * y),
-            d * z * (2 * z * z - 3 * x * x - 3 * y * y),
-            -c * x * (4 * z * z - x * x - y * y),
-            b / 2 * z * (x * x - y * y),
-            -a * x * (x * x - 3 * y * y),
-        ]
-    return torch.stack(basis, -1)

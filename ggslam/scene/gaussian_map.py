@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import InputError
+from ggslam.scene.harmonics import harmonic_rotations
 
 SH_C0 = 0.28209479177387814
 """Zeroth spherical-harmonic constant: colour = 0.5 + SH_C0 * sh[0] for degree 0."""
@@ -288,14 +289,16 @@ class GaussianMap:
         self.order += 1
 
     def move(self, rows: torch.Tensor, T_new_old: torch.Tensor) -> None:
-        """Moves Gaussians rigidly: means and rotations of `rows` (bool [N] or int64 [M]) by `T_new_old` [4, 4].
+        """Moves Gaussians of `rows` (bool [N] or int64 [M]) rigidly by `T_new_old` [4, 4]: means and rotations.
 
-        Only the degree-0 part of the colour is independent of the viewing direction; higher degrees are left as they
-        are, which is exact for translations.
+        Colours that depend on the viewing direction turn along.
         """
         T = T_new_old.to(self.means)
         self.means[rows] = self.means[rows] @ T[:3, :3].T + T[:3, 3]
         self.quaternions[rows] = _multiply(_quaternion(T[:3, :3]), self.quaternions[rows])
+        if self.sh_degree > 0:
+            turn = harmonic_rotations(T_new_old[:3, :3].double().cpu().numpy(), self.sh.shape[1])
+            self.sh[rows] = torch.einsum("kl,nlc->nkc", torch.from_numpy(turn).to(self.sh), self.sh[rows])
         self.version += 1
 
 

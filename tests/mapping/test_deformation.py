@@ -12,6 +12,7 @@ from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.pruning import prune
 from ggslam.mapping.settings import PruningSettings
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.harmonics import spherical_harmonics
 from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix, se3_exp
 
 
@@ -44,6 +45,26 @@ def test_each_gaussian_moves_with_its_birth() -> None:
     first, second = (m[third] for m in gaussians.moments["means"])
     np.testing.assert_allclose(first[0].numpy(), [0, 1, 0], atol=1e-6)
     np.testing.assert_allclose(second[0].numpy(), [0, 4, 0], atol=1e-6)
+
+
+def test_colours_turn_with_the_keyframe_of_each_gaussian() -> None:
+    """Every Gaussian by its own rotation: seen along the turned direction, each looks as before; moments likewise."""
+    gaussians = GaussianMap(sh_degree=3)
+    for birth in (-1, 0, 1):
+        sheet(1.0 + birth, birth, gaussians, spacing=0.2)
+    gaussians.sh[:] = 0.3 * torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(0))
+    gaussians.moments["sh"][0][:] = gaussians.sh
+    before = gaussians.sh.clone()
+    T = np.stack([se3_exp(np.array([0.1, 0, 0, 0.4, -0.2, 0.9])), se3_exp(np.array([0, 0, 0.2, -1.5, 0.3, 0.2]))])
+    move_with_keyframes(gaussians, T)
+    directions = torch.nn.functional.normalize(torch.randn((50, 3), generator=torch.Generator().manual_seed(1)), dim=1)
+    basis = spherical_harmonics(directions, 16)
+    for birth, R in ((-1, np.eye(3)), (0, T[0, :3, :3]), (1, T[1, :3, :3])):
+        own = gaussians.birth_keyframe == birth
+        turned = spherical_harmonics(directions @ torch.from_numpy(R).float().T, 16)
+        expected = torch.einsum("dk,nkc->dnc", basis, before[own])
+        for found in (gaussians.sh[own], gaussians.moments["sh"][0][own]):
+            assert float((torch.einsum("dk,nkc->dnc", turned, found) - expected).abs().max()) < 2e-6
 
 
 def test_the_gradient_of_a_rotation_turns_along() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.merging.moving import append_map, move_map, turn_colors, with_channels
+from ggslam.merging.moving import append_map, move_map, with_channels
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -41,15 +41,6 @@ def test_a_moved_map_looks_the_same_from_a_moved_camera(degree: int) -> None:
     move_map(gaussians, np.stack([T_NEW_OLD, T_NEW_OLD]))
     assert np.abs(picture(gaussians, T_NEW_OLD) - before).max() < 2e-3
     assert (gaussians.birth_keyframe.numpy()[:3] == [-1, 0, 1]).all()
-
-
-def test_colours_that_were_not_turned_would_look_different() -> None:
-    gaussians = some_map(2)
-    before = picture(gaussians, np.eye(4))
-    gaussians.move(torch.ones(len(gaussians), dtype=torch.bool), torch.from_numpy(T_NEW_OLD))
-    assert np.abs(picture(gaussians, T_NEW_OLD) - before).max() > 0.02
-    turn_colors(gaussians, T_NEW_OLD[:3, :3])
-    assert np.abs(picture(gaussians, T_NEW_OLD) - before).max() < 2e-3
 
 
 def test_each_keyframe_takes_its_own_gaussians_along() -> None:
