@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ggslam.errors import FormatError
 from ggslam.formats.gaussian_ply import gaussians_of_vertices
@@ -32,17 +33,24 @@ class GaussianRows:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self._rows: PlyRows | None = None
-        self._vertex: np.ndarray | None = None
-        try:
-            self._rows = PlyRows(self.path, "vertex")
-        except FormatError:  # or its reason is told now
-            self._vertex = read_ply(self.path).elements.get("vertex")
+        self._open(Path(path))
         self.like = gaussians_of_vertices(path, self._raw(0, 0), with_moments=False)
         """A map without Gaussians that has the channels of those here."""
 
+    def _open(self, path: Path) -> None:
+        self.path = path
+        self._rows: PlyRows | None = None
+        self._vertex: np.ndarray | None = None
+        try:
+            self._rows = PlyRows(path, "vertex")
+        except FormatError:  # or its reason is told now
+            self._vertex = read_ply(path).elements.get("vertex")
+
     def __len__(self) -> int:
+        return self._stored()
+
+    def _stored(self) -> int:
+        """Rows of the file."""
         if self._rows is not None:
             return self._rows.count
         return 0 if self._vertex is None else len(self._vertex)
@@ -68,3 +76,27 @@ class GaussianRows:
         if self._rows is not None:
             return self._rows.read(start, count)
         return None if self._vertex is None else self._vertex[start : start + count]
+
+
+class GaussiansInMemory(GaussianRows):
+    """A map that is in memory, as if it were a file.
+
+    Args:
+        path: of the file that it came from.
+        gaussians: the map.
+    """
+
+    def __init__(self, path: str | Path, gaussians: GaussianMap) -> None:
+        self.path, self._gaussians = Path(path), gaussians
+        self.like = GaussianMap(gaussians.sh_degree, gaussians.feature_channels, with_moments=False)
+
+    def __len__(self) -> int:
+        return len(self._gaussians)
+
+    def read(self, start: int, count: int) -> GaussianMap:
+        """Copies of the Gaussians of rows start to start + count."""
+        like = self.like
+        out = GaussianMap(like.sh_degree, like.feature_channels, with_moments=False)
+        out.growth = 0.0
+        out.append(self._gaussians.take(torch.arange(start, start + count)))
+        return out

@@ -31,14 +31,15 @@ _REACH = 3.0
 """Standard deviations that the extent of the prim is to hold."""
 
 
-def usd_package(path: str | Path) -> ModuleType:
-    """The module pxr of usd-core; raises MissingDependency if it is not installed, or too old to know the schema."""
-    pxr = package_for(path, "pxr", "usd", "usd-core")
-    schemas = package_for(path, "pxr.UsdVol", "usd", "usd-core")
+def usd_package(path: str | Path, verb: str = "write") -> ModuleType:
+    """The module pxr of usd-core, to read or write a file; raises MissingDependency if it is not installed, or too old to
+    know the schema."""
+    pxr = package_for(path, "pxr", "usd", "usd-core", verb=verb)
+    schemas = package_for(path, "pxr.UsdVol", "usd", "usd-core", verb=verb)
     if not hasattr(schemas, "ParticleField3DGaussianSplat"):
-        raise MissingDependency(f"to write {path} usd-core 26.3 or later is needed: `pip install -U 'ggslam[usd]'`")
-    for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdUtils", "Vt"):
-        package_for(path, f"pxr.{name}", "usd", "usd-core")
+        raise MissingDependency(f"to {verb} {path} usd-core 26.3 or later is needed: `pip install -U 'ggslam[usd]'`")
+    for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdUtils", "Vt"):
+        package_for(path, f"pxr.{name}", "usd", "usd-core", verb=verb)
     return pxr
 
 

@@ -13,9 +13,13 @@ import torch
 from ggslam.errors import FormatError
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.harmonics import harmonic_rotations
+from ggslam.scene.poses import left_multiplication, matrix_to_quaternion
 
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 """Rotation from x right, y down, z forward to y up, z backwards; its own inverse."""
+
+
+_STRETCH = 1e-3
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,36 @@ class SplatColumns:
         """Turns everything by 180 degrees about x: from x right, y down, z forward to y up, z backwards, or back."""
         self.means[:, 1:] *= -1
         self.quaternions[:, 2:] *= -1  # D R D with D = diag(1, -1, -1): the same ellipsoid as D R
+        self._turn_colors(UPRIGHT)
+
+    def move(self, R: np.ndarray, t: np.ndarray, scale: float = 1.0) -> None:
+        """Moves everything, in place: positions become scale R x + t.
+
+        Args:
+            R: rotation [3, 3].
+            t: [3] metres.
+            scale: above 0.
+        """
+        self.means[:] = scale * (self.means.astype(np.float64) @ R.T) + t
+        self.log_scales[:] += np.float32(np.log(scale))
+        turn = left_multiplication(matrix_to_quaternion(R))
+        self.quaternions[:] = self.quaternions.astype(np.float64) @ turn.T
+        self._turn_colors(R)
+
+    def move_by(self, T: np.ndarray) -> None:
+        """`move` by a matrix [4, 4]; raises ValueError for one that mirrors, shears or stretches."""
+        if np.array_equal(T, np.eye(4)):
+            return
+        size = float(np.linalg.det(T[:3, :3]))
+        if not (np.isfinite(T).all() and size > 0):
+            raise ValueError("Gaussians are mirrored or flattened, which is not read")
+        scale = float(np.cbrt(size))
+        R = T[:3, :3] / scale
+        if np.abs(R @ R.T - np.eye(3)).max() > _STRETCH:
+            raise ValueError("Gaussians are stretched along one axis, which is not read")
+        self.move(R, T[:3, 3], scale)
+
+    def _turn_colors(self, R: np.ndarray) -> None:
         if self.sh.shape[1] > 1:
-            signs = np.diag(harmonic_rotations(UPRIGHT, self.sh.shape[1]))  # it is diagonal, of 1 and -1
-            self.sh[:] *= signs.astype(np.float32)[:, None]
+            turn = harmonic_rotations(R, self.sh.shape[1])
+            self.sh[:] = np.einsum("kl,nlc->nkc", turn, self.sh.astype(np.float64))

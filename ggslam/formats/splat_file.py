@@ -14,8 +14,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.errors import FormatError
+from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
+from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.system.atomic import atomic_write
+from ggslam.system.foreign import read_foreign
 
 SPLAT_ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 """One Gaussian as it is stored."""
@@ -53,6 +57,22 @@ def splat_rows(gaussians: GaussianMap) -> np.ndarray:
     rows["rgba"] = _bytes(255 * rgba)
     rows["rotation"] = _bytes(128 + 128 * unit)
     return rows
+
+
+def read_splat(path: Path) -> SplatColumns:
+    """The Gaussians of a file.
+
+    Raises:
+        FormatError: it is missing, empty, or no whole number of Gaussians long.
+    """
+    data = read_foreign(path)
+    if not data or len(data) % SPLAT_ROW.itemsize:
+        raise FormatError(f"{path}: {len(data)} bytes are no whole number of Gaussians of {SPLAT_ROW.itemsize} bytes")
+    rows = np.frombuffer(data, SPLAT_ROW)
+    rgba = rows["rgba"] / 255
+    sh = ((rgba[:, None, :3] - 0.5) / SH_C0).astype(np.float32)
+    quaternions = (rows["rotation"].astype(np.float32) - 128) / 128
+    return columns_of(rows["position"], logarithms_of(rows["scale"]), quaternions, logits_of(rgba[:, 3]), sh)
 
 
 def _bytes(values: torch.Tensor) -> np.ndarray:

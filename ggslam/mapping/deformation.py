@@ -8,7 +8,7 @@ import torch
 
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.harmonics import harmonic_rotations
-from ggslam.scene.poses import matrix_to_quaternion
+from ggslam.scene.poses import left_multiplication, matrix_to_quaternion
 
 _BLOCK = 1 << 16
 """Gaussians moved at a time, so that the temporaries of a large map stay small."""
@@ -28,8 +28,8 @@ def move_with_keyframes(gaussians: GaussianMap, T_new_old: np.ndarray) -> None:
     birth = gaussians.birth_keyframe.long()
     R = torch.as_tensor(T_new_old[:, :3, :3], dtype=torch.float32).to(gaussians.device)
     t = torch.as_tensor(T_new_old[:, :3, 3], dtype=torch.float32).to(gaussians.device)
-    quaternions = torch.as_tensor(np.stack([matrix_to_quaternion(r) for r in T_new_old[:, :3, :3]]))
-    turn = left_multiplication(quaternions).to(gaussians.device)
+    quaternions = np.stack([matrix_to_quaternion(r) for r in T_new_old[:, :3, :3]])
+    turn = torch.from_numpy(left_multiplication(quaternions).astype(np.float32)).to(gaussians.device)
     harmonics = _harmonic_turns(T_new_old, gaussians)
     moved = torch.as_tensor(np.abs(T_new_old - np.eye(4)).max((1, 2)) > 0).to(gaussians.device)
     rows = torch.nonzero((birth >= 0) & moved[birth.clamp(min=0)], as_tuple=True)[0]
@@ -62,13 +62,6 @@ def _turn_colors(gaussians: GaussianMap, rows: torch.Tensor, turns: torch.Tensor
         first, second = gaussians.moments["sh"]
         first[rows] = turns @ first[rows]
         second[rows] = turns**2 @ second[rows]
-
-
-def left_multiplication(q: torch.Tensor) -> torch.Tensor:
-    """Matrices float32 [K, 4, 4] whose product with a quaternion wxyz is the Hamilton product of q [K, 4] with it."""
-    w, x, y, z = q.to(torch.float32).unbind(-1)
-    rows = [(w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w)]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def _times(matrices: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:

@@ -47,6 +47,13 @@ def se3_exp(twist: np.ndarray) -> np.ndarray:
     ])  # fmt: skip
 
 
+def left_multiplication(quaternions: np.ndarray) -> np.ndarray:
+    """Matrices [..., 4, 4] whose product with a quaternion wxyz is the Hamilton product of these [..., 4] with it."""
+    w, x, y, z = np.moveaxis(np.asarray(quaternions, np.float64), -1, 0)
+    rows = [(w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w)]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
 def so3_log(R: np.ndarray) -> np.ndarray:
     """Rotation vector [3] in radians of a rotation matrix [3, 3], angle in [0, pi]."""
     q = matrix_to_quaternion(R)

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,9 +32,15 @@ def splat_transform_command() -> list[str]:
 
 
 def by_splat_transform(path: Path, folder: Path) -> Splats:
-    """By way of a 3DGS PLY, into which it copies what stands in the file, axes as they are."""
-    source = [path / "lod-meta.json", "-L", "0"] if path.is_dir() else [path]
-    convert(splat_transform_command(), *source, folder / "seen.ply")
+    """By way of a 3DGS PLY, into which it copies what stands in the file, axes as they are. From version 2 on it turns
+    SPZ, which has to be turned back."""
+    command = splat_transform_command()
+    source: list[str | Path] = [path / "lod-meta.json", "-L", "0"] if path.is_dir() else [path]
+    said = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60)
+    version = re.search(r"v(\d+)\.", said.stdout + said.stderr)
+    if path.suffix == ".spz" and version is not None and int(version[1]) >= 2:
+        source += ["-r", "180,0,0"]
+    convert(command, *source, folder / "seen.ply")
     return from_ply(folder / "seen.ply")
 
 

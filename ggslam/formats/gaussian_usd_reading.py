@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads Gaussians of OpenUSD, prims of the schema ParticleField3DGaussianSplat, by the package usd-core; `gaussian_usd`
+writes them. Every such prim is taken, moved as those above it say, with the stage's up axis and metres per unit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ggslam.errors import FormatError
+from ggslam.formats.gaussian_usd import usd_package
+from ggslam.formats.splat_columns import UPRIGHT, SplatColumns
+from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
+from ggslam.system.foreign import open_foreign
+
+_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Rotation from x right, z up, y forward to x right, y down, z forward."""
+
+
+def read_gaussian_usd(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
+    """The Gaussians of a file, y down and z forward, and the names of objects by id (None: there are no ids).
+
+    Raises:
+        FormatError: it is damaged, or holds no Gaussians.
+        MissingDependency: usd-core is not installed or too old.
+    """
+    open_foreign(path).close()
+    pxr = usd_package(path, "read")
+    try:
+        stage = pxr.Usd.Stage.Open(str(path))
+        prims = [p for p in stage.Traverse() if p.IsA(pxr.UsdVol.ParticleField3DGaussianSplat)]
+        R = _Z_UP if pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z else UPRIGHT
+        metres, parts, names = float(pxr.UsdGeom.GetStageMetersPerUnit(stage)), [], dict[int, str]()
+        with_ids = False
+        for prim in prims:
+            columns, own = _columns(pxr, prim)
+            _place(pxr, prim, columns)
+            columns.move(R, np.zeros(3), metres)
+            parts.append(columns)
+            names |= {int(k): str(v) for k, v in (prim.GetCustomDataByKey("objects") or {}).items()}
+            with_ids |= own
+        if not parts:
+            raise ValueError("it holds no prim ParticleField3DGaussianSplat")
+        return SplatColumns.join(parts), names if with_ids else None
+    except (ValueError, TypeError, RuntimeError, KeyError, pxr.Tf.ErrorException) as error:
+        reason = str(error).strip().splitlines()
+        raise FormatError(f"{path}: not an OpenUSD file that can be read: {reason[-1] if reason else error}") from None
+
+
+def _columns(pxr: ModuleType, prim: Any) -> tuple[SplatColumns, bool]:
+    """The Gaussians of a prim in its own axes, and whether they have object ids."""
+
+    def of(*names: str) -> np.ndarray | None:
+        for name in names:
+            value = prim.GetAttribute(name).Get(pxr.Usd.TimeCode.EarliestTime()) if prim.HasAttribute(name) else None
+            if value is not None and len(value):
+                return np.array(value, np.float64)
+        return None
+
+    def needed(*names: str) -> np.ndarray:
+        value = of(*names)
+        if value is None:
+            raise ValueError(f"{prim.GetPath()} has no {names[0]}")
+        return value
+
+    means = needed("positions", "positionsh")
+    count = len(means)
+    turns = [prim.GetAttribute(name).Get(pxr.Usd.TimeCode.EarliestTime()) for name in ("orientations", "orientationsh")]
+    found = next((value for value in turns if value is not None and len(value)), None)
+    quaternions = np.tile([1.0, 0, 0, 0], (count, 1))
+    if found is not None:  # in memory the real part comes last
+        quaternions = np.roll(np.array(found, np.float64).reshape(-1, 4), 1, axis=1)
+    scales, opacities = needed("scales", "scalesh"), needed("opacities", "opacitiesh")
+    radiance = of("radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsCoefficientsh")
+    sh = np.zeros((count, 1, 3)) if radiance is None else radiance.reshape(count, -1, 3)
+    coefficients = {k: k for k in (1, 4, 9, 16)}.get(sh.shape[1], 16 if sh.shape[1] > 16 else 0)
+    ids = of("primvars:object_id")
+    lengths = {len(scales), len(quaternions), len(opacities), count, *([] if ids is None else [len(ids)])}
+    if not coefficients or len(lengths) != 1:
+        raise ValueError(f"{prim.GetPath()}: its attributes are not all of the same Gaussians")
+    columns = columns_of(
+        means, logarithms_of(scales), quaternions, logits_of(opacities), sh[:, :coefficients], ids
+    )
+    return columns, ids is not None
+
+
+def _place(pxr: ModuleType, prim: Any, columns: SplatColumns) -> None:
+    """Moves Gaussians as the prims above them say; ValueError for what mirrors or stretches them."""
+    matrix = pxr.UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(pxr.Usd.TimeCode.EarliestTime())
+    columns.move_by(np.array(matrix, np.float64).T)
