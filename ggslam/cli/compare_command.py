@@ -45,7 +45,11 @@ class AlignmentName(str, Enum):
     trajectory = "trajectory"
 
 
-SidePath = Annotated[Path, typer.Argument(metavar="A", help="Folder of a run, or PLY or PCD file: a cloud or a mesh.")]
+SidePath = Annotated[
+    Path,
+    typer.Argument(metavar="A", help="Folder of a run, PLY or PCD file with a cloud or mesh, or file of Gaussians "
+                   "(.sog, .spz, ...)."),
+]  # fmt: skip
 ReferencePath = Annotated[Path, typer.Argument(metavar="B", help="The reference: a run, cloud or mesh likewise.")]
 
 

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 EPILOG = """
 Objects are named by id or name, several separated by commas. Edits are done in the order given: a later one sees
-what an earlier one did. Distances are metres along the axes of the first camera: x right, y down, z forward.
+what an earlier one did. A file of Gaussians without object ids is moved as a whole: all.
+Distances are metres along the axes of the first camera: x right, y down, z forward.
 
 [bold]Examples[/]
 
@@ -29,6 +30,8 @@ what an earlier one did. Distances are metres along the axes of the first camera
   ggslam edit runs/kitchen --move chair "0.3 0 0.1" --rotate "0 90 0" --inpaint --out runs/kitchen_moved
 
   ggslam edit runs/kitchen --merge 4 9 --rename 4 table --recolor table "#3060c0" --in-place
+
+  ggslam edit statue.sog --move all "0 0 1" --rotate "0 90 0" --out statue.spz
 """
 VALUES = {"remove": 1, "keep": 1, "move": 2, "duplicate": 2, "recolor": 2, "merge": 2, "rename": 2, "rotate": 1}
 """Edits and how many values follow each; the second of --duplicate may be left out."""
@@ -72,7 +75,7 @@ class EditCommand(TyperCommand):
 
 def edit(
     ctx: typer.Context,
-    run: options.RunPath,
+    run: options.MapPath,
     remove: Annotated[str | None, _edit_option("OBJECTS", "Remove objects.")] = None,
     keep: Annotated[str | None, _edit_option("OBJECTS", "Keep these objects and remove everything else.")] = None,
     move: Annotated[str | None, _edit_option('OBJECTS "DX DY DZ"', "Move objects by so many metres.")] = None,
@@ -91,27 +94,34 @@ def edit(
     inpaint: Annotated[
         bool, typer.Option("--inpaint", help="Close the holes that removed and moved objects leave.")
     ] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder for the edited run; default: RUN-edited.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the edited run; default: RUN-edited. Of a file of Gaussians the file to write, "
+                     "whose name says the format."),
+    ] = None,
     in_place: Annotated[bool, typer.Option("--in-place", help="Change the run itself.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already at --out.")] = False,
     sequence: options.MovedSequence = None,
-) -> None:
+) -> None:  # fmt: skip
     """Edit a run's map: remove, keep, move, duplicate, recolour, merge and rename objects."""
     from ggslam.jobs.edit.edits import edit_run
-    from ggslam.runs.folder import RunFolder
+    from ggslam.runs.map_file import open_map
 
     edits = _edits(ctx.meta[_EDITS])
     if in_place and out is not None:
         raise ConfigError("--in-place and --out contradict each other")
     outcome = edit_run(
-        RunFolder.open(run), edits, out, in_place=in_place, overwrite=overwrite, inpainting=inpaint, sequence=sequence
+        open_map(run), edits, out, in_place=in_place, overwrite=overwrite, inpainting=inpaint, sequence=sequence
     )
     lines = list(outcome.changes)
     if outcome.filling is not None:
         added = f"inpainted: {outcome.filling.added} Gaussians added, " if outcome.inpainted else ""
         lines.append(f"{added}{outcome.filling.dropped} Gaussians dropped that were traces of what left its place")
     lines += [f"note: {note}" for note in outcome.notes]
-    lines.append(f"wrote {outcome.folder.path}, {len(outcome.pictures)} pictures of before and after in renders/")
+    if outcome.folder.path.is_dir():
+        lines.append(f"wrote {outcome.folder.path}, {len(outcome.pictures)} pictures of before and after in renders/")
+    else:
+        lines.append(f"wrote {outcome.folder.path}")
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 

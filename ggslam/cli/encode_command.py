@@ -71,7 +71,8 @@ Slicing = Annotated[
 ]
 Source = Annotated[
     Path,
-    typer.Argument(metavar="INPUT", help="PLY, 3DGS PLY or PCD file, folder that `ggslam run` wrote, or grid store."),
+    typer.Argument(metavar="INPUT", help="PLY or PCD file, file of Gaussians (3DGS .ply, .sog, .spz, ...), folder that "
+                   "`ggslam run` wrote, or grid store."),
 ]
 Out = Annotated[
     Path,

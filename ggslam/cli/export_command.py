@@ -26,6 +26,8 @@ EPILOG = """
 
   ggslam export runs/kitchen --out kitchen.usdz
 
+  ggslam export statue.sog --out statue.spz
+
   ggslam export kitchen.grid --format streamed-sog --out kitchen_web/
 
   ggslam export runs/kitchen --objects mug,7 --out objects/
@@ -107,8 +109,9 @@ Zoom = Annotated[
 
 SourcePath = Annotated[
     Path,
-    typer.Argument(metavar="RUN", help="Folder that `ggslam run` wrote; for streamed-sog also a grid store that "
-                   "`ggslam submaps` wrote."),
+    typer.Argument(metavar="MAP", help="Folder that `ggslam run` wrote; file of Gaussians (3DGS or compressed .ply, "
+                   ".sog or meta.json, .spz, .splat, .glb, .usda .usdc .usdz, .ggz); for streamed-sog also a grid "
+                   "store that `ggslam submaps` wrote."),
 ]  # fmt: skip
 
 

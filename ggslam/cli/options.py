@@ -29,6 +29,11 @@ LivePath = Annotated[
         "where the recording is now, if it was moved.",
     ),
 ]
+MapPath = Annotated[
+    Path,
+    typer.Argument(metavar="MAP", help="Folder that `ggslam run` wrote, or file of Gaussians: 3DGS or compressed .ply, "
+                   ".sog or meta.json, .spz, .splat, .glb, .usda .usdc .usdz, .ggz, or G-PCC .bin."),
+]  # fmt: skip
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `ggslam run` wrote.")]
 Start = Annotated[int, typer.Option("--start", help="First frame to use.", min=0)]
 Stop = Annotated[int | None, typer.Option(help="Stop before this frame.", min=1)]

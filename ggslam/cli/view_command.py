@@ -25,11 +25,13 @@ EPILOG = """
   ggslam view runs/kitchen --html kitchen.html
 
   ggslam view runs/monday --changes changes
+
+  ggslam view statue.spz
 """
 
 
 def view(
-    run: options.RunPath,
+    run: options.MapPath,
     host: options.Host = "127.0.0.1",
     port: options.Port = 8080,
     page: Annotated[
@@ -46,10 +48,10 @@ def view(
 ) -> None:
     """Look at a run in the browser: map, camera, frames; select, name, move, delete and export objects."""
     from ggslam.jobs.view.serve import serve_run, wait_for_interrupt, write_page
-    from ggslam.runs.folder import RunFolder
+    from ggslam.runs.map_file import open_map
     from ggslam.viewer.server import address, close_server
 
-    folder = RunFolder.open(run)
+    folder = open_map(run)
     if page is not None:
         if changes is not None:
             raise ConfigError("--changes: the page of --html does not show changes; ggslam report does")

@@ -20,7 +20,7 @@ from ggslam.errors import FormatError
 from ggslam.formats.gaussian_ply import object_ids
 from ggslam.formats.gaussian_rows import BLOCK, GaussianRows
 from ggslam.formats.splat_columns import SplatColumns
-from ggslam.formats.splat_repair import SplatFaults, columns_of, logits_of, map_of_columns, mend
+from ggslam.formats.splat_repair import THINNER, SplatFaults, columns_of, logits_of, map_of_columns, mend
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 
 _BYTES = ("red", "green", "blue")
@@ -63,7 +63,7 @@ class SplatLayout:
         if missing:
             raise FormatError(f"{path} holds no Gaussians: the properties {missing} of 'vertex' are missing")
         base = next((group for group in (_BASE, _BYTES) if set(group) <= set(names)), ())
-        rest, identities = _numbered(path, names, "f_rest_"), _numbered(path, names, "identity_")
+        rest, identities = _in_order(path, names, "f_rest_"), _in_order(path, names, "identity_")
         if len(rest) % 3:
             raise FormatError(f"{path}: {len(rest)} properties f_rest_*, expected as many for each of three colours")
         scales = ("scale_0", "scale_1", "scale_2")[: 3 if "scale_2" in names else 2]
@@ -85,7 +85,7 @@ class SplatLayout:
         """What the user should know of it."""
         out = []
         if len(self.scales) == 2:
-            out.append("2D Gaussians (no scale_2): read as flat ones")
+            out.append("2D Gaussians (no scale_2): read as discs, a thousandth of their width thick")
         if self.has_filter:
             out.append("filter_3D of Mip-Splatting is applied to sizes and opacities")
         if not self.base:
@@ -100,25 +100,25 @@ class SplatLayout:
 
     def columns(self, path: Path, vertex: np.ndarray, first: int) -> SplatColumns:
         """What some rows say, of which the first has the number `first` in the file."""
-        sizes = _stacked(vertex, self.scales)
+        sizes = _stack(vertex, self.scales)
         if len(self.scales) == 2:
-            sizes = np.column_stack([sizes, np.full(len(vertex), -np.inf, np.float32)])
+            sizes = np.column_stack([sizes, sizes.max(1) - THINNER])
         logits = vertex["opacity"].astype(np.float32)
         if self.has_filter:
-            sizes, logits = smoothed(sizes, logits, vertex[_FILTER].astype(np.float64))
+            sizes, logits = apply_filter(sizes, logits, vertex[_FILTER].astype(np.float64))
         sh = np.zeros((len(vertex), 1 + self.coefficients, 3), np.float32)
         sh[:, 0] = self._base_colors(vertex)
         for channel in range(3):
             start = channel * self.channel
-            sh[:, 1:, channel] = _stacked(vertex, self.rest[start : start + self.coefficients])
+            sh[:, 1:, channel] = _stack(vertex, self.rest[start : start + self.coefficients])
         ids = object_ids(path, vertex, first) if self.has_ids else None
-        quaternions = _stacked(vertex, ("rot_0", "rot_1", "rot_2", "rot_3"))
-        return columns_of(_stacked(vertex, ("x", "y", "z")), sizes, quaternions, logits, sh, ids)
+        quaternions = _stack(vertex, ("rot_0", "rot_1", "rot_2", "rot_3"))
+        return columns_of(_stack(vertex, ("x", "y", "z")), sizes, quaternions, logits, sh, ids)
 
     def _base_colors(self, vertex: np.ndarray) -> np.ndarray:
         if not self.base:
             return np.zeros((len(vertex), 3), np.float32)
-        values = _stacked(vertex, self.base)
+        values = _stack(vertex, self.base)
         if self.base == _BASE:
             return values
         whole = vertex.dtype["red"].kind in "iu"
@@ -126,10 +126,10 @@ class SplatLayout:
 
     def features(self, vertex: np.ndarray) -> np.ndarray | None:
         """float32 [N, F]: identity vectors of ggslam; numbers that are none become 0."""
-        return np.nan_to_num(_stacked(vertex, self.identities), posinf=0, neginf=0) if self.identities else None
+        return np.nan_to_num(_stack(vertex, self.identities), posinf=0, neginf=0) if self.identities else None
 
 
-def smoothed(
+def apply_filter(
     log_scales: np.ndarray, logits: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gaussians convolved with a round one that takes nothing from or adds to their mass.
@@ -170,14 +170,14 @@ class ForeignGaussianRows(GaussianRows):
         self._open(Path(path))
         self._layout = SplatLayout.of(self.path, self._raw(0, 0))
         self._faults, bad = SplatFaults(), [np.empty(0, np.int64)]
-        for start in range(0, self._stored(), BLOCK):
-            columns = self._columns(start, min(BLOCK, self._stored() - start))
+        for start in range(0, self._row_count(), BLOCK):
+            columns = self._columns(start, min(BLOCK, self._row_count() - start))
             bad.append(start + np.flatnonzero(~mend(columns, self._faults)))
         self._bad = np.concatenate(bad)
         self.like = self._map(0, 0)
 
     def __len__(self) -> int:
-        return self._stored() - len(self._bad)
+        return self._row_count() - len(self._bad)
 
     def read(self, start: int, count: int) -> GaussianMap:
         """The Gaussians of rows start to start + count, without optimizer state.
@@ -218,7 +218,7 @@ class ForeignGaussianRows(GaussianRows):
         return map_of_columns(columns.take(keep), None if features is None else features[keep])
 
 
-def _numbered(path: Path, names: Sequence[str], prefix: str) -> tuple[str, ...]:
+def _in_order(path: Path, names: Sequence[str], prefix: str) -> tuple[str, ...]:
     """The properties prefix0, prefix1, ... in numerical order; raises FormatError if one is missing between."""
     found = [name for name in names if name.startswith(prefix)]
     expected = tuple(f"{prefix}{i}" for i in range(len(found)))
@@ -227,7 +227,7 @@ def _numbered(path: Path, names: Sequence[str], prefix: str) -> tuple[str, ...]:
     return expected
 
 
-def _stacked(vertex: np.ndarray, names: Sequence[str]) -> np.ndarray:
+def _stack(vertex: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """float32 [N, len(names)]."""
     out = np.empty((len(vertex), len(names)), np.float32)
     with np.errstate(over="ignore"):

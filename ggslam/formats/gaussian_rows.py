@@ -47,9 +47,9 @@ class GaussianRows:
             self._vertex = read_ply(path).elements.get("vertex")
 
     def __len__(self) -> int:
-        return self._stored()
+        return self._row_count()
 
-    def _stored(self) -> int:
+    def _row_count(self) -> int:
         """Rows of the file."""
         if self._rows is not None:
             return self._rows.count

@@ -32,8 +32,8 @@ _REACH = 3.0
 
 
 def usd_package(path: str | Path, verb: str = "write") -> ModuleType:
-    """The module pxr of usd-core, to read or write a file; raises MissingDependency if it is not installed, or too old to
-    know the schema."""
+    """The module pxr of usd-core, to read or write a file; raises MissingDependency if it is not installed, or too old
+    to know the schema."""
     pxr = package_for(path, "pxr", "usd", "usd-core", verb=verb)
     schemas = package_for(path, "pxr.UsdVol", "usd", "usd-core", verb=verb)
     if not hasattr(schemas, "ParticleField3DGaussianSplat"):

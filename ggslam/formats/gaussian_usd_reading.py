@@ -60,20 +60,20 @@ def _columns(pxr: ModuleType, prim: Any) -> tuple[SplatColumns, bool]:
                 return np.array(value, np.float64)
         return None
 
-    def needed(*names: str) -> np.ndarray:
+    def require(*names: str) -> np.ndarray:
         value = of(*names)
         if value is None:
             raise ValueError(f"{prim.GetPath()} has no {names[0]}")
         return value
 
-    means = needed("positions", "positionsh")
+    means = require("positions", "positionsh")
     count = len(means)
     turns = [prim.GetAttribute(name).Get(pxr.Usd.TimeCode.EarliestTime()) for name in ("orientations", "orientationsh")]
     found = next((value for value in turns if value is not None and len(value)), None)
     quaternions = np.tile([1.0, 0, 0, 0], (count, 1))
     if found is not None:  # in memory the real part comes last
         quaternions = np.roll(np.array(found, np.float64).reshape(-1, 4), 1, axis=1)
-    scales, opacities = needed("scales", "scalesh"), needed("opacities", "opacitiesh")
+    scales, opacities = require("scales", "scalesh"), require("opacities", "opacitiesh")
     radiance = of("radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsCoefficientsh")
     sh = np.zeros((count, 1, 3)) if radiance is None else radiance.reshape(count, -1, 3)
     coefficients = {k: k for k in (1, 4, 9, 16)}.get(sh.shape[1], 16 if sh.shape[1] > 16 else 0)

@@ -64,7 +64,7 @@ class SplatFormat:
 def _in_memory(name: str, read: Callable[[Path], SplatColumns | tuple[SplatColumns, Names | None]]) -> SplatFormat:
     """A format that is read as a whole; `is_of` is set by the table."""
 
-    def opened(path: Path) -> SplatFile:
+    def open_file(path: Path) -> SplatFile:
         found = read(path)
         columns, names = (found, None) if isinstance(found, SplatColumns) else found
         faults = SplatFaults()
@@ -72,7 +72,7 @@ def _in_memory(name: str, read: Callable[[Path], SplatColumns | tuple[SplatColum
         gaussians = map_of_columns(columns if keep.all() else columns.take(keep.nonzero()[0]))
         return SplatFile(name, GaussiansInMemory(path, gaussians), names, faults.notes())
 
-    return SplatFormat(name, lambda path, head: False, opened)
+    return SplatFormat(name, lambda path, head: False, open_file)
 
 
 def _rows_of_ply(path: Path) -> SplatFile:

@@ -13,7 +13,8 @@ from ggslam.scene.gaussian_map import GaussianMap
 
 LARGEST_LOGIT = 13.8
 """Of an opacity of 0.999999: infinite logits, of what is wholly opaque or transparent, become this or its opposite."""
-_THINNER = np.float32(np.log(1000.0))
+THINNER = np.float32(np.log(1000.0))
+"""Logarithm of how many times thinner than wide a flat Gaussian is."""
 _LEAST_LOG_SCALE = np.float32(-20.0)
 _LEAST_NORM = 1e-6
 _POSITION, _SIZE, _TURN = "position is no number", "size is infinite or zero", "quaternion is zero or no number"
@@ -77,7 +78,7 @@ def _flatten(columns: SplatColumns, flat: np.ndarray, faults: SplatFaults) -> No
     _count(faults.bounded, _FLAT, flat)
     sizes = columns.log_scales[flat]
     widest = np.where(np.isneginf(sizes), -np.inf, sizes).max(1, initial=-np.inf)
-    columns.log_scales[flat] = np.maximum(sizes, np.maximum(widest - _THINNER, _LEAST_LOG_SCALE)[:, None])
+    columns.log_scales[flat] = np.maximum(sizes, np.maximum(widest - THINNER, _LEAST_LOG_SCALE)[:, None])
 
 
 def _count(counter: Counter[str], name: str, rows: np.ndarray) -> None:

@@ -86,12 +86,12 @@ def _unpack_frames(path: Path, data: bytes) -> tuple[int, int, int, int, list[by
         frame = data[start : start + packed]
         if size != width * count or len(frame) < packed:
             raise ValueError(f"attribute {number} has {size} bytes, expected {width * count}")
-        streams.append(_expanded(decoder, frame, size))
+        streams.append(_expand(decoder, frame, size))
         start += packed
     return version, count, degree, fraction, streams + [b""] * (6 - len(streams))
 
 
-def _expanded(decoder: object, frame: bytes, size: int) -> bytes:
+def _expand(decoder: object, frame: bytes, size: int) -> bytes:
     """A zstd frame of so many bytes; more are not made."""
     with decoder.stream_reader(frame) as reader:  # type: ignore[attr-defined]
         out = bytearray()

@@ -70,7 +70,15 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
+        self.has_poses = True
+        """Whether cameras saw the map from the poses of `keyframes`; False: they were made up, around it."""
+        self.has_recording = True
+        """Whether there was a recording that may still be there."""
         self._made_here = False
+
+    def output(self, name: str) -> Path:
+        """Where files that a command makes of the run go, if it is not told."""
+        return self.path / name
 
     @staticmethod
     def create(path: Path, overwrite: bool = False) -> RunFolder:
@@ -298,6 +306,14 @@ class RunFolder:
             raise RunFolderError(f"{self.path}: this run has no objects: it learned none, its map is not segmented")
         return ObjectTable.load(self.path / "objects.json")
 
+    def classifier(self) -> IdentityClassifier:
+        """What turns identity vectors into objects.
+
+        Raises:
+            FormatError: the file is missing or damaged.
+        """
+        return IdentityClassifier.from_file(self.path / "classifier.npz")
+
     def segmented_map(self) -> SegmentedMap:
         """The map with its objects, without optimizer state.
 
@@ -305,8 +321,7 @@ class RunFolder:
             RunFolderError: the run has no objects, or its files do not belong together.
             FormatError: a file is missing or damaged.
         """
-        table, gaussians = self.object_table(), self.gaussians()
-        classifier = IdentityClassifier.from_file(self.path / "classifier.npz")
+        table, gaussians, classifier = self.object_table(), self.gaussians(), self.classifier()
         self.check_objects(table, classifier, gaussians, set(np.unique(gaussians.object_id.numpy()).tolist()))
         votes = self.votes()
         if votes is not None:
@@ -356,4 +371,7 @@ def _why_no_run(path: Path) -> str:
         return "is not a run of ggslam (no run.json)"
     if not path.is_file():
         return "no such folder"
-    return "is a file, and a run is a folder" + ("; `ggslam decode` makes one of it" if path.suffix == ".ggz" else "")
+    if path.suffix in (".ggz", ".ggc"):
+        return "is a file, and a run is a folder; `ggslam decode` makes one of it"
+    taken = "view, render, export, edit, encode and compare take files of Gaussians"
+    return f"is a file, and a run is a folder ({taken})"

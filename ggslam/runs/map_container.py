@@ -37,6 +37,7 @@ from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.merging.moving import with_channels
 from ggslam.objects.encoding import code_of
+from ggslam.objects.table import ObjectTable
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import publish_run
 from ggslam.runs.records.container import CONTAINER_FORMAT, CONTAINER_VERSION, ContainerRecord
@@ -177,6 +178,30 @@ def read_container(path: Path, out: Path, overwrite: bool = False, threads: int 
         folder.discard()
         raise
     return RunFolder.open(out)
+
+
+def read_contained_map(path: Path) -> tuple[GaussianMap, dict[int, str] | None, KeyframesRecord, SequenceRecord]:
+    """The map in a container, without making a run of it: Gaussians, names of objects by id (None: there are no
+    objects), and the records of the run's keyframes and recording.
+
+    Raises:
+        FormatError: it is none, damaged, or of a later version.
+    """
+    with open_foreign(path) as file:
+        members = _read_members(path, file)
+    try:
+        cloud = decode_cloud(members[_MAP], None)
+        if not is_splat_cloud(cloud):
+            raise FormatError(f"{_MAP}: holds no map")
+        with tempfile.TemporaryDirectory() as name:
+            for member in {KeyframesRecord.FILE, SequenceRecord.FILE, _TABLE} & set(members):
+                write_bytes(Path(name) / member, members[member])
+            keyframes, sequence = KeyframesRecord.read(Path(name)), SequenceRecord.read(Path(name))
+            table = ObjectTable.load(Path(name) / _TABLE) if _TABLE in members else None
+    except (FormatError, RunFolderError, ConfigError) as error:
+        raise FormatError(f"{path}: {error}") from None
+    names = None if table is None else {record.id: record.name or "" for record in table.objects}
+    return gaussians_of(cloud), names, keyframes, sequence
 
 
 def _read_members(path: Path, file: Any) -> dict[str, bytes]:

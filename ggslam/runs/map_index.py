@@ -91,7 +91,7 @@ class MapInParts:
     """A map on disk, of which what a view needs is read.
 
     Args:
-        ply: the file of the map.
+        ply: the file of the map, or its rows.
         index: where its cells are; None: the whole map is one cell, which every view needs.
         cache_bytes: of cells that were read, in addition to those of the last view, as many are kept.
 
@@ -99,8 +99,10 @@ class MapInParts:
         FormatError: they do not fit together.
     """
 
-    def __init__(self, ply: Path, index: MapIndex | None, cache_bytes: int = CACHE_BYTES) -> None:
-        self.rows = GaussianRows(ply)
+    def __init__(
+        self, ply: Path | GaussianRows, index: MapIndex | None, cache_bytes: int = CACHE_BYTES
+    ) -> None:
+        self.rows = ply if isinstance(ply, GaussianRows) else GaussianRows(ply)
         """For going through all of the map."""
         self.in_cells = index is not None
         if index is not None:
@@ -108,7 +110,8 @@ class MapInParts:
         """Whether there is an index."""
         self.index = MapIndex.of_whole(len(self.rows)) if index is None else index
         if len(self.rows) != int(self.index.counts.sum()):
-            raise FormatError(f"{ply}: has {len(self.rows)} Gaussians, {MAP_INDEX} beside it speaks of others")
+            found = f"has {len(self.rows)} Gaussians, {MAP_INDEX} beside it speaks of others"
+            raise FormatError(f"{self.rows.path}: {found}")
         self._cached: OrderedDict[int, GaussianMap] = OrderedDict()
         self._room = cache_bytes // max(1, self.rows.like.bytes_per_gaussian)
         self._shown: tuple[int, ...] | None = None

@@ -43,7 +43,7 @@ class ObjectsInParts:
             FormatError: a file is missing or damaged.
         """
         table, parts = folder.object_table(), folder.map_in_parts()
-        classifier = IdentityClassifier.from_file(folder.path / "classifier.npz")
+        classifier = folder.classifier()
         counts: Counter[int] = Counter()
         for block in parts.rows.blocks():
             ids, found = np.unique(block.object_id.numpy(), return_counts=True)

@@ -27,6 +27,8 @@ from ggslam.errors import ConfigError, FormatError
 from ggslam.formats.gaussian_ply import write_gaussian_parts
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_point_cloud
+from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.splat_formats import open_splats, read_splats, splat_format
 from ggslam.jobs.code.attributes import attributes_to_code, restored_attributes
 from ggslam.runs.folder import RunFolder
 from ggslam.system.atomic import make_folder, write_bytes
@@ -68,7 +70,8 @@ def encode_file(
     """Codes a cloud or a Gaussian map.
 
     Args:
-        source: a PLY or PCD file, or a run folder: its points.ply (pointcloud) or map.ply (splat).
+        source: a PLY or PCD file, a file of Gaussians (see `formats.splat_formats`), or a run folder: its points.ply
+            (pointcloud) or map.ply (splat).
         out: the stream to write.
         settings: every choice of the codec; the preset adds what is coded and how.
         preset: "pointcloud": positions, colours, reflectance, and ids lossless; "splat": whole Gaussians of a 3DGS PLY.
@@ -85,7 +88,7 @@ def encode_file(
     _refuse_itself(path, out)
     try:
         if preset == "splat":
-            report = _encode_splats(path, out, settings, rate, ids, notes)
+            report = _encode_splats(path, out, settings, rate, ids, notes, own=source.is_dir())
         else:
             report = _encode_points(path, out, settings, ids, notes)
     except (ConfigError, FormatError) as error:
@@ -94,7 +97,7 @@ def encode_file(
 
 
 def _encode_points(path: Path, out: Path, settings: CodecSettings, ids: bool, notes: list[str]) -> CodingReport:
-    cloud = read_point_cloud(path)
+    cloud = read_point_cloud(path) if splat_format(path) is None or path.suffix.lower() == ".ply" else _points_of(path)
     points, settings = coded_points(cloud, settings)
     coded = attributes_to_code(cloud, ids)
     notes += coded.notes
@@ -106,11 +109,24 @@ def _encode_points(path: Path, out: Path, settings: CodecSettings, ids: bool, no
     return encoded.report
 
 
+def _points_of(path: Path) -> ColoredCloud:
+    """The points of Gaussians, sampled as a run's are."""
+    sampled = sample_points(read_splats(path))
+    if not len(sampled):
+        raise FormatError(f"{path}: its Gaussians are too faint for points; `preset` splat codes them whole")
+    return ColoredCloud(sampled.points.astype(np.float64), sampled.colors)
+
+
 def _encode_splats(
-    path: Path, out: Path, settings: CodecSettings, rate: str, ids: bool, notes: list[str]
+    path: Path, out: Path, settings: CodecSettings, rate: str, ids: bool, notes: list[str], own: bool
 ) -> CodingReport:
-    """Codes a 3DGS PLY that need not fit into memory."""
-    rows = GaussianRows(path)
+    """Codes Gaussians; those of a 3DGS PLY need not fit into memory. `own`: they are a run's, of which none is bad."""
+    if own:
+        rows = GaussianRows(path)
+    else:
+        opened = open_splats(path)
+        rows = opened.rows
+        notes += opened.notes
     if not len(rows):
         raise FormatError(f"{path}: no Gaussians")
     step, with_ids, sample = max(1, len(rows) // _SAMPLED), False, []

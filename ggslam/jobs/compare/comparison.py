@@ -14,6 +14,7 @@ from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.evaluation.geometry import THRESHOLDS_M, CloudScores, score_cloud
 from ggslam.evaluation.trajectory import TrajectoryScores, score_trajectory
 from ggslam.formats.point_cloud import read_point_cloud
+from ggslam.formats.splat_formats import splat_format
 from ggslam.formats.trajectory import read_tum
 from ggslam.formats.triangle_mesh import read_mesh
 from ggslam.geometry.clouds import Cloud, Overlap, overlap
@@ -27,7 +28,9 @@ from ggslam.jobs.compare.alignment import (
     check_registration,
     common_poses,
 )
-from ggslam.runs.folder import RunFolder
+from ggslam.runs.folder import MARKER, RunFolder
+from ggslam.runs.map_container import is_container
+from ggslam.runs.map_file import open_map
 from ggslam.runs.map_points import map_points
 from ggslam.runs.writing import TRUTH_FILE
 from ggslam.scene.poses import inverse
@@ -142,12 +145,19 @@ def compare(
 
 
 def read_side(path: Path, seed: int = 0) -> Side:
-    """Reads a run's folder, or a PLY or PCD file.
+    """Reads a run's folder, a PLY or PCD file, or points of a file of Gaussians, as a run's points are sampled.
 
     Raises:
         RunFolderError: a folder that is no run, or whose map has no points.
         FormatError: a file that cannot be read or has no points.
     """
+    if (path / MARKER).is_file():
+        return _read_run(path)
+    if splat_format(path) is not None or is_container(path):
+        points = sample_points(open_map(path).gaussians()).points
+        if not len(points):
+            raise FormatError(f"{path}: its Gaussians are too faint for points to compare")
+        return Side(path, np.asarray(points, np.float64))
     if path.is_dir():
         return _read_run(path)
     try:

@@ -7,11 +7,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.jobs.edit.edit import KINDS, Edit
+from ggslam.jobs.edit.edited_file import edit_file
 from ggslam.jobs.edit.edited_run import save_edited
 from ggslam.jobs.edit.pictures import before_and_after
 from ggslam.mapping.keyframe import ELSEWHERE
@@ -36,31 +37,12 @@ from ggslam.objects.segmented_rows import join_gaussians
 from ggslam.objects.table import ObjectTable
 from ggslam.objects.traces import drop_traces, places
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.map_file import MapFile, open_map
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.system.interrupts import delay_interrupts
-
-KINDS = ("remove", "keep", "move", "duplicate", "recolor", "merge", "rename")
-
-
-@dataclass(frozen=True)
-class Edit:
-    """One edit, as people write it.
-
-    Attributes:
-        kind: one of `KINDS`.
-        objects: names or ids, e.g. "mug,7"; of merge the object that stays; of rename exactly one.
-        value: what `kind` needs: "dx dy dz" in metres (move, duplicate; of the latter also "", just beside), a colour
-            (recolor), the object that is merged into the other (merge), the new name (rename); else "".
-        rotation: of move, "rx ry rz" in degrees, or "".
-    """
-
-    kind: Literal["remove", "keep", "move", "duplicate", "recolor", "merge", "rename"]
-    objects: str
-    value: str = ""
-    rotation: str = ""
 
 
 @dataclass
@@ -68,7 +50,7 @@ class EditOutcome:
     """What came of it.
 
     Attributes:
-        folder: the edited run.
+        folder: the edited run, or the file that stands for it.
         changes: the edits as sentences.
         filling: what happened to the places that removed and moved objects left; None if none did.
         inpainted: whether they were to be closed; if not, only traces were dropped.
@@ -98,7 +80,8 @@ def edit_run(
     """Edits a run's map, in the order given, and writes the result.
 
     Args:
-        folder: the run, or its folder; with objects.
+        folder: the run, or its folder; with objects. Or a file of Gaussians (see `runs.map_file.open_map`), of which a
+            file is written.
         edits: what to do.
         out: folder for the edited run; default: beside the run, with "-edited" added to its name.
         in_place: write into the run's own folder instead.
@@ -117,7 +100,12 @@ def edit_run(
         raise ConfigError("no edit was given; there are " + ", ".join(f"`{kind}`" for kind in KINDS))
     if sequence is not None and not inpainting:
         raise ConfigError("`sequence`: only `inpainting` looks at the recording")
-    folder = folder if isinstance(folder, RunFolder) else RunFolder.open(Path(folder))
+    folder = folder if isinstance(folder, RunFolder) else open_map(folder)
+    if isinstance(folder, MapFile):
+        if inpainting or in_place:
+            raise ConfigError(f"{folder.path}: `inpainting` and `in_place` need a run, and this is a file")
+        path, texts = edit_file(folder, edits, None if out is None else Path(out), overwrite, apply_edit, read_vector)
+        return EditOutcome(RunFolder(path), texts)
     sequence = None if sequence is None else Path(sequence)
     target = _target(folder, None if out is None else Path(out), in_place)
     source = _Source.of(folder)
@@ -230,10 +218,10 @@ def apply_edit(scene: SegmentedMap, edit: Edit) -> Change:
     if edit.kind == "keep":
         return keep_objects(scene, ids)
     if edit.kind == "move":
-        turn = _vector("rotation", edit.rotation) if edit.rotation else (0.0, 0.0, 0.0)
-        return move_objects(scene, ids, _vector("move", edit.value), turn)
+        turn = read_vector("rotation", edit.rotation) if edit.rotation else (0.0, 0.0, 0.0)
+        return move_objects(scene, ids, read_vector("move", edit.value), turn)
     if edit.kind == "duplicate":
-        return duplicate_objects(scene, ids, _vector("duplicate", edit.value) if edit.value else None)
+        return duplicate_objects(scene, ids, read_vector("duplicate", edit.value) if edit.value else None)
     if edit.kind == "recolor":
         return recolor_objects(scene, ids, parse_color(edit.value))
     if edit.kind == "merge":
@@ -249,7 +237,8 @@ def _single(table: ObjectTable, argument: str, text: str) -> int:
     return ids[0]
 
 
-def _vector(argument: str, text: str) -> tuple[float, float, float]:
+def read_vector(argument: str, text: str) -> tuple[float, float, float]:
+    """Three finite numbers of a text like "0.1 0 -0.2"; raises ConfigError, which names the argument, for others."""
     try:
         x, y, z = (float(part) for part in text.replace(",", " ").split())
     except ValueError:

@@ -24,6 +24,7 @@ from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.stores import is_store
 from ggslam.rendering.zoom import ZoomWidening
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.map_file import open_map
 from ggslam.volumes.output_frame import OutputFrame, output_frame
 
 _SCENES = (ExportFormat.gltf, ExportFormat.sog, ExportFormat.usd)
@@ -56,7 +57,8 @@ def export_run(
     written.
 
     Args:
-        run: the run, or its folder; for streamed-sog also the folder of a grid store.
+        run: the run, or its folder; a file of Gaussians, see `runs.map_file.open_map`; for streamed-sog also the folder
+            of a grid store.
         out: file or, for points, colmap, nerfstudio and for several objects with ply, folder to write.
         format: ply: 3DGS Gaussians; segmented: the same in the colours of their objects; compressed-ply, spz, spz4,
             splat, sog: the same in fewer bytes; streamed-sog: in pieces and levels of detail; gltf: .glb (a .glb
@@ -92,16 +94,18 @@ def export_run(
             place, format, voxel, objects, plain, discs, keyframes, recording, rendered, zoom, min_opacity,
             frame != "map",
         )  # fmt: skip
-        return export_movers(run if isinstance(run, RunFolder) else RunFolder.open(Path(run)), place)
+        return export_movers(_with_poses(run if isinstance(run, RunFolder) else open_map(run), "`movers`"), place)
     kind = choose_format(None if format is None else _format_named(format), place, objects)
     wanted = output_frame(frame)
     _refuse_ignored(kind, objects, keyframes, recording, rendered, zoom, wanted)
     _check_discs(kind, discs, min_opacity)
     if not isinstance(run, RunFolder) and is_store(Path(run)):
         return _export_store(Path(run), place, kind, objects, min_opacity, zoom, observer)
-    folder = run if isinstance(run, RunFolder) else RunFolder.open(Path(run))
+    folder = run if isinstance(run, RunFolder) else open_map(run)
+    if kind in (*_WITH_VIEWS, ExportFormat.mesh, ExportFormat.trajectory):
+        _with_poses(folder, f"format {kind.value}")
     images, points = None if recording is None else Path(recording), 0.01 if voxel is None else voxel
-    prepare = None if zoom == 1 else _widen_for(folder, zoom)
+    prepare = None if zoom == 1 else _widen_for(_with_poses(folder, "`zoom`"), zoom)
     if kind is ExportFormat.mesh:
         return export_mesh(folder, place, MeshRequest(voxel, objects, rendered, images, wanted), observer)
     if kind in _WITH_VIEWS:
@@ -137,6 +141,13 @@ def _export_store(
     if objects is not None:
         raise ConfigError(f"{path}: is a grid store, which has no table of objects: leave out `objects`")
     return stream_store(path, out, min_opacity, observer)
+
+
+def _with_poses(folder: RunFolder, what: str) -> RunFolder:
+    """The run itself; raises ConfigError for a map without poses and recording."""
+    if not (folder.has_poses and folder.has_recording):
+        raise ConfigError(f"{folder.path}: is a map without a run's poses and recording, which {what} needs")
+    return folder
 
 
 def _widen_for(folder: RunFolder, zoom: float) -> ZoomWidening:

@@ -42,7 +42,7 @@ def export_splats(
     count = chosen.write(path, OBJECT_EXTRAS if with_objects else ())
     if not with_objects:
         return f"wrote {path}: {count} Gaussians"
-    beside = _write_classifier(path, IdentityClassifier.from_file(folder.path / "classifier.npz"))
+    beside = _write_classifier(path, folder.classifier())
     return f"wrote {path}: {count} Gaussians with object ids and identities, and {beside.name}"
 
 

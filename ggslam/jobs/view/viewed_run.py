@@ -45,8 +45,10 @@ _DIGITS = 4
 
 
 class ViewedRun:
-    """A run for the viewer; an `EditableMap`. The run itself is never changed: edits are done to what is shown, and
-    done again, as `ggslam edit` does them, to the run's files when they are saved to another folder.
+    """A run (or a file of Gaussians) for the viewer; an `EditableMap`.
+
+    The run itself is never changed: edits are done to what is shown, and done again, as `ggslam edit` does them, to the
+    run's files when they are saved to another folder.
 
     Args:
         folder: the run.
@@ -106,6 +108,8 @@ class ViewedRun:
         return shown
 
     def _open_recording(self, path: Path | None) -> Sequence | None:
+        if path is None and not self.folder.has_recording:
+            return None
         try:
             return open_recording_of(self.folder, path)
         except GgslamError as error:
@@ -152,8 +156,11 @@ class ViewedRun:
             shown = min(len(self._gaussians), self._max_splats)
             parts = [f"{len(self._gaussians):,} Gaussians" + (f" ({shown:,} shown)" if shown < len(self._gaussians)
                                                               else "")]  # fmt: skip
-            parts.append(f"{len(self.frame_poses)} frames")
-            parts.append(f"{len(self.keyframe_poses)} keyframes")
+            if self.folder.has_poses:
+                parts.append(f"{len(self.frame_poses)} frames")
+                parts.append(f"{len(self.keyframe_poses)} keyframes")
+            else:
+                parts.append(f"{len(self.frame_poses)} views around it")
             if self._segmented is not None:
                 parts.append(f"{len(self._segmented.table)} objects")
             return " · ".join(parts)

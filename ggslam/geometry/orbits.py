@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras around a cloud that nobody recorded."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ggslam.scene.camera import Camera
+
+_ELEVATION = math.radians(20.0)
+_FARTHEST, _BACKGROUND = 0.95, 2.5
+"""Share of the points that are framed; but what is farther from the middle than so many times the median distance is
+background."""
+
+
+def orbit(points: np.ndarray, camera: Camera, count: int) -> np.ndarray:
+    """Poses on a circle around most of the points, a little above, looking at their middle.
+
+    Args:
+        points: float [N, 3], metres, at least one; y is down.
+        camera: that frames them.
+        count: of poses, the same angle apart; the first looks along z.
+
+    Returns:
+        T_world_camera float64 [count, 4, 4].
+    """
+    middle = np.median(points, axis=0).astype(np.float64)
+    distances = np.linalg.norm(points - middle, axis=1)
+    radius = min(float(np.quantile(distances, _FARTHEST)), _BACKGROUND * float(np.median(distances)))
+    half = min(math.atan(camera.width / (2 * camera.fx)), math.atan(camera.height / (2 * camera.fy)))
+    away = max(radius, 1e-3) / math.sin(half)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for pose, angle in zip(poses, 2 * np.pi * np.arange(count) / count, strict=True):
+        forward = np.array([math.sin(angle) * math.cos(_ELEVATION), math.sin(_ELEVATION),
+                            math.cos(angle) * math.cos(_ELEVATION)])  # fmt: skip
+        right = np.array([math.cos(angle), 0.0, -math.sin(angle)])
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+        pose[:3, 3] = middle - away * forward
+    return poses
