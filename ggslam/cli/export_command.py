@@ -10,7 +10,7 @@ import typer
 
 from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar
-from ggslam.jobs.export.formats import ExportFormat
+from ggslam.jobs.export.formats import ExportFormat, UpAxis
 from ggslam.volumes.output_frame import OutputFrame
 
 EPILOG = """
@@ -23,6 +23,8 @@ EPILOG = """
   ggslam export runs/kitchen --format gltf --out kitchen_splats.glb
 
   ggslam export runs/kitchen --zoom 4 --out kitchen.sog
+
+  ggslam export runs/kitchen --up y --out kitchen.ply
 
   ggslam export runs/kitchen --out kitchen.usdz
 
@@ -106,6 +108,12 @@ Zoom = Annotated[
                  "trained at 320x240, 4 for a window of 1280x960): sharper there, softer in small."),
 ]  # fmt: skip
 
+Up = Annotated[
+    UpAxis | None,
+    typer.Option(help="Formats of Gaussians: turn the map so that this axis points up, by its floor: y (most viewers: "
+                 "three.js, Unity), z (Blender, ROS), -y (SuperSplat). SPZ, glTF and OpenUSD have y upwards."),
+]  # fmt: skip
+
 
 SourcePath = Annotated[
     Path,
@@ -130,6 +138,7 @@ def export(
     rendered: Rendered = False,
     zoom: Zoom = 1.0,
     frame: Frame = OutputFrame.map,
+    up: Up = None,
 ) -> None:
     """Write a run's map, trajectory or images in a format that other programs read."""
     from ggslam.cli.observer import ProgressObserver
@@ -139,6 +148,6 @@ def export(
         message = export_run(
             run, out, asked, voxel=voxel, objects=objects, movers=movers, min_opacity=min_opacity, plain=plain,
             discs=discs, keyframes=keyframes, recording=sequence, rendered=rendered, zoom=zoom, frame=frame.value,
-            observer=ProgressObserver(bar),
+            up=up, observer=ProgressObserver(bar),
         )  # fmt: skip
     console.print(message, highlight=False, markup=False)

@@ -166,7 +166,7 @@ def open_splats(path: str | Path) -> SplatFile:
     known = splat_format(path)
     if known is None:
         names = ", ".join(format.name for format in SPLAT_FORMATS)
-        raise FormatError(f"{path}: not a map of Gaussians that is known: {names}")
+        raise FormatError(f"{path}: no Gaussians in a format that is known: {names}")
     opened = known.open(_file_of(Path(path)) or Path(path))
     if not len(opened.rows):
         reason = f" ({'; '.join(opened.notes)})" if opened.notes else ""

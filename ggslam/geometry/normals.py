@@ -18,7 +18,7 @@ _CHUNK = 1 << 17
 
 def estimate_normals(
     points: np.ndarray, rows: np.ndarray | None = None, neighbours: int = NEIGHBOURS, tree: cKDTree | None = None,
-    workers: int = -1, beside: np.ndarray | None = None,
+    workers: int = -1, beside: np.ndarray | None = None, thickness: float | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Unit normals float64 [n, 3] of points [N, 3], the direction of least variance among each point's nearest
     neighbours; their sign is arbitrary.
@@ -29,6 +29,8 @@ def estimate_normals(
         neighbours: points in a plane, the point itself included.
         tree: of the points; None: one is built.
         beside: [N, k], further coordinates in which neighbours lie near; the tree then is of all.
+        thickness: normals are zero where the variance along them is above this share of the middle one, across the
+            neighbours' second narrowest direction: there is no surface.
         workers: threads that search; one is faster for a few hundred points.
     """
     points = np.asarray(points, np.float64)
@@ -40,7 +42,10 @@ def estimate_normals(
         part = slice(start, start + _CHUNK)
         near = points[tree.query(places[rows[part]], count, workers=workers)[1].reshape(-1, count)]
         offsets = near - near.mean(1, keepdims=True)
-        normals[part] = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
+        variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+        normals[part] = axes[:, :, 0]
+        if thickness is not None:
+            normals[start:][: len(near)][variances[:, 0] > thickness * variances[:, 1]] = 0
     return normals
 
 

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from ggslam.errors import ConfigError
+from ggslam.jobs.export.chosen import Prepare
 from ggslam.jobs.export.formats import ExportFormat, choose_format
 from ggslam.jobs.export.map_files import (
     export_objects,
@@ -19,12 +21,14 @@ from ggslam.jobs.export.movers import export_movers
 from ggslam.jobs.export.scenes import export_scene
 from ggslam.jobs.export.splats import export_packed, export_pcd
 from ggslam.jobs.export.streams import stream_run, stream_store
+from ggslam.jobs.export.turning import upward_turn
 from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.stores import is_store
 from ggslam.rendering.zoom import ZoomWidening
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_file import open_map
+from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.volumes.output_frame import OutputFrame, output_frame
 
 _SCENES = (ExportFormat.gltf, ExportFormat.sog, ExportFormat.usd)
@@ -51,6 +55,7 @@ def export_run(
     rendered: bool = False,
     zoom: float = 1.0,
     frame: str = "map",
+    up: str | None = None,
     observer: Observer | None = None,
 ) -> str:
     """Writes a run in a form that other programs take, as `ggslam export` does; returns a line that says what was
@@ -80,6 +85,8 @@ def export_run(
             at 320x240, 4 for a window of 1280x960). Widens them as far as renderers will then widen them less: seen at
             that size they are sharper and without seams, at the training views' size softer.
         frame: mesh: "map", or "floor" (z up, 0 on the floor; floor.yaml beside it tells where that is in the map).
+        up: formats of Gaussians: "y", "-y" or "z": turn the map so that this axis of the file points up, away from the
+            map's floor. SPZ, glTF and OpenUSD have y upwards.
         observer: receives progress updates of meshes and streamed SOG.
 
     Raises:
@@ -90,44 +97,70 @@ def export_run(
     """
     place = Path(out)
     if movers:
-        _refuse_beside_movers(
-            place, format, voxel, objects, plain, discs, keyframes, recording, rendered, zoom, min_opacity,
-            frame != "map",
-        )  # fmt: skip
+        others = (format, voxel, objects, plain, discs, keyframes, recording, rendered, zoom, min_opacity, up)
+        _refuse_beside_movers(place, *others, frame != "map")
         return export_movers(_with_poses(run if isinstance(run, RunFolder) else open_map(run), "`movers`"), place)
     kind = choose_format(None if format is None else _format_named(format), place, objects)
     wanted = output_frame(frame)
-    _refuse_ignored(kind, objects, keyframes, recording, rendered, zoom, wanted)
+    _refuse_ignored(kind, objects, keyframes, recording, rendered, zoom, wanted, up)
     _check_discs(kind, discs, min_opacity)
     if not isinstance(run, RunFolder) and is_store(Path(run)):
+        if up is not None:
+            raise ConfigError(f"{run}: is a grid store, whose cells are not turned: leave out `up`")
         return _export_store(Path(run), place, kind, objects, min_opacity, zoom, observer)
     folder = run if isinstance(run, RunFolder) else open_map(run)
     if kind in (*_WITH_VIEWS, ExportFormat.mesh, ExportFormat.trajectory):
         _with_poses(folder, f"format {kind.value}")
     images, points = None if recording is None else Path(recording), 0.01 if voxel is None else voxel
-    prepare = None if zoom == 1 else _widen_for(_with_poses(folder, "`zoom`"), zoom)
+    widen = None if zoom == 1 else _widen_for(_with_poses(folder, "`zoom`"), zoom)
+    turn = None if up is None else upward_turn(folder, up, kind)
+    prepare = _both(widen, turn)
+    mesh = MeshRequest(voxel, objects, rendered, images, wanted)
+    wish = _Wish(place, kind, points, objects, min_opacity, plain, discs, keyframes, images, mesh)
+    said = _write(folder, wish, prepare, observer)
+    return said if turn is None else f"{said}; {turn.text}"
+
+
+@dataclass(frozen=True)
+class _Wish:
+    """Arguments of `export_run`; `points` is the distance of points, `mesh` what of them is about a mesh."""
+
+    place: Path
+    kind: ExportFormat
+    points: float
+    objects: str | None
+    min_opacity: float
+    plain: bool
+    discs: bool
+    keyframes: bool
+    images: Path | None
+    mesh: MeshRequest
+
+
+def _write(folder: RunFolder, wish: _Wish, prepare: Prepare | None, observer: Observer | None) -> str:
+    place, kind, objects, opacity, plain = wish.place, wish.kind, wish.objects, wish.min_opacity, wish.plain
     if kind is ExportFormat.mesh:
-        return export_mesh(folder, place, MeshRequest(voxel, objects, rendered, images, wanted), observer)
+        return export_mesh(folder, place, wish.mesh, observer)
     if kind in _WITH_VIEWS:
         write = export_colmap if kind is ExportFormat.colmap else export_nerfstudio
-        return write(folder, place, points, keyframes, images)
+        return write(folder, place, wish.points, wish.keyframes, wish.images)
     if kind is ExportFormat.segmented:
-        return export_segmented(folder, place, objects, min_opacity, plain, prepare)
+        return export_segmented(folder, place, objects, opacity, plain, prepare)
     if kind in _SCENES:
-        return export_scene(folder, place, kind.value, objects, min_opacity, plain, prepare)
+        return export_scene(folder, place, kind.value, objects, opacity, plain, prepare)
     if kind is ExportFormat.streamed_sog:
-        return stream_run(folder, place, objects, min_opacity, plain, observer, prepare)
+        return stream_run(folder, place, objects, opacity, plain, observer, prepare)
     if kind is ExportFormat.ply and objects is not None:
-        return export_objects(folder, place, objects, min_opacity, plain, prepare)
+        return export_objects(folder, place, objects, opacity, plain, prepare)
     if kind is ExportFormat.ply:
-        return export_splats(folder, place, min_opacity, plain, prepare)
+        return export_splats(folder, place, opacity, plain, prepare)
     if kind is ExportFormat.points:
-        return export_points(folder, place, points, discs, min_opacity)
+        return export_points(folder, place, wish.points, wish.discs, opacity)
     if kind is ExportFormat.pcd:
-        return export_pcd(folder, place, points, discs, min_opacity)
+        return export_pcd(folder, place, wish.points, wish.discs, opacity)
     if kind is ExportFormat.trajectory:
         return export_trajectory(folder, place)
-    return export_packed(folder, place, kind.value, min_opacity, prepare)
+    return export_packed(folder, place, kind.value, opacity, prepare)
 
 
 def _export_store(
@@ -141,6 +174,18 @@ def _export_store(
     if objects is not None:
         raise ConfigError(f"{path}: is a grid store, which has no table of objects: leave out `objects`")
     return stream_store(path, out, min_opacity, observer)
+
+
+def _both(first: Prepare | None, then: Prepare | None) -> Prepare | None:
+    """One after the other, where there are both."""
+    if first is None or then is None:
+        return first or then
+
+    def both(gaussians: GaussianMap) -> None:
+        first(gaussians)
+        then(gaussians)
+
+    return both
 
 
 def _with_poses(folder: RunFolder, what: str) -> RunFolder:
@@ -185,7 +230,7 @@ def _check_discs(kind: ExportFormat, discs: bool, min_opacity: float) -> None:
 
 def _refuse_ignored(
     kind: ExportFormat, objects: str | None, keyframes: bool, recording: str | Path | None, rendered: bool, zoom: float,
-    frame: OutputFrame,
+    frame: OutputFrame, up: str | None,
 ) -> None:  # fmt: skip
     """Raises ConfigError for an argument that this format leaves without effect."""
     if objects is not None and kind not in _WITH_OBJECTS:
@@ -199,5 +244,7 @@ def _refuse_ignored(
         raise ConfigError(f"`zoom` goes with formats of Gaussians, not {kind.value}")
     if frame is not OutputFrame.map and kind is not ExportFormat.mesh:
         raise ConfigError(f"`frame` goes with `format` mesh, not {kind.value}")
+    if up is not None and kind in _WITHOUT_GAUSSIANS:
+        raise ConfigError(f"`up` goes with formats of Gaussians, not {kind.value}")
     if rendered and kind is not ExportFormat.mesh:
         raise ConfigError(f"`rendered` goes with `format` mesh, not {kind.value}")

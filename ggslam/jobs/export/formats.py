@@ -30,6 +30,14 @@ class ExportFormat(str, Enum):
     nerfstudio = "nerfstudio"
 
 
+class UpAxis(str, Enum):
+    """The axis of a file that points up."""
+
+    y = "y"
+    minus_y = "-y"
+    z = "z"
+
+
 SUFFIXES = {
     ".ply": (ExportFormat.ply, ExportFormat.segmented, ExportFormat.compressed_ply, ExportFormat.mesh),
     ".glb": (ExportFormat.mesh, ExportFormat.gltf),
