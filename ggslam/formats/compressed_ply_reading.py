@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.formats.compressed_ply import CHUNK, SH_REACH
+from ggslam.formats.compressed_ply import CHUNK, levels_of_steps
 from ggslam.formats.ply import read_ply
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.splat_repair import columns_of, logits_of
@@ -82,8 +82,7 @@ def _harmonics(path: Path, rows: np.ndarray | None, count: int) -> np.ndarray:
     if len(rows) != count or len(names) not in (9, 24, 45):
         raise FormatError(f"{path}: 'sh' has {len(rows)} rows of {len(names)}, expected {count} of 9, 24 or 45")
     steps = np.stack([_column(path, rows, f"f_rest_{i}").astype(np.float64) for i in range(len(names))], 1)
-    levels = np.where(steps <= 0, 0.0, np.where(steps >= 255, 1.0, (steps + 0.5) / 256))
-    return ((levels - 0.5) * (2 * SH_REACH)).reshape(count, 3, -1).transpose(0, 2, 1)
+    return levels_of_steps(steps).reshape(count, 3, -1).transpose(0, 2, 1)
 
 
 def _rows(path: Path, elements: dict[str, np.ndarray], name: str) -> np.ndarray:

@@ -44,17 +44,25 @@ def export_packed(
     if kind in ("spz", "spz4"):
         spz_packages(path, 4 if kind == "spz4" else 3)
     make_folder(path.parent)
-    parts = _some(_parts(folder, min_opacity, kind != "splat", prepare), folder, min_opacity)
+    parts, left_out = _some(_parts(folder, min_opacity, kind != "splat", prepare), folder, min_opacity), ""
     if kind == "splat":
         count = write_splat(path, parts)
     else:
         gaussians = next(parts)
         count = len(gaussians)
         if kind == "compressed-ply":
-            write_compressed_ply(path, gaussians)
+            left_out = _left_out(write_compressed_ply(path, gaussians), gaussians.sh_degree)
         else:
             write_spz(path, gaussians, 4 if kind == "spz4" else 3)
-    return f"wrote {path}: {count} Gaussians, {path.stat().st_size / 1e6:.1f} MB"
+    return f"wrote {path}: {count} Gaussians, {path.stat().st_size / 1e6:.1f} MB{left_out}"
+
+
+def _left_out(written: int, degree: int) -> str:
+    """What a compressed PLY has not, for people."""
+    if written == degree:
+        return ""
+    which = f"degree {degree}" if written == degree - 1 else f"degrees {written + 1} to {degree}"
+    return f"; left out colours of {which}: they are too faint for its steps of 1/32"
 
 
 def export_pcd(
