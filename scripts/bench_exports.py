@@ -8,9 +8,10 @@
 Every format is written as `ggslam export --format` does it; its time is that of all processors together, without
 starting Python. Splat formats are read back as tests/conformance reads them, by the descriptions of the formats, and
 the frames that the run held out are rendered by the rules of 3D Gaussian Splatting: 0.3 px^2 of low-pass, nothing
-nearer than 0.2 m, no colours below 0. "vs map" is against the map of the run rendered so, over all pixels; "vs
-recording" against the frames, over pixels with measured depth, as `ggslam eval` scores. The first line is the map by
-ggslam's own rules. "ids": whether every Gaussian has the object id that it has in the run.
+nearer than 0.2 m, no colours below 0. "vs map" is against the map of the run rendered so, over all pixels, at half,
+once and twice the size of the run's images; "by ggslam" is the same at once the size of what ggslam's own readers find
+in the file; "vs recording" is against the frames, over pixels with measured depth, as `ggslam eval` scores. The first
+line is the map by ggslam's own rules. "ids": whether every Gaussian has the object id that it has in the run.
 
 Pictures come from ggslam's rasterizer with that low-pass, which differs from 3DGS in two rules (it draws the Gaussian
 that makes a pixel opaque, and lets one cover 0.999 of it, not 0.99); --check prints how far it is from the tests' own
@@ -36,13 +37,14 @@ from bench_low_pass import OURS, THREE_DGS, print_rows, print_titles, psnr_at_si
 from foreign_readers import by_usd_core
 from held_out import held_out_poses
 from scipy.spatial import cKDTree
-from splat_formats import SPLAT_FORMATS
+from splat_formats import SPLAT_FORMATS, SplatFormat
 from splat_maps import Splats
 from splat_rendering import Pinhole, decibels, render
 from standard_pictures import standard_picture
 
 from ggslam.errors import GgslamError
 from ggslam.evaluation.images import psnr, unit_range
+from ggslam.formats.splat_formats import read_splats
 from ggslam.jobs.export.export_run import export_run
 from ggslam.jobs.export.formats import ExportFormat
 from ggslam.rendering.cpu import CpuRasterizer
@@ -50,7 +52,12 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.scene.frame import Frame
 
-COLUMNS = ("format", "bytes", "bytes/Gaussian", "write, CPU s", "dB vs map", "dB vs recording", "ids")
+SIZES = (0.5, 1.0, 2.0)
+"""Of the pictures, times that of the run's images."""
+COLUMNS = (
+    "format", "bytes", "bytes/Gaussian", "write, CPU s", *(f"dB vs map, {size:g}x" for size in SIZES), "by ggslam",
+    "dB vs recording", "ids",
+)  # fmt: skip
 FORMATS = SPLAT_FORMATS | {
     "usd": replace(SPLAT_FORMATS["usd"], suffix=".usdc", read=lambda path: by_usd_core(path, path.parent))
 }
@@ -105,13 +112,30 @@ def line(
     size = size_of(path)
     cells = [f"{kind} --plain" if plain else kind, f"{size}", f"{size / len(original.means):.2f}", f"{seconds:.2f}"]
     if known is None:
-        return [*cells, "", "", ""]
+        return [*cells, *[""] * (len(COLUMNS) - len(cells))]
     seen = known.read(path)
+    ids = kept(seen, original, known.turn)
     if known.recolored:
-        return [*cells, "", "", kept(seen, original, known.turn)]
-    images = [standard_picture(seen, view.frame.camera, known.pose(view.T_camera_world)) for view in views]
-    same = decibels(images, [view.of_map for view in views])
-    return [*cells, f"{same:.1f}", f"{against_recording(views, images):.2f}", kept(seen, original, known.turn)]
+        return [*cells, *[""] * (len(COLUMNS) - len(cells) - 1), ids]
+    ours = Splats.of(read_splats(path / "lod-meta.json" if path.is_dir() else path))
+    read_by_us = decibels(pictures(ours, views), pictures(original, views))
+    same = [decibels(pictures(seen, views, size, known), pictures(original, views, size)) for size in SIZES]
+    images = pictures(seen, views, known=known)
+    scores = [f"{value:.1f}" for value in (*same, read_by_us)]
+    return [*cells, *scores, f"{against_recording(views, images):.2f}", ids]
+
+
+def pictures(
+    splats: Splats, views: list[View], size: float = 1.0, known: SplatFormat | None = None
+) -> list[np.ndarray]:
+    """What Gaussians look like in the views at a size; in the axes of a format where one is given."""
+    found = []
+    for view in views:
+        whole = view.frame.camera
+        camera = whole.resize(round(size * whole.width), round(size * whole.height))
+        pose = view.T_camera_world if known is None else known.pose(view.T_camera_world)
+        found.append(standard_picture(splats, camera, pose))
+    return found
 
 
 def kept(seen: Splats, original: Splats, turn: np.ndarray) -> str:
@@ -146,7 +170,8 @@ def bench(run: Path, arguments: argparse.Namespace) -> None:
     own = CpuRasterizer()
     images = [own.forward(gaussians, v.frame.camera, v.T_camera_world).image.numpy().transpose(1, 2, 0).copy()
               for v in views]  # fmt: skip
-    print(f"| the map by ggslam's rules | | | | | {against_recording(views, images):.2f} | |")
+    blank = " |" * (len(COLUMNS) - 3)
+    print(f"| the map by ggslam's rules |{blank} {against_recording(views, images):.2f} | |")
     wanted = arguments.formats or [kind.value for kind in ExportFormat]
     for kind, plain in [(name, plain) for name in wanted for plain in ([True, False] if name == "ply" else [False])]:
         with tempfile.TemporaryDirectory() as out:
