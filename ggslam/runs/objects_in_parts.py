@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.errors import RunFolderError
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.reporting.pictures import FITTED, IdentityColors
@@ -60,7 +61,9 @@ class ObjectsInParts:
         return SegmentedMap(gaussians, self.classifier, self.table)
 
     def identity_colors(self) -> IdentityColors:
-        """Colours of the identity vectors of the map, fitted to its labelled Gaussians."""
+        """Colours of the identity vectors of the map, fitted to its labelled Gaussians; RunFolderError: it has none."""
+        if not self.map.rows.like.feature_channels:
+            raise RunFolderError(f"{self.folder.path}: its Gaussians have object ids, but no identity vectors")
         step = max(1, sum(count for name, count in self.counts.items() if name > 0) // FITTED)
         sample, seen = [np.empty((0, self.map.rows.like.features.shape[1]), np.float32)], 0
         for block in self.map.rows.blocks():

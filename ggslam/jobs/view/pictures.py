@@ -67,11 +67,11 @@ class ViewPictures:
         if found is not None:
             measured = color_of_depth(found.depth, near, far)
             cells = [("recorded", found.color), cells[0], ("depth, recorded", measured), cells[1]]
-        if segmented is not None and self.identity is not None and view.features is not None:
-            colors = self.identity.picture(view.features.numpy(), alpha)
+        if segmented is not None:
             ids = object_ids(self._rasterizer, view, segmented)
             cells.append(("objects", color_of_ids(ids, segmented.table.palette(), outlines=True)))
-            cells.append(("identity (PCA)", colors))
+        if self.identity is not None and view.features is not None:
+            cells.append(("identity (PCA)", self.identity.picture(view.features.numpy(), alpha)))
         return table_of(cells, (camera.width, camera.height)), rendered if found is None else found.color
 
     def object_at(self, origin: np.ndarray, direction: np.ndarray, focal: float, hidden: set[int]) -> int:
@@ -118,6 +118,8 @@ def table_of(cells: list[tuple[str, np.ndarray]], size: tuple[int, int]) -> np.n
 
 def _identity_colors(segmented: SegmentedMap) -> IdentityColors | None:
     """Colours of identity vectors, fitted to those of the labelled Gaussians; None if there are none."""
+    if not segmented.gaussians.feature_channels:
+        return None
     labelled = np.flatnonzero(segmented.gaussians.object_id.numpy() > 0)
     if not len(labelled):
         return None

@@ -148,7 +148,10 @@ class ViewedRun:
     @property
     def colorings(self) -> tuple[Coloring, ...]:
         """See `ViewedMap`."""
-        return ("colour", "objects", "identity", "depth") if self.has_objects else ("colour", "depth")
+        if not self.has_objects:
+            return ("colour", "depth")
+        known = self._pictures.identity is not None
+        return ("colour", "objects", "identity", "depth") if known else ("colour", "objects", "depth")
 
     def describe(self) -> str:
         """See `ViewedMap`."""
