@@ -34,6 +34,7 @@ if _TYPE_CHECKING:
     from ggslam.formats.point_cloud import read_point_cloud as read_point_cloud
     from ggslam.formats.point_cloud import write_point_cloud as write_point_cloud
     from ggslam.formats.point_sampling import sample_points as sample_points
+    from ggslam.formats.splat_formats import read_splats as read_splats
     from ggslam.formats.trajectory import Trajectory as Trajectory
     from ggslam.formats.trajectory import read_trajectory as read_trajectory
     from ggslam.formats.trajectory import write_tum as write_tum
@@ -100,6 +101,7 @@ _HOMES = {
     "ggslam.formats.gaussian_ply": ("read_gaussian_ply", "write_gaussian_ply"),
     "ggslam.formats.point_cloud": ("read_point_cloud", "write_point_cloud"),
     "ggslam.formats.point_sampling": ("sample_points",),
+    "ggslam.formats.splat_formats": ("read_splats",),
     "ggslam.formats.trajectory": ("Trajectory", "read_trajectory", "write_tum"),
     "ggslam.jobs.edit.edits": ("Edit", "edit_run"),
     "ggslam.jobs.export.export_run": ("export_run",),

@@ -40,7 +40,7 @@ def edit_file(
         ConfigError: unknown objects, values that cannot be read, or a file that is there already.
         FormatError, MissingDependency, RunFolderError: it cannot be written.
     """
-    target = out or _beside(source.path)
+    target = out or edited_name(source.path)
     splat_writer(target)
     if target.exists() and (not overwrite or target.samefile(source.path)):
         raise ConfigError(f"{target}: is there already; use `overwrite` or another `out`")
@@ -78,8 +78,8 @@ def _text(values: Sequence[float]) -> str:
     return " ".join(f"{value:g}" for value in values)
 
 
-def _beside(path: Path) -> Path:
-    """NAME-edited with the same ending; a PLY of what cannot be written again."""
+def edited_name(path: Path) -> Path:
+    """What an edited file is called: NAME-edited with the same ending; of what cannot be written again a PLY."""
     name = path.name
     for ending in (".compressed.ply", path.suffix):
         if name.lower().endswith(ending.lower()) and ending:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.jobs.changes.shown import ChangesShown, changes_of, read_changes, sentence_of
+from ggslam.jobs.edit.edited_file import edited_name
 from ggslam.jobs.edit.edits import Edit, apply_edit, edit_run
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS, object_file_name
 from ggslam.jobs.view.pictures import ViewPictures
@@ -23,6 +24,7 @@ from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.table import ObjectRecord
 from ggslam.reporting.pictures import color_of_depth, depth_range
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.map_file import MapFile
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.changes import ChangedSide
 from ggslam.runs.records.movers import MoverFrameRecord, mover_colors
@@ -304,7 +306,8 @@ class ViewedRun:
 
     def default_target(self) -> str:
         """See `EditableMap`."""
-        return self.folder.path.resolve().name + "-edited"  # "." has no name
+        path = self.folder.path.resolve()  # "." has no name
+        return edited_name(path).name if isinstance(self.folder, MapFile) else f"{path.name}-edited"
 
     def save_folder(self) -> Path:
         """Where edited runs are saved: beside this one, whatever a page asks for."""
