@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ggslam.errors import FormatError
 from ggslam.formats.gaussian_ply import object_ids
@@ -185,10 +186,17 @@ class ForeignGaussianRows(GaussianRows):
         Raises:
             FormatError: the file cannot be read any more.
         """
-        if not count:
-            return self._map(0, 0)
-        begin, end = self._row_in_file(start), self._row_in_file(start + count - 1) + 1
-        return self._map(begin, end - begin)
+        if count <= BLOCK:
+            begin = self._row_in_file(start) if count else 0
+            return self._map(begin, self._row_in_file(start + count - 1) + 1 - begin if count else 0)
+        like = self.like
+        out = GaussianMap(like.sh_degree, like.feature_channels, with_moments=False)
+        out.growth = 0.0
+        out.reserve(count)
+        for first in range(start, start + count, BLOCK):  # so that columns of all are not there beside the map
+            part = self.read(first, min(BLOCK, start + count - first))
+            out.append(part.take(torch.arange(len(part))))
+        return out
 
     @property
     def has_ids(self) -> bool:

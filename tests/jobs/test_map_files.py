@@ -67,6 +67,13 @@ def test_every_command_takes_every_format(name: str, tmp_path: Path) -> None:
     assert "1.0000" in succeed("compare", path, tmp_path / "back.ply", "--align", "none")
 
 
+def test_the_folder_of_a_meta_json_is_a_file_too(tmp_path: Path) -> None:
+    written(tmp_path / "sog" / "meta.json")
+    assert "800" in succeed("encode", tmp_path / "sog", tmp_path / "map.bin", "--preset", "splat")
+    assert "800 Gaussians" in succeed("export", tmp_path / "sog", "--out", tmp_path / "map.splat")
+    assert "1.0000" in succeed("compare", tmp_path / "sog", tmp_path / "map.splat", "--align", "none")
+
+
 def test_cameras_stand_around_the_map_and_see_it_whole(tmp_path: Path) -> None:
     folder = open_map(written(tmp_path / "map.ply"))
     poses, camera = folder.keyframes().poses(), folder.sequence().camera

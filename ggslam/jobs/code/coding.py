@@ -30,7 +30,7 @@ from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_poi
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.splat_formats import open_splats, read_splats, splat_format
 from ggslam.jobs.code.attributes import attributes_to_code, restored_attributes
-from ggslam.runs.folder import RunFolder
+from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.system.atomic import make_folder, write_bytes
 from ggslam.system.foreign import read_foreign
 
@@ -88,7 +88,7 @@ def encode_file(
     _refuse_itself(path, out)
     try:
         if preset == "splat":
-            report = _encode_splats(path, out, settings, rate, ids, notes, own=source.is_dir())
+            report = _encode_splats(path, out, settings, rate, ids, notes, own=path != source)
         else:
             report = _encode_points(path, out, settings, ids, notes)
     except (ConfigError, FormatError) as error:
@@ -238,7 +238,7 @@ def read_bytes(path: Path) -> bytes:
 def _input_file(source: Path, preset: str) -> Path:
     if preset not in PRESETS:
         raise ConfigError(f"preset: expected one of {', '.join(PRESETS)}, found '{preset}'")
-    if not source.is_dir():
+    if not source.is_dir() or (not (source / MARKER).is_file() and splat_format(source) is not None):
         return source
     return RunFolder.open(source).path / ("map.ply" if preset == "splat" else "points.ply")
 
