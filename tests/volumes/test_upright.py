@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from distance_scenes import block_range, box, box_room, rotation, union, write_scene
 
+from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.map_upright import upright_of
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import TsdfMap
 from ggslam.volumes.upright import estimate_up
@@ -63,3 +66,19 @@ def test_without_surfaces_the_cameras_decide() -> None:
     assert np.array_equal(found.up, [0, -1, 0]) and found.support == 0 and found.floor is None
     two = np.stack([np.eye(4), np.diag([-1.0, -1, 1, 1])])  # upside down and not: no mean
     assert np.array_equal(estimate_up(two, np.zeros((5, 3)), np.zeros((5, 3))).up, [0, -1, 0])
+
+
+def test_up_of_a_map_whose_gaussians_lie_on_planes_and_are_turned_anyhow() -> None:
+    """Training leaves the axes of single Gaussians anywhere; the planes that neighbours lie in tell all the same."""
+    random = np.random.default_rng(0)
+    up = np.array([0.25, -0.95, 0.2]) / np.linalg.norm([0.25, -0.95, 0.2])
+    across = np.linalg.svd(up[None])[2][1:]
+    floor = random.uniform(-2, 2, (6000, 2)) @ across - 1.2 * up
+    wall = random.uniform(-1.2, 1, (3000, 1)) * up + random.uniform(-2, 2, (3000, 1)) * across[0] + 2 * across[1]
+    points = np.concatenate([floor, wall]) + random.normal(0, 0.004, (9000, 3))
+    gaussians = GaussianMap(with_moments=False)
+    anyhow = [torch.from_numpy(random.normal(size=(9000, width))).float() for width in (4, 3)]
+    gaussians.insert(torch.from_numpy(points).float(), anyhow[0], anyhow[1] - 4, 2.0, torch.full((9000, 3), 0.5))
+    found = upright_of(gaussians, np.tile(np.eye(4), (5, 1, 1)))
+    assert np.degrees(np.arccos(min(1.0, float(found.up @ up)))) < 0.5 and found.support > 0.3
+    assert found.floor == pytest.approx(-1.2, abs=0.01)
