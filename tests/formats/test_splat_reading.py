@@ -153,3 +153,30 @@ def test_names_that_lead_out_of_the_folder_are_refused(tmp_path: Path) -> None:
     (tmp_path / "in" / "meta.json").write_text(json.dumps(meta))
     with pytest.raises(FormatError, match="names a file"):
         read_splats(tmp_path / "in")
+
+
+def test_usd_in_centimetres_with_z_upwards(tmp_path: Path) -> None:
+    """Written by usd-core itself: a prim moved by 2 m, sizes of 3 cm, one colour along z."""
+    pytest.importorskip("pxr", reason="usd-core is not installed (extra [usd])")
+    from pxr import Gf, Usd, UsdGeom, UsdVol
+
+    stage = Usd.Stage.CreateNew(str(tmp_path / "map.usda"))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdGeom.Xform.Define(stage, "/above").AddTranslateOp().Set(Gf.Vec3d(0, 0, 200))
+    splat = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/above/splat")
+    splat.CreatePositionsAttr([Gf.Vec3f(100, 0, 0), Gf.Vec3f(0, 300, 0)])
+    splat.CreateScalesAttr([Gf.Vec3f(3, 3, 6)] * 2)
+    splat.CreateOrientationsAttr([Gf.Quatf(1, 0, 0, 0)] * 2)
+    splat.CreateOpacitiesAttr([0.25, 1.0])
+    splat.CreateRadianceSphericalHarmonicsDegreeAttr(1)
+    along_z = [Gf.Vec3f(0, 0, 0), Gf.Vec3f(0, 0, 0), Gf.Vec3f(0.5, 0.5, 0.5), Gf.Vec3f(0, 0, 0)]
+    splat.CreateRadianceSphericalHarmonicsCoefficientsAttr(along_z * 2)
+    stage.Save()
+    found = read_splats(tmp_path / "map.usda")
+    np.testing.assert_allclose(found.means.numpy(), [[1, -2, 0], [0, -2, 3]], atol=1e-6)  # y is down, z forward
+    turn = Rotation.from_quat(np.roll(found.quaternions.numpy()[0], -1)).as_matrix()
+    covariance = turn @ np.diag(np.square(found.scales.numpy()[0])) @ turn.T
+    np.testing.assert_allclose(covariance, np.diag([0.03**2, 0.06**2, 0.03**2]), atol=1e-8)  # long upwards
+    np.testing.assert_allclose(found.opacities.numpy(), [0.25, 1], atol=2e-6)
+    np.testing.assert_allclose(found.sh.numpy()[0, 1:, 0], [0.5, 0, 0], atol=1e-6)  # -y is up: 0.4886 times -y
