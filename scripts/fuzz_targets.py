@@ -98,6 +98,21 @@ def _ply_read(path: Path) -> Any:
     return read_ply(path)
 
 
+def _splats(folder: Path) -> list[Path]:
+    from ggslam.formats.splat_writing import write_splats
+
+    names = ("map.ply", "map.compressed.ply", "map.sog", "map.spz", "map.splat", "map.glb", "map.usdc")
+    for name in names:
+        write_splats(folder / name, _map(), {1: "mug"})
+    return [folder / name for name in names]
+
+
+def _splats_read(path: Path) -> Any:
+    from ggslam.formats.splat_formats import read_splats
+
+    return read_splats(path)
+
+
 def _gaussians_read(path: Path) -> Any:
     from ggslam.formats.gaussian_ply import read_gaussian_ply
 
@@ -444,6 +459,7 @@ RECORDINGS = ("replica", "tum", "7scenes", "scannet", "folder", "vmap", "icl-nui
 TARGETS = [
     Target("ply", _clouds_of := lambda folder: [p for p in _clouds(folder) if p.suffix == ".ply"], _ply_read, 8),
     Target("gaussians", _gaussian_plys, _gaussians_read, 6), Target("cloud", _clouds, _cloud_read, 8),
+    Target("splats", _splats, _splats_read, 8),
     Target("mesh", _clouds_of, _mesh_read), Target("trajectory", _trajectories, _trajectory_read, 6),
     Target("images", _images, _image_read, 10), Target("masks", _masks, _mask_read, 6),
     Target("gpcc", _codes, _code_read, 10), Target("user-data", _user_data, _user_data_read),

@@ -60,7 +60,8 @@ class _Document:
         start, step = int(found.get("byteOffset", 0)), stride or width * dtype.itemsize
         if count < 0 or start < 0 or (count and start + (count - 1) * step + width * dtype.itemsize > len(data)):
             raise ValueError("an accessor reaches beyond its view")
-        rows = np.ndarray((count, width), dtype, data, start, (step, dtype.itemsize)).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # of signalling NaN
+            rows = np.ndarray((count, width), dtype, data, start, (step, dtype.itemsize)).astype(np.float64)
         if dtype.kind != "f" and found.get("normalized"):
             rows = np.maximum(rows / np.iinfo(dtype).max, -1.0)
         return rows

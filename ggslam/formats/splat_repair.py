@@ -50,7 +50,8 @@ def mend(columns: SplatColumns, faults: SplatFaults) -> np.ndarray:
     Returns:
         bool [N]: those to keep.
     """
-    norms = np.linalg.norm(columns.quaternions.astype(np.float64), axis=1)
+    with np.errstate(invalid="ignore"):
+        norms = np.linalg.norm(columns.quaternions.astype(np.float64), axis=1)
     log_scales = columns.log_scales
     flat = np.isneginf(log_scales).any(1) & np.isfinite(log_scales).any(1) & ~np.isposinf(log_scales).any(1)
     flat &= ~np.isnan(log_scales).any(1)
@@ -111,9 +112,9 @@ def map_of_columns(columns: SplatColumns, features: np.ndarray | None = None) ->
 
 
 def logits_of(opacities: np.ndarray) -> np.ndarray:
-    """Logits float32 of opacities from 0 to 1; of 0 and 1 those of `LARGEST_LOGIT`."""
-    with np.errstate(divide="ignore"):
-        values = np.asarray(opacities, np.float64)
+    """Logits float32 of opacities; of 0 and less, and of 1 and more, those of `LARGEST_LOGIT`; NaN of NaN."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.clip(np.asarray(opacities, np.float64), 0.0, 1.0)
         logits = np.log(values) - np.log1p(-values)
     return np.clip(logits, -LARGEST_LOGIT, LARGEST_LOGIT).astype(np.float32)
 
@@ -129,8 +130,8 @@ def columns_of(
     object_id: np.ndarray | None = None,
 ) -> SplatColumns:  # fmt: skip
     """Columns of N Gaussians of numbers of any type, writable; 0 of N ids where there are none."""
-    ids = np.zeros(len(means), np.int32) if object_id is None else np.asarray(object_id).astype(np.int32)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # ids that are no numbers are some number, and harm nothing
+        ids = np.zeros(len(means), np.int32) if object_id is None else np.asarray(object_id).astype(np.int32)
         return SplatColumns(
             np.array(means, np.float32), np.array(log_scales, np.float32), np.array(quaternions, np.float32),
             np.array(logits, np.float32), np.array(sh, np.float32), ids,
