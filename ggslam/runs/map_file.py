@@ -15,7 +15,7 @@ import torch
 
 from ggslam.coding.decoder import decode_in_parts
 from ggslam.coding.splats import gaussians_of, is_splat_cloud
-from ggslam.errors import FormatError, RunFolderError
+from ggslam.errors import FormatError, InputError, RunFolderError
 from ggslam.formats.gaussian_rows import GaussiansInMemory
 from ggslam.formats.splat_formats import SplatFile, open_splats, splat_format
 from ggslam.formats.trajectory import Trajectory
@@ -97,7 +97,11 @@ class MapFile(RunFolder):
     @cached_property
     def _table(self) -> ObjectTable:
         names = {i: name for i, name in (self.opened.names or {}).items() if name}
-        return ObjectTable.of_parts(self.opened.rows.blocks(), self.classifier(), "masks", names)
+        try:
+            return ObjectTable.of_parts(self.opened.rows.blocks(), self.classifier(), "masks", names)
+        except InputError as error:  # ids of others may be any number
+            _log.warning("note: %s", printable(f"{self.path}: read without objects: {error}"))
+            return ObjectTable("masks", len(self.opened.rows))
 
     def classifier(self) -> IdentityClassifier:
         """The classifier that `ggslam export` puts beside a PLY; one without classes where there is none."""

@@ -111,6 +111,14 @@ def test_objects_of_a_file_are_edited_and_exported(name: str, tmp_path: Path) ->
     assert "views around it" in model.describe() and model.notes == []
 
 
+def test_object_ids_of_others_may_be_any_number(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    gaussians = two_things()
+    gaussians.object_id[:] = 100_000
+    write_splats(tmp_path / "map.glb", gaussians, {100_000: "statue"})
+    assert not open_map(tmp_path / "map.glb").has_objects() and "read without objects" in caplog.text
+    succeed("view", tmp_path / "map.glb", "--html", tmp_path / "page.html")
+
+
 def test_a_turned_file_keeps_its_colours(tmp_path: Path) -> None:
     path = written(tmp_path / "map.ply")
     succeed("edit", path, "--move", "all", "0 0 0", "--rotate", "20 90 -35", "--out", tmp_path / "turned.ply")
