@@ -161,11 +161,8 @@ class ViewedRun:
             shown = min(len(self._gaussians), self._max_splats)
             parts = [f"{len(self._gaussians):,} Gaussians" + (f" ({shown:,} shown)" if shown < len(self._gaussians)
                                                               else "")]  # fmt: skip
-            if self.folder.has_poses:
-                parts.append(f"{len(self.frame_poses)} frames")
-                parts.append(f"{len(self.keyframe_poses)} keyframes")
-            else:
-                parts.append(f"{len(self.frame_poses)} views around it")
+            taken = [f"{len(self.frame_poses)} frames", f"{len(self.keyframe_poses)} keyframes"]
+            parts += taken if self.folder.has_poses else [f"{len(self.frame_poses)} views around it"]
             if self._segmented is not None:
                 parts.append(f"{len(self._segmented.table)} objects")
             return " · ".join(parts)
