@@ -34,12 +34,19 @@ def map_points(
         InputError: an impossible voxel size or opacity.
         RunFolderError, FormatError: a file is missing or damaged.
     """
-    stored, views = MapInParts.of_folder(folder), RenderedViews.of_files(folder)
-    if not stored.in_cells:
+    stored = MapInParts.of_folder(folder)
+    return points_of_views(stored, RenderedViews.of_files(folder, stored), voxel_size, discs, min_opacity)
+
+
+def points_of_views(
+    stored: MapInParts, views: RenderedViews, voxel_size: float | None, discs: bool, min_opacity: float
+) -> Iterator[VoxelCloud]:
+    """As `map_points`, of a map and its views."""
+    if stored.in_cells:
+        parts = stored.parts()
+    else:
         whole = stored.read(stored.cells())
         parts, views.in_view = [MapPart.of(whole)], lambda camera, T_camera_world: whole
-    else:
-        parts, views.in_view = stored.parts(), stored.in_view
     if discs or not len(views):
         return sample_parts(parts, voxel_size, min_opacity, views.segmented is not None)
     voxel_size = voxel_size_for(parts) if voxel_size is None else voxel_size

@@ -56,20 +56,35 @@ class RenderedViews:
     _rasterizer: CpuRasterizer = field(default_factory=CpuRasterizer)
 
     @staticmethod
-    def of_files(folder: Path) -> RenderedViews:
-        """Those of the files of a run, whether it is complete yet or not.
+    def of_records(
+        recording: SequenceRecord, keyframes: KeyframesRecord, parts: MapInParts,
+        segmented: Callable[[GaussianMap], SegmentedMap] | None,
+    ) -> RenderedViews:  # fmt: skip
+        """Those of a run's keyframes.
+
+        Args:
+            recording: tells the cameras.
+            keyframes: tell where they were.
+            parts: the map.
+            segmented: see the class.
+        """
+        places = keyframes.keyframes
+        cameras = [recording.camera if k.frame == ELSEWHERE else recording.camera_of(k.frame) for k in places]
+        return RenderedViews(cameras, [k.T_world_camera for k in places], parts.in_view, segmented)
+
+    @staticmethod
+    def of_files(folder: Path, parts: MapInParts) -> RenderedViews:
+        """Those of the files of a run, whether it is complete yet or not, and of the map in them.
 
         Raises:
             RunFolderError, FormatError: one is missing or damaged.
         """
-        recording, keyframes = SequenceRecord.read(folder), KeyframesRecord.read(folder).keyframes
-        cameras = [recording.camera if k.frame == ELSEWHERE else recording.camera_of(k.frame) for k in keyframes]
-        views = RenderedViews(cameras, [k.T_world_camera for k in keyframes], MapInParts.of_folder(folder).in_view)
+        segmented = None
         if (folder / "objects.json").is_file():
             table = ObjectTable.load(folder / "objects.json")
             classifier = IdentityClassifier.from_file(folder / "classifier.npz")
-            views.segmented = lambda gaussians: SegmentedMap(gaussians, classifier, table)
-        return views
+            segmented = lambda gaussians: SegmentedMap(gaussians, classifier, table)  # noqa: E731
+        return RenderedViews.of_records(SequenceRecord.read(folder), KeyframesRecord.read(folder), parts, segmented)
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -17,6 +17,7 @@ from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.splat_formats import splat_format
 from ggslam.formats.trajectory import read_tum
 from ggslam.formats.triangle_mesh import read_mesh
+from ggslam.formats.voxel_cloud import join_clouds
 from ggslam.geometry.clouds import Cloud, Overlap, overlap
 from ggslam.geometry.icp import CloudRegistration, register
 from ggslam.jobs.compare.alignment import (
@@ -31,7 +32,7 @@ from ggslam.jobs.compare.alignment import (
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.map_container import is_container
 from ggslam.runs.map_file import open_map
-from ggslam.runs.map_points import map_points
+from ggslam.runs.opened_points import opened_points
 from ggslam.runs.writing import TRUTH_FILE
 from ggslam.scene.poses import inverse
 from ggslam.system.json_files import json_ready
@@ -154,10 +155,10 @@ def read_side(path: Path, seed: int = 0) -> Side:
     if (path / MARKER).is_file():
         return _read_run(path)
     if splat_format(path) is not None or is_container(path):
-        points = sample_points(open_map(path).gaussians()).points
-        if not len(points):
+        cloud = join_clouds(opened_points(open_map(path)))
+        if not len(cloud):
             raise FormatError(f"{path}: its Gaussians are too faint for points to compare")
-        return Side(path, np.asarray(points, np.float64))
+        return Side(path, cloud.points)
     if path.is_dir():
         return _read_run(path)
     try:
@@ -173,8 +174,7 @@ def read_side(path: Path, seed: int = 0) -> Side:
 def _read_run(path: Path) -> Side:
     folder = RunFolder.open(path)
     cloud = path / "points.ply"
-    made = [] if cloud.is_file() else [part.points for part in map_points(path)]
-    points = read_point_cloud(cloud).points if cloud.is_file() else np.concatenate([np.empty((0, 3)), *made])
+    points = read_point_cloud(cloud).points if cloud.is_file() else join_clouds(opened_points(folder)).points
     if not len(points):
         raise RunFolderError(f"{path}: the map has no points to compare")
     truth = read_tum(path / TRUTH_FILE) if (path / TRUTH_FILE).is_file() else None

@@ -18,8 +18,8 @@ from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.jobs.export.chosen import ChosenGaussians, Prepare
 from ggslam.objects.table import ObjectRecord
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.map_points import map_points
 from ggslam.runs.objects_in_parts import ObjectsInParts
+from ggslam.runs.opened_points import opened_points
 from ggslam.scene.gaussian_map import GaussianMap, rgb_to_sh
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.system.atomic import make_folder, write_bytes
@@ -166,7 +166,7 @@ def points_to_export(
     if not voxel_size > 0 or not 0 < opacity < 1:
         raise ConfigError(f"impossible voxel size {voxel_size} or minimum opacity {opacity}")
     try:
-        clouds = map_points(folder.path, voxel_size, discs, opacity)
+        clouds = opened_points(folder, voxel_size, discs, opacity)
         first = next(clouds, None)
     except InputError as error:
         raise ConfigError(str(error)) from None

@@ -142,7 +142,7 @@ def _views(folder: RunFolder, request: MeshRequest) -> _Views:
 
 def _map_views(folder: RunFolder) -> _Views:
     """The map as the keyframes see it."""
-    views = RenderedViews.of_files(folder.path)
+    views = RenderedViews.of_files(folder.path, folder.map_in_parts())
     if not len(views):
         raise RunFolderError(f"{folder.path}: no frame of this run was located")
     return _Views(_renders(views), len(views), f"depth rendered at {len(views)} keyframes")
