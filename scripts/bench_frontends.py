@@ -199,7 +199,7 @@ def run_college(folder: Path, budget_ms: float, arguments: argparse.Namespace) -
     """Five scans a metre apart, already split in edges and planes."""
     truth = list(read_pose_graph(folder / "graph.txt").values())
     names = [f"{10 * i:06d}.bin" for i in range(len(truth))]
-    pairs = [(read_raw_points(folder / f"planes_{n}"), read_raw_points(folder / f"edges_{n}")) for n in names]
+    pairs = [(read_raw_points(folder / f"planes_{n}", 3), read_raw_points(folder / f"edges_{n}", 3)) for n in names]
     scans = [split_features(planes, edges, LIDAR_NOISE, arguments.device) for planes, edges in pairs]
     run_lidar(folder.name, scans, [np.concatenate(pair) for pair in pairs], truth, budget_ms, arguments)
 

@@ -78,7 +78,7 @@ def localize(
     camera: options.OwnCamera = None,
     intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
-    columns: options.Columns = 4,
+    columns: options.Columns = None,
     skip_bad_frames: options.SkipBadFrames = False,
     threads: options.Threads = None,
 ) -> None:

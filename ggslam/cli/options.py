@@ -20,7 +20,10 @@ ConfigName = Annotated[str | None, typer.Option("--config", help="Preset name, o
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Override one setting; repeatable.")
 ]
-Columns = Annotated[int, typer.Option(help="Numbers that a .bin scan stores for each point.", min=3)]
+Columns = Annotated[
+    int | None,
+    typer.Option(help="Numbers that a .bin scan stores for each point; default: as its numbers tell.", min=3),
+]
 LivePath = Annotated[
     Path | None,
     typer.Argument(

@@ -80,7 +80,7 @@ def submaps(
     depth_scale: options.DepthScale = None,
     camera: options.OwnCamera = None,
     intrinsics: options.Intrinsics = None,
-    columns: options.Columns = 4,
+    columns: options.Columns = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what is in the store as JSON.")] = False,
 ) -> None:  # fmt: skip
     """Make a grid store, add a visit to one, or list its cells, parts, visits, objects and what changed."""

@@ -151,13 +151,17 @@ def _stored_type(names: list[str], sizes: list[int], types: list[str], counts: l
         raise ValueError("FIELDS, SIZE, TYPE and COUNT differ in length")
     fields: list[tuple] = []
     for number, (name, size, kind, count) in enumerate(zip(names, sizes, types, counts, strict=True)):
-        if kind not in _SIZES or size not in _SIZES[kind] or not 1 <= count <= 1 << 16:
+        if kind not in _SIZES or size not in _SIZES[kind] or not 0 <= count <= 1 << 16:
             raise ValueError(f"field '{name}' is of type {kind}, size {size} and count {count}")
+        if count == 0:  # padding that takes no bytes, which drivers of sensors write
+            continue
         unique = f"_ {number}" if name == "_" else name
         if any(unique == other[0] for other in fields):
             raise ValueError(f"field '{name}' is declared twice")
         code = f"<{kind.lower()}{size}"
         fields.append((unique, code) if count == 1 else (unique, code, (count,)))
+    if not fields:
+        raise ValueError("no field has a COUNT above 0")
     return np.dtype(fields)
 
 

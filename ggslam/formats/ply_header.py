@@ -22,6 +22,9 @@ NUMPY_CODES = {
 }  # fmt: skip
 """Scalar types of the PLY specification, both naming schemes."""
 
+_READ_CODES = {**NUMPY_CODES, "int64": "i8", "uint64": "u8", "long": "i8", "ulong": "u8"}
+"""And types of 8 bytes, which the specification lacks and programs write nevertheless (times, numbers of points)."""
+
 PLY_NAMES = {code: name for name, code in reversed(NUMPY_CODES.items())}
 """The classic name of each numpy type code."""
 
@@ -130,15 +133,15 @@ def _add_property(words: list[str], header: Header) -> None:
     if not header.elements:
         raise ValueError("property before the first element")
     types = words[1:3] if words[0] == "list" else words[:1]
-    unknown = [name for name in types if name not in NUMPY_CODES]
+    unknown = [name for name in types if name not in _READ_CODES]
     if unknown:
         raise ValueError(f"unknown type {unknown[0]!r}")
     if words[0] == "list":
-        if NUMPY_CODES[types[0]].startswith("f"):
+        if _READ_CODES[types[0]].startswith("f"):
             raise ValueError("a list length cannot be a floating-point number")
-        added = Property(words[3], NUMPY_CODES[types[1]], NUMPY_CODES[types[0]])
+        added = Property(words[3], _READ_CODES[types[1]], _READ_CODES[types[0]])
     else:
-        added = Property(words[1], NUMPY_CODES[types[0]])
+        added = Property(words[1], _READ_CODES[types[0]])
     properties = header.elements[-1].properties
     if any(added.name == other.name for other in properties):
         raise ValueError("property declared twice")

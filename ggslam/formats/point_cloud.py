@@ -19,6 +19,7 @@ from ggslam.formats.gaussian_ply import object_ids
 from ggslam.formats.pcd import read_pcd, write_pcd
 from ggslam.formats.ply import read_ply, write_ply
 from ggslam.formats.point_ply import grid_positions
+from ggslam.formats.positions import placed_rows
 from ggslam.scene.gaussian_map import SH_C0
 from ggslam.system.foreign import open_foreign
 
@@ -63,10 +64,14 @@ class ColoredCloud:
         return len(self.points)
 
 
-def read_point_cloud(path: str | Path) -> ColoredCloud:
+def read_point_cloud(path: str | Path, tell: bool = True) -> ColoredCloud:
     """Reads a PLY or PCD file; which one it is follows from its first bytes.
 
-    Points of a PCD file without a position (not a number: the sensor saw nothing there) are left out.
+    Points without a position (not a number: the sensor saw nothing there) are left out and counted.
+
+    Args:
+        path: the file.
+        tell: warn (logger `ggslam.formats.positions`) if points were left out.
 
     Raises:
         FormatError: the file is missing, neither PLY nor PCD, damaged, has no points, or colours or positions of a
@@ -82,13 +87,10 @@ def read_point_cloud(path: str | Path) -> ColoredCloud:
         ply = read_ply(path)
         if "vertex" not in ply.elements:
             raise FormatError(f"{path}: no element 'vertex'; it has {', '.join(ply.elements) or 'none'}")
-        return _cloud(path, ply.elements["vertex"], ply.comments)
+        return _cloud(path, ply.elements["vertex"], ply.comments, tell)
     if path.suffix.lower() != ".pcd" and not start.startswith((b"#", b"VERS")):
         raise FormatError(f"{path}: neither a PLY nor a PCD file (it begins with {start!r})")
-    rows = read_pcd(path)
-    x, y, z = _columns_of(path, rows, ("x", "y", "z"), "no positions")
-    somewhere = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
-    return replace(_cloud(path, rows[somewhere], []), nowhere=int((~somewhere).sum()))
+    return _cloud(path, read_pcd(path), [], tell)
 
 
 def write_point_cloud(
@@ -160,24 +162,24 @@ def _packed_rgb(colors: np.ndarray) -> np.ndarray:
     return ((r << 16) | (g << 8) | b).view(np.float32)
 
 
-def _cloud(path: Path, rows: np.ndarray, comments: list[str]) -> ColoredCloud:
+def _cloud(path: Path, rows: np.ndarray, comments: list[str], tell: bool) -> ColoredCloud:
     if not len(rows):
         raise FormatError(f"{path}: no points")
-    position = np.stack(_columns_of(path, rows, ("x", "y", "z"), "no positions"), 1)
+    axes = _position_names(path, rows)
+    stored = len(rows)
+    rows = rows[placed_rows(path, np.stack([rows[name] for name in axes], 1), tell)]
+    position = np.stack([rows[name] for name in axes], 1)
     points = position.astype(np.float64)
-    if not np.isfinite(points).all():
-        row = int(np.argmin(np.isfinite(points).all(1)))
-        raise FormatError(f"{path}: point {row} is {points[row].tolist()}, expected finite numbers")
     color_names = _color_names(rows)
     colors = None if color_names is None else _colors(path, rows, color_names)
     reflectance = _reflectance_name(rows)
-    used = {"x", "y", "z", *(color_names or ()), *((reflectance,) if reflectance else ())}
+    used = {*axes, *(color_names or ()), *((reflectance,) if reflectance else ())}
     others = [n for n in rows.dtype.names or () if n not in used]
     labels = {n: rows[n] for n in others if rows.dtype[n].kind in "iu" and n.lower() not in _ALPHA}
     if color_names == _GAUSSIAN_COLOR and "object_id" in others:  # of a 3DGS PLY, where all is float32
         labels["object_id"] = object_ids(path, rows)
     left_out = tuple(n for n in others if n not in labels)
-    cloud = ColoredCloud(points, colors, labels, left_out=left_out)
+    cloud = ColoredCloud(points, colors, labels, left_out=left_out, nowhere=stored - len(rows))
     if reflectance is not None:
         cloud = replace(cloud, reflectance=rows[reflectance], reflectance_name=reflectance)
     if not any(text.split()[:1] == ["voxel_size"] for text in comments):
@@ -186,11 +188,14 @@ def _cloud(path: Path, rows: np.ndarray, comments: list[str]) -> ColoredCloud:
     return replace(cloud, points=origin + voxel_size * grid, grid=grid, voxel_size=voxel_size, origin=origin)
 
 
-def _columns_of(path: Path, rows: np.ndarray, names: Sequence[str], reason: str) -> list[np.ndarray]:
-    missing = [n for n in names if n not in (rows.dtype.names or ()) or rows.dtype[n].kind not in "fiu"]
-    if missing:
-        raise FormatError(f"{path}: {reason}: expected the properties {' '.join(names)}, missing {' '.join(missing)}")
-    return [rows[n] for n in names]
+def _position_names(path: Path, rows: np.ndarray) -> tuple[str, str, str]:
+    """The properties x y z, or X Y Z as some programs call them."""
+    numbers = [name for name in rows.dtype.names or () if rows.dtype[name].kind in "fiu"]
+    for names in (("x", "y", "z"), ("X", "Y", "Z")):
+        if set(names) <= set(numbers):
+            return names
+    missing = " ".join(name for name in "xyz" if name not in numbers)
+    raise FormatError(f"{path}: no positions: expected the properties x y z, missing {missing}")
 
 
 def _color_names(rows: np.ndarray) -> tuple[str, ...] | None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of laser scans: a folder with one file a scan, in the order of their names, and a file of poses.
 
-    scans/000000.bin ...    or the files in the folder itself: .bin (float32 x y z intensity), .npy [n, 3 or more], .pcd
+    scans/000000.bin ...    or the files in the folder itself: .bin (float32), .npy [n, 3 or more], .pcd
     trajectory.txt          TUM (timestamp tx ty tz qx qy qz qw) or one matrix a line (KITTI, Replica), a row a scan;
                             or groundtruth.txt, or poses.txt; sensor to world; may be absent
 """
@@ -14,11 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import FormatError, SequenceError
-from ggslam.formats.point_cloud import read_point_cloud
-from ggslam.formats.raw_points import read_raw_points
+from ggslam.errors import SequenceError
+from ggslam.formats.cloud_files import read_cloud_file
 from ggslam.formats.trajectory import read_trajectory
-from ggslam.scene.arrays import read_array
 
 _SUFFIXES = (".bin", ".npy", ".pcd")
 _POSES = ("trajectory.txt", "groundtruth.txt", "poses.txt")
@@ -45,15 +43,17 @@ class ScanSequence:
     """
 
     def __init__(
-        self, path: Path, start: int = 0, stop: int | None = None, stride: int = 1, columns: int = 4
+        self, path: Path, start: int = 0, stop: int | None = None, stride: int = 1,
+        columns: int | None = None,
     ) -> None:
-        """Finds the scans and reads the poses; `columns`: numbers of a point in .bin files.
+        """Finds the scans and reads the poses; `columns`: of .bin files, see `read_raw_points`.
 
         Raises:
             SequenceError: no scans, or none selected, or another number of poses.
             FormatError: the poses are damaged.
         """
         self.path, self._columns = Path(path), columns
+        self._told = False
         files = scan_files(self.path)
         if not files:
             raise SequenceError(f"{path}: no scans ({', '.join(_SUFFIXES)})")
@@ -69,8 +69,14 @@ class ScanSequence:
         return len(self._files)
 
     def scan(self, index: int) -> LaserScan:
-        """Reads a scan of the selection. Raises FormatError if it is damaged."""
-        return LaserScan(index, float(self.timestamps[index]), _points(self._files[index], self._columns))
+        """Reads a scan of the selection. Of the first with points that have no position, how many is told.
+
+        Raises:
+            FormatError: it is damaged.
+        """
+        cloud = read_cloud_file(self._files[index], self._columns, tell=not self._told)
+        self._told = self._told or cloud.nowhere > 0
+        return LaserScan(index, float(self.timestamps[index]), cloud.points.astype(np.float32))
 
     def stream(self) -> Iterator[LaserScan]:
         """All scans in order."""
@@ -96,15 +102,3 @@ def _poses(folder: Path, count: int) -> tuple[np.ndarray, np.ndarray | None]:
             by_row = np.array_equal(found.timestamps, np.arange(count))
             return found.timestamps / (_RATE if by_row else 1.0), found.T_world_camera
     return np.arange(count) / _RATE, None
-
-
-def _points(path: Path, columns: int) -> np.ndarray:
-    if path.suffix.lower() == ".bin":
-        return read_raw_points(path, columns)[:, :3]
-    if path.suffix.lower() == ".pcd":
-        return read_point_cloud(path).points.astype(np.float32)
-    points = read_array(path)
-    if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind != "f":
-        shape = list(np.shape(points))
-        raise FormatError(f"{path}: expected floating-point numbers [n, 3 or more], found {shape}")
-    return np.ascontiguousarray(points[:, :3], np.float32)

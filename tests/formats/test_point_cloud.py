@@ -12,6 +12,7 @@ import torch
 
 from ggslam.errors import FormatError
 from ggslam.formats import lzf
+from ggslam.formats.cloud_files import read_cloud_file
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.pcd import parse_pcd, pcd_bytes
 from ggslam.formats.ply import write_ply
@@ -256,7 +257,7 @@ def vertices(**columns: list[float]) -> np.ndarray:
     ("rows", "reason"),
     [
         (vertices(x=[1], y=[2]), "missing z"),
-        (vertices(x=[1, 2], y=[1, float("nan")], z=[1, 2]), "point 1 is"),
+        (vertices(x=[1, 2], y=[1, float("nan")], z=[float("inf"), 2]), "none of its 2 points has a position"),
         (vertices(x=[], y=[], z=[]), "no points"),
         (vertices(x=[1], y=[1], z=[1], red=[0], green=[-3], blue=[0]), "expected 0 to 255"),
         (vertices(x=[1], y=[1], z=[1], red=[0], green=[float("inf")], blue=[0]), "colour of point 0"),
@@ -291,6 +292,116 @@ def test_damaged_pcd_headers_are_refused(tmp_path: Path, old: str, new: str, rea
     (tmp_path / "bad.pcd").write_text(text.replace(old, new))
     with pytest.raises(FormatError, match=reason):
         read_point_cloud(tmp_path / "bad.pcd")
+
+
+def test_padding_of_no_bytes(tmp_path: Path) -> None:
+    """As drivers of LiDARs write it: fields called _ whose COUNT is 0."""
+    rows = np.zeros(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("pad", "u1", (4,)), ("intensity", "<f4"),
+                        ("ring", "u1"), ("range", "<u4"), ("end", "u1", (15,))])  # fmt: skip
+    for axis, name in enumerate("xyz"):
+        rows[name] = POINTS[:, axis]
+    rows["intensity"], rows["ring"], rows["range"], rows["pad"] = [0, 1, 2], [7, 8, 9], [1, 1 << 31, 5], 200
+    head = (
+        "VERSION 0.7\nFIELDS x y z _ intensity ring _ range _\nSIZE 4 4 4 1 4 1 1 4 1\nTYPE F F F U F U U U U\n"
+        "COUNT 1 1 1 4 1 1 0 1 15\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA "
+    )
+    for encoding, body in (
+        ("binary", rows.tobytes()),
+        ("ascii", b"\n".join(" ".join(str(v) for v in [r["x"], r["y"], r["z"], *r["pad"], r["intensity"], r["ring"],
+                                                       r["range"], *r["end"]]).encode() for r in rows)),
+    ):  # fmt: skip
+        (tmp_path / "a.pcd").write_bytes(f"{head}{encoding}\n".encode() + body)
+        cloud = read_point_cloud(tmp_path / "a.pcd")
+        np.testing.assert_array_equal(cloud.points, POINTS)
+        assert cloud.reflectance is not None and cloud.reflectance.tolist() == [0, 1, 2]
+        assert cloud.labels["ring"].tolist() == [7, 8, 9] and cloud.labels["range"].tolist() == [1, 1 << 31, 5]
+    (tmp_path / "a.pcd").write_bytes(head.replace("1 1 1 4 1 1 0 1 15", "0 0 0 0 0 0 0 0 0").encode() + b"binary\n")
+    with pytest.raises(FormatError, match="no field has a COUNT"):
+        read_point_cloud(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_capital_letters(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    write_point_cloud(path, POINTS, {"label": np.array([1, 2, 3])})
+    path.write_bytes(path.read_bytes().replace(b" x y z", b" X Y Z").replace(b"double x", b"double X")
+                     .replace(b"float64 x", b"float64 X").replace(b"float64 y", b"float64 Y")
+                     .replace(b"float64 z", b"float64 Z"))  # fmt: skip
+    assert b"X" in path.read_bytes()[:400]
+    np.testing.assert_array_equal(read_point_cloud(path).points, POINTS)
+
+
+@pytest.mark.parametrize(("name", "code"), [("int64", "<i8"), ("ulong", "<u8")])
+def test_numbers_of_eight_bytes(tmp_path: Path, name: str, code: str) -> None:
+    rows = np.zeros(3, [("x", "<f4"), ("t", code), ("y", "<f4"), ("z", "<f4")])
+    for axis, axis_name in enumerate("xyz"):
+        rows[axis_name] = POINTS[:, axis]
+    rows["t"] = [1, 1_700_000_000_123_456_789, 3]
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty {name} t\n"
+    text = f"{head}property float y\nproperty float z\nend_header\n".encode()
+    (tmp_path / "a.ply").write_bytes(text + rows.tobytes())
+    cloud = read_point_cloud(tmp_path / "a.ply")
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    assert cloud.labels["t"].tolist() == [1, 1_700_000_000_123_456_789, 3]
+
+
+def cloud_files(folder: Path, points: np.ndarray) -> list[Path]:
+    """The same points [N, 3] in files of every kind that is read."""
+    rows = np.zeros(len(points), [(name, "<f4") for name in "xyz"])
+    for axis, name in enumerate("xyz"):
+        rows[name] = points[:, axis]
+    text = "\n".join(" ".join(str(v) for v in row) for row in points.tolist()).encode()
+    declared = "".join(f"property float {name}\n" for name in "xyz")
+    files = {"a.npy": b"", "a.bin": points.astype("<f4").tobytes()}
+    for encoding, body in (("ascii", text), ("binary_little_endian", rows.tobytes()),
+                           ("binary_big_endian", rows.astype([(n, ">f4") for n in "xyz"]).tobytes())):  # fmt: skip
+        head = f"ply\nformat {encoding} 1.0\nelement vertex {len(points)}\n{declared}end_header\n"
+        files[f"{encoding}.ply"] = head.encode() + body
+    columns = {name: points[:, axis].astype("<f4") for axis, name in enumerate("xyz")}
+    squeezed = pcd_bytes(columns, compressed=True)
+    plain = pcd_bytes(columns)
+    files |= {"binary.pcd": plain, "compressed.pcd": squeezed,
+              "ascii.pcd": plain[: plain.index(b"DATA")] + b"DATA ascii\n" + text}  # fmt: skip
+    assert b"binary_compressed" in squeezed
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    np.save(folder / "a.npy", points)
+    return [folder / name for name in files]
+
+
+def test_points_without_a_position_are_left_out_by_every_reader(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rng = np.random.default_rng(0)
+    points = np.repeat(rng.normal(size=(100, 3)), 5, axis=0).astype(np.float32).astype(np.float64)
+    gone = np.sort(rng.choice(500, 72, replace=False))
+    points[gone[:40]] = np.nan
+    points[gone[40:60], 1] = np.inf
+    points[gone[60:], 2] = -np.inf
+    kept = np.delete(points, gone, axis=0)
+    for path in cloud_files(tmp_path, points):
+        caplog.clear()
+        cloud = read_cloud_file(path, columns=3)
+        np.testing.assert_array_equal(cloud.points, kept, err_msg=path.name)
+        assert cloud.nowhere == 72, path
+        assert [record.getMessage() for record in caplog.records] == [
+            f"warning: {path}: left out 72 of 500 points that have no position (not a number)"
+        ]
+    caplog.clear()
+    assert read_cloud_file(tmp_path / "binary.pcd", tell=False).nowhere == 72 and not caplog.records
+    for path in cloud_files(tmp_path, np.full((200, 3), np.nan)):
+        with pytest.raises(FormatError, match="none of its 200 points has a position"):
+            read_cloud_file(path, columns=3)
+
+
+def test_colours_and_ids_stay_with_their_points(tmp_path: Path) -> None:
+    points = np.array([[1, 2, 3], [np.nan, 0, 0], [4, 5, 6]], np.float32)
+    for name in ("a.ply", "a.pcd"):
+        write_point_cloud(tmp_path / name, points, {"color": COLORS, "object_id": LABELS})
+        cloud = read_point_cloud(tmp_path / name)
+        assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]] and cloud.nowhere == 1
+        np.testing.assert_array_equal(cloud.colors, COLORS[[0, 2]])
+        assert cloud.labels["object_id"].tolist() == LABELS[[0, 2]].tolist()
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:

@@ -18,13 +18,47 @@ def test_points_are_read_back(tmp_path: Path) -> None:
 
 def test_damaged_points_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(b"\0" * 13)
-    with pytest.raises(FormatError, match="13 bytes, expected a multiple of 12"):
+    with pytest.raises(FormatError, match="13 bytes, expected a multiple of 4"):
         read_raw_points(tmp_path / "a.bin")
-    np.array([[0, 0, 0], [0, np.nan, 0]], "<f4").tofile(tmp_path / "b.bin")
-    with pytest.raises(FormatError, match="point 1 is"):
-        read_raw_points(tmp_path / "b.bin")
+    (tmp_path / "a.bin").write_bytes(b"\0" * 16)
+    with pytest.raises(FormatError, match="16 bytes, expected a multiple of 12"):
+        read_raw_points(tmp_path / "a.bin", 3)
     with pytest.raises(FormatError, match="file is missing"):
         read_raw_points(tmp_path / "c.bin")
+
+
+def lidar_numbers(columns: int, seed: int = 0) -> np.ndarray:
+    """A scan float32 [n, columns] of 32 rings in a hall: x y z, then intensity, ring, time."""
+    rng = np.random.default_rng(seed)
+    turn, ring = np.meshgrid(np.linspace(0, 2 * np.pi, 240, endpoint=False), np.arange(32), indexing="ij")
+    slope = np.radians(ring - 25.0).ravel()
+    reach = np.minimum(np.minimum(1.8 / np.maximum(-np.sin(slope), 1e-3), 12 + 6 * np.sin(3 * turn.ravel())), 60)
+    x, y = reach * np.cos(slope) * np.cos(turn.ravel()), reach * np.cos(slope) * np.sin(turn.ravel())
+    others = [x, y, reach * np.sin(slope), rng.integers(0, 100, len(x)), ring.ravel(), turn.ravel() / 63]
+    return np.stack(others[:columns], 1).astype("<f4")
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+@pytest.mark.parametrize("name", ["a.bin", "a.pcd.bin"])
+def test_the_numbers_tell_their_columns(tmp_path: Path, columns: int, name: str) -> None:
+    numbers = lidar_numbers(columns)
+    for kept in (len(numbers), 60 * 64):  # multiples of each other's widths, too
+        numbers[:kept].tofile(tmp_path / name)
+        assert np.array_equal(read_raw_points(tmp_path / name), numbers[:kept])
+        assert np.array_equal(read_raw_points(tmp_path / name, columns), numbers[:kept])
+    for other in {3, 4, 5, 6} - {columns, 2 * columns}:
+        if numbers[:kept].size % other == 0:
+            with pytest.raises(FormatError, match=f"expected {other} numbers .* repeat after {columns}"):
+                read_raw_points(tmp_path / name, other)
+
+
+def test_few_numbers_tell_nothing(tmp_path: Path) -> None:
+    points = np.random.default_rng(1).normal(size=(60, 1)).astype("<f4")
+    points.tofile(tmp_path / "a.bin")
+    points.tofile(tmp_path / "a.pcd.bin")
+    assert read_raw_points(tmp_path / "a.bin").shape == (15, 4)
+    assert read_raw_points(tmp_path / "a.pcd.bin").shape == (12, 5)
+    assert read_raw_points(tmp_path / "a.bin", 3).shape == (20, 3)
 
 
 def test_poses_are_read_in_order(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from ggslam.coding import AttributeSettings, PointCloud
 from ggslam.errors import FormatError
 from ggslam.formats.point_cloud import ColoredCloud
+from ggslam.formats.positions import left_out_words
 
 _MOST_IDS = 1 << 16
 _LEVELS = (1 << 16) - 1
@@ -88,7 +89,7 @@ def _note_what_is_left_out(cloud: ColoredCloud, notes: list[str]) -> None:
         if {"opacity", "scale_0", "rot_0"} <= set(cloud.left_out):
             notes.append("these are Gaussians: `preset` splat codes them whole")
     if cloud.nowhere:
-        notes.append(f"left out {cloud.nowhere} points that have no position (not a number)")
+        notes.append(left_out_words(cloud.nowhere, cloud.nowhere + len(cloud)))
 
 
 def restored_attributes(cloud: PointCloud) -> dict[str, np.ndarray]:

@@ -97,7 +97,8 @@ def encode_file(
 
 
 def _encode_points(path: Path, out: Path, settings: CodecSettings, ids: bool, notes: list[str]) -> CodingReport:
-    cloud = read_point_cloud(path) if splat_format(path) is None or path.suffix.lower() == ".ply" else _points_of(path)
+    is_cloud = splat_format(path) is None or path.suffix.lower() == ".ply"
+    cloud = read_point_cloud(path, tell=False) if is_cloud else _points_of(path)  # the notes tell it
     points, settings = coded_points(cloud, settings)
     coded = attributes_to_code(cloud, ids)
     notes += coded.notes

@@ -55,7 +55,7 @@ class LocalizeRequest:
         out: folder for the results; None: localized/NAME.
         radius: R' in metres; None: the store's.
         voxel: edge of the target's voxels in metres; None: 0.03 for images, 0.15 for scans, or what the map allows.
-        columns: numbers of a point in .bin scans.
+        columns: numbers of a point in .bin scans; None: as they tell themselves.
         threads: None: all processors.
         tracker, scans: settings of the front-ends.
     """
@@ -68,7 +68,7 @@ class LocalizeRequest:
     out: Path | None = None
     radius: float | None = None
     voxel: float | None = None
-    columns: int = 4
+    columns: int | None = None
     threads: int | None = None
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
     scans: ScanTrackerSettings = field(default_factory=ScanTrackerSettings)

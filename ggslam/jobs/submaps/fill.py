@@ -44,7 +44,7 @@ class SubmapsRequest:
         at: seconds at which the visit began, on the clock of all visits; None: the recording's own clock.
         settings: fields of `SubmapSettings` that are not the default's (of a new store) or the store's.
         sequence: how the recording is read.
-        columns: numbers of a point in .bin scans.
+        columns: numbers of a point in .bin scans; None: as they tell themselves.
     """
 
     source: Path
@@ -54,7 +54,7 @@ class SubmapsRequest:
     at: float | None
     settings: Mapping[str, Any]
     sequence: SequenceRequest
-    columns: int = 4
+    columns: int | None = None
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def make_store(request: SubmapsRequest, observer: Observer, add_run: AddRun = st
             written = record_visit(store, watched, poses, sights, request.visit or source.resolve().name, request.at)
             observer.note(f"{len(written)} cells written")
         elif is_cloud(source):
-            store_of_cloud(source, store, request.visit, request.at)
+            store_of_cloud(source, store, request.visit, request.at, request.columns)
         else:
             add_run(source, store, request.visit, request.at)
 

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import FormatError, RunFolderError
-from ggslam.formats.point_cloud import read_point_cloud
-from ggslam.formats.raw_points import read_raw_points
+from ggslam.errors import RunFolderError
+from ggslam.formats.cloud_files import SUFFIXES, read_cloud_file
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, arrays_of_map, gaussians_to_bytes
 from ggslam.jobs.submaps.visit_records import remember_run
 from ggslam.localization.places import PLACES, StoredView, stored_places_to_bytes
@@ -20,7 +19,7 @@ from ggslam.localization.surface import NORMAL
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import fingerprint
-from ggslam.scene.arrays import read_all_arrays, read_array
+from ggslam.scene.arrays import read_all_arrays
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
@@ -35,7 +34,6 @@ from ggslam.submaps.settings import SubmapSettings
 INDOORS = SubmapSettings(voxel=0.02)
 """For maps of depth cameras."""
 _CELLS_AT_ONCE = 64
-_CLOUDS = (".ply", ".pcd", ".npy", ".bin")
 
 
 def is_store(path: Path) -> bool:
@@ -45,7 +43,7 @@ def is_store(path: Path) -> bool:
 
 def is_cloud(path: Path) -> bool:
     """Whether a path names a cloud, by its suffix."""
-    return path.suffix.lower() in _CLOUDS and not path.is_dir()
+    return path.suffix.lower() in SUFFIXES and not path.is_dir()
 
 
 def open_or_create(path: Path, settings: SubmapSettings) -> GridStore:
@@ -116,14 +114,16 @@ def visit_of(folder: RunFolder) -> str:
     return f"run {fingerprint(folder)[:16]}"
 
 
-def store_of_cloud(path: Path, store: GridStore, visit: str | None = None, at: float | None = None) -> None:
-    """Cuts a cloud (.ply, .pcd; .npy [n, 3 or more]; .bin, float32 x y z intensity) into the cells of a store.
+def store_of_cloud(
+    path: Path, store: GridStore, visit: str | None = None, at: float | None = None, columns: int | None = None
+) -> None:
+    """Cuts a cloud into the cells of a store; `columns`: see `read_cloud_file`.
 
     Raises:
         FormatError: the file is missing or damaged.
     """
     store.begin_visit(visit or path.name)
-    points, attributes = _cloud(path)
+    points, attributes = _cloud(path, columns)
     due = _Due(store, at or 0.0).of(points)
     store_cloud(store, points[due], {name: values[due] for name, values in attributes.items()}, at or 0.0)
 
@@ -159,15 +159,8 @@ def _put(store: GridStore, writes: list[CellWrite]) -> None:
     store.put_cells(list(merged.values()))
 
 
-def _cloud(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    if path.suffix.lower() == ".bin":
-        return read_raw_points(path, 4)[:, :3], {}
-    if path.suffix.lower() == ".npy":
-        points = read_array(path)
-        if getattr(points, "ndim", 0) != 2 or points.shape[1] < 3 or points.dtype.kind != "f":
-            raise FormatError(f"{path}: expected floating-point numbers [n, 3 or more], found {list(np.shape(points))}")
-        return points[:, :3], {}
-    cloud = read_point_cloud(path)
+def _cloud(path: Path, columns: int | None = None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    cloud = read_cloud_file(path, columns)
     return cloud.points, {} if cloud.colors is None else {"color": cloud.colors}
 
 
