@@ -108,8 +108,6 @@ def _side_information(cloud: CloudToCode) -> dict[str, Any]:
     content: dict[str, Any] = {}
     if not cloud.quantization.resolution()[1]:
         content["scale"] = cloud.quantization.scale / cloud.quantization.unit
-    if cloud.quantization.centre:
-        content["centre"] = cloud.quantization.centre
     if any(cloud.quantization.shift):
         content["shift"] = list(cloud.quantization.shift)
     if any(plan.name != plan.description.label or plan.description.instance for plan, _ in cloud.plans):

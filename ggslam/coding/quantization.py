@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Positions to grid and back: p~ = clip(floor(s p) - o, c_min, c_max), as in the slice-parallel G-PCC encoder for
-embedded systems whose equations 4 and 5 these are. The scale s is a number of voxels per metre, o an integer origin.
+"""Positions to grid and back: p~ = clip(round(s p) - o, c_min, c_max), as in the slice-parallel G-PCC encoder for
+embedded systems whose equations 4 and 5 these are (which cut off, where this rounds). The scale s is a number of voxels
+per metre, o an integer origin.
 
-The sequence parameter set holds s as a quotient of integers and o as the offset of its box: every decoder can place the
-points. A scale that is no such quotient, and the place of a point within its voxel, travel exactly in a user data unit.
+A grid coordinate g denotes the centre of its voxel, the point (g + o) / s: so have it the grids of `VoxelCloud`, clouds
+of whole numbers, and the standard, by which every decoder places the points. The sequence parameter set holds s as a
+quotient of integers and o as the offset of its box; a scale that is no such quotient travels exactly in a user data
+unit.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from ggslam.errors import ConfigError
 
 GRID_BITS = 21
 ROUNDING = 1e-3
-"""Voxels that a coordinate may lie below a voxel's face and still count as in it: points that were on a grid once stay
+"""Voxels that a coordinate may lie below a voxel's face and still count as in it: points that lay on faces once stay
 apart, whichever way their coordinates were rounded."""
 _MAX_FIELD = (1 << 32) - 2
 
@@ -28,9 +31,10 @@ class Quantization:
     """How positions lie on the grid.
 
     scale: voxels per unit of the positions (metres, or steps of an integer grid).
-    origin: subtracted from floor(scale p), voxels.
+    origin: subtracted from round(scale p), voxels.
     size: voxels along each axis; grid positions are clipped to [0, size - 1].
-    centre: added to grid positions when they are restored, in voxels: 0.5 for the centres of the voxels.
+    centre: added to grid positions when they are restored, in voxels: 0, but in streams of earlier versions, whose
+        coordinates denote the lowest corner of a voxel.
     metres: whether restored positions are metres.
     unit: length of a step of the positions, in metres if `metres`.
     shift: added to restored positions.
@@ -64,7 +68,7 @@ class Quantization:
         """Points [N, 3] seen on this grid."""
         size = self.size or (1 << 31,) * 3
         exact = self.scale == 1 and np.issubdtype(points.dtype, np.integer)
-        return GridPoints(points, self.scale, ROUNDING, self.origin, size, exact)
+        return GridPoints(points, self.scale, 0.5 + ROUNDING, self.origin, size, exact)
 
     def restore(self, grid: np.ndarray) -> np.ndarray:
         """Positions float64 [N, 3] of grid positions."""
@@ -136,7 +140,7 @@ def choose_quantization(
             raise ConfigError(f"positions that span {longest:g} fit on no grid: name a voxel size")
     scale = geometry_scale / voxel_size
     with np.errstate(over="ignore", invalid="ignore"):
-        first, last = np.floor(low * scale + ROUNDING), np.floor(high * scale + ROUNDING)
+        first, last = (np.floor(corner * scale + 0.5 + ROUNDING) for corner in (low, high))
     if not np.isfinite(first).all() or not np.isfinite(last).all() or np.abs([first, last]).max() >= 1 << 52:
         raise ConfigError(f"voxels of {1 / scale:g} are too small for positions up to {np.abs([low, high]).max():g}")
     extent = (last - first).astype(np.int64) + 1
@@ -145,9 +149,6 @@ def choose_quantization(
             f"the grid is {extent.max()} voxels long, more than 2^{GRID_BITS}: choose larger voxels "
             f"(now {1 / scale:g}) or a smaller geometry scale"
         )
-    # A point of an integer grid stands for itself, a voxel of another grid for the integers in it: where the scale is
-    # a / b, they lie 0, 1 / b, ... (b - 1) / b of a voxel from its lower face, one as often as the other.
-    centre = 0.5 * (1 - 1 / Fraction(scale).limit_denominator(1 << 16).denominator) if integers else 0.5
     x, y, z = (int(v) for v in first)
-    return Quantization(scale, (x, y, z), (int(extent[0]), int(extent[1]), int(extent[2])), centre,
-                        unit is not None or not integers, unit or 1.0, shift)  # fmt: skip
+    return Quantization(scale, (x, y, z), (int(extent[0]), int(extent[1]), int(extent[2])),
+                        metres=unit is not None or not integers, unit=unit or 1.0, shift=shift)  # fmt: skip

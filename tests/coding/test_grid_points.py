@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled grid against the equation p~ = clip(floor(s p + rounding) - o, 0, size - 1)."""
+"""The compiled grid against the equation p~ = clip(floor(s p + 1/2 + rounding) - o, 0, size - 1)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ORIGIN, SIZE = (-5, 0, 2), (40, 100, 70)
 
 def expected(points: np.ndarray, scale: float) -> np.ndarray:
     exact = scale == 1 and np.issubdtype(points.dtype, np.integer)
-    whole = points.astype(np.int64) if exact else np.floor(points.astype(np.float64) * scale + ROUNDING)
+    whole = points.astype(np.int64) if exact else np.floor(points.astype(np.float64) * scale + 0.5 + ROUNDING)
     return np.clip(whole - ORIGIN, 0, np.array(SIZE) - 1).astype(np.int32)
 
 
