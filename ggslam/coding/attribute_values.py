@@ -2,9 +2,11 @@
 """Attributes as the caller has them, and as components for the coder: colour spaces, bit depths, ids.
 
 Ids must come back exactly, which the transform does not promise at any quantiser parameter. They are therefore coded as
-their rank in the sorted table of ids times a stride, with a step well below the stride: rounding then undoes the error.
-The encoder knows what a decoder will reconstruct and lists the ranks that come out wrong. Up to some hundred ids there
-are none; with thousands there are, as the transform's 15-bit factors let large values shrink by up to a thousandth.
+their rank in the sorted table of ids (small ids as themselves) times a stride, plus half a stride, with a step well
+below the stride: cutting off then undoes the error. The stride is a power of two, which the attribute's scale in the
+sequence parameter set tells, so that every decoder cuts off and shows plain ranks. The encoder knows what a decoder
+will reconstruct and lists the ranks that come out wrong. Up to some hundred ids there are none; with thousands there
+are, as the transform's 15-bit factors let large values shrink by up to a thousandth.
 """
 
 from __future__ import annotations
@@ -30,29 +32,50 @@ from ggslam.errors import ConfigError, FormatError
 
 _GBR = [1, 2, 0]  # where G, B, R are in R, G, B
 _RGB = [2, 0, 1]  # and back
+ID_BITS = 16
+_SMALL_IDS = 256  # few enough that the transform brings all of them back
 
 
 @dataclass(frozen=True)
 class IdTable:
-    """The ids of a lossless attribute: ids[rank], coded as rank times stride."""
+    """The ids of a lossless attribute: ids[rank], coded as start + stride * rank."""
 
     ids: np.ndarray
     stride: int
+    start: int = 0
 
     @staticmethod
-    def of(values: np.ndarray) -> IdTable:
+    def of(values: np.ndarray, bits: int = ID_BITS - 1) -> IdTable:
+        """The table of ids, with a stride of 2^`bits` at most."""
         ids = np.unique(values).astype(np.uint16)
-        return IdTable(ids, 65535 // max(1, len(ids) - 1))
+        if ids[-1] < _SMALL_IDS:
+            ids = np.arange(ids[-1] + 1, dtype=np.uint16)
+        return IdTable.of_bits(ids, min(bits, ID_BITS - (len(ids) - 1).bit_length()))
+
+    @staticmethod
+    def of_bits(ids: np.ndarray, bits: int) -> IdTable:
+        """The table with a stride of 2^`bits`."""
+        return IdTable(ids, 1 << bits, 1 << bits >> 1)
+
+    @property
+    def bits(self) -> int:
+        """Of the stride, a power of two."""
+        return self.stride.bit_length() - 1
+
+    @property
+    def tells_ids(self) -> bool:
+        """Whether ranks are the ids."""
+        return int(self.ids[-1]) == len(self.ids) - 1
 
     def qp(self) -> int:
         """Quantiser parameter of a step at most three tenths of the stride, at least 4 (a step of one)."""
         return int(np.clip(4 + np.floor(6 * np.log2(max(1.0, 0.3 * self.stride))), 4, 99))
 
     def components(self, values: np.ndarray) -> np.ndarray:
-        return (np.searchsorted(self.ids, values) * self.stride).astype(np.int32)
+        return (np.searchsorted(self.ids, values) * self.stride + self.start).astype(np.int32)
 
     def ranks(self, components: np.ndarray) -> np.ndarray:
-        return np.minimum((components + self.stride // 2) // self.stride, len(self.ids) - 1)
+        return np.clip((components - self.start + self.stride // 2) // self.stride, 0, len(self.ids) - 1)
 
 
 @dataclass(frozen=True)
@@ -111,6 +134,8 @@ class CodedAttribute:
     @property
     def dtype(self) -> np.dtype:
         """Of the values."""
+        if self.table is not None:
+            return np.dtype(np.uint16)
         low, high = self.description.reach()
         if self.description.matrix == MATRIX_YCGCO:
             high >>= 1
@@ -210,11 +235,13 @@ def plan_summaries(
         raise ConfigError(f"CodecSettings.attributes: there is no attribute {sorted(unknown)[0]!r}")
     plans: list[tuple[CodedAttribute, AttributeParameters]] = []
     sets: dict[AttributeParameters, int] = {}
-    for index, (name, summary) in enumerate(attributes.items()):
-        own = settings.attribute(name)
-        description = _describe(name, summary, own)
+    described = {name: _describe(name, summary, settings.attribute(name)) for name, summary in attributes.items()}
+    tables = _tables(attributes, described, settings)
+    for index, name in enumerate(attributes):
+        own, description, table = settings.attribute(name), described[name], tables.get(name)
+        if table is not None and _told_by_scale(described, tables):
+            description = replace(description, fraction_bits=table.bits)
         instance = sum(plan.description.label == description.label for plan, _ in plans)
-        table = IdTable.of(summary.ids) if own.lossless else None
         plan = CodedAttribute(name, index, replace(description, instance=instance), table)
         parameters = _parameters(name, description.bit_depth, own, settings, table)
         # Attributes that are coded alike share a set: its id has 4 bits, and whole Gaussians have up to 21 attributes.
@@ -226,6 +253,21 @@ def plan_summaries(
     if len(plans) > MAX_ATTRIBUTES:
         raise ConfigError(f"{len(plans)} attributes; {MAX_ATTRIBUTES} are supported")
     return plans
+
+
+def _tables(
+    attributes: Mapping[str, AttributeSummary], described: Mapping[str, AttributeDescription], settings: CodecSettings
+) -> dict[str, IdTable]:
+    """Of the lossless attributes. All have one stride: the reference decoder takes the first's for all."""
+    ids = {name: summary.ids for name, summary in attributes.items() if settings.attribute(name).lossless}
+    bits = min((IdTable.of(values).bits for values in ids.values()), default=0)
+    return {name: IdTable.of(values, bits) for name, values in ids.items()}
+
+
+def _told_by_scale(described: Mapping[str, AttributeDescription], tables: Mapping[str, IdTable]) -> bool:
+    """Whether the stride of ids stands in the sequence parameter set: not beside a reflectance, to which the reference
+    decoder would apply it."""
+    return all(name in tables for name, description in described.items() if description.label == "reflectance")
 
 
 def _check_array(name: str, values: np.ndarray, count: int) -> None:

@@ -113,7 +113,9 @@ def _side_information(cloud: CloudToCode) -> dict[str, Any]:
     if any(plan.name != plan.description.label or plan.description.instance for plan, _ in cloud.plans):
         content["names"] = [plan.name for plan, _ in cloud.plans]
     tables = {
-        plan.name: {"ids": plan.table.ids.tolist(), "stride": plan.table.stride}
+        plan.name: {
+            "bits": plan.table.bits, "ids": len(plan.table.ids) if plan.table.tells_ids else plan.table.ids.tolist(),
+        }
         for plan, _ in cloud.plans
         if plan.table is not None
     }

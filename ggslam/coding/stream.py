@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.coding.attribute_syntax import AttributeHeader, AttributeParameters
-from ggslam.coding.attribute_values import CodedAttribute, IdTable
+from ggslam.coding.attribute_values import ID_BITS, CodedAttribute, IdTable
 from ggslam.coding.container import Unit, UnitType, read_units
 from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
 from ggslam.coding.native_settings import AttributePayload, CodingContext
@@ -177,18 +177,27 @@ def _attributes(sequence: SequenceParameters, side: dict[str, Any]) -> list[Code
         if description.matrix == MATRIX_BT709 and (description.components != 3 or description.bit_depth != 8):
             description = replace(description, matrix=None)
         table = tables.get(name) if isinstance(tables, dict) else None
-        result.append(CodedAttribute(str(name), index, description, None if table is None else _table(name, table)))
+        result.append(CodedAttribute(str(name), index, description, None if table is None else read_table(name, table)))
     return result
 
 
-def _table(name: str, content: Any) -> IdTable:
+def read_table(name: str, content: Any) -> IdTable:
+    """The table of ids in a stream's user data: ids as a list, or their number if they are 0, 1, ...; the bits of the
+    stride, or in streams of earlier versions the stride of ranks that begin at 0. Raises FormatError if damaged."""
     try:
-        ids, stride = np.asarray(content["ids"], np.uint16), int(content["stride"])
-    except (KeyError, ValueError, TypeError, OverflowError):
+        told = content["ids"]
+        if isinstance(told, int) and not 1 <= told <= 1 << ID_BITS:
+            raise ValueError
+        ids = np.arange(told, dtype=np.uint16) if isinstance(told, int) else np.asarray(told, np.uint16)
+        bits = content.get("bits")
+        if bits is not None and not 0 <= int(bits) < ID_BITS:
+            raise ValueError
+        table = IdTable(ids, int(content["stride"])) if bits is None else IdTable.of_bits(ids, int(bits))
+    except (AttributeError, KeyError, ValueError, TypeError, OverflowError):
         raise FormatError(f"the table of the ids of attribute {name} is damaged") from None
-    if ids.ndim != 1 or len(ids) == 0 or not 1 <= stride <= 65535:
+    if ids.ndim != 1 or len(ids) == 0 or not 1 <= table.stride <= 65535:
         raise FormatError(f"the table of the ids of attribute {name} is damaged")
-    return IdTable(ids, stride)
+    return table
 
 
 def _quantization(sequence: SequenceParameters, side: dict[str, Any]) -> Quantization:

@@ -8,8 +8,10 @@ import pytest
 
 from ggslam.coding import AttributeSettings, CodecSettings, decode_cloud, encode_cloud
 from ggslam.coding.attribute_values import IdTable
+from ggslam.coding.container import UnitType, read_units, unit_bytes
 from ggslam.coding.slice_coder import rgb_to_ycbcr, ycbcr_to_rgb
-from ggslam.errors import ConfigError
+from ggslam.coding.stream import read_stream, read_table
+from ggslam.errors import ConfigError, FormatError
 
 IDS = {"id": AttributeSettings(lossless=True)}
 
@@ -67,6 +69,33 @@ def test_ids_come_back_exactly(count: int) -> None:
     assert np.array_equal(cloud.attributes["id"], true[tuple(cloud.points.astype(int).T)])
     corrected = sum(s.user_data_bytes for s in coded.report.slices)
     assert (corrected > 0) == (count > 300)
+
+
+def test_every_decoder_sees_small_ids_and_the_ranks_of_others(surface: tuple) -> None:
+    """By the attribute's scale in the sequence parameter set, without the table in the user data."""
+    points = surface[0]
+    for known, expected in (([0, 4, 200], [0, 4, 200]), ([9, 300, 65535], [0, 1, 2])):
+        ids = np.array(known, np.uint16)[np.arange(len(points)) % 3]
+        data = encode_cloud(points, {"id": ids}, CodecSettings(attributes=IDS)).data
+        units = [unit for unit in read_units(data) if unit.kind is not UnitType.USER_DATA]
+        bare = decode_cloud(b"".join(unit_bytes(unit.kind, bytes(unit.payload)) for unit in units))
+        mine = decode_cloud(data).attributes["id"]
+        assert np.array_equal(np.array(known)[np.searchsorted(expected, bare.attributes["reflectance"])], mine)
+        assert np.unique(bare.attributes["reflectance"]).tolist() == expected
+
+
+def test_ids_beside_a_reflectance_leave_its_scale_alone(surface: tuple) -> None:
+    values = {"id": (surface[0][:, 0] % 9).astype(np.uint16), "reflectance": surface[1][:, 0]}
+    stream = read_stream(encode_cloud(surface[0], values, CodecSettings(attributes=IDS)).data)
+    assert [a.description.fraction_bits for a in stream.attributes] == [0, 0]
+
+
+def test_tables_of_earlier_versions_are_read() -> None:
+    table = read_table("id", {"ids": [3, 9, 400], "stride": 32767})
+    assert table.ids[table.ranks(np.array([0, 32767, 65000, 40]))].tolist() == [3, 9, 400, 3]
+    for damaged in ({"ids": 0, "bits": 3}, {"ids": [1], "bits": 16}, {"ids": [1]}, {"ids": [], "bits": 2}, 7):
+        with pytest.raises(FormatError, match="table of the ids"):
+            read_table("id", damaged)
 
 
 def test_ids_are_cheap_where_they_rarely_change(surface: tuple) -> None:

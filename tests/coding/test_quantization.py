@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
+from ggslam.coding.container import UnitType, unit_bytes
 from ggslam.coding.quantization import ROUNDING, Quantization, choose_quantization
 from ggslam.coding.stream import read_stream
+from ggslam.coding.user_data import write_user_data
 from ggslam.errors import ConfigError, FormatError
 
 
@@ -143,6 +145,14 @@ def test_points_on_the_grid_come_back_as_they_are(size: float) -> None:
         sequence = read_stream(encode_cloud(points, settings=CodecSettings(voxel_size=size)).data).sequence
         standard = (cloud.grid_points + np.array(sequence.offset)) / float(sequence.resolution)
         assert np.abs(standard - cloud.points).max() < 1e-6 * size  # as decoders have it that know the standard alone
+
+
+def test_streams_of_earlier_versions_are_restored_as_they_were() -> None:
+    """Their coordinates denoted a voxel's lowest corner, and the user data told where in it the point lay."""
+    data = encode_cloud(np.array([[1.0, 2, 3]]), settings=CodecSettings(voxel_size=0.5)).data
+    old = data + unit_bytes(UnitType.USER_DATA, write_user_data({"centre": 0.5}))
+    assert decode_cloud(data).points.tolist() == [[1, 2, 3]]
+    assert decode_cloud(old).points.tolist() == [[1.25, 2.25, 3.25]]
 
 
 def test_the_mean_of_metric_points_does_not_move(metres: np.ndarray) -> None:

@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
 from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
@@ -77,6 +81,40 @@ def test_our_streams_decode_there(tmc3: str, tmp_path: Path, voxels: VoxelCloud,
     assert theirs.shape[1] == 6 + ids
 
 
+@pytest.mark.parametrize("slices", [1, 3])
+@pytest.mark.parametrize(("ids", "plain"), [([0, 1, 2, 7, 31, 255], True), ([3, 700, 40_000, 65_535], False),
+                                            (range(100, 400), False)])  # fmt: skip
+def test_ids_arrive_there_as_numbers(
+    tmc3: str, tmp_path: Path, voxels: VoxelCloud, ids: Sequence[int], plain: bool, slices: int
+) -> None:
+    """Small ids as themselves, others as their ranks, whose table stands in the user data: at every point."""
+    rng = np.random.default_rng(len(ids))
+    known = np.array(list(ids), np.uint16)
+    values = known[(voxels.grid[:, 0] // 7 * 37 + rng.integers(0, 3, len(voxels.grid))) % len(known)]
+    values[: len(known)] = known
+    write_point_cloud(tmp_path / "a.ply", voxels.grid.astype(np.float32), {"color": voxels.colors, "object_id": values})
+    encode_file(tmp_path / "a.ply", tmp_path / "a.bin", CodecSettings(qp=28, slices=slices))
+    rows = reference_decodes(tmc3, tmp_path / "a.bin")
+    numbers = rows[:, 6].astype(int)  # its reflectance
+    table = user_data(tmp_path / "a.bin")["tables"]["object_id"]["ids"]
+    assert table == (int(known.max()) + 1 if plain else known.tolist())
+    found = numbers if plain else np.array(table)[numbers]
+    true = {tuple(p): v for p, v in zip(voxels.grid.tolist(), values.tolist(), strict=True)}
+    assert found.tolist() == [true[tuple(p)] for p in rows[:, :3].astype(int).tolist()]
+    assert np.array_equal(our_rows(tmp_path / "a.bin", "object_id")[:, 3], found)
+
+
+def user_data(stream: Path) -> dict:
+    """What docs/formats.md says of it, read by the standard library alone: units of a byte and a length, JSON."""
+    data, at = stream.read_bytes(), 0
+    while at < len(data):
+        kind, size = data[at], int.from_bytes(data[at + 1 : at + 5], "big")
+        payload, at = data[at + 5 : at + 5 + size], at + 5 + size
+        if kind == 9 and payload[:8] == b"ggslam-2":
+            return dict(json.loads(zlib.decompress(payload[8:])))
+    raise AssertionError("no user data")
+
+
 @pytest.mark.parametrize("high", [200, 4000, 60000])
 def test_reflectance_arrives_there(tmc3: str, tmp_path: Path, voxels: VoxelCloud, high: int) -> None:
     values = (np.arange(len(voxels.grid)) % 97 * high // 97).astype(np.uint16)
@@ -113,6 +151,55 @@ def test_clouds_of_a_run_are_read_there(tmc3: str, tmp_path: Path, voxels: Voxel
     if name == "points_grid.ply":
         assert len(theirs) == len(voxels.grid)
         assert np.array_equal(theirs, our_rows(tmp_path / "b.bin", "color"))
+
+
+@pytest.fixture
+def metres(voxels: VoxelCloud) -> np.ndarray:
+    """Points float32 [N, 3] off the grid, on both sides of 0."""
+    jitter = np.random.default_rng(5).uniform(-0.5, 0.5, voxels.grid.shape)
+    return ((voxels.grid - 60 + jitter) * 0.02).astype(np.float32)
+
+
+def far_off(points: np.ndarray, path: Path) -> tuple[float, float, int]:
+    """Farthest along an axis, and the mean offset, of the points of a file from those nearest to `points`; how many
+    there are."""
+    found = read_point_cloud(path).points
+    _, nearest = cKDTree(found).query(points)
+    off = found[nearest] - points
+    return float(np.abs(off).max()), float(np.abs(off.mean(0)).max()), len(found)
+
+
+@pytest.mark.parametrize("on_grid", [True, False])
+def test_metric_clouds_lie_there_where_they_were(
+    tmc3: str, tmp_path: Path, metres: np.ndarray, on_grid: bool
+) -> None:
+    points = (np.rint(metres / 0.02) * 0.02).astype(np.float32) if on_grid else metres
+    write_point_cloud(tmp_path / "a.ply", points, {"color": np.zeros(points.shape, np.uint8)})
+    encode_file(tmp_path / "a.ply", tmp_path / "a.bin", CodecSettings(voxel_size=0.02))
+    decode_file(tmp_path / "a.bin", tmp_path / "ours.ply")
+    reference_decodes(tmc3, tmp_path / "a.bin", 0.02)
+    for name in ("a.theirs.ply", "ours.ply"):
+        most, mean, count = far_off(points, tmp_path / name)
+        assert most < (1e-5 if on_grid else 0.01 * 1.003) and mean < (1e-6 if on_grid else 2e-4)
+        assert count == len(np.unique(np.floor(points / 0.02 + 0.501), axis=0))
+
+
+@pytest.mark.parametrize("on_grid", [True, False])
+def test_their_metric_streams_lie_here_where_they_were(
+    tmc3: str, tmp_path: Path, metres: np.ndarray, on_grid: bool
+) -> None:
+    """By the options of docs/compress.md: read in steps of 0.01 mm (cut off), coded in voxels of 2 cm (rounded)."""
+    points = (np.rint(metres / 0.02) * 0.02).astype(np.float32) if on_grid else metres
+    write_point_cloud(tmp_path / "a.ply", points, {"color": np.zeros(points.shape, np.uint8)})
+    run(tmc3, "--mode=0", f"--uncompressedDataPath={tmp_path / 'a.ply'}", "--inputScale=100000", "--srcUnit=1",
+        f"--compressedStreamPath={tmp_path / 'b.bin'}", "--positionQuantizationScale=0.0005",
+        "--trisoupNodeSizeLog2=0", "--mergeDuplicatedPoints=1", "--transformType=0", "--convertPlyColourspace=1",
+        "--colourMatrix=1", "--qp=22", "--bitdepth=8", "--attribute=color")  # fmt: skip
+    decode_file(tmp_path / "b.bin", tmp_path / "ours.ply")
+    reference_decodes(tmc3, tmp_path / "b.bin", 0.02)
+    for name in ("b.theirs.ply", "ours.ply"):
+        most, mean, _ = far_off(points, tmp_path / name)
+        assert most < (2e-5 if on_grid else 0.01 * 1.003) and mean < (2e-5 if on_grid else 2e-4)
 
 
 def test_what_we_decode_is_read_there(tmc3: str, tmp_path: Path, voxels: VoxelCloud) -> None:
