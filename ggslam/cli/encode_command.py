@@ -183,6 +183,8 @@ def _contain(source: Path, out: Path, settings: CodecSettings, rate: Rate) -> No
         f"{done.gaussians} Gaussians; the same files of the run take {done.run_bytes} bytes, "
         f"{done.run_bytes / max(1, total):.1f} times as many", highlight=False,
     )  # fmt: skip
+    for note in done.notes:
+        console.print(f"note: {note}", highlight=False, markup=False)
     console.print(f"wrote {out}", highlight=False, markup=False)
 
 

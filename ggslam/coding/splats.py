@@ -105,6 +105,11 @@ def splat_settings(settings: CodecSettings, rate: str, attributes: Mapping[str, 
     )
 
 
+def means_of(gaussians: GaussianMap) -> np.ndarray:
+    """Positions float64 [N, 3] as they are coded."""
+    return gaussians.means.detach().cpu().numpy().astype(np.float64)
+
+
 def is_splat_cloud(cloud: PointCloud) -> bool:
     """Whether a decoded cloud is a Gaussian map."""
     return cloud.metadata.get("preset") == "splat"

@@ -31,7 +31,8 @@ import torch
 from ggslam import __version__
 from ggslam.coding import CodecSettings, decode_cloud
 from ggslam.coding.block_encoder import encode_blocks
-from ggslam.coding.splats import BIRTH, gaussians_of, is_splat_cloud, splat_attributes, splat_settings
+from ggslam.coding.outliers import reach_of
+from ggslam.coding.splats import BIRTH, gaussians_of, is_splat_cloud, means_of, splat_attributes, splat_settings
 from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.gaussian_rows import GaussianRows
@@ -76,12 +77,14 @@ class Contained:
         gaussians: of its map.
         sizes: bytes by member.
         run_bytes: that map.ply and the same files take in the run's folder.
+        notes: what the reader should know.
     """
 
     path: Path
     gaussians: int
     sizes: dict[str, int] = field(default_factory=dict)
     run_bytes: int = 0
+    notes: list[str] = field(default_factory=list)
 
 
 def is_container(path: str | Path) -> bool:
@@ -117,11 +120,11 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
     make_folder(out.parent)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as name:
         stream = Path(name) / _MAP
-        _encode_map(rows, births, with_objects, rate, settings, stream)
+        count, notes = _encode_map(rows, births, with_objects, rate, settings, stream)
         members = {n: (folder.path / n).read_bytes() for n in names}
         members |= {PLACES_FILE: arrays_to_bytes(**places), _MAP: stream.read_bytes()}
         head = ContainerRecord(
-            format=CONTAINER_FORMAT, version=CONTAINER_VERSION, ggslam=__version__, gaussians=len(rows), rate=rate,
+            format=CONTAINER_FORMAT, version=CONTAINER_VERSION, ggslam=__version__, gaussians=count, rate=rate,
             files={n: FileRecord(bytes=len(b), sha256=hashlib.sha256(b).hexdigest()) for n, b in members.items()},
         )  # fmt: skip
         with atomic_write(out) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
@@ -129,22 +132,27 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
                 archive.writestr(zipfile.ZipInfo(member), content)
     sizes = {n: len(b) for n, b in members.items()}
     plain = sum((folder.path / n).stat().st_size for n in (*names, PLACES_FILE, "map.ply"))
-    return Contained(out, len(rows), sizes, plain)
+    return Contained(out, count, sizes, plain, notes)
 
 
 def _encode_map(
     rows: GaussianRows, births: np.ndarray, with_objects: bool, rate: str, settings: CodecSettings, out: Path
-) -> None:
+) -> tuple[int, list[str]]:
+    """Writes the stream; returns how many Gaussians are in it, and what the reader should know."""
     chosen = splat_settings(settings, rate, splat_attributes(rows.like, with_objects, births[:0]))
+    reach = reach_of((means_of(block) for block in rows.blocks()), chosen, len(rows))
 
     def blocks() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         begin = 0
         for block in rows.blocks():
             own = births[begin : begin + len(block)]
             begin += len(block)
-            yield block.means.numpy().astype(np.float64), splat_attributes(block, with_objects, own)
+            points, attributes = means_of(block), splat_attributes(block, with_objects, own)
+            kept = reach.kept(points)
+            yield points[kept], {name: values[kept] for name, values in attributes.items()}
 
-    encode_blocks(blocks(), chosen, out)
+    report = encode_blocks(blocks(), reach.settings, out)
+    return report.points, reach.notes("Gaussian")
 
 
 def read_container(path: Path, out: Path, overwrite: bool = False, threads: int | None = None) -> RunFolder:

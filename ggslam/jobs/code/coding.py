@@ -21,7 +21,8 @@ from ggslam.coding import (
 from ggslam.coding.block_encoder import encode_blocks
 from ggslam.coding.decoder import CloudInParts, decode_in_parts
 from ggslam.coding.listing import StreamListing, list_units
-from ggslam.coding.splats import gaussians_of, is_splat_cloud, splat_attributes, splat_settings
+from ggslam.coding.outliers import reach_of
+from ggslam.coding.splats import gaussians_of, is_splat_cloud, means_of, splat_attributes, splat_settings
 from ggslam.coding.study import GridCloud, on_grid
 from ggslam.errors import ConfigError, FormatError
 from ggslam.formats.gaussian_ply import write_gaussian_parts
@@ -37,8 +38,6 @@ from ggslam.system.foreign import read_foreign
 PRESETS = ("pointcloud", "splat")
 Box = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner, metres."""
-_SAMPLED = 1 << 18
-"""Gaussians that tell where most of them lie."""
 
 
 @dataclass(frozen=True)
@@ -99,12 +98,14 @@ def encode_file(
 def _encode_points(path: Path, out: Path, settings: CodecSettings, ids: bool, notes: list[str]) -> CodingReport:
     is_cloud = splat_format(path) is None or path.suffix.lower() == ".ply"
     cloud = read_point_cloud(path, tell=False) if is_cloud else _points_of(path)  # the notes tell it
-    points, settings = coded_points(cloud, settings)
     coded = attributes_to_code(cloud, ids)
-    notes += coded.notes
-    settings = replace(settings, attributes={**settings.attributes, **coded.settings}, metadata=coded.metadata)
-    attributes = coded.values
-    encoded = encode_cloud(points, attributes, settings)
+    points, settings = coded_points(cloud, settings)
+    reach = reach_of([points], settings)
+    kept = reach.kept(points)
+    notes += coded.notes + reach.notes("point")
+    own = {**settings.attributes, **coded.settings}
+    settings = replace(reach.settings, attributes=own, metadata=coded.metadata)
+    encoded = encode_cloud(points[kept], {name: values[kept] for name, values in coded.values.items()}, settings)
     make_folder(out.parent)
     write_bytes(out, encoded.data)
     return encoded.report
@@ -130,22 +131,19 @@ def _encode_splats(
         notes += opened.notes
     if not len(rows):
         raise FormatError(f"{path}: no Gaussians")
-    step, with_ids, sample = max(1, len(rows) // _SAMPLED), False, []
-    for block in rows.blocks():
-        sample.append(block.means.numpy()[::step].astype(np.float64))
-        with_ids = with_ids or (ids and bool(block.object_id.any()))
+    with_ids = ids and any(bool(block.object_id.any()) for block in rows.blocks())
     settings = splat_settings(settings, rate, splat_attributes(rows.like, with_ids))
-    outliers = _Outliers(np.concatenate(sample))
+    reach = reach_of((means_of(block) for block in rows.blocks()), settings, len(rows))
 
     def blocks() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         for block in rows.blocks():
-            points = block.means.numpy().astype(np.float64)
-            outliers.add(points)
-            yield points, splat_attributes(block, with_ids)
+            points, attributes = means_of(block), splat_attributes(block, with_ids)
+            kept = reach.kept(points)
+            yield points[kept], {name: values[kept] for name, values in attributes.items()}
 
     make_folder(out.parent)
-    report = encode_blocks(blocks(), settings, out)
-    notes += outliers.notes()
+    report = encode_blocks(blocks(), reach.settings, out)
+    notes += reach.notes("Gaussian")
     return report
 
 
@@ -163,7 +161,9 @@ def study_cloud(source: Path, settings: CodecSettings) -> GridCloud:
         settings = replace(settings, voxel_size=settings.voxel_size or cloud.voxel_size)
         return on_grid(cloud.points, cloud.colors, settings)
     points, settings = coded_points(cloud, settings)
-    return on_grid(points, cloud.colors, settings)
+    reach = reach_of([points], settings)
+    kept = reach.kept(points)
+    return on_grid(points[kept], cloud.colors[kept], reach.settings)
 
 
 def decode_file(
@@ -299,26 +299,3 @@ def _refuse_itself(source: Path, out: Path) -> None:
     if source.exists() and out.exists() and out.samefile(source):
         raise ConfigError(f"{out}: is the input itself")
 
-
-class _Outliers:
-    """Counts Gaussians far outside the others.
-
-    Args:
-        sample: of their means, float64 [N, 3].
-    """
-
-    def __init__(self, sample: np.ndarray) -> None:
-        low, high = np.quantile(sample, [0.001, 0.999], axis=0)
-        self._bulk = float((high - low).max())
-        self._low, self._high = low - 10 * self._bulk, high + 10 * self._bulk
-        self._far = 0
-
-    def add(self, points: np.ndarray) -> None:
-        """Means float64 [M, 3]."""
-        self._far += int(((points < self._low) | (points > self._high)).any(1).sum())
-
-    def notes(self) -> list[str]:
-        """A note if a few Gaussians cost the others their precision."""
-        if not self._far or self._bulk == 0:
-            return []
-        return [f"{self._far} Gaussians lie far outside the others; the grid spans them too and is coarser for it"]

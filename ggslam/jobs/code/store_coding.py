@@ -6,7 +6,7 @@ A zip archive whose members are stored as they are, so that a reader takes the c
     cells.json          see `runs.records.cells.CellsRecord`: grid, quality; of each cell Gaussians, bytes and SHA-256
     cells/3_0_-2.bin    a G-PCC stream of the Gaussians of cell (3, 0, -2); `ggslam decode` reads it, too
 
-All cells are coded on steps of one length, that of coding all Gaussians at once.
+All cells are coded on steps of one length, that of coding all Gaussians at once but the few outermost.
 """
 
 from __future__ import annotations
@@ -24,7 +24,15 @@ import numpy as np
 
 from ggslam import __version__
 from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
-from ggslam.coding.splats import POSITION_BITS, gaussians_of, is_splat_cloud, splat_attributes, splat_settings
+from ggslam.coding.outliers import SAMPLED, bulk_of
+from ggslam.coding.splats import (
+    POSITION_BITS,
+    gaussians_of,
+    is_splat_cloud,
+    means_of,
+    splat_attributes,
+    splat_settings,
+)
 from ggslam.errors import ConfigError, FormatError
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.submaps.cell_gaussians import (
@@ -87,7 +95,7 @@ def encode_cell(task: CodeTask) -> bytes:
     gaussians = map_of_arrays(gaussians_from_bytes(task.data, task.name)[0])
     attributes = splat_attributes(gaussians, with_ids=True)
     settings = splat_settings(replace(task.settings, threads=own_threads()), task.rate, attributes)
-    return encode_cloud(gaussians.means.numpy().astype(np.float64), attributes, settings).data
+    return encode_cloud(means_of(gaussians), attributes, settings).data
 
 
 def encode_store(
@@ -115,7 +123,7 @@ def encode_store(
         if not coding.counts:
             raise ConfigError(f"{path}: has no Gaussians to code; stores made of runs have some")
         if chosen.voxel_size is None:
-            chosen = replace(chosen, voxel_size=_step(store, list(coding.counts)))
+            chosen = replace(chosen, voxel_size=_step(store, coding.counts))
         coding.observer.begin("encode", len(coding.counts))
         (engine or Engine()).do(encode_cell, coding.tasks(rate, chosen), coding.take)
         coding.join(rate)
@@ -183,10 +191,12 @@ def _file_of(key: CellKey) -> str:
     return f"{key[0]}_{key[1]}_{key[2]}.bin"
 
 
-def _step(store: GridStore, keys: list[CellKey]) -> float:
-    """Edge of the voxels: that of a grid of `POSITION_BITS` over all cells."""
-    extent = (np.ptp(np.array(keys), axis=0) + 1)[store.grid.spans].max() * store.grid.spacing
-    return float(extent) / (1 << POSITION_BITS)
+def _step(store: GridStore, counts: dict[CellKey, int]) -> float:
+    """Edge of the voxels: that of a grid of `POSITION_BITS` over the cells, but those of a few Gaussians far away."""
+    keys = np.array(list(counts))
+    numbers = np.maximum(1, np.array(list(counts.values())) // max(1, sum(counts.values()) // SAMPLED))
+    extent = (np.ptp(bulk_of(np.repeat(keys, numbers, axis=0)), axis=0) + 1)[store.grid.spans].max()
+    return float(extent * store.grid.spacing) / (1 << POSITION_BITS)
 
 
 class CodedCells:
