@@ -28,7 +28,15 @@ from held_out import held_out_poses
 from timing import seconds
 
 from ggslam.coding import CodecSettings, CodingReport, EncodedCloud, decode_cloud, encode_cloud
-from ggslam.coding.splats import RATES, gaussians_of, splat_attributes, splat_settings
+from ggslam.coding.splats import (
+    RATES,
+    gaussians_of,
+    means_of,
+    rest_range,
+    splat_attributes,
+    splat_reach,
+    splat_settings,
+)
 from ggslam.evaluation.image_sets import ImageScoreMean
 from ggslam.evaluation.images import score_image
 from ggslam.formats.gaussian_ply import write_gaussian_ply
@@ -93,11 +101,15 @@ def quality(views: list[View], gaussians: GaussianMap) -> list[str]:
 
 def through_gpcc(gaussians: GaussianMap, rate: str, repeats: int) -> Coded:
     """Codes a map at a rate; stops the script if an object id changed."""
-    points = gaussians.means.numpy().astype(np.float64)
+    points = means_of(gaussians)
 
     def encode() -> EncodedCloud:
-        attributes = splat_attributes(gaussians)
-        return encode_cloud(points, attributes, splat_settings(CodecSettings(), rate, attributes))
+        rest = rest_range([gaussians])
+        attributes = splat_attributes(gaussians, rest=rest)
+        settings = splat_settings(CodecSettings(), rate, attributes, rest)
+        return encode_cloud(
+            points, attributes, splat_reach(lambda: [gaussians], len(gaussians), settings, rate).settings
+        )
 
     encoded = encode()
     cloud = decode_cloud(encoded.data)

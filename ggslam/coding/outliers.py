@@ -82,13 +82,16 @@ def _number(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def reach_of(parts: Iterable[np.ndarray], settings: CodecSettings, count: int | None = None) -> Reach:
+def reach_of(
+    parts: Iterable[np.ndarray], settings: CodecSettings, count: int | None = None, finest: float = 0.0
+) -> Reach:
     """What of a cloud to code, and on which voxels.
 
     Args:
         parts: its points [N, 3], some at a time.
         settings: as asked for. A box says what to code; then all stays as it is.
         count: of all points; None: of the only part.
+        finest: voxels that the settings do not name are no smaller than this, metres.
     """
     if settings.box is not None:
         return Reach(settings)
@@ -103,19 +106,21 @@ def reach_of(parts: Iterable[np.ndarray], settings: CodecSettings, count: int | 
     if not np.isfinite(sample).all():  # the encoder says so
         return Reach(settings)
     return _choose(bulk_of(sample), np.ptp(np.stack(corners).astype(np.float64), axis=0).max(), settings,
-                   np.issubdtype(sample.dtype, np.integer))  # fmt: skip
+                   np.issubdtype(sample.dtype, np.integer), finest)  # fmt: skip
 
 
-def _choose(bulk: np.ndarray, whole: float, settings: CodecSettings, integers: bool) -> Reach:
+def _choose(bulk: np.ndarray, whole: float, settings: CodecSettings, integers: bool, finest: float) -> Reach:
     """For a cloud whose longest side is `whole`."""
     side = float(np.ptp(bulk, axis=0).max())
     if side <= 0 or whole <= _FAR * side:
-        return Reach(settings)
+        named = integers or settings.voxel_size is not None
+        fine = finest > whole / ((1 << settings.geometry_bits) - 1)
+        return Reach(replace(settings, voxel_size=finest) if fine and not named else settings)
     voxel, most = settings.voxel_size or (1.0 if integers else None), (1 << GRID_BITS) - 2
     if voxel is None:
         voxel, finer = side / ((1 << settings.geometry_bits) - 1), max(0, settings.geometry_bits - _FINE_BITS)
         needed = whole * settings.geometry_scale / most
-        voxel = needed if voxel < needed <= voxel * (1 << finer) else voxel
+        voxel = max(needed if voxel < needed <= voxel * (1 << finer) else voxel, finest)
         settings = replace(settings, voxel_size=voxel)
     reach = most * voxel / settings.geometry_scale
     if whole <= reach * (1 + 1e-9):

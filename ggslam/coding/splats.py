@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whole Gaussians in a G-PCC stream: every parameter of a map as an attribute of its positions.
 
-Ranges, bit depths and quantisers are those of MPEG's exploration of Gaussian splat coding with the geometry-based
-codec: positions of 18 bits, everything else of 12 bits within fixed ranges, four rates r01 (smallest) to r04.
+Ranges and bit depths are those of MPEG's exploration of Gaussian splat coding with the geometry-based codec: positions
+of 18 bits at most, everything else of 12 bits within fixed ranges, four rates r01 (smallest) to r04. Quantisers are our
+own: chosen so that a further byte gains as much in pictures wherever it is spent (at the bytes of MPEG's, pictures are
+3 to 10 dB closer to the map's). Positions are as fine as the Gaussians are small, and SH coefficients above degree 0,
+which are small numbers, have a range of their own: the transform shrinks levels by up to a thousandth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +18,8 @@ import numpy as np
 import torch
 
 from ggslam.coding.cloud import PointCloud
+from ggslam.coding.least_rotations import least_rotations
+from ggslam.coding.outliers import SAMPLED, Reach, reach_of
 from ggslam.coding.settings import AttributeSettings, CodecSettings
 from ggslam.errors import ConfigError, FormatError
 from ggslam.scene.gaussian_map import GaussianMap
@@ -25,43 +30,53 @@ _LEVELS = (1 << VALUE_BITS) - 1
 RANGES = {"sh": (-4.0, 4.0), "opacity": (-7.0, 18.0), "scale": (-26.0, 4.0), "rotation": (-1.0, 1.0)}
 """Of SH coefficients, opacity logits, natural logarithms of scales, and components of unit quaternions."""
 _SH_CHROMA_OFFSET = 4
+_WIDEST_REST = 4.0
 BIRTH = "birth"
 """Attribute: number of the keyframe that inserted a Gaussian, plus 1; 0: unknown."""
 
 
 @dataclass(frozen=True)
 class SplatRate:
-    """Quantiser parameters: of the SH coefficients by degree, opacity, scales and rotations."""
+    """Quantiser parameters: of the SH coefficients by degree, opacity, scales and rotations. `voxel`: edge of the
+    positions' voxels, in parts of a typical Gaussian's size."""
 
     sh: tuple[int, int, int, int]
     opacity: int
     scale: int
     rotation: int
+    voxel: float
 
 
 RATES = {
-    "r01": SplatRate((42, 54, 62, 65), 57, 42, 62),
-    "r02": SplatRate((34, 46, 54, 57), 49, 34, 54),
-    "r03": SplatRate((26, 38, 46, 49), 41, 26, 46),
-    "r04": SplatRate((18, 30, 38, 41), 33, 18, 38),
+    "r01": SplatRate((38, 32, 32, 32), 41, 36, 46, 1 / 8),
+    "r02": SplatRate((32, 28, 28, 28), 36, 30, 40, 1 / 12),
+    "r03": SplatRate((26, 24, 24, 24), 31, 24, 36, 1 / 24),
+    "r04": SplatRate((20, 20, 20, 20), 26, 18, 30, 1 / 64),
 }
 
 
+def rest_range(blocks: Iterable[GaussianMap]) -> float:
+    """The range of a map's SH coefficients above degree 0: the power of two, 1/8 to 4, that none exceeds."""
+    most = max((float(block.sh[:, 1:].detach().abs().amax()) for block in blocks if block.sh[:, 1:].numel()), default=4)
+    return float(2.0 ** np.clip(np.ceil(np.log2(max(most, 1e-9))), -3, 2)) if np.isfinite(most) else 4.0
+
+
 def splat_attributes(
-    gaussians: GaussianMap, with_ids: bool | None = None, births: np.ndarray | None = None
+    gaussians: GaussianMap, with_ids: bool | None = None, births: np.ndarray | None = None, rest: float = 4.0
 ) -> dict[str, np.ndarray]:
     """The parameters of a map as uint16 attributes of 12 bits, values outside their ranges clipped.
 
     "sh_0" ... "sh_15" [N, 3] by coefficient, "opacity" [N], "scale" [N, 3], "rotation" [N, 3] (x, y, z of the
-    quaternion, whose sign is chosen so that w is not negative), "rotation_w" [N]; "object_id" [N] if any is set; of
-    parts of a map as `with_ids` says; "birth" [N], one more than `births` (-1: unknown), where these are given.
+    quaternion), "rotation_w" [N] (w; axes are named so that it is most, see `least_rotations`); "object_id" [N]
+    if any is set; of parts of a map as `with_ids` says; "birth" [N], one more than `births` (-1: unknown), where these
+    are given. `rest`: of `rest_range`.
     """
     quaternions = torch.nn.functional.normalize(gaussians.quaternions.detach(), dim=1).cpu().numpy()
-    quaternions = np.where(quaternions[:, :1] < 0, -quaternions, quaternions)
+    quaternions, scales = least_rotations(quaternions, gaussians.log_scales.detach().cpu().numpy())
     sh = gaussians.sh.detach().cpu().numpy()
-    out = {f"sh_{k}": _levels(sh[:, k], "sh") for k in range(sh.shape[1])}
+    out = {f"sh_{k}": _levels(sh[:, k] * (_WIDEST_REST / rest if k else 1), "sh") for k in range(sh.shape[1])}
     out["opacity"] = _levels(gaussians.opacity_logits.detach().cpu().numpy(), "opacity")
-    out["scale"] = _levels(gaussians.log_scales.detach().cpu().numpy(), "scale")
+    out["scale"] = _levels(scales, "scale")
     out["rotation"] = _levels(quaternions[:, 1:], "rotation")
     out["rotation_w"] = _levels(quaternions[:, 0], "rotation")
     object_id = gaussians.object_id.cpu().numpy()
@@ -74,13 +89,16 @@ def splat_attributes(
     return out
 
 
-def splat_settings(settings: CodecSettings, rate: str, attributes: Mapping[str, np.ndarray]) -> CodecSettings:
+def splat_settings(
+    settings: CodecSettings, rate: str, attributes: Mapping[str, np.ndarray], rest: float = 4.0
+) -> CodecSettings:
     """The settings with those of a rate: grid, bit depths and quantisers. Gaussians that share a voxel stay apart.
 
     Args:
         settings: slices, threads and tools are kept.
         rate: one of `RATES`.
         attributes: of `splat_attributes`.
+        rest: as given there.
 
     Raises:
         ConfigError: an unknown rate.
@@ -94,20 +112,40 @@ def splat_settings(settings: CodecSettings, rate: str, attributes: Mapping[str, 
             chosen[name] = AttributeSettings(lossless=True)
         elif name.startswith("sh_"):
             degree = int(np.sqrt(int(name[3:])))
+            wider = round(6 * np.log2(_WIDEST_REST / rest)) if degree else 0  # steps of the same length
             chosen[name] = AttributeSettings(
-                qps.sh[degree], _SH_CHROMA_OFFSET, VALUE_BITS, color_space="none", label="color"
+                qps.sh[degree] + wider, _SH_CHROMA_OFFSET, VALUE_BITS, color_space="none", label="color"
             )
         else:
             qp = {"opacity": qps.opacity, "scale": qps.scale}.get(name, qps.rotation)
             chosen[name] = AttributeSettings(qp, 0, VALUE_BITS, color_space="none")
+    metadata = {"preset": "splat"} | ({"rest_range": rest} if rest != _WIDEST_REST else {})
     return replace(
-        settings, geometry_bits=POSITION_BITS, duplicates="keep", attributes=chosen, metadata={"preset": "splat"}
+        settings, geometry_bits=POSITION_BITS, duplicates="keep", attributes=chosen, metadata=metadata
     )
 
 
 def means_of(gaussians: GaussianMap) -> np.ndarray:
     """Positions float64 [N, 3] as they are coded."""
     return gaussians.means.detach().cpu().numpy().astype(np.float64)
+
+
+def splat_reach(blocks: Callable[[], Iterable[GaussianMap]], count: int, settings: CodecSettings, rate: str) -> Reach:
+    """What of a map to code, and on which voxels: see `reach_of`. They are as fine as its Gaussians are small, by the
+    middle one of their axes, but no finer than `POSITION_BITS` make them.
+
+    Args:
+        blocks: gives the parts of the map, as often as it is called.
+        count: of all Gaussians.
+        settings: of `splat_settings`; a voxel size named there stays.
+        rate: one of `RATES`.
+    """
+    step, sizes = max(1, count // SAMPLED), []
+    for block in blocks() if settings.voxel_size is None else ():
+        sizes.append(np.median(block.log_scales[::step].detach().cpu().numpy(), axis=1))
+    size = float(np.exp(np.median(np.concatenate(sizes).astype(np.float64)))) if sizes else 0.0
+    finest = RATES[rate].voxel * size if np.isfinite(size) else 0.0
+    return reach_of((means_of(block) for block in blocks()), settings, count, finest)
 
 
 def is_splat_cloud(cloud: PointCloud) -> bool:
@@ -139,9 +177,17 @@ def gaussians_of(cloud: PointCloud) -> GaussianMap:
         object_id=torch.from_numpy(values["object_id"].astype(np.int32)) if "object_id" in values else None,
     )  # fmt: skip
     out.sh[rows] = torch.stack([_values(values[name], "sh") for name in coefficients], 1)
+    out.sh[rows, 1:] *= _told_range(cloud) / _WIDEST_REST
     if BIRTH in values:
         out.birth_keyframe[rows] = torch.from_numpy(values[BIRTH].astype(np.int32) - 1)
     return out
+
+
+def _told_range(cloud: PointCloud) -> float:
+    told = cloud.metadata.get("rest_range", _WIDEST_REST)
+    if not isinstance(told, (int, float)) or not 0 < told <= _WIDEST_REST:
+        raise FormatError("the range of the SH coefficients is damaged")
+    return float(told)
 
 
 def _levels(values: np.ndarray, kind: str) -> np.ndarray:

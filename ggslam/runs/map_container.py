@@ -31,8 +31,16 @@ import torch
 from ggslam import __version__
 from ggslam.coding import CodecSettings, decode_cloud
 from ggslam.coding.block_encoder import encode_blocks
-from ggslam.coding.outliers import reach_of
-from ggslam.coding.splats import BIRTH, gaussians_of, is_splat_cloud, means_of, splat_attributes, splat_settings
+from ggslam.coding.splats import (
+    BIRTH,
+    gaussians_of,
+    is_splat_cloud,
+    means_of,
+    rest_range,
+    splat_attributes,
+    splat_reach,
+    splat_settings,
+)
 from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.gaussian_rows import GaussianRows
@@ -139,15 +147,16 @@ def _encode_map(
     rows: GaussianRows, births: np.ndarray, with_objects: bool, rate: str, settings: CodecSettings, out: Path
 ) -> tuple[int, list[str]]:
     """Writes the stream; returns how many Gaussians are in it, and what the reader should know."""
-    chosen = splat_settings(settings, rate, splat_attributes(rows.like, with_objects, births[:0]))
-    reach = reach_of((means_of(block) for block in rows.blocks()), chosen, len(rows))
+    rest = rest_range(rows.blocks())
+    chosen = splat_settings(settings, rate, splat_attributes(rows.like, with_objects, births[:0]), rest)
+    reach = splat_reach(rows.blocks, len(rows), chosen, rate)
 
     def blocks() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         begin = 0
         for block in rows.blocks():
             own = births[begin : begin + len(block)]
             begin += len(block)
-            points, attributes = means_of(block), splat_attributes(block, with_objects, own)
+            points, attributes = means_of(block), splat_attributes(block, with_objects, own, rest)
             kept = reach.kept(points)
             yield points[kept], {name: values[kept] for name, values in attributes.items()}
 

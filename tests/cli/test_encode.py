@@ -104,9 +104,9 @@ def test_coarser_geometry_and_clouds_in_metres(ggslam: Ggslam, tmp_path: Path) -
     assert ggslam("encode", tmp_path / "points.ply", tmp_path / "a.bin", "--geometry-scale", 0.5)[0] == 0
     assert ggslam("decode", tmp_path / "a.bin", tmp_path / "half.ply")[0] == 0
     half = read_point_cloud(tmp_path / "half.ply")
-    assert 300 < len(half) < 800 and half.grid is None
+    assert 300 < len(half) < 800 and half.voxel_size == 0.04
     distance = np.abs(cloud.points[:, None] - half.points[None]).max(2).min(1)
-    assert distance.max() < 0.011  # half of a voxel of 2 cm
+    assert distance.max() < 0.0201  # half of a voxel of 4 cm
     scattered = np.random.default_rng(0).random((500, 3)) * 3
     attributes = {"color": np.full((500, 3), 90, np.uint8), "label": np.arange(500) - 200}
     write_point_cloud(tmp_path / "scan.pcd", scattered, attributes)
@@ -138,13 +138,13 @@ def test_whole_gaussians_come_back_as_a_map(ggslam: Ggslam, tmp_path: Path) -> N
         back = read_gaussian_ply(tmp_path / "back.ply")
         distance = (gaussians.means[:, None] - back.means[None]).norm(dim=2)
         nearest = distance.argmin(1)
-        assert distance.min(1).values.max() < 2 / 2**18 and len(nearest.unique()) == 400
+        voxel = {"r01": 1 / 8, "r04": 1 / 64}[rate] * float(gaussians.log_scales.median(1).values.median().exp())
+        assert distance.min(1).values.max() < 3**0.5 * 0.51 * voxel and len(nearest.unique()) == 400
         assert (back.object_id[nearest] == gaussians.object_id).all()
         errors.append((back.sh[nearest] - gaussians.sh).abs().mean().item())
         if rate == "r04":
-            assert (back.log_scales[nearest] - gaussians.log_scales).abs().max() < 0.1
-            q, p = (torch.nn.functional.normalize(m, dim=1) for m in (back.quaternions[nearest], gaussians.quaternions))
-            assert (q * p).sum(1).abs().min() > 0.99
+            scales = [m.sort(1).values for m in (back.log_scales[nearest], gaussians.log_scales)]  # axes are renamed
+            assert (scales[0] - scales[1]).abs().max() < 0.1
     assert errors[1] < 0.02 < errors[0] < 1
 
 
@@ -243,7 +243,7 @@ def test_mistakes_are_named(ggslam: Ggslam, tmp_path: Path) -> None:
 
 def test_what_is_left_out_is_said(ggslam: Ggslam, tmp_path: Path) -> None:
     write_point_cloud(tmp_path / "a.pcd", np.array([[0.0, 1, 2], [np.nan, 0, 0], [3, 4, 5]]), {})
-    assert "left out 1 points" in ggslam("encode", tmp_path / "a.pcd", tmp_path / "a.bin")[1]
+    assert "left out 1 of 3 points" in ggslam("encode", tmp_path / "a.pcd", tmp_path / "a.bin")[1]
     gaussians = GaussianMap()
     means, quaternions = torch.rand(20, 3), torch.tensor([[1.0, 0, 0, 0]]).repeat(20, 1)
     gaussians.insert(means, quaternions, torch.full((20, 3), -3.0), torch.zeros(20), torch.rand(20, 3))

@@ -22,7 +22,15 @@ from ggslam.coding.block_encoder import encode_blocks
 from ggslam.coding.decoder import CloudInParts, decode_in_parts
 from ggslam.coding.listing import StreamListing, list_units
 from ggslam.coding.outliers import reach_of
-from ggslam.coding.splats import gaussians_of, is_splat_cloud, means_of, splat_attributes, splat_settings
+from ggslam.coding.splats import (
+    gaussians_of,
+    is_splat_cloud,
+    means_of,
+    rest_range,
+    splat_attributes,
+    splat_reach,
+    splat_settings,
+)
 from ggslam.coding.study import GridCloud, on_grid
 from ggslam.errors import ConfigError, FormatError
 from ggslam.formats.gaussian_ply import write_gaussian_parts
@@ -132,12 +140,13 @@ def _encode_splats(
     if not len(rows):
         raise FormatError(f"{path}: no Gaussians")
     with_ids = ids and any(bool(block.object_id.any()) for block in rows.blocks())
-    settings = splat_settings(settings, rate, splat_attributes(rows.like, with_ids))
-    reach = reach_of((means_of(block) for block in rows.blocks()), settings, len(rows))
+    rest = rest_range(rows.blocks())
+    settings = splat_settings(settings, rate, splat_attributes(rows.like, with_ids), rest)
+    reach = splat_reach(rows.blocks, len(rows), settings, rate)
 
     def blocks() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         for block in rows.blocks():
-            points, attributes = means_of(block), splat_attributes(block, with_ids)
+            points, attributes = means_of(block), splat_attributes(block, with_ids, rest=rest)
             kept = reach.kept(points)
             yield points[kept], {name: values[kept] for name, values in attributes.items()}
 

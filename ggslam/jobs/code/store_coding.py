@@ -30,6 +30,7 @@ from ggslam.coding.splats import (
     gaussians_of,
     is_splat_cloud,
     means_of,
+    rest_range,
     splat_attributes,
     splat_settings,
 )
@@ -93,8 +94,9 @@ def is_cells_file(path: str | Path) -> bool:
 def encode_cell(task: CodeTask) -> bytes:
     """The stream of a cell. Raises FormatError if its Gaussians are damaged."""
     gaussians = map_of_arrays(gaussians_from_bytes(task.data, task.name)[0])
-    attributes = splat_attributes(gaussians, with_ids=True)
-    settings = splat_settings(replace(task.settings, threads=own_threads()), task.rate, attributes)
+    rest = rest_range([gaussians])
+    attributes = splat_attributes(gaussians, with_ids=True, rest=rest)
+    settings = splat_settings(replace(task.settings, threads=own_threads()), task.rate, attributes, rest)
     return encode_cloud(means_of(gaussians), attributes, settings).data
 
 
