@@ -3,13 +3,14 @@
 
 A zip archive whose members are stored as they are:
 
-    container.json   {"format": "ggslam map", "version": 1, "ggslam": version that wrote it, "gaussians": their number,
+    container.json   {"format": "ggslam map", "version": 2, "ggslam": version that wrote it, "gaussians": their number,
                      "rate": of the map, "files": {member: {"bytes", "sha256"}}}
     map.bin          a G-PCC stream of Gaussians (`ggslam decode` reads it), in slices; attribute `birth` is the number
                      of the keyframe that inserted a Gaussian, plus 1, `object_id` its object
-    places.npz       of the run, without `birth`
+    places.bin       places.npz of the run, without `birth`, see `scene.packed_arrays`; in version 1 places.npz
     run.json, keyframes.json, trajectory.txt, config.yaml, sequence.json, timing.json and, where the run has them,
-    loops.json, ground_truth.txt, objects.json, classifier.npz, as in the run's folder
+    loops.json, ground_truth.txt, objects.json, classifier.npz, as in the run's folder; those that get smaller
+    so as NAME.xz
 
 Votes, clouds, scores and pictures stay behind. Identity vectors become the codes of their objects.
 """
@@ -61,18 +62,19 @@ from ggslam.runs.writing import RUN_FILES, TRUTH_FILE
 from ggslam.scene.arrays import arrays_of, arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.scene.packed_arrays import pack_arrays, pack_bytes, unpack_arrays, unpack_bytes
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.system.atomic import atomic_write, make_folder, write_bytes
 from ggslam.system.foreign import open_foreign
 
 SUFFIX = ".ggz"
-_HEAD, _MAP = "container.json", "map.bin"
+_HEAD, _MAP, _PLACES, _XZ = "container.json", "map.bin", "places.bin", ".xz"
 _CLASSIFIER, _TABLE = "classifier.npz", "objects.json"
 _NEEDED = (
     RunRecord.FILE, KeyframesRecord.FILE, "trajectory.txt", "config.yaml", SequenceRecord.FILE, TimingRecord.FILE,
 )  # fmt: skip
 _PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, *MOVER_FILES, _TABLE, _CLASSIFIER)
-_MEMBERS = frozenset((_HEAD, _MAP, PLACES_FILE, *_NEEDED, *_PERHAPS))
+_MEMBERS = frozenset((_HEAD, _MAP, _PLACES, PLACES_FILE, *_NEEDED, *_PERHAPS))
 _MOST_KEYFRAMES = (1 << 16) - 2
 
 
@@ -129,8 +131,8 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as name:
         stream = Path(name) / _MAP
         count, notes = _encode_map(rows, births, with_objects, rate, settings, stream)
-        members = {n: (folder.path / n).read_bytes() for n in names}
-        members |= {PLACES_FILE: arrays_to_bytes(**places), _MAP: stream.read_bytes()}
+        members = dict(_smallest(n, (folder.path / n).read_bytes()) for n in names)
+        members |= {_PLACES: pack_arrays(places), _MAP: stream.read_bytes()}
         head = ContainerRecord(
             format=CONTAINER_FORMAT, version=CONTAINER_VERSION, ggslam=__version__, gaussians=count, rate=rate,
             files={n: FileRecord(bytes=len(b), sha256=hashlib.sha256(b).hexdigest()) for n, b in members.items()},
@@ -141,6 +143,12 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
     sizes = {n: len(b) for n, b in members.items()}
     plain = sum((folder.path / n).stat().st_size for n in (*names, PLACES_FILE, "map.ply"))
     return Contained(out, count, sizes, plain, notes)
+
+
+def _smallest(name: str, content: bytes) -> tuple[str, bytes]:
+    """A member as it is, or as .xz."""
+    packed = pack_bytes(content)
+    return (name + _XZ, packed) if len(packed) < len(content) else (name, content)
 
 
 def _encode_map(
@@ -222,26 +230,48 @@ def read_contained_map(path: Path) -> tuple[GaussianMap, dict[int, str] | None, 
 
 
 def _read_members(path: Path, file: Any) -> dict[str, bytes]:
-    """All members, each what the head says of it. They are stored, so none is larger than the file."""
+    """All members, each what the head says of it, expanded. They are stored, so none is larger than the file, but .xz
+    ones."""
     try:
         with zipfile.ZipFile(file) as archive:
             found = archive.infolist()
             names = [info.filename for info in found]
-            odd = [n for n in names if n not in _MEMBERS] or [n for n in names if names.count(n) > 1]
+            plain = [n.removesuffix(_XZ) for n in names]
+            odd = [n for n in names if n.removesuffix(_XZ) not in _MEMBERS] or [n for n in plain if plain.count(n) > 1]
             if odd or any(info.compress_type != zipfile.ZIP_STORED for info in found):
                 raise FormatError(f"{path}: no map of ggslam: holds {odd[0] if odd else 'compressed members'}")
             members = {info.filename: archive.read(info) for info in found}
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError) as error:
         raise FormatError(f"{path}: no whole container of a map: {error}") from None
     head = _head(path, members.pop(_HEAD, b""))
-    for name in (_MAP, PLACES_FILE, *_NEEDED):
-        if name not in members:
-            raise FormatError(f"{path}: holds no {name}")
     for name, content in members.items():
         told = head.get(name)
         if told is None or told.sha256 != hashlib.sha256(content).hexdigest():
             raise FormatError(f"{path}: {name} is damaged: not the content that {_HEAD} tells the checksum of")
+    members = dict(_expanded(path, name, content) for name, content in members.items())
+    for name in (_MAP, _PLACES, *_NEEDED):
+        if name not in members and not (name == _PLACES and PLACES_FILE in members):
+            raise FormatError(f"{path}: holds no {name}")
     return members
+
+
+def _expanded(path: Path, name: str, content: bytes) -> tuple[str, bytes]:
+    if not name.endswith(_XZ):
+        return name, content
+    try:
+        return name.removesuffix(_XZ), unpack_bytes(content)
+    except FormatError as error:
+        raise FormatError(f"{path}: {name}: {error}") from None
+
+
+def _places(path: Path, members: dict[str, bytes]) -> dict[str, np.ndarray]:
+    if _PLACES not in members:  # of version 1
+        held = io.BytesIO(members[PLACES_FILE])
+        return arrays_of(held, f"{path}: {PLACES_FILE}: damaged", lambda found: {n: found[n] for n in found.files})
+    try:
+        return unpack_arrays(members[_PLACES])
+    except FormatError as error:
+        raise FormatError(f"{path}: {_PLACES}: {error}") from None
 
 
 def _head(path: Path, content: bytes) -> Mapping[str, FileRecord]:
@@ -270,8 +300,7 @@ def _write_run(path: Path, members: dict[str, bytes], staged: Path, threads: int
     if with_objects:
         gaussians = _with_codes(gaussians, IdentityClassifier.from_file(staged / _CLASSIFIER))
     write_gaussian_ply(staged / "map.ply", gaussians, ("object_id", "identity") if with_objects else ())
-    held = io.BytesIO(members[PLACES_FILE])
-    arrays = arrays_of(held, f"{path}: {PLACES_FILE}: damaged", lambda found: {n: found[n] for n in found.files})
+    arrays = _places(path, members)
     births = gaussians.birth_keyframe.numpy().astype(np.int32)
     write_bytes(staged / PLACES_FILE, arrays_to_bytes(**{**arrays, "birth": births}))
     save_points(staged)

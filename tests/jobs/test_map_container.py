@@ -19,7 +19,8 @@ from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_container import read_container
 from ggslam.runs.recordings import SequenceRequest
-from ggslam.scene.arrays import read_all_arrays
+from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
+from ggslam.scene.packed_arrays import pack_bytes, unpack_arrays, unpack_bytes
 
 FEW = ["mapping.iterations_per_frame=1", "mapping.first_frame_iterations=4", "refine_iterations=0"]
 
@@ -41,7 +42,7 @@ def run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 def container(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("container") / "run.ggz"
     result = ggslam("encode", run.path, out, "--slices", 2, "--rate", "r04")
-    assert result.exit_code == 0 and "places.npz" in result.output and "times as many" in result.output, result.output
+    assert result.exit_code == 0 and "places.bin" in result.output and "times as many" in result.output, result.output
     return out
 
 
@@ -77,6 +78,39 @@ def test_a_run_comes_back(run: RunFolder, container: Path, again: RunFolder) -> 
     np.testing.assert_allclose(means[1], means[0], atol=0.51 * step)
     mark = again.mark()
     assert mark.complete and "decoded" in mark.edits[-1] and mark.files is not None and "map.ply" in mark.files
+
+
+def test_places_come_back_bit_for_bit_in_fewer_bytes(run: RunFolder, container: Path, again: RunFolder) -> None:
+    before, after = (read_all_arrays(f.path / "places.npz", "places") for f in (run, again))
+    assert list(before) == list(after)
+    for name in set(before) - {"birth"}:
+        assert before[name].dtype == after[name].dtype and before[name].tobytes() == after[name].tobytes(), name
+    plain = sum(values.nbytes for name, values in before.items() if name != "birth")
+    with zipfile.ZipFile(container) as archive:
+        assert archive.getinfo("places.bin").file_size < 0.8 * plain
+        texts = [info for info in archive.infolist() if info.filename.endswith(".json.xz")]
+        assert sum(i.file_size for i in texts) < 0.5 * sum((run.path / i.filename[:-3]).stat().st_size for i in texts)
+
+
+def test_files_of_version_1_are_read(run: RunFolder, container: Path, again: RunFolder, tmp_path: Path) -> None:
+    """Whose members were the run's own files."""
+    with zipfile.ZipFile(container) as archive:
+        head = json.loads(archive.read("container.json"))
+        members = {}
+        for name in archive.namelist():
+            content = archive.read(name)
+            members[name.removesuffix(".xz")] = unpack_bytes(content) if name.endswith(".xz") else content
+    members["places.npz"] = arrays_to_bytes(**unpack_arrays(members.pop("places.bin")))
+    del members["container.json"]
+    files = {name: {"bytes": len(b), "sha256": hashlib.sha256(b).hexdigest()} for name, b in members.items()}
+    with zipfile.ZipFile(tmp_path / "old.ggz", "w") as archive:
+        for name, content in {
+            "container.json": json.dumps({**head, "version": 1, "files": files}).encode(), **members,
+        }.items():  # fmt: skip
+            archive.writestr(name, content)
+    old = read_container(tmp_path / "old.ggz", tmp_path / "old")
+    for name in ("map.ply", "places.npz", "objects.json", "keyframes.json"):
+        assert (old.path / name).read_bytes() == (again.path / name).read_bytes(), name
 
 
 def test_identity_vectors_say_the_object(run: RunFolder, again: RunFolder) -> None:
@@ -123,15 +157,19 @@ def test_what_is_damaged_is_refused(container: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(container) as archive:
         head = json.loads(archive.read("container.json"))
     cases: list[tuple[Path, str]] = [
-        (_rewritten(container, tmp_path / "later.ggz", container_json=json.dumps({**head, "version": 2}).encode()),
-         "version 2"),
+        (_rewritten(container, tmp_path / "later.ggz", container_json=json.dumps({**head, "version": 3}).encode()),
+         "version 3"),
         (_rewritten(container, tmp_path / "other.ggz", container_json=b"{}"), "not the head"),
         (_rewritten(container, tmp_path / "wrong.ggz", container_json=json.dumps({**head, "files": {}}).encode()),
          "is damaged"),
         (_rewritten(container, tmp_path / "less.ggz", map_bin=None), "holds no map.bin"),
         (_rewritten(container, tmp_path / "more.ggz", **{"../../outside": b"x"}), "no map of ggslam"),
         (_rewritten(container, tmp_path / "stream.ggz", map_bin=b"no stream"), "map.bin"),
-        (_rewritten(container, tmp_path / "record.ggz", run_json=b"[]"), "run.json"),
+        (_rewritten(container, tmp_path / "record.ggz", **{"run.json.xz": pack_bytes(b"[]")}), "run.json"),
+        (_rewritten(container, tmp_path / "packed.ggz", **{"run.json.xz": b"[]"}), "run.json.xz: damaged"),
+        (_rewritten(container, tmp_path / "twice.ggz", **{"run.json": b"[]"}), "no map of ggslam"),
+        (_rewritten(container, tmp_path / "places.ggz", **{"places.bin": b"[]"}), "places.bin: no packed"),
+        (_rewritten(container, tmp_path / "nowhere.ggz", **{"places.bin": None}), "holds no places.bin"),
     ]  # fmt: skip
     bad.write_bytes(content[: len(content) // 2])
     cases.append((bad, "no whole container"))

@@ -9,7 +9,7 @@ from ggslam.runs.records.mark import FileRecord
 from ggslam.runs.records.record import Record
 
 CONTAINER_FORMAT = "ggslam map"
-CONTAINER_VERSION = 1
+CONTAINER_VERSION = 2
 
 
 class ContainerRecord(Record):
