@@ -118,8 +118,8 @@ def encode(
 ) -> None:
     """Encode a point cloud or a Gaussian map as an MPEG G-PCC stream (ISO/IEC 23090-9), in parallel slices."""
     from ggslam.coding import CodecSettings
+    from ggslam.jobs.code.coded_cells import is_cells_file
     from ggslam.jobs.code.coding import encode_file
-    from ggslam.jobs.code.store_coding import is_cells_file
     from ggslam.jobs.submaps.stores import is_store
     from ggslam.runs.map_container import is_container
 

@@ -140,12 +140,16 @@ def splat_reach(blocks: Callable[[], Iterable[GaussianMap]], count: int, setting
         settings: of `splat_settings`; a voxel size named there stays.
         rate: one of `RATES`.
     """
-    step, sizes = max(1, count // SAMPLED), []
-    for block in blocks() if settings.voxel_size is None else ():
-        sizes.append(np.median(block.log_scales[::step].detach().cpu().numpy(), axis=1))
-    size = float(np.exp(np.median(np.concatenate(sizes).astype(np.float64)))) if sizes else 0.0
-    finest = RATES[rate].voxel * size if np.isfinite(size) else 0.0
+    finest = finest_voxel(blocks(), count, rate) if settings.voxel_size is None else 0.0
     return reach_of((means_of(block) for block in blocks()), settings, count, finest)
+
+
+def finest_voxel(blocks: Iterable[GaussianMap], count: int, rate: str) -> float:
+    """Edge of the voxels that are fine enough for `count` Gaussians, metres: a part of the middle axis of most."""
+    step = max(1, count // SAMPLED)
+    sizes = [np.median(block.log_scales[::step].detach().cpu().numpy(), axis=1) for block in blocks if len(block)]
+    size = float(np.exp(np.median(np.concatenate(sizes).astype(np.float64)))) if sizes else 0.0
+    return RATES[rate].voxel * size if np.isfinite(size) else 0.0
 
 
 def is_splat_cloud(cloud: PointCloud) -> bool:

@@ -193,8 +193,13 @@ def read_objects(store: GridStore) -> StoreObjects | None:
         raise FormatError(f"{path}: is a link; a store holds none")
     if not path.exists():
         return None
+    return parse_objects(read_foreign(path), str(path))
+
+
+def parse_objects(content: bytes, path: str) -> StoreObjects:
+    """The content of the file; `path` is for messages. Raises FormatError as `read_objects`."""
     try:
-        values = json.loads(read_foreign(path))
+        values = json.loads(content)
         if isinstance(values, dict) and values.get("version") != VERSION:
             raise ValueError(f"version {values.get('version')!r:.20}, this program reads version {VERSION}")
         return pydantic.TypeAdapter(StoreObjects).validate_python(values)
@@ -212,4 +217,9 @@ def write_objects(store: GridStore, objects: StoreObjects) -> None:
     Raises:
         RunFolderError: it cannot be written.
     """
-    write_bytes(store.path / OBJECTS_FILE, json.dumps(asdict(objects), indent=1).encode(), fsync=True)
+    write_bytes(store.path / OBJECTS_FILE, objects_to_bytes(objects), fsync=True)
+
+
+def objects_to_bytes(objects: StoreObjects) -> bytes:
+    """Content of the file."""
+    return json.dumps(asdict(objects), indent=1).encode()

@@ -9,13 +9,17 @@ from ggslam.runs.records.mark import FileRecord
 from ggslam.runs.records.record import Record
 from ggslam.submaps.settings import GridAxes
 
-CELLS_FORMAT, CELLS_VERSION = "ggslam cells", 1
+CELLS_FORMAT, CELLS_VERSION = "ggslam cells", 2
 
 
 class CellMember(FileRecord):
-    """A cell: its Gaussians, and bytes and checksum of its stream."""
+    """A cell: its Gaussians, and bytes and checksum of its stream; the visit that wrote it last, that its Gaussians are
+    from, and when it was recorded, seconds."""
 
     gaussians: int
+    visit: str | None = None
+    seen_by: str | None = None
+    recorded_at: float | None = None
 
 
 class CellsRecord(Record):
@@ -27,6 +31,8 @@ class CellsRecord(Record):
         rate: quality of the Gaussians.
         spacing, axes: of the store's grid.
         cells: by member.
+        visits: names, oldest first.
+        files: the store's objects and what it remembers of visits, by member (version 2).
     """
 
     format: str
@@ -36,6 +42,8 @@ class CellsRecord(Record):
     spacing: float
     axes: GridAxes
     cells: dict[str, CellMember]
+    visits: list[str] = []
+    files: dict[str, FileRecord] = {}
 
     @staticmethod
     def parse(content: bytes) -> CellsRecord:
