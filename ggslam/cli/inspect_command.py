@@ -29,13 +29,15 @@ EPILOG = """
   ggslam inspect --formats
 
   ggslam inspect kitchen.bin
+
+  ggslam inspect kitchen.ggz
 """
 
 
 def inspect(
     sequence: Annotated[
         Path | None,
-        typer.Argument(metavar="SEQUENCE|STREAM", help="A recording, or a file that `ggslam encode` wrote."),
+        typer.Argument(metavar="SEQUENCE|STREAM", help="A recording, or what `ggslam encode` wrote: .bin, .ggz, .ggc."),
     ] = None,
     start: options.Start = 0,
     stop: options.Stop = None,
@@ -53,7 +55,7 @@ def inspect(
     formats: Annotated[bool, typer.Option("--formats", help="List the formats that ggslam reads.")] = False,
     samples: int = typer.Option(8, help="Number of frames to read and check.", min=1),
 ) -> None:
-    """Print what was recognised in a recording, and likely mistakes; of a G-PCC stream, print every unit."""
+    """Print what was recognised in a recording, and likely mistakes; of a coded file, what is in it and its bytes."""
     from ggslam.sequences import open_sequence, recognise_format
 
     if formats:
@@ -61,6 +63,9 @@ def inspect(
         return
     if sequence is None:
         raise typer.BadParameter("give a recording or a stream, or --formats")
+    if sequence.suffix.lower() in (".ggz", ".ggc") and not sequence.is_dir():
+        _print_contents(sequence)
+        return
     is_stream = sequence.is_file() and format_name is None and recognise_format(sequence) is None
     if is_stream or (sequence.suffix and not sequence.exists()):
         _print_stream(sequence)
@@ -131,6 +136,23 @@ def _print_formats() -> None:
     for known in FORMATS:
         console.print(f"[bold]{known.name:<13}[/] {escape(known.layout)}", highlight=False, soft_wrap=True)
     console.print(f"[bold]{RIG:<13}[/] {escape(RIG_LAYOUT)}", highlight=False, soft_wrap=True)
+
+
+def _print_contents(path: Path) -> None:
+    """What is in a .ggz or .ggc."""
+    from ggslam.jobs.code.coded_cells import is_cells_file
+    from ggslam.jobs.code.contents import contents_of_cells, contents_of_run
+
+    found = contents_of_cells(path) if is_cells_file(path) else contents_of_run(path)
+    for name, value in found.facts:
+        console.print(f"[bold]{name:<17}[/] {escape(value)}", highlight=False, soft_wrap=True)
+    rows = [
+        [name, str(size), f"{size / max(1, found.gaussians):.2f}"]
+        for name, size in [*found.parts.most_common(), ("the file", sum(found.parts.values()))]
+    ]
+    console.print(table("contained", ["part", "bytes", "bytes a Gaussian"], rows))
+    for problem in found.problems:
+        console.print(f"[red]damaged:[/] {escape(problem)}", highlight=False, soft_wrap=True)
 
 
 def _print_stream(path: Path) -> None:

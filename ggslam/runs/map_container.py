@@ -21,10 +21,9 @@ import hashlib
 import io
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -68,13 +67,13 @@ from ggslam.system.atomic import atomic_write, make_folder, write_bytes
 from ggslam.system.foreign import open_foreign
 
 SUFFIX = ".ggz"
-_HEAD, _MAP, _PLACES, _XZ = "container.json", "map.bin", "places.bin", ".xz"
-_CLASSIFIER, _TABLE = "classifier.npz", "objects.json"
+_HEAD, MAP, _PLACES, _XZ = "container.json", "map.bin", "places.bin", ".xz"
+_CLASSIFIER, TABLE = "classifier.npz", "objects.json"
 _NEEDED = (
     RunRecord.FILE, KeyframesRecord.FILE, "trajectory.txt", "config.yaml", SequenceRecord.FILE, TimingRecord.FILE,
 )  # fmt: skip
-_PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, *MOVER_FILES, _TABLE, _CLASSIFIER)
-_MEMBERS = frozenset((_HEAD, _MAP, _PLACES, PLACES_FILE, *_NEEDED, *_PERHAPS))
+_PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, *MOVER_FILES, TABLE, _CLASSIFIER)
+_MEMBERS = frozenset((_HEAD, MAP, _PLACES, PLACES_FILE, *_NEEDED, *_PERHAPS))
 _MOST_KEYFRAMES = (1 << 16) - 2
 
 
@@ -125,14 +124,14 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
     if births is None or births.shape != (len(rows),) or births.max(initial=0) > _MOST_KEYFRAMES:
         raise RunFolderError(f"{places_file}: not of this map, which has {len(rows)} Gaussians")
     with_objects = folder.has_objects()
-    optional = _PERHAPS if with_objects else [name for name in _PERHAPS if name not in (_TABLE, _CLASSIFIER)]
+    optional = _PERHAPS if with_objects else [name for name in _PERHAPS if name not in (TABLE, _CLASSIFIER)]
     names = [*_NEEDED, *(name for name in optional if (folder.path / name).is_file())]
     make_folder(out.parent)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as name:
-        stream = Path(name) / _MAP
+        stream = Path(name) / MAP
         count, notes = _encode_map(rows, births, with_objects, rate, settings, stream)
         members = dict(_smallest(n, (folder.path / n).read_bytes()) for n in names)
-        members |= {_PLACES: pack_arrays(places), _MAP: stream.read_bytes()}
+        members |= {_PLACES: pack_arrays(places), MAP: stream.read_bytes()}
         head = ContainerRecord(
             format=CONTAINER_FORMAT, version=CONTAINER_VERSION, ggslam=__version__, gaussians=count, rate=rate,
             files={n: FileRecord(bytes=len(b), sha256=hashlib.sha256(b).hexdigest()) for n, b in members.items()},
@@ -185,8 +184,7 @@ def read_container(path: Path, out: Path, overwrite: bool = False, threads: int 
         FormatError: it is none, damaged, or of a later version.
         RunFolderError: the folder cannot be written.
     """
-    with open_foreign(path) as file:
-        members = _read_members(path, file)
+    members = open_container(path).members
     folder = RunFolder.create(out, overwrite)
 
     def write(staged: Path) -> RunRecord:
@@ -212,12 +210,11 @@ def read_contained_map(path: Path) -> tuple[GaussianMap, dict[int, str] | None, 
     Raises:
         FormatError: it is none, damaged, or of a later version.
     """
-    with open_foreign(path) as file:
-        members = _read_members(path, file)
+    members = open_container(path).members
     try:
-        cloud = decode_cloud(members[_MAP], None)
+        cloud = decode_cloud(members[MAP], None)
         if not is_splat_cloud(cloud):
-            raise FormatError(f"{_MAP}: holds no map")
+            raise FormatError(f"{MAP}: holds no map")
         with tempfile.TemporaryDirectory() as name:
             for member in {KeyframesRecord.FILE, SequenceRecord.FILE, _TABLE} & set(members):
                 write_bytes(Path(name) / member, members[member])
@@ -229,11 +226,30 @@ def read_contained_map(path: Path) -> tuple[GaussianMap, dict[int, str] | None, 
     return gaussians_of(cloud), names, keyframes, sequence
 
 
-def _read_members(path: Path, file: Any) -> dict[str, bytes]:
-    """All members, each what the head says of it, expanded. They are stored, so none is larger than the file, but .xz
-    ones."""
+@dataclass(frozen=True)
+class Container:
+    """A container in memory.
+
+    Attributes:
+        head: what it says of itself.
+        sizes: bytes of the members as they lie in the file.
+        members: their content by the names of a run's files, expanded.
+    """
+
+    head: ContainerRecord
+    sizes: dict[str, int]
+    members: dict[str, bytes]
+
+
+def open_container(path: Path) -> Container:
+    """All members of a container, each what the head says of it. They are stored, so none is larger than the file, but
+    .xz ones.
+
+    Raises:
+        FormatError: it is none, damaged, or of a later version.
+    """
     try:
-        with zipfile.ZipFile(file) as archive:
+        with open_foreign(path) as file, zipfile.ZipFile(file) as archive:
             found = archive.infolist()
             names = [info.filename for info in found]
             plain = [n.removesuffix(_XZ) for n in names]
@@ -243,16 +259,17 @@ def _read_members(path: Path, file: Any) -> dict[str, bytes]:
             members = {info.filename: archive.read(info) for info in found}
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError) as error:
         raise FormatError(f"{path}: no whole container of a map: {error}") from None
+    sizes = {name: len(content) for name, content in members.items()}
     head = _head(path, members.pop(_HEAD, b""))
     for name, content in members.items():
-        told = head.get(name)
+        told = head.files.get(name)
         if told is None or told.sha256 != hashlib.sha256(content).hexdigest():
             raise FormatError(f"{path}: {name} is damaged: not the content that {_HEAD} tells the checksum of")
     members = dict(_expanded(path, name, content) for name, content in members.items())
-    for name in (_MAP, _PLACES, *_NEEDED):
+    for name in (MAP, _PLACES, *_NEEDED):
         if name not in members and not (name == _PLACES and PLACES_FILE in members):
             raise FormatError(f"{path}: holds no {name}")
-    return members
+    return Container(head, sizes, members)
 
 
 def _expanded(path: Path, name: str, content: bytes) -> tuple[str, bytes]:
@@ -274,8 +291,7 @@ def _places(path: Path, members: dict[str, bytes]) -> dict[str, np.ndarray]:
         raise FormatError(f"{path}: {_PLACES}: {error}") from None
 
 
-def _head(path: Path, content: bytes) -> Mapping[str, FileRecord]:
-    """What the head says of the members."""
+def _head(path: Path, content: bytes) -> ContainerRecord:
     try:
         head = ContainerRecord.parse(content)
     except ValueError as error:
@@ -283,7 +299,7 @@ def _head(path: Path, content: bytes) -> Mapping[str, FileRecord]:
     if head.version > CONTAINER_VERSION:
         known = f"this ggslam reads up to {CONTAINER_VERSION}: use a newer one"
         raise FormatError(f"{path}: is of version {head.version}; {known}")
-    return head.files
+    return head
 
 
 def _write_run(path: Path, members: dict[str, bytes], staged: Path, threads: int | None) -> RunRecord:
@@ -291,12 +307,12 @@ def _write_run(path: Path, members: dict[str, bytes], staged: Path, threads: int
         if name in members and name != RunRecord.FILE:
             write_bytes(staged / name, members[name])
     try:
-        cloud = decode_cloud(members[_MAP], threads)
+        cloud = decode_cloud(members[MAP], threads)
     except (FormatError, ConfigError) as error:
-        raise FormatError(f"{path}: {_MAP}: {error}") from None
+        raise FormatError(f"{path}: {MAP}: {error}") from None
     if not is_splat_cloud(cloud) or BIRTH not in cloud.attributes:
-        raise FormatError(f"{path}: {_MAP}: holds no map with its keyframes' numbers")
-    gaussians, with_objects = gaussians_of(cloud), {_CLASSIFIER, _TABLE} <= set(members)
+        raise FormatError(f"{path}: {MAP}: holds no map with its keyframes' numbers")
+    gaussians, with_objects = gaussians_of(cloud), {_CLASSIFIER, TABLE} <= set(members)
     if with_objects:
         gaussians = _with_codes(gaussians, IdentityClassifier.from_file(staged / _CLASSIFIER))
     write_gaussian_ply(staged / "map.ply", gaussians, ("object_id", "identity") if with_objects else ())

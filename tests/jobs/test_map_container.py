@@ -14,7 +14,9 @@ from kept import build_once, session_folder
 from typer.testing import CliRunner, Result
 
 from ggslam.cli.main import app
+from ggslam.coding.listing import list_units
 from ggslam.errors import FormatError, GgslamError, RunFolderError
+from ggslam.jobs.code.contents import contents_of_run
 from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_container import read_container
@@ -132,6 +134,27 @@ def test_containers_are_merged(container: Path, room: Path, tmp_path: Path) -> N
     merged = RunFolder.open(tmp_path / "both").mark().merged
     assert merged is not None and [part.run for part in merged] == [str(container), str(other)]
     assert "run.ggz" in result.output
+
+
+def test_inspect_says_what_is_inside(run: RunFolder, container: Path, tmp_path: Path) -> None:
+    found = contents_of_run(container)
+    facts = dict(found.facts)
+    assert found.gaussians == len(run.gaussians()) == int(facts["Gaussians"]) and not found.problems
+    assert facts["keyframes"] == f"{len(run.keyframes().keyframes)} of 8 frames"
+    assert facts["objects"].startswith(f"{len(run.object_table())}: ") and "rate r04" in facts["map of a run"]
+    assert sum(found.parts.values()) == container.stat().st_size
+    with zipfile.ZipFile(container) as archive:
+        stream = archive.read("map.bin")
+        assert found.parts["places.bin"] == archive.getinfo("places.bin").file_size
+    parts = list_units(stream).parts
+    assert found.parts["positions"] == parts["geometry"] and found.parts["colours"] == parts["sh_0"]
+    said = ggslam("inspect", container)
+    assert said.exit_code == 0
+    for words in ("Gaussians", "keyframes", "places.bin", str(container.stat().st_size), str(parts["scale"])):
+        assert words in said.output, words
+    (tmp_path / "cut.ggz").write_bytes(container.read_bytes()[:-1000])
+    for path in (tmp_path / "cut.ggz", tmp_path / "none.ggz"):
+        assert isinstance(ggslam("inspect", path).exception, GgslamError)
 
 
 def _rewritten(container: Path, out: Path, **changes: bytes | None) -> Path:

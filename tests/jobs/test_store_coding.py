@@ -18,6 +18,7 @@ from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
 from ggslam.coding.splats import gaussians_of, splat_attributes, splat_settings
 from ggslam.errors import FormatError
 from ggslam.jobs.code.coded_cells import CodedCells, decode_store
+from ggslam.jobs.code.contents import contents_of_cells
 from ggslam.jobs.code.store_coding import encode_store
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, cell_arrays, gaussians_of_cell, gaussians_to_bytes
 from ggslam.jobs.tasks.engines import Engine
@@ -155,6 +156,29 @@ def test_objects_and_visits_are_kept(store: Path, tmp_path: Path) -> None:
         with pytest.raises(FormatError, match=rf"torn\.ggc: {name}"):
             decode_store(tmp_path / "torn.ggc", tmp_path / "no.grid")
         assert not (tmp_path / "no.grid").exists()
+
+
+def test_inspect_says_what_is_inside(store: Path, tmp_path: Path) -> None:
+    several_visits(store, tmp_path / "two.grid")
+    file = tmp_path / "two.ggc"
+    done = encode_store(tmp_path / "two.grid", file, engine=Engine(workers=1))
+    found = contents_of_cells(file)
+    facts = dict(found.facts)
+    assert found.gaussians == done.gaussians == int(facts["Gaussians"])
+    assert facts["objects"] == "1: mug (3); 1 more are gone" and facts["visits"].startswith("2: run ")
+    assert facts["visits"].endswith(", second") and facts["grid"].startswith(f"{len(done.sizes)} cells of 2 m")
+    assert sum(found.parts.values()) == file.stat().st_size and found.parts["object ids"] > 0 and not found.problems
+    said = succeed("inspect", file)
+    assert "mug (3)" in said and "positions" in said and str(file.stat().st_size) in said
+    data = bytearray(file.read_bytes())
+    with zipfile.ZipFile(file) as archive:
+        info = archive.getinfo(next(name for name in archive.namelist() if name.startswith("cells/")))
+    data[info.header_offset + 60 + info.file_size // 2] ^= 255
+    file.write_bytes(data)
+    found = contents_of_cells(file)
+    assert len(found.problems) == 1 and info.filename in found.problems[0]
+    assert found.parts["damaged cells"] == info.file_size and sum(found.parts.values()) == file.stat().st_size
+    assert "damaged:" in succeed("inspect", file)
 
 
 def test_files_of_version_1_are_read(store: Path, coded: Path, tmp_path: Path) -> None:

@@ -75,8 +75,7 @@ class CodedCells:
             KeyError: there is no such cell.
             FormatError: it is damaged.
         """
-        name = self.members[key]
-        content = self._content(name, self.head.cells[name])
+        name, content = self.members[key], self.content(key)
         try:
             cloud = decode_cloud(content, threads)
         except (FormatError, ConfigError) as error:
@@ -85,6 +84,10 @@ class CodedCells:
             raise FormatError(f"{self.path}: {name}: holds no Gaussians")
         return gaussians_of(cloud)
 
+
+    def content(self, key: CellKey) -> bytes:
+        """The stream of a cell; errors as of `read`."""
+        return self._content(self.members[key], self.of(key))
 
     def objects(self) -> StoreObjects | None:
         """What the store knew of objects; None: nothing. Raises FormatError if it is damaged."""
