@@ -140,6 +140,8 @@ def encode(
         return _contain(source, out, settings, rate)
     done = encode_file(source, out, settings, preset.value, rate.value, ids)
     _print_report(done.report)
+    if preset is Preset.splat:
+        _print_loss(rate)
     for note in done.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
     console.print(f"wrote {done.path}", highlight=False, markup=False)
@@ -163,6 +165,7 @@ def _encode_store(
         f"a Gaussian; in the store {done.store_bytes}, {done.store_bytes / max(1, total):.1f} times as many; "
         f"{done.seconds:.1f} s", highlight=False,
     )  # fmt: skip
+    _print_loss(rate)
     for line in (f"wrote {out}", *(f"left out: {line}" for line in done.failures.values())):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if done.failures:
@@ -183,9 +186,16 @@ def _contain(source: Path, out: Path, settings: CodecSettings, rate: Rate) -> No
         f"{done.gaussians} Gaussians; the same files of the run take {done.run_bytes} bytes, "
         f"{done.run_bytes / max(1, total):.1f} times as many", highlight=False,
     )  # fmt: skip
+    _print_loss(rate)
     for note in done.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
     console.print(f"wrote {out}", highlight=False, markup=False)
+
+
+def _print_loss(rate: Rate) -> None:
+    from ggslam.coding.splats import loss_words
+
+    console.print(loss_words(rate.value), highlight=False, soft_wrap=True)
 
 
 def _refuse_ignored(context: typer.Context, preset: Preset, sweep: Sweep | None, of_store: bool) -> None:

@@ -55,6 +55,16 @@ RATES = {
 }
 
 
+LOSSES = {"r01": (0.4, 2.6), "r02": (0.1, 1.4), "r03": (0.1, 0.8), "r04": (0.05, 0.4)}
+"""dB of held-out pictures that five maps lost (docs/compress.md), the least and the most."""
+
+
+def loss_words(rate: str) -> str:
+    """What a rate costs in pictures, for people."""
+    least, most = LOSSES[rate]
+    return f"rate {rate} costs {least:g} to {most:g} dB of held-out pictures (measured; most with SH degree 3)"
+
+
 def rest_range(blocks: Iterable[GaussianMap]) -> float:
     """The range of a map's SH coefficients above degree 0: the power of two, 1/8 to 4, that none exceeds."""
     most = max((float(block.sh[:, 1:].detach().abs().amax()) for block in blocks if block.sh[:, 1:].numel()), default=4)

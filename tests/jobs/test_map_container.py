@@ -45,6 +45,7 @@ def container(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("container") / "run.ggz"
     result = ggslam("encode", run.path, out, "--slices", 2, "--rate", "r04")
     assert result.exit_code == 0 and "places.bin" in result.output and "times as many" in result.output, result.output
+    assert "rate r04 costs 0.05 to 0.4 dB" in " ".join(result.output.split())
     return out
 
 
