@@ -139,9 +139,7 @@ def encode(
     if contained:
         return _contain(source, out, settings, rate)
     done = encode_file(source, out, settings, preset.value, rate.value, ids)
-    _print_report(done.report)
-    if preset is Preset.splat:
-        _print_loss(rate)
+    _print_report(done.report, rate if preset is Preset.splat else None)
     for note in done.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
     console.print(f"wrote {done.path}", highlight=False, markup=False)
@@ -221,7 +219,7 @@ def _refuse_ignored(context: typer.Context, preset: Preset, sweep: Sweep | None,
         raise ConfigError("--plots goes with --sweep")
 
 
-def _print_report(report: CodingReport) -> None:
+def _print_report(report: CodingReport, rate: Rate | None) -> None:
     parts = {"geometry": report.geometry_bytes, **report.attribute_bytes}
     parts["headers"] = report.total_bytes - sum(parts.values())
     rows = [[name, str(size), _rate(size, report.input_points)] for name, size in parts.items()]
@@ -233,6 +231,8 @@ def _print_report(report: CodingReport) -> None:
         f"{report.input_points} points{merged}; slices: {len(report.slices)}; {report.seconds:.2f} s, "
         f"{speed:.2f} million points/s", highlight=False,
     )  # fmt: skip
+    if rate is not None:
+        _print_loss(rate)
 
 
 def _rate(size: int, points: int) -> str:
