@@ -239,7 +239,7 @@ def plan_summaries(
     tables = _tables(attributes, described, settings)
     for index, name in enumerate(attributes):
         own, description, table = settings.attribute(name), described[name], tables.get(name)
-        if table is not None and _told_by_scale(described, tables):
+        if table is not None and _scale_tells_stride(described, tables):
             description = replace(description, fraction_bits=table.bits)
         instance = sum(plan.description.label == description.label for plan, _ in plans)
         plan = CodedAttribute(name, index, replace(description, instance=instance), table)
@@ -264,7 +264,7 @@ def _tables(
     return {name: IdTable.of(values, bits) for name, values in ids.items()}
 
 
-def _told_by_scale(described: Mapping[str, AttributeDescription], tables: Mapping[str, IdTable]) -> bool:
+def _scale_tells_stride(described: Mapping[str, AttributeDescription], tables: Mapping[str, IdTable]) -> bool:
     """Whether the stride of ids stands in the sequence parameter set: not beside a reflectance, to which the reference
     decoder would apply it."""
     return all(name in tables for name, description in described.items() if description.label == "reflectance")

@@ -34,7 +34,7 @@ class Reach:
         settings: as asked for, with the voxel size that suits the bulk.
         box: float64 [2, 3], outside of which points are left out; None: none are.
         bulk: float64 [2, 3], what most points lie within; None: the cloud has no outliers.
-        far, left_out, farthest: points that `kept` saw outside the bulk and its surroundings, those left out of them,
+        far, left_out, farthest: points that `keep` saw outside the bulk and its surroundings, those left out of them,
             and how far from the bulk's middle they lie along an axis.
     """
 
@@ -45,7 +45,7 @@ class Reach:
     left_out: int = field(default=0, init=False)
     farthest: float = field(default=0.0, init=False)
 
-    def kept(self, points: np.ndarray) -> np.ndarray | slice:
+    def keep(self, points: np.ndarray) -> np.ndarray | slice:
         """Index of the points [N, 3] that are coded; the others are counted."""
         if self.bulk is None:
             return slice(None)

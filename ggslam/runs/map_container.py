@@ -164,7 +164,7 @@ def _encode_map(
             own = births[begin : begin + len(block)]
             begin += len(block)
             points, attributes = means_of(block), splat_attributes(block, with_objects, own, rest)
-            kept = reach.kept(points)
+            kept = reach.keep(points)
             yield points[kept], {name: values[kept] for name, values in attributes.items()}
 
     report = encode_blocks(blocks(), reach.settings, out)
@@ -265,14 +265,14 @@ def open_container(path: Path) -> Container:
         told = head.files.get(name)
         if told is None or told.sha256 != hashlib.sha256(content).hexdigest():
             raise FormatError(f"{path}: {name} is damaged: not the content that {_HEAD} tells the checksum of")
-    members = dict(_expanded(path, name, content) for name, content in members.items())
+    members = dict(_expand(path, name, content) for name, content in members.items())
     for name in (MAP, _PLACES, *_NEEDED):
         if name not in members and not (name == _PLACES and PLACES_FILE in members):
             raise FormatError(f"{path}: holds no {name}")
     return Container(head, sizes, members)
 
 
-def _expanded(path: Path, name: str, content: bytes) -> tuple[str, bytes]:
+def _expand(path: Path, name: str, content: bytes) -> tuple[str, bytes]:
     if not name.endswith(_XZ):
         return name, content
     try:

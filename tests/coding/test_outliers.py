@@ -52,7 +52,7 @@ def test_a_cloud_without_outliers_is_coded_as_ever() -> None:
     settings = CodecSettings(geometry_bits=12)
     for parts in ([points], [points * [1, 30, 1]], [np.concatenate([points, points + 8])], [points[:9]], []):
         reach = reach_of(parts, settings, sum(map(len, parts)))
-        assert reach.settings == settings and reach.kept(points) == slice(None) and not reach.notes("point")
+        assert reach.settings == settings and reach.keep(points) == slice(None) and not reach.notes("point")
 
 
 def test_the_bulk_passes_over_a_few() -> None:

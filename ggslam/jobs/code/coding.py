@@ -109,7 +109,7 @@ def _encode_points(path: Path, out: Path, settings: CodecSettings, ids: bool, no
     coded = attributes_to_code(cloud, ids)
     points, settings = coded_points(cloud, settings)
     reach = reach_of([points], settings)
-    kept = reach.kept(points)
+    kept = reach.keep(points)
     notes += coded.notes + reach.notes("point")
     own = {**settings.attributes, **coded.settings}
     settings = replace(reach.settings, attributes=own, metadata=coded.metadata)
@@ -147,7 +147,7 @@ def _encode_splats(
     def blocks() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         for block in rows.blocks():
             points, attributes = means_of(block), splat_attributes(block, with_ids, rest=rest)
-            kept = reach.kept(points)
+            kept = reach.keep(points)
             yield points[kept], {name: values[kept] for name, values in attributes.items()}
 
     make_folder(out.parent)
@@ -171,7 +171,7 @@ def study_cloud(source: Path, settings: CodecSettings) -> GridCloud:
         return on_grid(cloud.points, cloud.colors, settings)
     points, settings = coded_points(cloud, settings)
     reach = reach_of([points], settings)
-    kept = reach.kept(points)
+    kept = reach.keep(points)
     return on_grid(points[kept], cloud.colors[kept], reach.settings)
 
 
