@@ -216,10 +216,10 @@ def read_contained_map(path: Path) -> tuple[GaussianMap, dict[int, str] | None, 
         if not is_splat_cloud(cloud):
             raise FormatError(f"{MAP}: holds no map")
         with tempfile.TemporaryDirectory() as name:
-            for member in {KeyframesRecord.FILE, SequenceRecord.FILE, _TABLE} & set(members):
+            for member in {KeyframesRecord.FILE, SequenceRecord.FILE, TABLE} & set(members):
                 write_bytes(Path(name) / member, members[member])
             keyframes, sequence = KeyframesRecord.read(Path(name)), SequenceRecord.read(Path(name))
-            table = ObjectTable.load(Path(name) / _TABLE) if _TABLE in members else None
+            table = ObjectTable.load(Path(name) / TABLE) if TABLE in members else None
     except (FormatError, RunFolderError, ConfigError) as error:
         raise FormatError(f"{path}: {error}") from None
     names = None if table is None else {record.id: record.name or "" for record in table.objects}

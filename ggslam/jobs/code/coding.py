@@ -36,10 +36,12 @@ from ggslam.errors import ConfigError, FormatError
 from ggslam.formats.gaussian_ply import write_gaussian_parts
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_point_cloud
-from ggslam.formats.point_sampling import sample_points
-from ggslam.formats.splat_formats import open_splats, read_splats, splat_format
+from ggslam.formats.splat_formats import open_splats, splat_format
+from ggslam.formats.voxel_cloud import join_clouds
 from ggslam.jobs.code.attributes import attributes_to_code, restored_attributes
 from ggslam.runs.folder import MARKER, RunFolder
+from ggslam.runs.map_file import open_map
+from ggslam.runs.opened_points import opened_points
 from ggslam.system.atomic import make_folder, write_bytes
 from ggslam.system.foreign import read_foreign
 
@@ -121,10 +123,12 @@ def _encode_points(path: Path, out: Path, settings: CodecSettings, ids: bool, no
 
 def _points_of(path: Path) -> ColoredCloud:
     """The points of Gaussians, sampled as a run's are."""
-    sampled = sample_points(read_splats(path))
+    sampled = join_clouds(opened_points(open_map(path)))
     if not len(sampled):
         raise FormatError(f"{path}: its Gaussians are too faint for points; `preset` splat codes them whole")
-    return ColoredCloud(sampled.points.astype(np.float64), sampled.colors)
+    return ColoredCloud(
+        sampled.points, sampled.colors, grid=sampled.grid, voxel_size=sampled.voxel_size, origin=sampled.origin
+    )
 
 
 def _encode_splats(
