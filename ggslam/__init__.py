@@ -55,6 +55,7 @@ if _TYPE_CHECKING:
     from ggslam.rendering import neighbour_loss as neighbour_loss
     from ggslam.rendering import render as render
     from ggslam.runs.folder import RunFolder as RunFolder
+    from ggslam.runs.opened_points import surface_points as surface_points
     from ggslam.runs.saving import save_run as save_run
     from ggslam.scene.camera import Camera as Camera
     from ggslam.scene.frame import Frame as Frame
@@ -101,6 +102,7 @@ _HOMES = {
     "ggslam.formats.gaussian_ply": ("read_gaussian_ply", "write_gaussian_ply"),
     "ggslam.formats.point_cloud": ("read_point_cloud", "write_point_cloud"),
     "ggslam.formats.point_sampling": ("sample_points",),
+    "ggslam.runs.opened_points": ("surface_points",),
     "ggslam.formats.splat_formats": ("read_splats",),
     "ggslam.formats.trajectory": ("Trajectory", "read_trajectory", "write_tum"),
     "ggslam.jobs.edit.edits": ("Edit", "edit_run"),

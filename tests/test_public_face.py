@@ -23,7 +23,7 @@ NAMES = """
     TsdfMap collate_frames color_loss decode_cloud depth_loss edit_run encode_cloud evaluate_run export_run
     identity_loss load_config neighbour_loss objects_at open_sequence read_gaussian_ply read_point_cloud read_splats
     read_trajectory render render_run run_recording sample_points save_run score_cloud score_image
-    score_trajectory write_gaussian_ply write_point_cloud write_synthetic_sequence write_tum
+    score_trajectory surface_points write_gaussian_ply write_point_cloud write_synthetic_sequence write_tum
 """
 PUBLIC = NAMES.split()
 

@@ -6,7 +6,7 @@
     keyframes.json   poses, exposures and frame numbers of the keyframes; how each frame was tracked
     map.ply          Gaussians in the fields of 3DGS
     map_cells.json   of a run whose memory was limited: which rows of map.ply lie in which cell
-    points.ply       coloured cloud sampled from the map, metres; points_grid.ply: the same in integer grid cells
+    points.ply       coloured points of the surface, metres; points_grid.ply: the same in integer grid cells
     places.npz       what another recording needs to start in this map
     config.yaml      all settings; sequence.json: where the recording was and how it was read
     timing.json      seconds by part; steps.csv: the same, memory, Gaussians and losses step by step

@@ -4,14 +4,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
-from ggslam.formats.voxel_cloud import VoxelCloud
+from ggslam.formats.voxel_cloud import VoxelCloud, join_clouds
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.map_file import MapFile
+from ggslam.runs.map_file import MapFile, open_map
 from ggslam.runs.map_points import map_points, points_of_views
 from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.rendered_views import RenderedViews
+
+
+def surface_points(run: str | Path | RunFolder, voxel_size: float = 0.01) -> VoxelCloud:
+    """The surface that a run's keyframes see of its map: one coloured point for each voxel that it crosses, with object
+    ids if there are any. Nothing but the run's folder is needed.
+
+    Args:
+        run: the run, or its folder; or a file of Gaussians, which gives discs unless it tells where it was seen from.
+        voxel_size: metres, 0.001 to 1.
+
+    Raises:
+        InputError: an impossible voxel size.
+        RunFolderError, FormatError: a file is missing or damaged.
+    """
+    return join_clouds(opened_points(run if isinstance(run, RunFolder) else open_map(run), voxel_size))
 
 
 def opened_points(

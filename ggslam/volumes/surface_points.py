@@ -26,6 +26,9 @@ from ggslam.volumes.tsdf import SIDE, TsdfMap
 
 _TRUNCATION = 3.0
 """Voxels on either side of the surface that a view tells about."""
+_LEAST_WEIGHT = 0.02
+"""In measurements from 1 m: what one view from 4 m tells of a voxel near the end of its truncation. Rendered views need
+no others to confirm them, and where voxels count as unknown the surface has a rim without points."""
 _FARTHEST = 1000.0
 """Metres."""
 _LEAST_AREA = 0.1
@@ -120,7 +123,7 @@ class _Sweep:
 
     def take_finished(self, with_object_id: bool) -> VoxelCloud:
         """The points of what is finished, which is forgotten."""
-        cloud = _points_of(extract_mesh(self._tsdf), self._voxel, with_object_id)
+        cloud = _points_of(extract_mesh(self._tsdf, _LEAST_WEIGHT), self._voxel, with_object_id)
         edge = SIDE * _CUBE_BLOCKS
         of_point = voxel_keys(cloud.grid + np.rint(cloud.origin / self._voxel), edge)
         present = np.unique(of_point)

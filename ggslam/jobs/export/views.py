@@ -57,7 +57,7 @@ def export_colmap(
     """Writes `images/`, a sparse model `sparse/0/` in COLMAP's binary form and `sparse/0/test.txt`, the images that
     were held out; returns a line that says so.
 
-    Images are as the run saw them: undistorted, at its resolution, PNG. Points are sampled from the map.
+    Images are as the run saw them: undistorted, at its resolution, PNG. Points are those of its surface.
 
     Args:
         folder: of the run.
