@@ -26,9 +26,9 @@ from ggslam.volumes.tsdf import SIDE, TsdfMap
 
 _TRUNCATION = 3.0
 """Voxels on either side of the surface that a view tells about."""
-_LEAST_WEIGHT = 0.02
-"""In measurements from 1 m: what one view from 4 m tells of a voxel near the end of its truncation. Rendered views need
-no others to confirm them, and where voxels count as unknown the surface has a rim without points."""
+_LEAST_WEIGHT = 0.06
+"""In measurements from 1 m: what one view from 3 m tells of a voxel halfway through its truncation. Where more is asked
+for, a surface has a rim without points; where less, noisy maps have points that only one view shows."""
 _FARTHEST = 1000.0
 """Metres."""
 _LEAST_AREA = 0.1
