@@ -7,6 +7,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from command_line import ggslam, refuse, succeed
@@ -15,9 +16,10 @@ from scipy.spatial import cKDTree
 
 import ggslam as library
 from ggslam.formats.point_ply import read_points
-from ggslam.formats.voxel_cloud import join_clouds
+from ggslam.formats.voxel_cloud import VoxelCloud, join_clouds
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_points import map_points
+from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
 
 
@@ -61,6 +63,38 @@ def test_points_lie_on_the_exact_surface(exact: Path, run: RunFolder) -> None:
     sample = truth.data[:: len(truth.data) // 20_000]
     covered = cKDTree(cloud.points).query(sample)[0]
     assert (covered < 0.03).mean() > 0.95
+
+
+def seen(cloud: VoxelCloud, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which point each pixel shows, the nearest one, int64 [n], and the pixels that show one, bool [H, W]."""
+    points = transform_points(cloud.points, inverse(T_world_camera))
+    row, column, inside = camera.project(points, 0.05)
+    order = np.flatnonzero(inside)[np.argsort(-points[inside, 2], kind="stable")]
+    shown = np.full((camera.height, camera.width), -1)
+    shown[row[order], column[order]] = order
+    return shown[shown >= 0], shown >= 0
+
+
+@pytest.mark.long("a run")
+def test_points_have_the_colours_and_ids_of_what_is_seen(exact: Path, run: RunFolder) -> None:
+    sequence, poses = library.open_sequence(exact), run.keyframes().poses()
+    errors = []
+    for discs in (False, True):
+        cloud = join_clouds(map_points(run.path, 0.02, discs=discs))
+        assert cloud.object_id is not None
+        squares, right = [], []
+        for index in (2, 7, 12):
+            frame = sequence.frame(index)
+            rows, shows = seen(cloud, frame.camera.scale(0.5), poses[index])
+            image = cv2.resize(frame.color, shows.shape[::-1], interpolation=cv2.INTER_AREA)
+            mask = frame.load_mask()
+            assert mask is not None
+            mask = cv2.resize(mask, shows.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            squares.append(np.mean((cloud.colors[rows].astype(float) - image[shows]) ** 2))
+            right.append(np.mean(cloud.object_id[rows] == mask[shows]))
+        errors.append((10 * np.log10(255**2 / np.mean(squares)), np.mean(right)))
+    (decibels, ids), (of_discs, _) = errors
+    assert decibels > 22 and decibels > of_discs + 3 and ids > 0.92
 
 
 @pytest.mark.long("a run")
