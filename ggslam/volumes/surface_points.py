@@ -36,7 +36,7 @@ _LEAST_AREA = 0.1
 _CUBE_BLOCKS = 4
 """Edge of the cubes that finished space is counted in, blocks."""
 _NEIGHBOURS = np.array([neighbour_step(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
-_CHUNK = 200_000
+_CHUNK = 50_000
 """Triangles whose points are held in memory at a time."""
 MOST_BLOCKS = 40_000
 """Blocks held before finished ones are handed out; 5 KB each."""
@@ -93,9 +93,7 @@ def surface_points(
         view = look(number, False)
         sweep.add(number, view)
         if sweep.blocks > most_blocks or number == count - 1:
-            cloud = sweep.take_finished(with_object_id)
-            if len(cloud):
-                yield cloud
+            yield from sweep.take_finished(with_object_id)
 
 
 def _cubes(view: SurfaceView, voxel_size: float) -> np.ndarray:
@@ -121,17 +119,19 @@ class _Sweep:
         self._tsdf.integrate(view.depth, view.camera, view.T_world_camera, view.color, view.labels)
         self._to_come.is_done(number)
 
-    def take_finished(self, with_object_id: bool) -> VoxelCloud:
-        """The points of what is finished, which is forgotten."""
-        cloud = _points_of(extract_mesh(self._tsdf, _LEAST_WEIGHT), self._voxel, with_object_id)
-        edge = SIDE * _CUBE_BLOCKS
-        of_point = voxel_keys(cloud.grid + np.rint(cloud.origin / self._voxel), edge)
-        present = np.unique(of_point)
-        ripe = present[self._all_around(present, self._to_come.are_done)]
-        new = np.setdiff1d(ripe, self._handed_out, assume_unique=True)
-        self._handed_out = np.union1d(self._handed_out, new)
+    def take_finished(self, with_object_id: bool) -> Iterator[VoxelCloud]:
+        """The points of what is finished, which is forgotten when all were taken."""
+        out = self._handed_out
+        for cloud in _clouds_of(extract_mesh(self._tsdf, _LEAST_WEIGHT), self._voxel, with_object_id):
+            of_point = voxel_keys(cloud.grid + np.rint(cloud.origin / self._voxel), SIDE * _CUBE_BLOCKS)
+            present = np.unique(of_point)
+            ripe = present[self._all_around(present, self._to_come.are_done)]
+            new = np.setdiff1d(ripe, out, assume_unique=True)
+            self._handed_out = np.union1d(self._handed_out, new)
+            cloud = _of_rows(cloud, np.isin(of_point, new))
+            if len(cloud):
+                yield cloud
         self._forget()
-        return _of_rows(cloud, np.isin(of_point, new))
 
     def _all_around(self, cubes: np.ndarray, holds: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Whether something holds of cubes and of all their neighbours: a voxel's surface is made of voxels beside
@@ -150,21 +150,31 @@ class _Sweep:
         return np.isin(cubes, self._handed_out) | ~np.isin(cubes, present)
 
 
-def _points_of(mesh: Mesh, voxel: float, with_object_id: bool) -> VoxelCloud:
-    """One point for each voxel of the grid that triangles lie in. Triangles of marching cubes lie in one each."""
-    sums = [VoxelSums.empty()] if not len(mesh.triangles) else []
+def _clouds_of(mesh: Mesh, voxel: float, with_object_id: bool) -> Iterator[VoxelCloud]:
+    """One point for each voxel of the grid that triangles lie in: those of marching cubes lie in one each, and all of a
+    voxel follow one another."""
     labels = mesh.triangle_labels().astype(np.int32) if with_object_id else np.zeros(len(mesh.triangles), np.int32)
-    for start in range(0, len(mesh.triangles), _CHUNK):
-        triangles = mesh.triangles[start : start + _CHUNK]
-        corners = mesh.vertices[triangles].astype(np.float64)
-        centroid, (first, second) = corners.mean(1), np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)
-        area = np.linalg.norm(np.cross(first, second), axis=1) / 2
-        color = mesh.colors[triangles].mean(1) / 255
-        keys, weight = pack(np.rint(centroid / voxel).astype(np.int64)), area[:, None]
-        sums.append(
-            VoxelSums.of([VoxelSums(keys, labels[start : start + _CHUNK], area, weight * color, weight * centroid)])
-        )
-    return cloud_of_sums(VoxelSums.of(sums), voxel, with_object_id, _LEAST_AREA * voxel**2)
+    start = 0
+    while start < len(mesh.triangles):
+        keys, centroid, area = _triangles(mesh, start, start + _CHUNK, voxel)
+        if start + _CHUNK < len(mesh.triangles):  # the last voxel may go on in the next chunk
+            others = np.flatnonzero(keys != keys[-1])
+            count = int(others[-1]) + 1 if len(others) else len(keys)
+        else:
+            count = len(keys)
+        part, weight = slice(start, start + count), area[:count, None]
+        color = mesh.colors[mesh.triangles[part]].mean(1) / 255
+        sums = VoxelSums(keys[:count], labels[part], area[:count], weight * color, weight * centroid[:count])
+        yield cloud_of_sums(VoxelSums.of([sums]), voxel, with_object_id, _LEAST_AREA * voxel**2)
+        start += count
+
+
+def _triangles(mesh: Mesh, start: int, stop: int, voxel: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Voxels (packed, [n]), centroids [n, 3] and areas [n] of some triangles."""
+    corners = mesh.vertices[mesh.triangles[start:stop]].astype(np.float64)
+    centroid, (first, second) = corners.mean(1), np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)
+    area = np.linalg.norm(np.cross(first, second), axis=1) / 2
+    return pack(np.rint(centroid / voxel).astype(np.int64)), centroid, area
 
 
 def _of_rows(cloud: VoxelCloud, chosen: np.ndarray) -> VoxelCloud:
