@@ -24,6 +24,8 @@ ROUNDING = 1e-3
 """Voxels that a coordinate may lie below a voxel's face and still count as in it: points that lay on faces once stay
 apart, whichever way their coordinates were rounded."""
 _MAX_FIELD = (1 << 32) - 2
+_LEAST_VOXEL = 1e-6
+"""Metres, of a cloud without extent."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,8 @@ def choose_quantization(
     integers = np.issubdtype(points.dtype, np.integer)
     if voxel_size is None:
         longest = float((high / 2 - low / 2).max()) * 2
-        voxel_size = 1.0 if integers or longest == 0 else longest / ((1 << bits) - 1)
+        least = max(_LEAST_VOXEL, float(np.abs([low, high]).max()) * 2.0**-50)  # of points all at one place
+        voxel_size = 1.0 if integers else longest / ((1 << bits) - 1) if longest else least
         if not 1e-12 <= voxel_size <= 1e12:
             raise ConfigError(f"positions that span {longest:g} fit on no grid: name a voxel size")
     scale = geometry_scale / voxel_size

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from ggslam.formats.point_sampling import MapPart, sample_parts, voxel_size_for
+from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.runs.map_index import MapInParts
 from ggslam.runs.rendered_views import RenderedViews
@@ -49,5 +49,5 @@ def points_of_views(
         parts, views.in_view = [MapPart.of(whole)], lambda camera, T_camera_world: whole
     if discs or not len(views):
         return sample_parts(parts, voxel_size, min_opacity, views.segmented is not None)
-    voxel_size = voxel_size_for(parts) if voxel_size is None else voxel_size
+    voxel_size = views.usual_voxel() if voxel_size is None else voxel_size
     return views.points(voxel_size, _FEW_BLOCKS if stored.in_cells else MOST_BLOCKS)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import InputError
+from ggslam.formats.point_sampling import USUAL_VOXEL
 from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.objects.rendered_ids import object_ids
@@ -35,6 +37,8 @@ _COARSE = 0.25
 """Size of views that only tell how far they reach."""
 _FINEST = 4.0
 """Views are rendered at most at so many times the training views' size, for voxels small against their pixels."""
+_ROOM = 6.0
+"""Metres: up to such a usual depth points are a centimetre apart."""
 _PIXELS_A_VOXEL = 1.5
 """A pixel spans no more voxels than this at the usual depth."""
 
@@ -123,15 +127,26 @@ class RenderedViews:
         ids = None if self.segmented is None else object_ids(rasterizer, drawn, self.segmented(gaussians))
         return SurfaceView(depth, camera, T, color, ids)
 
+    def usual_voxel(self) -> float:
+        """Edge of voxels that suits the map, a whole number of centimetres: 1 in rooms, more where most of what is seen
+        is farther away, in halls or where depth has a wrong unit."""
+        depths = [depth for depth, _ in self._usual_depths()]
+        return USUAL_VOXEL * max(1, math.ceil(float(np.median(depths)) / _ROOM)) if depths else USUAL_VOXEL
+
     def zoom_for(self, voxel_size: float) -> float:
         """How many times larger than the keyframes' images views have to be for voxels of this size, metres."""
-        spacings = []
-        for number in np.linspace(0, len(self) - 1, min(len(self), 8)).astype(int):
-            view = self.view(number, _COARSE, only_depth=True)
-            if (view.depth > 0).any():
-                spacings.append(float(np.median(view.depth[view.depth > 0])) / self.cameras[number].fx)
+        spacings = [depth / focal for depth, focal in self._usual_depths()]
         wanted = float(np.median(spacings)) / (_PIXELS_A_VOXEL * voxel_size) if spacings else 1.0
         return float(np.clip(wanted, 1, _FINEST))
+
+    def _usual_depths(self) -> list[tuple[float, float]]:
+        """Median depth of some of the views, metres, and their focal length, pixels."""
+        found = []
+        for number in np.linspace(0, len(self) - 1, min(len(self), 8)).astype(int):
+            depth = self.view(number, _COARSE, only_depth=True).depth
+            if (depth > 0).any():
+                found.append((float(np.median(depth[depth > 0])), self.cameras[number].fx))
+        return found
 
     def points(self, voxel_size: float, most_blocks: int = MOST_BLOCKS) -> Iterator[VoxelCloud]:
         """The surface that the keyframes see, one point for each voxel of a grid; see
@@ -148,5 +163,10 @@ class RenderedViews:
         def look(number: int, coarse: bool) -> SurfaceView:
             return views.view(number, _COARSE if coarse else zoom, only_depth=coarse)
 
-        return surface_points(look, len(views), voxel_size, self.segmented is not None, most_blocks)
+        try:
+            yield from surface_points(look, len(views), voxel_size, self.segmented is not None, most_blocks)
+        except InputError as error:
+            if "blocks" not in str(error):
+                raise
+            raise InputError(f"voxel size {voxel_size:g} m: too small for what a view shows ({error})") from None
 

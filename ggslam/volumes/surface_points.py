@@ -38,6 +38,7 @@ _CUBE_BLOCKS = 4
 _NEIGHBOURS = np.array([neighbour_step(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
 _CHUNK = 50_000
 """Triangles whose points are held in memory at a time."""
+_GROWTH = 1.5
 MOST_BLOCKS = 40_000
 """Blocks held before finished ones are handed out; 5 KB each."""
 
@@ -89,11 +90,12 @@ def surface_points(
     """
     settings = TsdfSettings(voxel=voxel_size, truncation_voxels=_TRUNCATION, max_depth=_FARTHEST)
     sweep = _Sweep(TsdfMap(settings, context), [_cubes(look(k, True), voxel_size) for k in range(count)])
+    limit = most_blocks
     for number in range(count):
-        view = look(number, False)
-        sweep.add(number, view)
-        if sweep.blocks > most_blocks or number == count - 1:
+        sweep.add(number, look(number, False))
+        if sweep.blocks > limit or number == count - 1:
             yield from sweep.take_finished(with_object_id)
+            limit = max(most_blocks, int(_GROWTH * sweep.blocks))  # where little is finished, it pays to look rarely
 
 
 def _cubes(view: SurfaceView, voxel_size: float) -> np.ndarray:

@@ -26,6 +26,13 @@ def test_the_equation() -> None:
     assert q.apply(points).tolist() == [[0, 9, 1], [3, 0, 99], [0, 10, 0]]
 
 
+@pytest.mark.parametrize("place", [(1.5, 2.25, -3.1), (463000.25, 5427000.5, 300.0)])
+def test_points_all_at_one_place_stay_there(place: tuple[float, ...]) -> None:
+    points = np.tile(place, (3, 1))
+    decoded = decode_cloud(encode_cloud(points, settings=CodecSettings(duplicates="keep")).data)
+    assert np.abs(decoded.points - points).max() < 1e-5
+
+
 @pytest.mark.parametrize("bits", [4, 10, 16, 21])
 def test_error_is_half_a_voxel_at_most(metres: np.ndarray, bits: int) -> None:
     coded = encode_cloud(metres, settings=CodecSettings(geometry_bits=bits, duplicates="keep"), reconstruct=True)

@@ -129,6 +129,19 @@ def test_a_turned_file_keeps_its_colours(tmp_path: Path) -> None:
     assert float((seen - torch.einsum("dk,nkc->dnc", spherical_harmonics(directions, 4), before)).abs().max()) < 1e-5
 
 
+def test_a_file_with_objects_turns_as_a_whole(tmp_path: Path) -> None:
+    """What has no object turns along."""
+    gaussians = two_things()
+    gaussians.object_id[:50] = 0
+    write_splats(tmp_path / "map.ply", gaussians, {1: "a", 2: "b"})
+    succeed("edit", tmp_path / "map.ply", "--move", "all", "0 0 1", "--rotate", "0 90 0", "--out", tmp_path / "t.ply")
+    turned, means = read_splats(tmp_path / "t.ply"), gaussians.means.double().numpy()
+    R = Rotation.from_euler("xyz", [0, 90, 0], degrees=True).as_matrix()
+    expected = (means - means.mean(0)) @ R.T + means.mean(0) + [0, 0, 1]
+    assert np.abs(turned.means.numpy() - expected).max() < 1e-4
+    assert open_map(tmp_path / "t.ply").has_objects()
+
+
 def test_what_needs_a_recording_says_so(tmp_path: Path) -> None:
     path = written(tmp_path / "map.ply")
     for words, expected in (

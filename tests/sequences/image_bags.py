@@ -136,15 +136,19 @@ def compressed_depth(metres: bool, depth: np.ndarray, a: float = 10100.0, b: flo
 def write_image_bag(
     folder: Path, storage: str, colors: Callable[[ImageMessages, float, int], Any],
     depths: Callable[[ImageMessages, float, int], Any], count: int = 3, info: bool = True,
-    size: tuple[int, int] = (WIDTH, HEIGHT),
+    size: tuple[int, int] = (WIDTH, HEIGHT), region: tuple[int, int] | None = None,
 ) -> Path:  # fmt: skip
-    """A bag with `count` pairs of images, 1/30 s apart; `colors` and `depths` make message i at a time."""
+    """A bag with `count` pairs of images, 1/30 s apart; `colors` and `depths` make message i at a time; with
+    a region the images are the part of the sensor that begins there."""
     ros2 = not storage.startswith("ros1")
     messages = ImageMessages(ros2)
     sent: list[tuple[str, float, Any]] = []
     if info:
         calibration = messages.info("color_optical", (), "plumb_bob")
         calibration.width, calibration.height = size
+        if region is not None:
+            roi = calibration.roi
+            (roi.x_offset, roi.y_offset), roi.width, roi.height = region, WIDTH, HEIGHT
         sent += [(f"{topic.rsplit('/', 1)[0]}/camera_info", 999.9, calibration) for topic in (COLOR_TOPIC, DEPTH_TOPIC)]
     for i in range(count):
         time = 1000 + i / 30

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from command_line import ggslam, refuse, succeed
 from image_bags import (
+    COLOR_TOPIC,
     HEIGHT,
     LAYOUTS,
     LOSSLESS,
@@ -32,6 +33,7 @@ from image_bags import (
 from ggslam.errors import SequenceError
 from ggslam.sequences import open_sequence
 from ggslam.sequences.formats.ros_images import COLOR, DEPTH
+from ggslam.sequences.formats.ros_topics import is_rectified
 
 Make = Callable[[ImageMessages, float, int], Any]
 FLOAT32_MM = 0.001
@@ -216,3 +218,34 @@ def test_inspect_and_run(room: Path, tmp_path: Path, storage: str) -> None:
     succeed("run", path, *own, "--stop", 3, "--iterations", 1, "--refine", 0, "--out", tmp_path / "run")
     assert (tmp_path / "run" / "map.ply").is_file()
     assert off([frame.color for frame in open_sequence(path)], lambda i: frames[i].color) == 0
+
+
+def plain_bag(tmp_path: Path, **options: Any) -> Path:
+    return write_image_bag(
+        tmp_path, "ros1", lambda m, t, i: m.raw_image(t, "rgb8", picture(i)),
+        lambda m, t, i: m.raw_image(t, "16UC1", depth_mm(i)), **options,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("role", ["color", "depth", "color_info"])
+def test_a_topic_of_another_kind_is_refused(tmp_path: Path, role: str) -> None:
+    wrong = COLOR_TOPIC if role == "color_info" else f"{COLOR_TOPIC.rsplit('/', 1)[0]}/camera_info"
+    with pytest.raises(SequenceError, match=r"holds sensor_msgs/\w+, expected sensor_msgs/"):
+        open_sequence(plain_bag(tmp_path), topics=[f"{role}={wrong}"])
+
+
+def test_images_of_a_region_of_the_sensor(tmp_path: Path) -> None:
+    """The camera_info is that of the whole sensor; the image begins at the region's corner."""
+    whole = open_sequence(plain_bag(tmp_path, size=(WIDTH, HEIGHT))).camera
+    (tmp_path / "part").mkdir()
+    part = open_sequence(plain_bag(tmp_path / "part", size=(WIDTH + 12, HEIGHT + 8), region=(7, 5))).camera
+    assert (part.width, part.height, part.fx, part.fy) == (WIDTH, HEIGHT, whole.fx, whole.fy)
+    assert (part.cx, part.cy) == (whole.cx - 7, whole.cy - 5)
+
+
+@pytest.mark.parametrize(("topic", "rectified"), [
+    ("/camera/color/image_rect_color", True), ("/a/image_rect/compressed", True), ("/cam/image_rectified", True),
+    ("/direct/color/image_raw", False), ("/rect/color/image_raw", False), ("/a/corrected", False),
+])  # fmt: skip
+def test_which_topics_are_rectified(topic: str, rectified: bool) -> None:
+    assert is_rectified(topic) is rectified

@@ -80,6 +80,7 @@ def test_colours_and_ids_are_those_of_the_surface() -> None:
     assert (cloud.object_id[wall] == 2).mean() > 0.99
 
 
+@pytest.mark.long("a walk of thirty views, fused twice")
 def test_what_is_handed_out_early_is_what_all_at_once_gives() -> None:
     """A walk along a wall, of which no more is held than a few blocks."""
     whole = cloud_of(30, 3.0)

@@ -44,12 +44,16 @@ def edit_file(
     splat_writer(target)
     if target.exists() and (not overwrite or target.samefile(source.path)):
         raise ConfigError(f"{target}: is there already; use `overwrite` or another `out`")
+    names: dict[int, str] | None = None
     if source.has_objects():
         scene = source.segmented_map()
-        texts = [apply(scene, edit).text for edit in edits]
+        texts = [
+            _edit_whole(source.path, scene.gaussians, edit, vector) if _is_whole(edit) else apply(scene, edit).text
+            for edit in edits
+        ]
         gaussians, names = scene.gaussians, {record.id: record.name or "" for record in scene.table.objects}
     else:
-        gaussians, names = source.gaussians(), None
+        gaussians = source.gaussians()
         texts = [_edit_whole(source.path, gaussians, edit, vector) for edit in edits]
     if not len(gaussians):
         raise ConfigError(f"{target}: nothing is left to write")
@@ -58,10 +62,15 @@ def edit_file(
     return target, texts
 
 
+def _is_whole(edit: Edit) -> bool:
+    """Whether an edit moves everything: what has no object, too."""
+    return edit.kind == "move" and edit.objects.strip().casefold() == WHOLE
+
+
 def _edit_whole(
     path: Path, gaussians: GaussianMap, edit: Edit, vector: Callable[[str, str], tuple[float, float, float]]
 ) -> str:
-    if edit.kind != "move" or edit.objects.strip().casefold() != WHOLE:
+    if not _is_whole(edit):
         raise ConfigError(
             f"{path}: its Gaussians have no object ids, so that it can only be moved as a whole: `move` {WHOLE}, "
             f"found `{edit.kind}` {edit.objects}"

@@ -19,7 +19,14 @@ from ggslam.scene.poses import is_valid_pose
 from ggslam.sequences.association import pair_images, poses_at
 from ggslam.sequences.formats.ros_images import color_image, depth_image, in_metres
 from ggslam.sequences.formats.ros_messages import Bag, BagImage
-from ggslam.sequences.formats.ros_topics import REGISTERED, Topics, find_topics, poses_of, static_transform
+from ggslam.sequences.formats.ros_topics import (
+    REGISTERED,
+    Topics,
+    find_topics,
+    is_rectified,
+    poses_of,
+    static_transform,
+)
 from ggslam.sequences.images import read_color
 from ggslam.sequences.json_files import camera_of
 from ggslam.sequences.pixel_grid import image_size
@@ -123,7 +130,7 @@ class _Lens:
 def _color_lens(bag: Bag, topics: Topics) -> _Lens:
     if topics.color_info is None:
         raise SequenceError(f"{bag.path}: no camera_info belongs to {topics.color}; `topics` color_info=TOPIC names it")
-    info, rectified = bag.message(topics.color_info, 0), "rect" in topics.color
+    info, rectified = bag.message(topics.color_info, 0), is_rectified(topics.color)
     place = f"{bag.path}, {topics.color_info}"
     camera = _camera(place, info, rectified)
     return _Lens(camera) if rectified else _Lens(camera, *_distortion(place, info))
@@ -145,7 +152,14 @@ def _color_camera(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera
 def _camera(place: str, info: Any, rectified: bool) -> Camera:
     K = np.asarray(_value(info, "p" if rectified else "k"), float).reshape(3, -1)
     numbers = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    return camera_of(place, int(info.width), int(info.height), *numbers)
+    camera = camera_of(place, int(info.width), int(info.height), *numbers)
+    region = info.roi
+    sizes = (int(region.width), int(region.height))
+    if sizes == (camera.width, camera.height) or min(sizes) <= 0 or region.width > camera.width:
+        return camera
+    # K and P are those of the whole sensor; the images are a part of it.
+    cx, cy = camera.cx - int(region.x_offset), camera.cy - int(region.y_offset)
+    return camera_of(place, *sizes, camera.fx, camera.fy, cx, cy)
 
 
 def _distortion(place: str, info: Any) -> tuple[np.ndarray | None, bool]:
@@ -166,7 +180,7 @@ def _place_depth(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera 
         return
     place = f"{bag.path}, {topics.depth_info}"
     info = bag.message(topics.depth_info, 0)
-    depth_camera = _camera(place, info, "rect" in topics.depth)
+    depth_camera = _camera(place, info, is_rectified(topics.depth))
     depth_frame = bag.message(topics.depth, 0).header.frame_id
     color_frame = bag.message(topics.color, 0).header.frame_id
     if depth_frame == color_frame and np.allclose(
@@ -175,7 +189,7 @@ def _place_depth(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera 
         return
     T = np.eye(4) if depth_frame == color_frame else static_transform(bag, color_frame, depth_frame)
     if T is not None and is_valid_pose(T):
-        distortion, fisheye = (None, False) if "rect" in topics.depth else _distortion(place, info)
+        distortion, fisheye = (None, False) if is_rectified(topics.depth) else _distortion(place, info)
         recording.depth_camera = DepthCamera(depth_camera, T, distortion, fisheye)
         return
     recording.warnings.append(

@@ -44,6 +44,10 @@ def find_topics(bag: Bag, given: Mapping[str, str]) -> Topics:
     for role, topic in given.items():
         if topic not in bag.types:
             raise SequenceError(f"{bag.path}: no topic {topic} (for {role}); it holds {', '.join(sorted(bag.types))}")
+        wanted = IMAGE_TYPES if role in ("color", "depth") else (INFO_TYPE,) if role.endswith("_info") else ()
+        if wanted and bag.types[topic] not in wanted:
+            expected = " or ".join(wanted)
+            raise SequenceError(f"{bag.path}: {topic} (for {role}) holds {bag.types[topic]}, expected {expected}")
     kinds: dict[str, tuple[bool | None, str]] = {}
     if not {"color", "depth"} <= set(given):
         kinds = {topic: _kind(bag, topic) for topic, name in bag.types.items() if name in IMAGE_TYPES}
@@ -66,11 +70,17 @@ def _kind(bag: Bag, topic: str) -> tuple[bool | None, str]:
     return holds_depth, f"encoding '{pixel_encoding(message)}'{UNKNOWN if holds_depth is None else ''}"
 
 
+def is_rectified(topic: str) -> bool:
+    """Whether a topic says that its images are rectified, as `image_rect`, `image_rect_color` or `rectified` do."""
+    names = topic.removesuffix("/compressed").removesuffix("/compressedDepth").rsplit("/", 1)[-1].split("_")
+    return "rect" in names or "rectified" in names
+
+
 def _color_score(topic: str) -> float:
     score = 2.0 * any(word in topic for word in ("color", "rgb")) - 2.0 * any(
         word in topic for word in ("depth", "infra", "ir/", "confidence", "mask", "left", "right", "fisheye")
     )
-    return score + 0.5 * ("rect" in topic) - 0.25 * topic.endswith("compressed")
+    return score + 0.5 * is_rectified(topic) - 0.25 * topic.endswith("compressed")
 
 
 def _depth_score(topic: str) -> float:
