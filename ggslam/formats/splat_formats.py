@@ -81,14 +81,15 @@ def _rows_of_ply(path: Path) -> SplatFile:
 
 
 def _properties(path: Path, head: bytes) -> set[str]:
-    """Names of the properties of a PLY's vertices; empty: it is none, or has none."""
+    """Names of the properties of a PLY's vertices; empty: it is none, or has none.
+
+    Raises:
+        FormatError: it is a PLY that is cut off or damaged.
+    """
     if head[:3] != b"ply":
         return set()
-    try:
-        with open_foreign(path) as file:
-            elements = {element.name: element for element in read_header(file, path).elements}
-    except (FormatError, OSError):
-        return set()
+    with open_foreign(path) as file:
+        elements = {element.name: element for element in read_header(file, path).elements}
     return {p.name for p in elements["vertex"].properties} if "vertex" in elements else set()
 
 
