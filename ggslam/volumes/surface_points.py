@@ -26,7 +26,7 @@ from ggslam.volumes.tsdf import SIDE, TsdfMap
 
 _TRUNCATION = 3.0
 """Voxels on either side of the surface that a view tells about."""
-_LEAST_WEIGHT = 0.06
+LEAST_WEIGHT = 0.06
 """In measurements from 1 m: what one view from 3 m tells of a voxel halfway through its truncation. Where more is asked
 for, a surface has a rim without points; where less, noisy maps have points that only one view shows."""
 _FARTHEST = 1000.0
@@ -124,7 +124,7 @@ class _Sweep:
     def take_finished(self, with_object_id: bool) -> Iterator[VoxelCloud]:
         """The points of what is finished, which is forgotten when all were taken."""
         out = self._handed_out
-        for cloud in _clouds_of(extract_mesh(self._tsdf, _LEAST_WEIGHT), self._voxel, with_object_id):
+        for cloud in _clouds_of(extract_mesh(self._tsdf, LEAST_WEIGHT), self._voxel, with_object_id):
             of_point = voxel_keys(cloud.grid + np.rint(cloud.origin / self._voxel), SIDE * _CUBE_BLOCKS)
             present = np.unique(of_point)
             ripe = present[self._all_around(present, self._to_come.are_done)]

@@ -16,14 +16,13 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.volumes.mesh import extract_mesh
 from ggslam.volumes.settings import TsdfSettings
+from ggslam.volumes.surface_points import LEAST_WEIGHT
 from ggslam.volumes.tsdf import TsdfMap
 
 MOST_BLOCKS = 150_000
 """Of the fused depth: 770 MB. Larger recordings are scored up to there."""
 _FARTHEST = 1000.0
 """Metres."""
-_LEAST_WEIGHT = 0.02
-"""In measurements from 1 m: what a single look from some 5 m tells belongs to the measured surface."""
 
 
 class SurfaceScorer:
@@ -85,7 +84,7 @@ class SurfaceScorer:
         """Of the points whose depth was measured; None if that are none."""
         if self._tsdf is None or not self._measured.any():
             return None
-        mesh = extract_mesh(self._tsdf, _LEAST_WEIGHT)
+        mesh = extract_mesh(self._tsdf, LEAST_WEIGHT)
         if not len(mesh.vertices):
             return None
         return score_surface(self._points[self._measured], mesh.vertices, mesh.normals, self._voxel)
