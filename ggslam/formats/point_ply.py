@@ -18,7 +18,8 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.ply import read_ply, write_ply, write_ply_parts
-from ggslam.formats.point_sampling import VoxelCloud, sample_points
+from ggslam.formats.point_sampling import sample_points
+from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.system.atomic import write_failure
 
 __all__ = ["GRID_FILE", "METRIC_FILE", "VoxelCloud", "grid_positions", "read_points", "sample_points",

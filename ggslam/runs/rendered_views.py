@@ -26,7 +26,8 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.poses import inverse
-from ggslam.volumes.surface_points import MOST_BLOCKS, SurfaceView, surface_points
+from ggslam.volumes.posed_view import PosedView
+from ggslam.volumes.surface_points import MOST_BLOCKS, surface_points
 
 MIN_ALPHA = 0.5
 """Where the map covers less of a pixel than this, the pixel has no rendered depth."""
@@ -102,7 +103,7 @@ class RenderedViews:
         cameras, poses = [self.cameras[i] for i in order], [self.poses[i] for i in order]
         return RenderedViews(cameras, poses, self.in_view, self.segmented, self._rasterizer)
 
-    def view(self, number: int, zoom: float = 1.0, only_depth: bool = False) -> SurfaceView:
+    def view(self, number: int, zoom: float = 1.0, only_depth: bool = False) -> PosedView:
         """What a keyframe sees of the map.
 
         Args:
@@ -122,10 +123,10 @@ class RenderedViews:
         sure = (alpha >= MIN_ALPHA) & (np.abs(mean - median) <= SPREAD * median)
         depth = np.where(sure, mean, 0).astype(np.float32)
         if only_depth:
-            return SurfaceView(depth, camera, T)
+            return PosedView(depth, camera, T)
         color = color_to_uint8(drawn.image.numpy() / np.maximum(alpha, MIN_ALPHA))  # rendered over black
         ids = None if self.segmented is None else object_ids(rasterizer, drawn, self.segmented(gaussians))
-        return SurfaceView(depth, camera, T, color, ids)
+        return PosedView(depth, camera, T, color, ids)
 
     def usual_voxel(self) -> float:
         """Edge of voxels that suits the map, a whole number of centimetres: 1 in rooms, more where most of what is seen
@@ -160,7 +161,7 @@ class RenderedViews:
         views = self.in_order()
         zoom = views.zoom_for(voxel_size)
 
-        def look(number: int, coarse: bool) -> SurfaceView:
+        def look(number: int, coarse: bool) -> PosedView:
             return views.view(number, _COARSE if coarse else zoom, only_depth=coarse)
 
         try:

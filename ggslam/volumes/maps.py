@@ -21,6 +21,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.occupancy import OccupancyMap
+from ggslam.volumes.posed_view import PosedView
 from ggslam.volumes.tsdf import TsdfMap
 from ggslam.volumes.tsdf_torch import TorchTsdf
 from ggslam.volumes.volume_settings import VolumeSettings
@@ -69,18 +70,6 @@ def _statistics(seconds: np.ndarray) -> dict[str, Any]:
     windows = [float(ms[k : k + WINDOW].mean()) for k in range(0, len(ms), WINDOW)]
     return {"mean_ms": float(ms.mean()), "p95_ms": float(np.percentile(ms, 95)), "max_ms": float(ms.max()),
             "by_window_ms": windows}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class PosedView:
-    """Images to fuse: depth float32 [H, W] in metres, colour uint8 [H, W, 3], object ids uint16 [H, W] or None, and
-    T_world_camera [4, 4]."""
-
-    depth: np.ndarray
-    camera: Camera
-    T_world_camera: np.ndarray
-    color: np.ndarray
-    labels: np.ndarray | None = None
 
 
 class VolumeMaps:
@@ -148,7 +137,7 @@ class VolumeMaps:
         self.times.rows.append(row)
 
     def _fuse(
-        self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, color: np.ndarray,
+        self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, color: np.ndarray | None,
         labels: np.ndarray | None,
     ) -> None:  # fmt: skip
         self._receiver.integrate(depth, camera, T_world_camera, color, labels)

@@ -10,7 +10,7 @@ the middle of its voxel (B. Curless and M. Levoy, 1996; W. Lorensen and H. Cline
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,9 +18,8 @@ from ggslam.formats.cubes_to_come import CubesToCome
 from ggslam.formats.voxel_cloud import VoxelCloud, VoxelSums, cloud_of_sums, pack
 from ggslam.geometry.voxels import neighbour_step, voxel_keys
 from ggslam.native.loader import NativeContext
-from ggslam.scene.camera import Camera
-from ggslam.scene.poses import transform_points
 from ggslam.volumes.mesh import Mesh, extract_mesh
+from ggslam.volumes.posed_view import PosedView
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import SIDE, TsdfMap
 
@@ -29,7 +28,7 @@ _TRUNCATION = 3.0
 LEAST_WEIGHT = 0.06
 """In measurements from 1 m: what one view from 3 m tells of a voxel halfway through its truncation. Where more is asked
 for, a surface has a rim without points; where less, noisy maps have points that only one view shows."""
-_FARTHEST = 1000.0
+FARTHEST = 1000.0
 """Metres."""
 _LEAST_AREA = 0.1
 """Squared voxels: where the surface only cuts off a corner of a voxel, its neighbours have the point."""
@@ -43,31 +42,7 @@ MOST_BLOCKS = 40_000
 """Blocks held before finished ones are handed out; 5 KB each."""
 
 
-@dataclass(frozen=True)
-class SurfaceView:
-    """What a camera sees of a surface.
-
-    Attributes:
-        depth: float32 [H, W], metres; 0: none.
-        camera: of the images.
-        T_world_camera: float64 [4, 4].
-        color: uint8 [H, W, 3], or None.
-        labels: uint16 [H, W], object ids, or None.
-    """
-
-    depth: np.ndarray
-    camera: Camera
-    T_world_camera: np.ndarray
-    color: np.ndarray | None = None
-    labels: np.ndarray | None = None
-
-    def points(self) -> np.ndarray:
-        """Where its pixels with depth lie, float64 [n, 3], world frame."""
-        seen = self.camera.back_project(self.depth)[self.depth > 0]
-        return transform_points(seen.astype(np.float64), self.T_world_camera)
-
-
-Look = Callable[[int, bool], SurfaceView]
+Look = Callable[[int, bool], PosedView]
 """Gives a view by its number; if coarse, at a fraction of the size, without colour and labels."""
 
 
@@ -88,7 +63,7 @@ def surface_points(
         most_blocks: see `MOST_BLOCKS`.
         context: threads to work on.
     """
-    settings = TsdfSettings(voxel=voxel_size, truncation_voxels=_TRUNCATION, max_depth=_FARTHEST)
+    settings = TsdfSettings(voxel=voxel_size, truncation_voxels=_TRUNCATION, max_depth=FARTHEST)
     sweep = _Sweep(TsdfMap(settings, context), [_cubes(look(k, True), voxel_size) for k in range(count)])
     limit = most_blocks
     for number in range(count):
@@ -98,7 +73,7 @@ def surface_points(
             limit = max(most_blocks, int(_GROWTH * sweep.blocks))  # where little is finished, it pays to look rarely
 
 
-def _cubes(view: SurfaceView, voxel_size: float) -> np.ndarray:
+def _cubes(view: PosedView, voxel_size: float) -> np.ndarray:
     """The cubes that a view's surfaces lie in, keys, each once."""
     return np.unique(voxel_keys(view.points(), voxel_size * SIDE * _CUBE_BLOCKS))
 
@@ -116,7 +91,7 @@ class _Sweep:
         """With voxels."""
         return self._tsdf.dense_blocks
 
-    def add(self, number: int, view: SurfaceView) -> None:
+    def add(self, number: int, view: PosedView) -> None:
         """Fuses a view."""
         self._tsdf.integrate(view.depth, view.camera, view.T_world_camera, view.color, view.labels)
         self._to_come.is_done(number)

@@ -10,14 +10,15 @@ import pytest
 
 from ggslam.formats.voxel_cloud import VoxelCloud, join_clouds
 from ggslam.scene.camera import Camera
-from ggslam.volumes.surface_points import SurfaceView, surface_points
+from ggslam.volumes.posed_view import PosedView
+from ggslam.volumes.surface_points import surface_points
 
 CAMERA = Camera(240, 180, 200.0, 200.0, 119.5, 89.5)
 CENTRE, RADIUS, WALL = np.array([0.03, -0.02, 1.2]), 0.25, 2.004
 VOXEL = 0.01
 
 
-def look(places: list[np.ndarray], noise: float, number: int, coarse: bool) -> SurfaceView:
+def look(places: list[np.ndarray], noise: float, number: int, coarse: bool) -> PosedView:
     """A ball before a wall, from a place, looking along z."""
     camera = CAMERA.scale(0.25) if coarse else CAMERA
     rays, place = camera.rays().astype(float), places[number]
@@ -32,7 +33,7 @@ def look(places: list[np.ndarray], noise: float, number: int, coarse: bool) -> S
     T = np.eye(4)
     T[:3, 3] = place
     color = np.where(ball[..., None], [200, 40, 20], [10, 60, 180]).astype(np.uint8)
-    return SurfaceView(depth.astype(np.float32), camera, T, color, np.where(ball, 7, 2).astype(np.uint16))
+    return PosedView(depth.astype(np.float32), camera, T, color, np.where(ball, 7, 2).astype(np.uint16))
 
 
 def places(count: int, reach: float) -> list[np.ndarray]:
@@ -95,8 +96,8 @@ def test_what_is_handed_out_early_is_what_all_at_once_gives() -> None:
 
 @pytest.mark.parametrize("count", [0, 2])
 def test_nothing_seen_gives_no_cloud(count: int) -> None:
-    def nothing(number: int, coarse: bool) -> SurfaceView:
+    def nothing(number: int, coarse: bool) -> PosedView:
         camera = CAMERA.scale(0.25) if coarse else CAMERA
-        return SurfaceView(np.zeros((camera.height, camera.width), np.float32), camera, np.eye(4))
+        return PosedView(np.zeros((camera.height, camera.width), np.float32), camera, np.eye(4))
 
     assert list(surface_points(nothing, count, VOXEL)) == []

@@ -16,13 +16,11 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.volumes.mesh import extract_mesh
 from ggslam.volumes.settings import TsdfSettings
-from ggslam.volumes.surface_points import LEAST_WEIGHT
+from ggslam.volumes.surface_points import FARTHEST, LEAST_WEIGHT
 from ggslam.volumes.tsdf import TsdfMap
 
 MOST_BLOCKS = 150_000
 """Of the fused depth: 770 MB. Larger recordings are scored up to there."""
-_FARTHEST = 1000.0
-"""Metres."""
 
 
 class SurfaceScorer:
@@ -45,7 +43,7 @@ class SurfaceScorer:
             return
         self._points, self._voxel = cloud.points, cloud.voxel_size
         self._measured = np.zeros(len(self._points), bool)
-        self._tsdf = TsdfMap(TsdfSettings(voxel=self._voxel, max_depth=_FARTHEST))
+        self._tsdf = TsdfMap(TsdfSettings(voxel=self._voxel, max_depth=FARTHEST))
 
     def _cloud_of(self, folder: RunFolder) -> VoxelCloud | None:
         """The points of a run; None, and a reason, where they are not scored."""

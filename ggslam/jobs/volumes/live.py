@@ -13,7 +13,8 @@ from ggslam.scene.frame import Frame
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
 from ggslam.tracking.tracker import TrackingStatus
-from ggslam.volumes.maps import PosedView, VolumeMaps
+from ggslam.volumes.maps import VolumeMaps
+from ggslam.volumes.posed_view import PosedView
 
 
 class LiveVolumes:
