@@ -29,6 +29,8 @@ EPILOG = """
   ggslam synth demo/tuesday --changes 5 --visit 2
 
   ggslam synth demo/busy --movers walker,mug,door
+
+  ggslam synth demo/fast --path turns --speed 3 --blur 0.4
 """
 
 
@@ -38,6 +40,19 @@ class SceneName(str, Enum):
     room = "room"
     loop = "loop"
     corridor = "corridor"
+    bare = "bare"
+
+
+class PathName(str, Enum):
+    """How the camera moves."""
+
+    loop = "loop"
+    round = "round"
+    pan = "pan"
+    turns = "turns"
+    still = "still"
+    route = "route"
+    walk = "walk"
 
 
 def synth(
@@ -46,16 +61,32 @@ def synth(
         SceneName,
         typer.Option(
             help="room: one furnished room; loop: a walk through four rooms and four corridors, back into the first; "
-            "corridor: a walk along a furnished corridor, longer with more frames, without a loop."
+            "corridor: a walk along a furnished corridor, longer with more frames, without a loop; bare: the same "
+            "without furniture."
         ),
     ] = SceneName.room,
     frames: Annotated[
         int | None,
-        typer.Option(help="Number of frames; default: room 60, with movers 120, loop 480, corridor 720.", min=2),
+        typer.Option(help="Number of frames; default: room 60, with movers 120, loop 480, corridors 720.", min=2),
     ] = None,
     width: Annotated[int, typer.Option(help="Image width.", min=16)] = 320,
     height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
     seed: Annotated[int, typer.Option(help="Seed of textures, camera path and noise.", min=0)] = 0,
+    path: Annotated[
+        PathName | None,
+        typer.Option(
+            help="loop: around the room and back; round: around it, seeing all of it; pan: turning on the spot; turns: "
+            "looking quickly from side to side; still: a tripod; route, walk: along a loop's or a corridor's way. "
+            "Default: loop in the room, else the scene's way."
+        ),
+    ] = None,
+    speed: Annotated[
+        int, typer.Option(help="How many times as far as usual the camera moves between two frames.", min=1)
+    ] = 1,
+    blur: Annotated[
+        float,
+        typer.Option(help="Share of the time between two frames for which the shutter is open.", min=0, max=1),
+    ] = 0.0,
     depth_distortion: Annotated[
         float | None,
         typer.Option(help="Fixed error of the depth camera, steps of disparity; default 0, for the loop 0.3."),
@@ -91,19 +122,21 @@ def synth(
 
     if frames is None:
         frames = FRAMES_WITH_MOVERS if movers is not None else SCENES[scene.value].frames
-    write = _writer(rig, rig_delay, changes, visit, movers)
+    write = _writer(rig, rig_delay, changes, visit, movers, speed, blur)
     cameras = f" by each of {rig}" if rig is not None else ""
     with progress_bar() as bar:
         task = bar.add_task("render", total=frames, info="")
         write(
             folder, frames=frames, width=width, height=height, seed=seed, noise=noise, scene=scene.value,
-            depth_distortion=depth_distortion,
+            depth_distortion=depth_distortion, trajectory=None if path is None else path.value,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
     console.print(f"wrote {folder}: {frames} frames of {width}x{height}{cameras}", highlight=False, markup=False)
 
 
-def _writer(rig: str | None, delay: float, changes: int | None, visit: int, movers: str | None) -> Callable[..., Path]:
+def _writer(
+    rig: str | None, delay: float, changes: int | None, visit: int, movers: str | None, speed: int, blur: float
+) -> Callable[..., Path]:
     """What writes the recording, with the options that the others do not have."""
     from ggslam.synthetic import write_synthetic_rig, write_synthetic_sequence
 
@@ -111,8 +144,13 @@ def _writer(rig: str | None, delay: float, changes: int | None, visit: int, move
         raise SequenceError("--visit: only with --changes there are two visits")
     if rig is None:
         moving = [] if movers is None else movers.split(",")
-        return partial(write_synthetic_sequence, changes=changes, visit=visit, movers=moving)
-    for option, value in (("--changes", changes), ("--movers", movers)):
-        if value is not None:
+        return partial(
+            write_synthetic_sequence, changes=changes, visit=visit, movers=moving, speed=speed, blur=blur
+        )
+    asked = {
+        "--changes": changes is not None, "--movers": movers is not None, "--speed": speed != 1, "--blur": blur > 0
+    }  # fmt: skip
+    for option, given in asked.items():
+        if given:
             raise SequenceError(f"{option}: not with --rig")
     return partial(write_synthetic_rig, cameras=rig.split(","), delay=delay)

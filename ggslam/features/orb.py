@@ -128,17 +128,24 @@ class ViewMatches:
     def __len__(self) -> int:
         return len(self.points)
 
-    def count_explained(
+    def explained(
         self, T_world_camera: np.ndarray, camera: Camera, settings: FeatureSettings, slack: float = 1.0
-    ) -> int:
-        """How many the view sees where they have to be if it is at a pose [4, 4]; `slack` widens the limit."""
+    ) -> np.ndarray:
+        """Which of them the view sees where they have to be if it is at a pose [4, 4], bool [m]; `slack` widens the
+        limit."""
         T = inverse(T_world_camera) @ self.T_world_known
         x, y, z = (self.points @ T[:3, :3].T + T[:3, 3]).T
         ahead = np.where(z > 0.05, z, np.inf)
         off = np.hypot(
             camera.fx * x / ahead + camera.cx - self.pixels[:, 0], camera.fy * y / ahead + camera.cy - self.pixels[:, 1]
         )
-        return int((np.isfinite(ahead) & (off < slack * settings.limit(camera))).sum())
+        return np.isfinite(ahead) & (off < slack * settings.limit(camera))
+
+    def count_explained(
+        self, T_world_camera: np.ndarray, camera: Camera, settings: FeatureSettings, slack: float = 1.0
+    ) -> int:
+        """How many are `explained`."""
+        return int(self.explained(T_world_camera, camera, settings, slack).sum())
 
     def pose(self, camera: Camera, settings: FeatureSettings) -> FeaturePose | None:
         """The pose most of them agree on; None without enough of them. The same matches give the same pose."""

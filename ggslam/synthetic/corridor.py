@@ -33,8 +33,9 @@ SWING_DEG, TURN_AFTER = 48.0, 2.0
 Piece = Callable[["_Spot"], None]
 
 
-def furnished_corridor(seed: int = 0, frames: int = 720) -> Scene:
-    """The corridor, long enough for a walk of so many frames. The seed decides what stands where."""
+def furnished_corridor(seed: int = 0, frames: int = 720, bare: bool = False) -> Scene:
+    """The corridor, long enough for a walk of so many frames. The seed decides what stands where; `bare`: nothing does,
+    and there are no arches."""
     m = HousePalette(seed)
     b = SceneBuilder()
     way = PACE * frames + TURN_AFTER
@@ -43,7 +44,7 @@ def furnished_corridor(seed: int = 0, frames: int = 720) -> Scene:
     b.instance("first wall").box((-WALL / 2, WIDTH / 2, HEIGHT / 2), (WALL, WIDTH, HEIGHT), m.brick)
     b.instance("last wall").box((length + WALL / 2, WIDTH / 2, HEIGHT / 2), (WALL, WIDTH, HEIGHT), m.brick)
     for number in range(sections):
-        _section(b, m, number, seed)
+        _section(b, m, number, seed, bare)
     b.scene.bounds = ((0.0, 0.0, 0.0), (length, WIDTH, HEIGHT))
     b.scene.lights = [
         replace(light, bounds=((x - 1.5 * SECTION, 0.0, 0.0), (x + 1.5 * SECTION, WIDTH, HEIGHT)))
@@ -81,7 +82,7 @@ class _Spot:
         return materials[int(self.rng.integers(len(materials)))]
 
 
-def _section(b: SceneBuilder, m: HousePalette, number: int, seed: int) -> None:
+def _section(b: SceneBuilder, m: HousePalette, number: int, seed: int, bare: bool) -> None:
     """Floor, ceiling, walls and what stands before them. Depends on nothing but the section's number and the seed."""
     rng = np.random.default_rng([seed, 12, number])
     x = (number + 0.5) * SECTION
@@ -95,11 +96,13 @@ def _section(b: SceneBuilder, m: HousePalette, number: int, seed: int) -> None:
         wall = b.instance(name)
         wall.box((x, y - inward * WALL / 2, HEIGHT / 2), (SECTION, WALL, HEIGHT), material)
         wall.box((x, y + inward * 0.008, 0.05), (SECTION, 0.016, 0.10), m.white)
+    ceiling_lamp(b, m, x, WIDTH / 2, (2.3, 2.1, 1.75))
+    if bare:
+        return
     arch = b.instance("arch")
     for y in (0.1, WIDTH - 0.1):
         arch.box((number * SECTION, y, HEIGHT / 2), (0.24, 0.2, HEIGHT), m.white, faces={0: m.oak, 1: m.oak})
     arch.box((number * SECTION, WIDTH / 2, HEIGHT - 0.11), (0.24, WIDTH - 0.4, 0.22), m.walnut)
-    ceiling_lamp(b, m, x, WIDTH / 2, (2.3, 2.1, 1.75))
     pieces = [rng.permutation(len(PIECES))[:4], ("south", "south", "north", "north"), (1.15, 2.95, 1.15, 2.95)]
     for piece, side, place in zip(*pieces, strict=True):
         along = number * SECTION + place + float(rng.uniform(-0.1, 0.1))

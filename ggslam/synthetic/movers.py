@@ -53,6 +53,10 @@ class MovingScene:
         self._told.append([mover.describe_frame(frame, mask) for mover in self.movers])
         return replace(images, mask=mask)
 
+    def color(self, camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:
+        """Colour uint8 [H, W, 3] of the frame rendered last, from another pose [4, 4]."""
+        return self._caster.render(camera, T_world_camera).color
+
     def truth(self) -> dict[str, Any]:
         """What moved in the frames so far; for JSON."""
         return {

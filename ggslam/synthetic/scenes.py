@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from ggslam.synthetic.corridor import furnished_corridor
 from ggslam.synthetic.house import ring_of_rooms
@@ -28,4 +29,5 @@ SCENES = {
     "room": SceneKind(lambda seed, frames: furnished_room(seed), 60, 30.0, "loop", 0.0),
     "loop": SceneKind(lambda seed, frames: ring_of_rooms(seed), 480, 10.0, "route", 0.3),
     "corridor": SceneKind(furnished_corridor, 720, 10.0, "walk", 0.0),
+    "bare": SceneKind(partial(furnished_corridor, bare=True), 720, 10.0, "walk", 0.0),
 }

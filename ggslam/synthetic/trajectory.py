@@ -12,9 +12,11 @@ from scipy.ndimage import gaussian_filter1d
 from ggslam.errors import SequenceError
 from ggslam.synthetic.scene import Scene
 
-TRAJECTORIES = ("loop", "round", "pan", "route", "walk")
+TRAJECTORIES = ("loop", "round", "pan", "route", "walk", "turns", "still")
 LARGEST_STEP, LARGEST_TURN = 0.045, 1.9
 """Metres and degrees between frames that a path keeps to (short recordings see less of the scene)."""
+TURN_PEAK, TURN_FRAMES = 4.7, 88
+"""Of "turns": degrees between frames at the fastest, and frames from one side to the other and back."""
 CLEARANCE = 0.18
 """Metres that the camera stays away from every shape."""
 ROUTE_CLEARANCE = 0.3
@@ -33,8 +35,9 @@ def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int =
         frames: how many.
         trajectory: "loop": once around the ellipse, the view swinging over the points nearest to the first and back, so
             that the end meets the beginning; "round": around the ellipse while the view passes over all the points;
-            "pan": turning on the spot; "route": along the scene's route, past its beginning for `SEEN_AGAIN` of it;
-            "walk": along the scene's route from its beginning, as far as one gets at the usual pace.
+            "pan": turning on the spot; "turns": from side to side, slow at either end and fast between, while walking;
+            "still": as a camera on a tripod; "route": along the scene's route, past its beginning for `SEEN_AGAIN` of
+            it; "walk": along the scene's route from its beginning, as far as one gets at the usual pace.
         seed: of the unrest.
 
     Raises:
@@ -44,6 +47,8 @@ def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int =
         raise SequenceError(f"trajectory: expected one of {', '.join(TRAJECTORIES)}, found '{trajectory}'")
     if frames < 2:
         raise SequenceError(f"frames: expected at least 2, found {frames}")
+    if trajectory == "still":
+        return np.repeat(_path(scene, frames, "pan", seed, 1.0)[:1], frames, 0)
     if trajectory in ("route", "walk"):
         return _route(scene, frames, seed, closed=trajectory == "route")
     for size in (1.0, 0.7, 0.45, 0.25, 0.1):
@@ -71,7 +76,9 @@ def _path(scene: Scene, frames: int, trajectory: str, seed: int, size: float) ->
     position += 0.012 * unrest[:, :3]
     first = np.arctan2(*(scene.interest[0] - (cx, cy, cz))[1::-1])
     turn_limit = np.radians(LARGEST_TURN) * frames
-    if trajectory == "loop":
+    if trajectory == "turns":
+        heading = first + _swings(frames)
+    elif trajectory == "loop":
         swing = min(np.radians(32), turn_limit / (2 * np.pi) * 0.8)
         heading = first + swing * np.sin(2 * np.pi * phase)
     else:
@@ -83,6 +90,13 @@ def _path(scene: Scene, frames: int, trajectory: str, seed: int, size: float) ->
         forward = np.array([np.cos(angle) * np.cos(tilt), np.sin(angle) * np.cos(tilt), np.sin(tilt)])
         poses[i] = _look_along(position[i], forward, 0.012 * unrest[i, 5])
     return poses
+
+
+def _swings(frames: int) -> np.ndarray:
+    """Headings of "turns" against the first, radians [frames]: the pace goes with the fourth power of a sine."""
+    sine = np.sin(2 * np.pi * (np.arange(frames) - 0.5) / TURN_FRAMES)
+    turned = np.cumsum(np.radians(TURN_PEAK) * np.sign(sine) * sine**4)
+    return turned - turned.max() / 2
 
 
 def _look_along(position: np.ndarray, forward: np.ndarray, roll: float) -> np.ndarray:

@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,7 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
 from ggslam.synthetic.changes import MadeChange, room_at_two_visits
+from ggslam.synthetic.exposure import exposed_color
 from ggslam.synthetic.movers import MovingScene, find_movers, movers_of
 from ggslam.synthetic.scene import Scene
 from ggslam.synthetic.scenes import SCENES, SceneKind
@@ -48,6 +50,8 @@ def write_synthetic_sequence(
     frame_rate: float | None = None,
     scene: Scene | str = "room",
     depth_distortion: float | None = None,
+    speed: int = 1,
+    blur: float = 0.0,
     changes: int | None = None,
     visit: int = 1,
     movers: Sequence[str] = (),
@@ -72,6 +76,8 @@ def write_synthetic_sequence(
             corridor; or a scene of one's own, for which None means as for the room.
         depth_distortion: what the depth camera always measures wrongly, in steps of disparity, see
             `disparity_distortion`; nothing without noise. None: 0.3 in the house, else 0.
+        speed: how many times as far as usual the camera moves between two frames.
+        blur: share of the time between two frames for which the shutter is open: colour is blurred by the motion.
         changes: things of the room that differ between its two visits (see `room_at_two_visits`); the second one's
             folder has them in changes.json. The camera goes all around ("round") if no trajectory is given.
         visit: which of the two, 1 or 2; the second goes the other way round.
@@ -94,10 +100,11 @@ def write_synthetic_sequence(
     if changes is not None:
         scene, made = _scene_of_visit(scene, seed, changes, visit)
         trajectory = trajectory or "round"
-    plan = plan_recording(width, height, frames, seed, noise, trajectory, frame_rate, scene, depth_distortion)
+    plan = plan_recording(width, height, frames, seed, noise, trajectory, frame_rate, scene, depth_distortion,
+                          speed, blur)
     poses = plan.poses
     if visit > 1:  # another hand, and the way back
-        poses = np.ascontiguousarray(camera_path(plan.scene, len(poses), plan.trajectory, seed + 1)[::-1])
+        poses = _poses(plan.scene, len(poses), plan.trajectory, seed + 1, speed)[::-1].copy()
     check_target(target, "camera.yaml", overwrite)
     moving = find_movers(plan.scene, plan.camera, poses, seed, wanted)
     plan = replace(plan, scene=moving.scene)
@@ -129,6 +136,7 @@ class RecordingPlan:
         scene, camera, seed, noise, trajectory, frame_rate: of it.
         distortion: of its depth camera, steps of disparity.
         poses: T_world_camera, float64 [n, 4, 4].
+        blur: share of the time between two frames for which the shutter is open.
     """
 
     scene: Scene
@@ -139,6 +147,7 @@ class RecordingPlan:
     frame_rate: float
     distortion: float
     poses: np.ndarray
+    blur: float = 0.0
 
     @property
     def times(self) -> np.ndarray:
@@ -148,7 +157,7 @@ class RecordingPlan:
 
 def plan_recording(
     width: int, height: int, frames: int | None, seed: int, noise: bool, trajectory: str | None,
-    frame_rate: float | None, scene: Scene | str, depth_distortion: float | None,
+    frame_rate: float | None, scene: Scene | str, depth_distortion: float | None, speed: int = 1, blur: float = 0.0,
 ) -> RecordingPlan:  # fmt: skip
     """What is to be recorded, of arguments as of `write_synthetic_sequence`.
 
@@ -161,11 +170,18 @@ def plan_recording(
     trajectory = kind.trajectory if trajectory is None else trajectory
     distortion = kind.depth_distortion if depth_distortion is None else depth_distortion
     _check_numbers(width, height, frame_rate, distortion)
-    scene = scene if isinstance(scene, Scene) else kind.build(seed, frames)
+    if speed < 1 or not 0 <= blur <= 1:
+        raise SequenceError(f"expected a speed of 1 or more and a blur from 0 to 1, found {speed} and {blur:g}")
+    scene = scene if isinstance(scene, Scene) else kind.build(seed, frames * speed)
     focal = FOCAL_LENGTH * width
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-    poses = camera_path(scene, frames, trajectory, seed)
-    return RecordingPlan(scene, camera, seed, noise, trajectory, frame_rate, distortion, poses)
+    poses = _poses(scene, frames, trajectory, seed, speed)
+    return RecordingPlan(scene, camera, seed, noise, trajectory, frame_rate, distortion, poses, blur)
+
+
+def _poses(scene: Scene, frames: int, trajectory: str, seed: int, speed: int) -> np.ndarray:
+    """Every `speed`-th pose of a path, float64 [frames, 4, 4]."""
+    return np.ascontiguousarray(camera_path(scene, frames * speed, trajectory, seed)[::speed])
 
 
 def write_recording(
@@ -279,6 +295,8 @@ def _write_images(
     for i, pose in enumerate(poses):
         images = moving.render(i, plan.camera, pose)
         color, depth = images.color, images.depth
+        if plan.blur:
+            color = exposed_color(partial(moving.color, plan.camera), poses, i, plan.blur)
         if plan.noise:
             rng = np.random.default_rng([plan.seed, 4, i, *([number] if number else [])])
             color, depth = noisy_color(color, rng), noisy_depth(depth, plan.camera, rng, offset)
@@ -304,6 +322,7 @@ def _write_description(folder: Path, plan: RecordingPlan, poses: np.ndarray, tim
         "seed": plan.seed,
         "noise": plan.noise,
         "trajectory": plan.trajectory,
+        **({"blur": plan.blur} if plan.blur else {}),
         "width": camera.width,
         "height": camera.height,
         "fx": camera.fx,

@@ -8,11 +8,13 @@ import dataclasses
 import numpy as np
 
 from ggslam.features.orb import FeatureView
+from ggslam.geometry.moved_depth import largest_shift
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import orthonormalize
+from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.tracking.engine import CpuTrackingEngine, TrackingEngine
+from ggslam.tracking.feature_hold import hold_to_features
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
@@ -23,6 +25,8 @@ from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, Track
 
 MIN_TEXTURED = 200
 """Textured points from which grey values are trusted."""
+USUAL_DEPTH = 2.0
+"""Metres, of scenes whose median depth is not known yet."""
 
 
 class GicpTracker(Tracker):
@@ -131,38 +135,76 @@ class GicpTracker(Tracker):
         self, mode: PhotometricMode, view: FeatureView, points: PointSource, target: GicpTarget
     ) -> tuple[AlignmentResult, str]:
         """As `_locate`, in a photometric mode."""
-        guess = self.state.motion.predict()
+        guess, coarse = self._start(view)
         photometric = self._photometric_part(view) if mode == "always" or self.state.motion.lost else None
-        found = self._align(points, target, guess, photometric)
+        found = self._align(points, target, guess, photometric, coarse)
+        if not coarse:
+            found = self._hold(found, guess, view, points)
         if photometric is not None and not self._explains_greys(found) and not found.degenerate:
             # Images that do not agree (too far apart, shutters out of step) must not pull at good geometry.
-            found = self._align(points, target, guess, None)
+            found = self._align(points, target, guess, None, coarse)
             if self._share(view).contradict(found.T_world_camera):
                 return self._retry(view, points, target, found, photometric)
-        if self._is_convincing(found) and not (found.degenerate and mode != "never"):
-            return found, ""
         if photometric is None and found.degenerate and mode != "never":
             photometric = self._photometric_part(view)
-            found = self._align(points, target, guess, photometric) if photometric else found
-        if self._is_convincing(found) and self._explains_greys(found):
+            found = self._align(points, target, guess, photometric, coarse) if photometric else found
+        sure = mode == "never" or not found.degenerate or self._explains_greys(found)
+        if sure and self._is_convincing(found) and not self._is_far_off(view, found):
+            return found, ""
+        if not coarse and self._is_vouched(found):
             return found, ""
         return self._retry(view, points, target, found, photometric)
+
+    def _start(self, view: FeatureView) -> tuple[np.ndarray, bool]:
+        """Where the first alignment starts [4, 4], and whether coarsely: at constant velocity, or where that moves the
+        image far, at what the features vouch for."""
+        guess = self.state.motion.predict()
+        if self._is_wide(guess):
+            shared = self._share(view)
+            for _, pose in shared.starts():
+                if shared.vouch(pose):
+                    return pose, False
+        return guess, True
+
+    def _hold(
+        self, found: AlignmentResult, start: np.ndarray, view: FeatureView, points: PointSource
+    ) -> AlignmentResult:
+        """See `hold_to_features`."""
+        enough = self.settings.recovery.convincing_overlap
+        return hold_to_features(found, start, self._share(view), points, self._noise(), enough)
+
+    def _is_wide(self, T_world_camera: np.ndarray) -> bool:
+        """Whether the image shifts far from the last pose to this one [4, 4]."""
+        T_new_old = inverse(T_world_camera) @ self.state.motion.T_world_camera
+        shift = largest_shift(T_new_old, self.camera, self._median_depth or USUAL_DEPTH)
+        return shift > self.settings.recovery.wide_share * self.camera.width
+
+    def _is_far_off(self, view: FeatureView, found: AlignmentResult) -> bool:
+        """Whether a pose after a wide step, where alignments have several minima, is not where features have it."""
+        if not self._is_wide(found.T_world_camera):
+            return False
+        shared = self._share(view)
+        return bool(shared.contradict(found.T_world_camera)) or (
+            found.degenerate and not shared.vouch(found.T_world_camera)
+        )
 
     def _mode(self, median_depth: float) -> PhotometricMode:
         """The photometric mode with "auto" decided."""
         settings = self.settings.photometric
         if settings.mode != "auto":
             return settings.mode
-        assert self.noise is not None
-        return "always" if self.noise.sigma(median_depth) > settings.noisy_m else "degenerate"
+        return "always" if self._noise().sigma(median_depth) > settings.noisy_m else "degenerate"
 
     def _align(
         self, points: PointSource, target: GicpTarget, guess: np.ndarray, photometric: PhotometricPart | None,
         coarse: bool = True,
     ) -> AlignmentResult:  # fmt: skip
-        assert self.noise is not None
         settings = self.settings.align if coarse else dataclasses.replace(self.settings.align, coarse_iterations=0)
-        return self.engine.align(points, target, guess, settings, self.noise, photometric)
+        return self.engine.align(points, target, guess, settings, self._noise(), photometric)
+
+    def _noise(self) -> DepthNoise:
+        assert self.noise is not None
+        return self.noise
 
     def _photometric_part(self, view: FeatureView) -> PhotometricPart | None:
         """Textured points of the view and the reference; None without either."""
@@ -187,6 +229,11 @@ class GicpTracker(Tracker):
     def _is_convincing(self, found: AlignmentResult) -> bool:
         return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.recovery.convincing_overlap
 
+    def _is_vouched(self, found: AlignmentResult) -> bool:
+        """Whether features, if they were asked, vouch for a pose."""
+        usable = found.status is not AlignmentStatus.LOST and self._features is not None
+        return usable and self._features.vouch(found.T_world_camera)
+
     def _explains_greys(self, found: AlignmentResult) -> bool:
         """Whether the images agree at the pose found; true if none were compared."""
         limit = self.settings.recovery.convincing_residual
@@ -195,7 +242,11 @@ class GicpTracker(Tracker):
     def _is_acceptable(self, found: AlignmentResult) -> bool:
         """Whether to believe a pose at all. Some overlap can be had anywhere (a floor is a floor), so that a pose short
         of the convincing overlap, or after being lost, must be witnessed by grey values."""
-        if found.status is AlignmentStatus.LOST or found.overlap < self.settings.recovery.min_overlap:
+        if found.status is AlignmentStatus.LOST:
+            return False
+        if self._is_vouched(found):
+            return True
+        if found.overlap < self.settings.recovery.min_overlap:
             return False
         if self.state.motion.lost:
             return self._is_witnessed(found)
@@ -230,6 +281,8 @@ class GicpTracker(Tracker):
         starts += [(name, pose, False) for name, pose in shared.starts()]
         for name, guess, coarse in starts:
             candidate = self._align(points, target, guess, photometric, coarse)
+            if not coarse and shared.vouch(guess):
+                candidate = self._hold(candidate, guess, view, points)
             if self._is_better(candidate, best, shared):
                 best, reason = candidate, name
         if best.photometric_share > 0 and not self._explains_greys(best) and not best.degenerate:

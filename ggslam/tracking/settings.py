@@ -169,6 +169,9 @@ class RecoverySettings:
     """`points.near_weight` while something may move: what is near may take the pose along."""
     wary_frames: int = setting(16, 0, 1000)
     """Frames for which that holds, after images suddenly agreed less or something was found that may move."""
+    wide_share: float = setting(0.15, 0, 10)
+    """Over this share of the image width, by which the image shifts from frame to frame, an alignment starts where
+    matched features have the camera, and is held to them."""
     views: int = setting(2, 1, 100)
     """Located frames whose features are matched, the latest first."""
     features: FeatureSettings = field(default_factory=FeatureSettings)

@@ -20,6 +20,11 @@ less than this share of what another pose explains."""
 JUMP_SLACK = 3.0
 """Features this many limits off contradict a pose for good: in fast turns colour and depth that are out of step differ
 by less."""
+VOUCHED_SHARE, VOUCHED_TIMES = 0.5, 3
+"""Features vouch for a pose that explains this share of those shared with a view, and so many times the number that
+makes a pose..."""
+VOUCHED_CELLS, CELLS = 4, 4
+"""...in so many parts of the image, which has `CELLS` x `CELLS`: those on one thing that moves vouch for nothing."""
 CLEARLY_FEWER = 0.7
 """Of two poses one is preferred if the other explains less than this share of what it does."""
 
@@ -65,13 +70,28 @@ class SharedFeatures:
             f"{best.inliers} with another"
         )
 
+    def vouch(self, T_world_camera: np.ndarray) -> bool:
+        """Whether a pose [4, 4] is right without further witnesses: most of what the view shares with an earlier one,
+        all over the image, lies where this pose has it."""
+        return any(self._vouches(shared, T_world_camera) for shared in self.matches)
+
+    def _vouches(self, shared: ViewMatches, T_world_camera: np.ndarray) -> bool:
+        explained = shared.explained(T_world_camera, self._camera, self._settings)
+        needed = max(VOUCHED_TIMES * self._settings.min_inliers, VOUCHED_SHARE * len(shared))
+        if explained.sum() < needed:
+            return False
+        size = (self._camera.width, self._camera.height)
+        cells = np.floor(shared.pixels[explained] / size * CELLS).clip(0, CELLS - 1) @ (CELLS, 1)
+        return len(np.unique(cells)) >= VOUCHED_CELLS
+
+    def count_explained(self, T_world_camera: np.ndarray) -> int:
+        """Matches with any of the earlier views that lie where a pose [4, 4] has them."""
+        return sum(shared.count_explained(T_world_camera, self._camera, self._settings) for shared in self.matches)
+
     def prefer(self, T_one: np.ndarray, T_other: np.ndarray) -> bool | None:
         """Whether one pose [4, 4] explains clearly more of the features than another; None: there is no clear
         difference."""
-        one, other = (
-            sum(shared.count_explained(T, self._camera, self._settings) for shared in self.matches)
-            for T in (T_one, T_other)
-        )
+        one, other = self.count_explained(T_one), self.count_explained(T_other)
         if max(one, other) < self._settings.min_inliers or min(one, other) >= CLEARLY_FEWER * max(one, other):
             return None
         return one > other
