@@ -7,12 +7,15 @@ from collections.abc import Callable
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ggslam.cli.console import console, progress_bar
 from ggslam.errors import SequenceError
+
+if TYPE_CHECKING:
+    from ggslam.synthetic import Shutter
 
 EPILOG = """
 [bold]Examples[/]
@@ -87,6 +90,13 @@ def synth(
         float,
         typer.Option(help="Share of the time between two frames for which the shutter is open.", min=0, max=1),
     ] = 0.0,
+    rolling: Annotated[
+        float,
+        typer.Option(help="The same between the first row of an image that is read and the last.", min=0, max=1),
+    ] = 0.0,
+    depth_delay: Annotated[
+        float, typer.Option(help="The same by which depth is later than colour.", min=-0.4, max=0.4)
+    ] = 0.0,
     depth_distortion: Annotated[
         float | None,
         typer.Option(help="Fixed error of the depth camera, steps of disparity; default 0, for the loop 0.3."),
@@ -118,11 +128,11 @@ def synth(
     ] = None,
 ) -> None:
     """Generate a recording: textured, furnished rooms with exact poses and instance masks."""
-    from ggslam.synthetic import FRAMES_WITH_MOVERS, SCENES
+    from ggslam.synthetic import FRAMES_WITH_MOVERS, SCENES, Shutter
 
     if frames is None:
         frames = FRAMES_WITH_MOVERS if movers is not None else SCENES[scene.value].frames
-    write = _writer(rig, rig_delay, changes, visit, movers, speed, blur)
+    write = _writer(rig, rig_delay, changes, visit, movers, speed, Shutter(blur, rolling, depth_delay))
     cameras = f" by each of {rig}" if rig is not None else ""
     with progress_bar() as bar:
         task = bar.add_task("render", total=frames, info="")
@@ -135,7 +145,7 @@ def synth(
 
 
 def _writer(
-    rig: str | None, delay: float, changes: int | None, visit: int, movers: str | None, speed: int, blur: float
+    rig: str | None, delay: float, changes: int | None, visit: int, movers: str | None, speed: int, shutter: Shutter
 ) -> Callable[..., Path]:
     """What writes the recording, with the options that the others do not have."""
     from ggslam.synthetic import write_synthetic_rig, write_synthetic_sequence
@@ -145,10 +155,11 @@ def _writer(
     if rig is None:
         moving = [] if movers is None else movers.split(",")
         return partial(
-            write_synthetic_sequence, changes=changes, visit=visit, movers=moving, speed=speed, blur=blur
+            write_synthetic_sequence, changes=changes, visit=visit, movers=moving, speed=speed, shutter=shutter
         )
     asked = {
-        "--changes": changes is not None, "--movers": movers is not None, "--speed": speed != 1, "--blur": blur > 0
+        "--changes": changes is not None, "--movers": movers is not None, "--speed": speed != 1,
+        "--blur": shutter.blur, "--rolling": shutter.rolling, "--depth-delay": shutter.depth_delay,
     }  # fmt: skip
     for option, given in asked.items():
         if given:

@@ -4,6 +4,7 @@ corridor (`corridor`), ray-cast (`raycast`) and written out (`writer`). And a la
 scanner."""
 
 from ggslam.synthetic.corridor import furnished_corridor
+from ggslam.synthetic.exposure import Shutter
 from ggslam.synthetic.house import ring_of_rooms
 from ggslam.synthetic.movers import MOVERS
 from ggslam.synthetic.raycast import RayCaster, RayImages
@@ -31,6 +32,7 @@ __all__ = [
     "Scene",
     "SceneBuilder",
     "Shape",
+    "Shutter",
     "World",
     "camera_path",
     "cast_rays",

@@ -13,6 +13,7 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.synthetic.carried import carried_mug
 from ggslam.synthetic.drawer import opened_drawer
+from ggslam.synthetic.exposure import View
 from ggslam.synthetic.motion import Mover, Setting, Views
 from ggslam.synthetic.raycast import RayCaster, RayImages
 from ggslam.synthetic.scene import Scene, Shape
@@ -53,9 +54,13 @@ class MovingScene:
         self._told.append([mover.describe_frame(frame, mask) for mover in self.movers])
         return replace(images, mask=mask)
 
-    def color(self, camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:
-        """Colour uint8 [H, W, 3] of the frame rendered last, from another pose [4, 4]."""
-        return self._caster.render(camera, T_world_camera).color
+    def at_another_pose(self) -> tuple[View, View, View]:
+        """Colour, depth and ids of the frame rendered last, as functions of a camera and T_world_camera [4, 4]."""
+        return (
+            lambda camera, pose: self._caster.render(camera, pose).color,
+            lambda camera, pose: self._caster.measure(camera, pose)[0],
+            lambda camera, pose: self._caster.measure(camera, pose)[1],
+        )
 
     def truth(self) -> dict[str, Any]:
         """What moved in the frames so far; for JSON."""

@@ -8,8 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -21,7 +20,7 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
 from ggslam.synthetic.changes import MadeChange, room_at_two_visits
-from ggslam.synthetic.exposure import exposed_color
+from ggslam.synthetic.exposure import Shutter
 from ggslam.synthetic.movers import MovingScene, find_movers, movers_of
 from ggslam.synthetic.scene import Scene
 from ggslam.synthetic.scenes import SCENES, SceneKind
@@ -34,6 +33,7 @@ LARGEST_DISTORTION = 10.0
 CHANGES_FILE = "changes.json"
 MOVERS_FILE = "movers.json"
 FRAMES_WITH_MOVERS = 120
+PLAIN_SHUTTER = Shutter()
 FOCAL_LENGTH = 0.75
 """As a share of the image width: 67 degrees of view."""
 
@@ -51,7 +51,7 @@ def write_synthetic_sequence(
     scene: Scene | str = "room",
     depth_distortion: float | None = None,
     speed: int = 1,
-    blur: float = 0.0,
+    shutter: Shutter = PLAIN_SHUTTER,
     changes: int | None = None,
     visit: int = 1,
     movers: Sequence[str] = (),
@@ -77,7 +77,7 @@ def write_synthetic_sequence(
         depth_distortion: what the depth camera always measures wrongly, in steps of disparity, see
             `disparity_distortion`; nothing without noise. None: 0.3 in the house, else 0.
         speed: how many times as far as usual the camera moves between two frames.
-        blur: share of the time between two frames for which the shutter is open: colour is blurred by the motion.
+        shutter: how colour is blurred, rows read and depth delayed.
         changes: things of the room that differ between its two visits (see `room_at_two_visits`); the second one's
             folder has them in changes.json. The camera goes all around ("round") if no trajectory is given.
         visit: which of the two, 1 or 2; the second goes the other way round.
@@ -100,8 +100,9 @@ def write_synthetic_sequence(
     if changes is not None:
         scene, made = _scene_of_visit(scene, seed, changes, visit)
         trajectory = trajectory or "round"
-    plan = plan_recording(width, height, frames, seed, noise, trajectory, frame_rate, scene, depth_distortion,
-                          speed, blur)
+    plan = plan_recording(
+        width, height, frames, seed, noise, trajectory, frame_rate, scene, depth_distortion, speed, shutter
+    )
     poses = plan.poses
     if visit > 1:  # another hand, and the way back
         poses = _poses(plan.scene, len(poses), plan.trajectory, seed + 1, speed)[::-1].copy()
@@ -136,7 +137,7 @@ class RecordingPlan:
         scene, camera, seed, noise, trajectory, frame_rate: of it.
         distortion: of its depth camera, steps of disparity.
         poses: T_world_camera, float64 [n, 4, 4].
-        blur: share of the time between two frames for which the shutter is open.
+        shutter: of its camera.
     """
 
     scene: Scene
@@ -147,7 +148,7 @@ class RecordingPlan:
     frame_rate: float
     distortion: float
     poses: np.ndarray
-    blur: float = 0.0
+    shutter: Shutter = PLAIN_SHUTTER
 
     @property
     def times(self) -> np.ndarray:
@@ -157,7 +158,8 @@ class RecordingPlan:
 
 def plan_recording(
     width: int, height: int, frames: int | None, seed: int, noise: bool, trajectory: str | None,
-    frame_rate: float | None, scene: Scene | str, depth_distortion: float | None, speed: int = 1, blur: float = 0.0,
+    frame_rate: float | None, scene: Scene | str, depth_distortion: float | None, speed: int = 1,
+    shutter: Shutter = PLAIN_SHUTTER,
 ) -> RecordingPlan:  # fmt: skip
     """What is to be recorded, of arguments as of `write_synthetic_sequence`.
 
@@ -170,13 +172,13 @@ def plan_recording(
     trajectory = kind.trajectory if trajectory is None else trajectory
     distortion = kind.depth_distortion if depth_distortion is None else depth_distortion
     _check_numbers(width, height, frame_rate, distortion)
-    if speed < 1 or not 0 <= blur <= 1:
-        raise SequenceError(f"expected a speed of 1 or more and a blur from 0 to 1, found {speed} and {blur:g}")
+    if speed < 1:
+        raise SequenceError(f"speed: expected 1 or more, found {speed}")
     scene = scene if isinstance(scene, Scene) else kind.build(seed, frames * speed)
     focal = FOCAL_LENGTH * width
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     poses = _poses(scene, frames, trajectory, seed, speed)
-    return RecordingPlan(scene, camera, seed, noise, trajectory, frame_rate, distortion, poses, blur)
+    return RecordingPlan(scene, camera, seed, noise, trajectory, frame_rate, distortion, poses, shutter)
 
 
 def _poses(scene: Scene, frames: int, trajectory: str, seed: int, speed: int) -> np.ndarray:
@@ -294,16 +296,19 @@ def _write_images(
     offset = disparity_distortion(plan.camera, plan.distortion, plan.seed + number) if plan.distortion else 0.0
     for i, pose in enumerate(poses):
         images = moving.render(i, plan.camera, pose)
-        color, depth = images.color, images.depth
-        if plan.blur:
-            color = exposed_color(partial(moving.color, plan.camera), poses, i, plan.blur)
+        color, depth, mask = images.color, images.depth, images.mask
+        if not plan.shutter.is_plain:
+            of_color, of_depth, of_mask = moving.at_another_pose()
+            color = plan.shutter.color(of_color, plan.camera, poses, i)
+            depth = plan.shutter.depth(of_depth, plan.camera, poses, i)
+            mask = plan.shutter.mask(of_mask, plan.camera, poses, i)
         if plan.noise:
             rng = np.random.default_rng([plan.seed, 4, i, *([number] if number else [])])
             color, depth = noisy_color(color, rng), noisy_depth(depth, plan.camera, rng, offset)
         raw = np.rint(np.minimum(depth * DEPTH_SCALE, 65535)).astype(np.uint16)
         _write_png(folder / "rgb" / f"{i:06d}.png", cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
         _write_png(folder / "depth" / f"{i:06d}.png", raw)
-        _write_png(folder / "masks" / f"{i:06d}.png", images.mask)
+        _write_png(folder / "masks" / f"{i:06d}.png", mask)
         if progress is not None:
             progress(i + 1, len(poses))
 
@@ -322,7 +327,7 @@ def _write_description(folder: Path, plan: RecordingPlan, poses: np.ndarray, tim
         "seed": plan.seed,
         "noise": plan.noise,
         "trajectory": plan.trajectory,
-        **({"blur": plan.blur} if plan.blur else {}),
+        **({} if plan.shutter.is_plain else {"shutter": asdict(plan.shutter)}),
         "width": camera.width,
         "height": camera.height,
         "fx": camera.fx,

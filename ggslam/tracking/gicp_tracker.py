@@ -184,9 +184,9 @@ class GicpTracker(Tracker):
         if not self._is_wide(found.T_world_camera):
             return False
         shared = self._share(view)
-        return bool(shared.contradict(found.T_world_camera)) or (
-            found.degenerate and not shared.vouch(found.T_world_camera)
-        )
+        if found.degenerate and shared.could_vouch:
+            return not shared.vouch(found.T_world_camera)
+        return bool(shared.contradict(found.T_world_camera))
 
     def _mode(self, median_depth: float) -> PhotometricMode:
         """The photometric mode with "auto" decided."""

@@ -75,6 +75,11 @@ class SharedFeatures:
         all over the image, lies where this pose has it."""
         return any(self._vouches(shared, T_world_camera) for shared in self.matches)
 
+    @property
+    def could_vouch(self) -> bool:
+        """Whether enough is shared with the last view to vouch for a pose."""
+        return bool(self.matches) and len(self.matches[0]) >= VOUCHED_TIMES * self._settings.min_inliers
+
     def _vouches(self, shared: ViewMatches, T_world_camera: np.ndarray) -> bool:
         explained = shared.explained(T_world_camera, self._camera, self._settings)
         needed = max(VOUCHED_TIMES * self._settings.min_inliers, VOUCHED_SHARE * len(shared))
