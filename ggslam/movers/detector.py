@@ -67,8 +67,9 @@ class MoverDetector:
         return replace(frame, depth=np.where(self.expected, np.float32(0), frame.depth))
 
     def look(
-        self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin, context: NativeContext, sure: bool = True
-    ) -> None:
+        self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin, context: NativeContext,
+        sure: bool = True, swift: bool = False,
+    ) -> None:  # fmt: skip
         """Finds what moves in a frame: `mask`.
 
         Args:
@@ -77,6 +78,8 @@ class MoverDetector:
             margin: see there.
             context: that it is computed in.
             sure: whether the pose is; if it is not, nothing begins to move.
+            swift: whether the camera moved so fast that shutters warp its images: nothing begins to move, and no later
+                frame is held to this one.
         """
         self.mask = self.things = None
         if T_world_camera is None:
@@ -84,7 +87,7 @@ class MoverDetector:
             return
         s, factor = self.settings, coarse_factor(frame.camera, self.settings)
         view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera, margin, context)
-        earlier, self.views = self.views, [*self.views[-AGES[-1] :], view]
+        earlier, self.views = self.views, [*self.views[-AGES[-1] :], *([] if swift else [view])]
         passed, clearly, surely, same = np.zeros((4, *view.depth.shape), np.int8)
         known, stayed, left = np.zeros((3, *view.depth.shape), bool)
         ages = [age for age in AGES if age <= len(earlier)]
@@ -113,7 +116,7 @@ class MoverDetector:
         most = known if moved is None else view.depth > 0  # what moves may hide most of what was seen before
         if found is None or found.small.sum() > s.max_share * most.sum():
             return
-        found = found.keep_credible(novel, (clearly + surely >= s.min_passed) & sure, moved)
+        found = found.keep_credible(novel, (clearly + surely >= s.min_passed) & (sure and not swift), moved)
         if found is None:
             return
         self.found = found.small
@@ -124,7 +127,7 @@ class MoverDetector:
             self.small = thin_out(seen_twice, factor)
             self.segments = found.segments_on(seen_twice)
             self.trail.add(view, self.small)
-        likely = found.full > 0 if _stays_in_place(view, earlier[-1], found.small) else seen_twice
+        likely = found.full > 0 if earlier and _stays_in_place(view, earlier[-1], found.small) else seen_twice
         self.expected = None if likely is None else grow(likely, PREDICTED)
 
     def clean(self, frame: Frame) -> Frame:

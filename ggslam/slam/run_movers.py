@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ggslam.geometry.moved_depth import largest_shift
 from ggslam.movers.detector import GROWN, MoverDetector, coarse_factor, grow
 from ggslam.movers.evidence import CoarseView, Margin
 from ggslam.movers.recent import RecentFrame
@@ -16,6 +17,7 @@ from ggslam.movers.tracks import MoverTracks
 from ggslam.movers.trail import gone_since
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
@@ -23,6 +25,9 @@ from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 SURE = (TrackingStatus.FIRST, TrackingStatus.OK, TrackingStatus.DEGENERATE)
 """How frames are tracked in which something may be found that did not move before."""
+SWIFT = 3.0
+"""Widths of the image a second by which it shifts where rolling shutters warp it: by a tenth of its width between the
+first row and the last, if they are a thirtieth of a second apart."""
 DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 """Where frames are that nothing is said of: their poses may be wrong."""
 
@@ -44,6 +49,8 @@ class RunMovers:
         self.tracks = MoverTracks()
         """The movers one by one."""
         self._margin = _margin(settings, DepthNoise())
+        self._before: tuple[float, np.ndarray] | None = None
+        """Time of the frame before, seconds, and T_world_camera; None: it was not located."""
 
     @property
     def active(self) -> bool:
@@ -73,7 +80,8 @@ class RunMovers:
         known = result.status not in DOUBTFUL
         shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
         T_world_camera = result.T_world_camera if known else None
-        self.detector.look(shown, T_world_camera, self._margin, self.context, result.status in SURE)
+        swift = self._is_swift(frame, T_world_camera, result.median_depth_m)
+        self.detector.look(shown, T_world_camera, self._margin, self.context, result.status in SURE, swift)
         if known:
             self.tracks.look(RecentFrame.of(shown, result.T_world_camera, self._margin), self.detector.things)
         else:
@@ -83,6 +91,14 @@ class RunMovers:
             return result
         self.pixels.add(frame.index, mask)
         return replace(result, points=_without(result.points, mask))
+
+    def _is_swift(self, frame: Frame, T_world_camera: np.ndarray | None, depth_m: float) -> bool:
+        """Whether the image shifts so fast since the frame before that shutters warp it."""
+        before, self._before = self._before, None if T_world_camera is None else (frame.timestamp, T_world_camera)
+        if before is None or T_world_camera is None or not frame.timestamp > before[0]:
+            return False
+        shift = largest_shift(inverse(T_world_camera) @ before[1], frame.camera, depth_m)
+        return shift > SWIFT * frame.camera.width * (frame.timestamp - before[0])
 
     def clean(self, frame: Frame) -> Frame:
         """The frame that `look` saw last without depth where something moves, which `Frame.moving` tells."""
@@ -128,6 +144,8 @@ class RunMovers:
     def move(self, T_new_old: np.ndarray) -> None:
         """Follows a correction [4, 4] of the world about the camera."""
         self.detector.move(T_new_old)
+        if self._before is not None:
+            self._before = self._before[0], T_new_old @ self._before[1]
         self.tracks.move(T_new_old)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -19,12 +20,17 @@ from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, P
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import PointSource
+from ggslam.tracking.seen_before import share_seen_before
 from ggslam.tracking.settings import DepthNoise, PhotometricMode, TrackerSettings
 from ggslam.tracking.shared_features import JUMP_SLACK, SharedFeatures
 from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, TrackingStatus
 
 MIN_TEXTURED = 200
 """Textured points from which grey values are trusted."""
+ALIKE_SHARE = 0.01
+"""Of the image width, by which the image shifts between two starts of which one is enough."""
+LEAST_SEEN = 0.5
+"""Share of a frame that the last views have to show where its overlap is held to that."""
 USUAL_DEPTH = 2.0
 """Metres, of scenes whose median depth is not known yet."""
 
@@ -80,6 +86,7 @@ class GicpTracker(Tracker):
         points = self._points(frame.depth, noise)
         motion.wary = max(0, motion.wary - 1)
         view = FeatureView(frame.color, frame.depth, motion.T_world_camera)
+        motion.watch(frame.color, self.camera)
         if target is None:
             return self._begin(view, points)
         self.noise = noise  # what could not be measured before the first keyframe is taken as usual
@@ -89,7 +96,7 @@ class GicpTracker(Tracker):
             motion.wary = self.settings.recovery.wary_frames
             points = self._points(frame.depth, noise)
             found, reason = self._locate(view, points, target)
-        if not self._is_acceptable(found):
+        if not self._is_acceptable(found, points):
             return self._give_up(points, found)
         T = orthonormalize(found.T_world_camera)
         self._look_at_residuals(points, found)
@@ -239,7 +246,7 @@ class GicpTracker(Tracker):
         limit = self.settings.recovery.convincing_residual
         return found.photometric_share == 0 or found.photometric_residual <= limit
 
-    def _is_acceptable(self, found: AlignmentResult) -> bool:
+    def _is_acceptable(self, found: AlignmentResult, points: PointSource) -> bool:
         """Whether to believe a pose at all. Some overlap can be had anywhere (a floor is a floor), so that a pose short
         of the convincing overlap, or after being lost, must be witnessed by grey values."""
         if found.status is AlignmentStatus.LOST:
@@ -250,7 +257,18 @@ class GicpTracker(Tracker):
             return False
         if self.state.motion.lost:
             return self._is_witnessed(found)
-        return self._is_convincing(found) or self._is_witnessed(found, tolerance=2)
+        if self._is_convincing(found) or self._is_witnessed(found, tolerance=2):
+            return True
+        return not found.degenerate and self._matches_what_was_seen(found, points)
+
+    def _matches_what_was_seen(self, found: AlignmentResult, points: PointSource) -> bool:
+        """Whether the overlap is convincing for so much as the last views show of the frame: a fast turn leaves
+        little, and its blurred image bears no witness."""
+        views, needed = self.state.motion.views, self.settings.recovery.convincing_overlap
+        seen = share_seen_before(points.read(), found.T_world_camera, views, self.camera)
+        if seen < LEAST_SEEN or found.overlap < needed * seen:
+            return False
+        return self._features is None or not self._features.contradict(found.T_world_camera, JUMP_SLACK)
 
     def _is_witnessed(self, found: AlignmentResult, tolerance: float = 1) -> bool:
         """Whether there is some overlap and the images agree over enough of the frame."""
@@ -276,19 +294,39 @@ class GicpTracker(Tracker):
         best, reason = found, ""
         if photometric is not None and found.photometric_share == 0:  # all starts are compared by the same measure
             best = self._align(points, target, self.state.motion.predict(), photometric)
-        # Feature matches are good to a centimetre or two; the coarse level would slide off along a bare wall.
-        starts, shared = [("last pose", self.state.motion.T_world_camera, True)], self._share(view)
-        starts += [(name, pose, False) for name, pose in shared.starts()]
-        for name, guess, coarse in starts:
+        shared = self._share(view)
+        for name, guess, coarse in self._starts(shared):
             candidate = self._align(points, target, guess, photometric, coarse)
-            if not coarse and shared.vouch(guess):
+            vouched = not coarse and shared.vouch(guess)
+            if vouched:
                 candidate = self._hold(candidate, guess, view, points)
             if self._is_better(candidate, best, shared):
                 best, reason = candidate, name
+            if vouched and self._is_vouched(best) and self._explains_greys(best):
+                break  # there is no better start
         if best.photometric_share > 0 and not self._explains_greys(best) and not best.degenerate:
             plain = self._align(points, target, best.T_world_camera, None, coarse=False)
             best = best if shared.prefer(best.T_world_camera, plain.T_world_camera) else plain
         return best, reason
+
+    def _starts(self, shared: SharedFeatures) -> Iterator[tuple[str, np.ndarray, bool]]:
+        """Other starts than constant velocity, the likeliest first: a name, a pose [4, 4], and whether it is coarse.
+        Feature matches are good to a centimetre or two; the coarse level would slide off along a bare wall."""
+        motion, tried = self.state.motion, [self.state.motion.predict()]
+        turned = motion.T_world_camera @ motion.turned
+        starts = [(name, pose, False) for name, pose in shared.starts()]
+        starts.append(("last pose", motion.T_world_camera, True))
+        if self._is_wide(turned):
+            starts.append(("shift of the image", turned, True))
+        for name, pose, coarse in starts:
+            if not any(self._is_alike(pose, other) for other in tried):
+                tried.append(pose)
+                yield name, pose, coarse
+
+    def _is_alike(self, T_one: np.ndarray, T_other: np.ndarray) -> bool:
+        """Whether two starts [4, 4] lead to the same place."""
+        shift = largest_shift(inverse(T_one) @ T_other, self.camera, self._median_depth or USUAL_DEPTH)
+        return shift < ALIKE_SHARE * self.camera.width
 
     @staticmethod
     def _is_better(candidate: AlignmentResult, best: AlignmentResult, shared: SharedFeatures) -> bool:

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ggslam.features.orb import FeatureView
+from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, orthonormalize, separation
+from ggslam.tracking.image_turn import image_turn, small_image
 from ggslam.tracking.photometric import PhotometricReference
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import PhotometricSettings, TrackerSettings
@@ -34,6 +36,8 @@ class CameraMotion:
         reference: the same, prepared; None: not yet.
         greys: how much grey values of the last located frames differed from the reference, the newest first.
         wary: so many more frames are located as if something near moved.
+        small: of the last frame, located or not, see `small_image`; None: there was none.
+        turned: float64 [4, 4], by how the image shifted, from the last located frame to the one at hand.
     """
 
     T_world_camera: np.ndarray
@@ -44,10 +48,18 @@ class CameraMotion:
     reference: PhotometricReference | None = None
     greys: list[float] = field(default_factory=list)
     wary: int = 0
+    small: np.ndarray | None = None
+    turned: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+    def watch(self, color: np.ndarray, camera: Camera) -> None:
+        """Sees the next frame's colour uint8 [H, W, 3]: `turned`."""
+        before, self.small = self.small, small_image(color)
+        step = np.eye(4) if before is None else image_turn(before, self.small, camera)
+        self.turned = self.turned @ step if self.lost else step
 
     def predict(self) -> np.ndarray:
-        """The next pose [4, 4] at constant velocity."""
-        return self.T_world_camera @ self.velocity
+        """The next pose [4, 4] at constant velocity; of a lost camera, as the images shifted since it was located."""
+        return self.T_world_camera @ (self.turned if self.lost else self.velocity)
 
     def is_sudden(self, residual: float) -> bool:
         """Whether images that differ by `residual` agree far less than those of the frames before did: something near

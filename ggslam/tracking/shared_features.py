@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ggslam.features.orb import FeatureSettings, FeatureView, ViewMatches, match_views
+from ggslam.features.orb import FeaturePose, FeatureSettings, FeatureView, ViewMatches, match_views
 from ggslam.scene.camera import Camera
 
 CONTRADICTED_BELOW = 0.4
@@ -45,13 +45,20 @@ class SharedFeatures:
         self._camera, self._settings = camera, settings
         self.matches: list[ViewMatches] = [match_views(view, known, camera, settings) for known in earlier]
         """With each of the earlier views."""
+        self._poses: dict[int, FeaturePose | None] = {}
 
     def starts(self) -> Iterator[tuple[str, np.ndarray]]:
         """What most of the matches with each view agree on: a name and a pose [4, 4]."""
-        for number, shared in enumerate(self.matches):
-            pose = shared.pose(self._camera, self._settings)
+        for number in range(len(self.matches)):
+            pose = self._pose(number)
             if pose is not None:
                 yield f"features of view {number}", pose.T_world_camera
+
+    def _pose(self, number: int) -> FeaturePose | None:
+        """What most of the matches with an earlier view agree on."""
+        if number not in self._poses:
+            self._poses[number] = self.matches[number].pose(self._camera, self._settings)
+        return self._poses[number]
 
     def contradict(self, T_world_camera: np.ndarray, slack: float = 1.0) -> str:
         """Why a pose [4, 4] cannot be right: another one explains far more of what the view shares with the last one.
@@ -62,7 +69,7 @@ class SharedFeatures:
         found = shared.count_explained(T_world_camera, self._camera, self._settings, slack)
         if len(shared) < needed or found >= CONTRADICTED_BELOW * len(shared):
             return ""
-        best = shared.pose(self._camera, self._settings)
+        best = self._pose(0)
         if best is None or best.inliers < needed or found >= CONTRADICTED_BELOW * best.inliers:
             return ""
         return (

@@ -173,9 +173,7 @@ class FeatureTracker(Tracker):
                 f"{needed} needed"
             )
         pose = self.state.motion.T_world_camera.copy()
-        return TrackingResult(
-            pose, TrackingStatus.LOST, found.overlap, found.rmse, reason, points, _as_gicp(found)
-        )
+        return TrackingResult(pose, TrackingStatus.LOST, found.overlap, found.rmse, reason, points, _as_gicp(found))
 
     def _may_ask_gicp(self) -> bool:
         return self.features.gicp_fallback and self.target is not None

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What part of a frame earlier views can have shown: more than that cannot match the map, however right the pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ggslam.features.orb import FeatureView
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse
+from ggslam.tracking.points import FramePoints
+
+POINTS = 600
+"""Of a frame that are looked at."""
+
+
+def share_seen_before(
+    points: FramePoints, T_world_camera: np.ndarray, views: Sequence[FeatureView], camera: Camera
+) -> float:
+    """Share of a frame's points that lie, at a pose [4, 4], where any of some earlier views has depth."""
+    chosen = points.points[:: max(1, len(points) // POINTS)].astype(float)
+    seen = np.zeros(len(chosen), bool)
+    for view in views:
+        T = inverse(view.T_world_camera) @ T_world_camera
+        x, y, z = (chosen @ T[:3, :3].T + T[:3, 3]).T
+        ahead = np.where(z > 0, z, np.inf)
+        columns = np.rint(camera.fx * x / ahead + camera.cx).astype(int)
+        rows = np.rint(camera.fy * y / ahead + camera.cy).astype(int)
+        inside = (z > 0) & (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
+        seen[inside] |= view.depth[rows[inside], columns[inside]] > 0
+    return float(seen.mean()) if len(seen) else 0.0
