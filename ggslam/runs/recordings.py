@@ -42,8 +42,8 @@ class SequenceRequest:
     camera: Path | None = None
     intrinsics: str | None = None
 
-    def open(self) -> Sequence:
-        """Opens the recording.
+    def open(self, truth: bool = True) -> Sequence:
+        """Opens the recording; `truth`: with its true poses.
 
         Raises:
             SequenceError: it cannot be read.
@@ -53,7 +53,7 @@ class SequenceRequest:
             self.path, format=self.format, start=self.start, stop=self.stop, stride=self.stride, scale=self.scale,
             masks=self.masks, depth_scale=self.depth_scale, on_bad_frame=self.on_bad_frame,  # type: ignore[arg-type]
             depth_camera=self.depth_camera, min_confidence=self.min_confidence, topics=self.topics,
-            pose_convention=self.pose_convention, camera=self.camera, intrinsics=self.intrinsics,
+            pose_convention=self.pose_convention, camera=self.camera, intrinsics=self.intrinsics, truth=truth,
         )  # fmt: skip
 
 
@@ -63,7 +63,7 @@ class LiveRequest(SequenceRequest):
 
     record: Path | None = None
 
-    def open(self) -> LiveSequence:  # type: ignore[override]
+    def open(self, truth: bool = True) -> LiveSequence:  # type: ignore[override]
         """Starts the camera; what comes back has what a run needs of a sequence.
 
         Raises:

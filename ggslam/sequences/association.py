@@ -12,6 +12,8 @@ from ggslam.scene.poses import se3_exp, so3_log
 
 TOLERANCE = 0.02
 """Seconds between colour and depth, as in the TUM benchmark's own tool."""
+FEW = 0.04
+"""Share of the colour images that may lack depth without a word: two clocks of 30 Hz drift past each other."""
 WIDE_TOLERANCE = 0.08
 """Tried when almost nothing pairs up within `TOLERANCE`."""
 
@@ -56,7 +58,7 @@ def pair_images(
     """
     pairs = pair_times(color, depth, TOLERANCE)
     if pairs and 2 * len(pairs) >= min(len(color), len(depth)):
-        return pairs, []
+        return pairs, left_out(len(color), len(pairs), names)
     wide = pair_times(color, depth, WIDE_TOLERANCE)
     if not wide:
         gap = min((np.abs(depth - t).min() for t in color), default=np.inf) if len(depth) else np.inf
@@ -69,6 +71,17 @@ def pair_images(
         f"{WIDE_TOLERANCE} s instead"
     )
     return wide, [warning]
+
+
+def left_out(images: int, used: int, names: tuple[str, str]) -> list[str]:
+    """A warning if more than `FEW` of the colour images have no depth of their time."""
+    count = images - used
+    if count <= FEW * images:
+        return []
+    return [
+        f"{count} of {images} colour images ({names[0]}) are left out: no depth image ({names[1]}) is within "
+        f"{TOLERANCE:g} s that does not go with another one"
+    ]
 
 
 def span(times: np.ndarray) -> str:

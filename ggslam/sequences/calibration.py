@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrations written as YAML: camera.yaml of a plain folder, and files for `--depth-camera`.
+"""Calibrations: camera.yaml of a plain folder, and files for `--camera` and `--depth-camera`. Files of other programs
+are translated into the same entries (`camera_files`).
 
     width: 640            size, focal lengths and principal point in pixels, as in `scene.camera.Camera`
     height: 480
@@ -7,7 +8,7 @@
     fy: 585.0
     cx: 319.5
     cy: 239.5
-    distortion: [...]     4, 5 or 8 coefficients in OpenCV's order; optional
+    distortion: [...]     4, 5, 8, 12 or 14 coefficients in OpenCV's order; optional
     distortion_model: opencv | fisheye
 
 A depth camera's calibration holds also
@@ -26,28 +27,23 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import is_valid_pose
-from ggslam.sequences.recording import DepthCamera, Recording, read_text
-from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
+from ggslam.sequences.camera_files.lens_models import distortion_of
+from ggslam.sequences.camera_files.reading import read_entries
+from ggslam.sequences.json_files import camera_of
+from ggslam.sequences.recording import Calibration, DepthCamera, Recording
 
-MODELS = ("opencv", "fisheye")
 _LARGEST_NUMBER = 1e300
 FARTHEST_CENTRE = 100.0
 """Image sizes; no principal point, not even that of a picture cut out of a larger one, lies farther off."""
 
 
 def read_calibration(path: Path) -> dict[str, Any]:
-    """Entries of a YAML file.
+    """Entries of a file, whichever known program wrote it.
 
     Raises:
-        SequenceError: missing, not YAML, or without entries.
+        SequenceError: missing, damaged, without entries, or of a camera that cannot be used.
     """
-    try:
-        settings = parse_yaml(read_text(path))
-    except PlainYamlError as error:
-        raise SequenceError(f"{path}: not YAML: {error}") from None
-    if not isinstance(settings, dict):
-        raise SequenceError(f"{path}: expected entries width, height, fx, fy, cx, cy, depth_scale, found none")
-    return settings
+    return read_entries(path)
 
 
 def number_entry(path: Path, settings: dict[str, Any], key: str) -> float:
@@ -73,24 +69,32 @@ def camera_entry(path: Path, settings: dict[str, Any]) -> Camera:
         raise SequenceError(f"{path}: {error}") from None
 
 
-def distortion_entry(path: Path, settings: dict[str, Any]) -> tuple[np.ndarray | None, bool]:
-    """Coefficients float64 [4, 5 or 8] or None, and whether they are of the fisheye model.
+def camera_or_calibration(path: Path, settings: dict[str, Any]) -> tuple[Camera | None, Calibration | None]:
+    """The camera, or where the file tells no size (K.txt) its (fx, fy, cx, cy) for images as they are.
 
     Raises:
-        SequenceError: another number of them, or another model.
+        SequenceError: the entries are no camera.
+    """
+    if "width" in settings or "height" in settings or not {"fx", "fy", "cx", "cy"} <= settings.keys():
+        return camera_entry(path, settings), None
+    fx, fy, cx, cy = (number_entry(path, settings, key) for key in ("fx", "fy", "cx", "cy"))
+    camera_of(path, 1, 1, fx, fy, cx, cy)
+    return None, (fx, fy, cx, cy)
+
+
+def distortion_entry(path: Path, settings: dict[str, Any]) -> tuple[np.ndarray | None, bool]:
+    """Coefficients float64 [4, 5, 8, 12 or 14] or None, and whether they are of the fisheye model.
+
+    Raises:
+        SequenceError: another number of them, or a model that cannot be undone.
     """
     model, distortion = settings.get("distortion_model", "opencv"), settings.get("distortion")
-    if model not in MODELS:
-        raise SequenceError(f"{path}: expected 'distortion_model' to be {' or '.join(MODELS)}, found '{model}'")
     if distortion is None:
         return None, False
-    fisheye = model == "fisheye"
-    counts = (4,) if fisheye else (4, 5, 8)
-    values = distortion if isinstance(distortion, list) else []
-    if len(values) not in counts or not all(isinstance(v, (int, float)) and abs(v) < _LARGEST_NUMBER for v in values):
-        wanted = "4" if fisheye else "4, 5 or 8"
-        raise SequenceError(f"{path}: expected {wanted} numbers for 'distortion', found '{distortion}'")
-    return np.array(values, float), fisheye
+    values = distortion if isinstance(distortion, list) else [None]
+    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and abs(v) < _LARGEST_NUMBER for v in values):
+        raise SequenceError(f"{path}: expected numbers for 'distortion', found '{distortion}'")
+    return distortion_of(path, str(model), np.array(values, float))
 
 
 def depth_camera_entry(path: Path, settings: Any) -> DepthCamera:
@@ -101,6 +105,11 @@ def depth_camera_entry(path: Path, settings: Any) -> DepthCamera:
     """
     if not isinstance(settings, dict):
         raise SequenceError(f"{path}: expected entries width, height, fx, fy, cx, cy, T_color_depth of a depth camera")
+    if "T_color_depth" not in settings:
+        raise SequenceError(
+            f"{path}: entry 'T_color_depth' is missing: the 16 numbers, row by row, that bring points of the depth "
+            "camera into the colour camera's frame (metres)"
+        )
     T = transform_entry(str(path), settings, "T_color_depth")
     distortion, fisheye = distortion_entry(path, settings)
     return DepthCamera(camera_entry(path, settings), T, distortion, fisheye)

@@ -79,6 +79,7 @@ def open_sequence(
     pose_convention: str | None = None,
     camera: str | Path | None = None,
     intrinsics: str | None = None,
+    truth: bool = True,
 ) -> Sequence:
     """Opens an RGB-D recording.
 
@@ -93,14 +94,16 @@ def open_sequence(
         depth_scale: depth units per metre, instead of the recording's own.
         on_bad_frame: "error": a damaged frame or mask raises; "skip": `stream` skips the frame and lists it in
             `skipped_frames`; a frame whose mask alone is damaged comes without it and is listed in `mask_problems`.
-        depth_camera: YAML file with the calibration of a depth camera beside the colour camera (see `calibration`); its
+        depth_camera: file with the calibration of a depth camera beside the colour camera (see `calibration`); its
             depth images are registered to the colour images.
         min_confidence: depth less sure than this (0 low, 1 medium, 2 high) is dropped where the recording tells how
             sure it is; None: `DEFAULT_CONFIDENCE`.
         topics: of a ROS bag, "role=topic" each, where they are not found by themselves; see `ros_topics`.
         pose_convention: what the recording's poses really are, if not what its format says; see `pose_conventions`.
-        camera: YAML file with the calibration of the colour camera, instead of the recording's own (see `calibration`).
+        camera: file with the calibration of the colour camera, instead of the recording's own (see `calibration` and
+            `camera_files`).
         intrinsics: the same as "fx fy cx cy", then up to 8 coefficients of distortion, of colour images as stored.
+        truth: whether the recording's true poses are read. They are never needed: what is wrong with them is a warning.
 
     Raises:
         MissingDependency: a package is needed to read the recording.
@@ -113,12 +116,14 @@ def open_sequence(
             "masks": masks, "depth_scale": depth_scale, "depth_camera": depth_camera, "min_confidence": min_confidence,
             "topics": topics or None, "pose_convention": pose_convention, "camera": camera, "intrinsics": intrinsics,
         }  # fmt: skip
-        return _open_rig(given_path(path), rig, start, stop, stride, scale, on_bad_frame, of_cameras)
+        return _open_rig(given_path(path), rig, (start, stop, stride), scale, on_bad_frame, truth, of_cameras)
     if format == RIG:
         raise SequenceError(f"{path}: expected {RIG_LAYOUT}")
     read = partial(
         _read_recording, given_path(path), format, None if masks is None else given_path(masks),
-        _options(depth_camera, min_confidence, topics, camera, intrinsics, depth_scale), pose_convention,
+        dataclasses.replace(
+            _options(depth_camera, min_confidence, topics, camera, intrinsics, depth_scale), truth=truth
+        ), pose_convention,
     )  # fmt: skip
     recording = read()
     selection = select(recording.path, len(recording.files), start, stop, stride)
@@ -134,17 +139,19 @@ def open_sequence(
 
 
 def _open_rig(
-    path: Path, file: Path, start: int, stop: int | None, stride: int, scale: float | None, on_bad_frame: OnBadFrame,
-    of_cameras: Mapping[str, object],
+    path: Path, file: Path, selected: tuple[int, int | None, int], scale: float | None, on_bad_frame: OnBadFrame,
+    truth: bool, of_cameras: Mapping[str, object],
 ) -> Sequence:  # fmt: skip
     """A rig; `of_cameras` are arguments that hold for one camera alone."""
     given = [name for name, value in of_cameras.items() if value is not None]
     if given:
         raise SequenceError(f"{file}: `{given[0]}` is of one camera; say it in the rig's file, as `{given[0]}` there")
-    sequence = open_rig(
-        file, open_sequence, start=start, stop=stop, stride=stride, scale=scale, on_bad_frame=on_bad_frame
-    )
-    sequence.options = {"path": path, "format": RIG, "scale": sequence.scale, "on_bad_frame": on_bad_frame}
+    start, stop, stride = selected
+    read = partial(open_sequence, truth=truth)
+    sequence = open_rig(file, read, start=start, stop=stop, stride=stride, scale=scale, on_bad_frame=on_bad_frame)
+    sequence.options = {
+        "path": path, "format": RIG, "scale": sequence.scale, "on_bad_frame": on_bad_frame,
+    }  # fmt: skip
     return sequence
 
 
@@ -152,8 +159,7 @@ def _read_recording(
     folder: Path, format: str | None, masks: Path | None, options: ReadOptions, pose_convention: str | None,
 ) -> Recording:  # fmt: skip
     """Reads a recording's description and applies the user's options; arguments and errors as in `open_sequence`."""
-    if not os.path.exists(folder):  # noqa: PTH110 (Path's raises for impossible names)
-        raise SequenceError(f"{folder}: no such folder or file")
+    _check_kind(folder)
     found = _find_format(folder, format)
     if folder.is_dir():
         refuse_links(folder, SequenceError, links=True)  # people share images between recordings by links
@@ -167,7 +173,7 @@ def _read_recording(
     if options.depth_camera is not None:
         use_depth_camera(recording, options.depth_camera)
     if options.own_camera is not None:
-        use_own_camera(recording, options.own_camera)
+        use_own_camera(recording, options.own_camera, options.depth_scale is not None)
     if options.min_confidence is not None:
         recording.min_confidence = options.min_confidence
     if masks is not None:
@@ -175,13 +181,25 @@ def _read_recording(
     if options.depth_scale is not None:
         recording.depth_scale = options.depth_scale
     if pose_convention is not None:
-        if recording.poses is None:
+        if recording.poses is not None:
+            recording.poses = convert_poses(recording.poses, pose_convention)
+        elif options.truth and not recording.pose_problem:
             raise SequenceError(f"{folder}: tells no poses, so there are none to convert from {pose_convention}")
-        recording.poses = convert_poses(recording.poses, pose_convention)
     if not SMALLEST_SCALE <= recording.depth_scale <= 1 / SMALLEST_SCALE:
         found_scale = f"found {recording.depth_scale}"
         raise SequenceError(f"{folder}: depth scale must be a positive number of usual size, {found_scale}")
     return recording
+
+
+def _check_kind(path: Path) -> None:
+    """Raises SequenceError unless there is a folder or a regular file."""
+    if os.path.exists(path):  # noqa: PTH110 (Path's raises for impossible names)
+        if not os.path.isfile(path) and not os.path.isdir(path):  # noqa: PTH112, PTH113
+            raise SequenceError(f"{path}: is neither a folder nor a regular file (a pipe, a socket or a device?)")
+        return
+    if os.path.islink(path):  # noqa: PTH114
+        raise SequenceError(f"{path}: is a link to {os.readlink(path)}, which is not there")  # noqa: PTH115
+    raise SequenceError(f"{path}: no such folder or file")
 
 
 def _check_places(recording: Recording) -> None:

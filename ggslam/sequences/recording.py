@@ -135,6 +135,7 @@ class ReadOptions:
         min_confidence: depth less sure than this (0 to 2) is dropped; None: `DEFAULT_CONFIDENCE`.
         own_camera: of colour, instead of what the recording tells.
         depth_scale: units of the depth images per metre, instead of what the recording tells.
+        truth: whether true poses are read.
     """
 
     depth_camera: Path | None = None
@@ -142,6 +143,7 @@ class ReadOptions:
     min_confidence: int | None = None
     own_camera: OwnCamera | None = None
     depth_scale: float | None = None
+    truth: bool = True
 
     def recorded_camera(self, read: Callable[[], T]) -> T | None:
         """What `read` finds in the recording about its colour camera; None where a user tells the camera: then nobody
@@ -155,14 +157,31 @@ class ReadOptions:
         return _read_with_hint(read, "`camera` or `intrinsics` tell the camera instead")
 
     def recorded_scale(self, read: Callable[[], float]) -> float:
-        """Units of depth images per metre: what a user tells, else what `read` finds.
+        """Units of depth images per metre: what a user tells as such, else what `read` finds, else what a camera file
+        tells beside its camera.
 
         Raises:
             SequenceError: of `read`; it names the argument that would tell the scale.
         """
+        if self.depth_scale is not None:
+            return self.depth_scale
         of_camera = None if self.own_camera is None else self.own_camera.depth_scale
-        told = of_camera if self.depth_scale is None else self.depth_scale
-        return _read_with_hint(read, "`depth_scale` tells it instead") if told is None else told
+        try:
+            return read()
+        except SequenceError as error:
+            if of_camera is not None:
+                return of_camera
+            raise SequenceError(f"{error} (`depth_scale` tells it instead)") from None
+
+    def add_truth(self, recording: Recording, read: Callable[[], None]) -> None:
+        """Lets `read` give a recording its true poses, unless nobody wants them. They serve scores, so that they are
+        missing or damaged is a warning, and `Recording.pose_problem`."""
+        if not self.truth:
+            return
+        try:
+            read()
+        except SequenceError as error:
+            recording.lack_poses(str(error))
 
     def recorded_depth_camera(self, read: Callable[[], T]) -> T | None:
         """What `read` finds about a depth camera beside the colour camera; None where a user tells it.
@@ -207,6 +226,7 @@ class Recording:
         min_confidence: depth less sure than this is dropped in frames that have a confidence image.
         poses: float64 [n, 4, 4] T_world_camera with rows of NaN where unknown, or None.
         pose_source: file or folder that the poses come from, for reports.
+        pose_problem: why the poses that the recording should have cannot be used; "" where they can.
         camera_source: where the intrinsics come from, for reports; "" where only one place can tell them.
         time_source: where the timestamps come from, for reports.
         depth_delays: float64 [n], seconds at which each frame's depth was taken after its colour; None: not known.
@@ -230,6 +250,7 @@ class Recording:
     min_confidence: int = DEFAULT_CONFIDENCE
     poses: np.ndarray | None = None
     pose_source: str = "none"
+    pose_problem: str = ""
     camera_source: str = ""
     time_source: str = f"nominal {NOMINAL_RATE:g} frames/s"
     depth_delays: np.ndarray | None = None
@@ -237,11 +258,28 @@ class Recording:
     problems: dict[int, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
-    def take_poses(self, poses: np.ndarray, source: str, problems: Mapping[int, str]) -> None:
-        """Sets the poses, float64 [n, 4, 4]; `problems` tells why frames have none, if nothing else is wrong there."""
+    def take_poses(self, poses: np.ndarray, source: str, problems: Mapping[int, str] | None = None) -> None:
+        """Sets the true poses, float64 [n, 4, 4], rows of NaN where there is none. They serve scores, so what is wrong
+        with them, `problems` (what has none -> reason), is a warning; where not one is left, there are none."""
+        known = int(np.isfinite(poses).all((1, 2)).sum())
+        reasons = list((problems or {}).values())
+        first = f"; the first problem: {reasons[0]}" if reasons else ""
+        if not known:
+            self.lack_poses(f"{source}: no frame has a true pose{first}")
+            return
         self.poses, self.pose_source = poses, source
-        for number, reason in problems.items():
-            self.problems.setdefault(number, reason)
+        without = len(poses) - known
+        if without or reasons:
+            have = "has" if without == 1 else "have"
+            self.warnings.append(
+                f"{source}: {without} of {len(poses)} frames {have} no true pose; scores are over the other "
+                f"{known}{first}"
+            )
+
+    def lack_poses(self, reason: str) -> None:
+        """Notes that the true poses cannot be used."""
+        self.poses, self.pose_problem = None, reason
+        self.warnings.append(f"no true poses: {reason}")
 
 
 class RecordingFormat(Protocol):

@@ -81,6 +81,7 @@ class Sequence:
             index of the frame -> reason.
         instance_names: mask id -> name, as far as known.
         pose_source, time_source, camera_source: where poses, timestamps and intrinsics come from, for reports.
+        pose_problem: why the true poses that the recording should have cannot be used; "" where they can.
         options: arguments of `open_sequence` besides the selection; None if it was made otherwise.
         warnings: what a user should know about this recording.
         skipped_frames: damaged frames skipped so far (only with on_bad_frame="skip").
@@ -114,6 +115,7 @@ class Sequence:
         self.depth_scale: float = recording.depth_scale
         self.instance_names: dict[int, str] = dict(recording.instance_names)
         self.pose_source: str = recording.pose_source
+        self.pose_problem: str = recording.pose_problem
         self.time_source: str = recording.time_source
         self.camera_source: str = recording.camera_source
         self.warnings: list[str] = list(recording.warnings)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ggslam.sequences.pose_files import read_matrix_rows, read_tum_poses
+from ggslam.sequences.pose_files import read_pose_rows
 
 SHIFTED = "1 0 0 {x} 0 1 0 2 0 0 1 3"
 
@@ -19,7 +19,8 @@ SHIFTED = "1 0 0 {x} 0 1 0 2 0 0 1 3"
 def test_a_row_that_is_no_pose_is_not_a_number(tmp_path: Path, wrong: str, reason: str) -> None:
     path = tmp_path / "poses.txt"
     path.write_text("\n".join([SHIFTED.format(x=5), wrong, SHIFTED.format(x=7) + " 0 0 0 1"]))
-    poses, problems = read_matrix_rows(path)
+    rows = read_pose_rows(path)
+    poses, problems = rows.poses, rows.problems
     assert np.isnan(poses[1]).all() and list(problems) == [1]
     assert "poses.txt, line 2" in problems[1] and reason in problems[1]
     assert poses[0, :3, 3].tolist() == [5, 2, 3] and poses[2, :3, 3].tolist() == [7, 2, 3]
@@ -29,7 +30,9 @@ def test_a_row_that_is_no_pose_is_not_a_number(tmp_path: Path, wrong: str, reaso
 def test_a_tum_line_without_a_rotation_is_named(tmp_path: Path) -> None:
     path = tmp_path / "trajectory.txt"
     path.write_text("# time tx ty tz qx qy qz qw\n0.5 1 2 3 0 0 0 1\n0.6 1 2 3 0 0 0 0\n")
-    times, poses, problems = read_tum_poses(path)
+    rows = read_pose_rows(path)
+    times, poses, problems = rows.stamps, rows.poses, rows.problems
+    assert times is not None
     assert times.tolist() == [0.5, 0.6] and list(problems) == [1] and "line 3" in problems[1]
     np.testing.assert_array_equal(poses[0], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
     assert np.isnan(poses[1]).all()

@@ -95,7 +95,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     if request.map is not None:
         earlier = RunFolder.open(request.map)
         config = replace(config, sh_degree=earlier.config().sh_degree)
-    sequence = request.sequence.open()
+    sequence = request.sequence.open(truth=request.evaluate)
     if request.sequence.masks is not None and not sequence.has_masks:
         raise SequenceError(f"{request.sequence.masks}: none of the masks there belongs to a frame of this run")
     out = request.out if request.out is not None else Path("runs") / sequence.name

@@ -10,28 +10,35 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.association import poses_at
 from ggslam.sequences.calibration import (
-    camera_entry,
+    camera_or_calibration,
     depth_camera_entry,
     distortion_entry,
     number_entry,
     read_calibration,
 )
+from ggslam.sequences.camera_files.finding import CAMERA_FILE, find_camera_file
+from ggslam.sequences.image_folders import ImagePairs, depth_images, pair_folders
 from ggslam.sequences.masks import find_masks
-from ggslam.sequences.pose_files import data_lines, read_matrix_rows, read_tum_poses
+from ggslam.sequences.pose_files import (
+    PoseRows,
+    data_lines,
+    read_pose_rows,
+    take_rows,
+    take_rows_by_number,
+    take_rows_by_time,
+)
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     NOMINAL_RATE,
     FrameFiles,
     ReadOptions,
     Recording,
-    image_files,
     image_numbers,
-    last_number,
     missing_depth_problems,
     nominal_timestamps,
 )
+from ggslam.sequences.stamps import UNITS, are_counted, unit_of_stamps
 
 GENERATOR_KEY = "generator"
 """Entry of camera.yaml that marks a recording as written by `ggslam.synthetic`."""
@@ -54,31 +61,30 @@ class FolderFormat:
         return (folder / "camera.yaml").is_file()
 
     def read(self, folder: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
-        path = folder / "camera.yaml"
+        path = folder / CAMERA_FILE
+        path = path if path.exists() or options.own_camera is not None else find_camera_file(folder) or path
         read = partial(read_calibration, path)
         settings = read() if path.exists() else options.recorded_camera(read) or {}
-        colors = image_files(folder / "rgb")
-        if not colors:
-            raise SequenceError(f"{folder / 'rgb'}: no images")
-        masks: list[Path | None] = [None] * len(colors)
+        pairs = pair_folders(folder, folder / "rgb", folder / "depth")
+        masks: list[Path | None] = [None] * len(pairs.colors)
         if (folder / "masks").is_dir():
-            masks = find_masks(folder / "masks", colors)
-        files = [FrameFiles(*pair) for pair in zip(colors, _depth_files(folder, colors), masks, strict=True)]
-        camera = options.recorded_camera(lambda: camera_entry(path, settings))
+            masks = find_masks(folder / "masks", pairs.colors)
+        files = [FrameFiles(*entry) for entry in zip(pairs.colors, pairs.depths, masks, strict=True)]
+        camera, calibration = options.recorded_camera(partial(camera_or_calibration, path, settings)) or (None, None)
         distortion, fisheye = options.recorded_camera(lambda: distortion_entry(path, settings)) or (None, False)
         depth_camera = None
         if "depth_camera" in settings:
             depth_camera = options.recorded_depth_camera(lambda: depth_camera_entry(path, settings["depth_camera"]))
-        timestamps, time_source = _timestamps(folder, colors, settings)
-        left_out = _without_color(folder, files)
+        timestamps, time_source = _timestamps(folder, pairs, path, settings)
         recording = Recording(
-            self.name, folder, files, timestamps,
-            options.recorded_scale(lambda: number_entry(path, settings, "depth_scale")), camera, distortion=distortion,
-            fisheye=fisheye, depth_camera=depth_camera, time_source=time_source, problems=missing_depth_problems(files),
-            instance_names=_instances(path, settings), warnings=left_out,
+            self.name, folder, files, timestamps, options.recorded_scale(lambda: _depth_scale(path, settings)), camera,
+            calibration, distortion=distortion, fisheye=fisheye, depth_camera=depth_camera, time_source=time_source,
+            depth_delays=pairs.delays, problems=missing_depth_problems(files), warnings=pairs.warnings,
+            instance_names=_instances(path, settings),
+            camera_source="" if path.name == CAMERA_FILE else path.name,
         )  # fmt: skip
         if (folder / "poses.txt").is_file():
-            _add_poses(recording, folder / "poses.txt")
+            options.add_truth(recording, lambda: _add_poses(recording, folder / "poses.txt"))
         return recording
 
     def lacks_camera_only(self, folder: Path) -> bool:
@@ -107,27 +113,16 @@ def _instances(path: Path, settings: dict[str, Any]) -> dict[int, str]:
         raise SequenceError(f"{path}: expected 'instances' to map ids to names, found '{instances}'") from None
 
 
-def _depth_files(folder: Path, colors: list[Path]) -> list[Path]:
-    """The depth image of each colour image: of the same name, else of the same number; a missing one gets a name."""
-    candidates = image_files(folder / "depth", (".png",))
-    if not candidates:
-        raise SequenceError(f"{folder / 'depth'}: no PNG images")
-    by_name = {path.stem: path for path in candidates}
-    by_number = {last_number(path.stem): path for path in candidates}
-    by_number.pop(None, None)
-    if any(color.stem in by_name for color in colors):
-        return [by_name.get(c.stem, folder / "depth" / f"{c.stem}.png") for c in colors]
-    found = [by_number.get(last_number(color.stem)) for color in colors]
-    if not any(found):
-        raise SequenceError(
-            f"{folder}: colour and depth images have neither names nor numbers in common ({colors[0].name}, "
-            f"{candidates[0].name})"
-        )
-    return [path or folder / "depth" / f"{color.stem}.png" for path, color in zip(found, colors, strict=True)]
+def _depth_scale(path: Path, settings: dict[str, Any]) -> float:
+    if not settings and not path.exists():
+        raise SequenceError(f"{path.parent}: holds no {path.name}, and nothing tells the units of its depth images per metre")
+    return number_entry(path, settings, "depth_scale")
 
 
-def _timestamps(folder: Path, colors: list[Path], settings: dict[str, Any]) -> tuple[np.ndarray, str]:
-    path = folder / "timestamps.txt"
+def _timestamps(
+    folder: Path, pairs: ImagePairs, camera_file: Path, settings: dict[str, Any]
+) -> tuple[np.ndarray, str]:
+    path, colors = folder / "timestamps.txt", pairs.colors
     if path.is_file():
         try:
             times = np.array([float(line.split()[0]) for _, line in data_lines(path)])
@@ -136,15 +131,12 @@ def _timestamps(folder: Path, colors: list[Path], settings: dict[str, Any]) -> t
         if len(times) != len(colors):
             raise SequenceError(f"{path}: expected {len(colors)} times, one an image, found {len(times)}")
         return times, path.name
-    try:
-        if all("." in color.stem for color in colors):
-            return np.array([float(color.stem) for color in colors]), "names of the images"
-    except ValueError:
-        pass
-    rate = number_entry(folder / "camera.yaml", settings, "frame_rate") if "frame_rate" in settings else NOMINAL_RATE
+    if pairs.times is not None:
+        return pairs.times, "names of the images"
+    rate = number_entry(camera_file, settings, "frame_rate") if "frame_rate" in settings else NOMINAL_RATE
     if rate <= 0:
-        raise SequenceError(f"{folder / 'camera.yaml'}: expected a positive 'frame_rate', found {rate:g}")
-    source = f"{rate:g} frames/s of camera.yaml" if "frame_rate" in settings else f"nominal {rate:g} frames/s"
+        raise SequenceError(f"{camera_file}: expected a positive 'frame_rate', found {rate:g}")
+    source = f"{rate:g} frames/s of {camera_file.name}" if "frame_rate" in settings else f"nominal {rate:g} frames/s"
     return _numbered_times(folder, colors) / rate, source
 
 
@@ -154,41 +146,43 @@ def _numbered_times(folder: Path, colors: list[Path]) -> np.ndarray:
     steps = np.ones(0) if numbers is None else np.diff(numbers)
     if numbers is None or not len(steps) or (steps == steps[0]).all():
         return nominal_timestamps(len(colors), 1.0)
-    depths = image_numbers(image_files(folder / "depth", (".png",)))
+    depths = image_numbers(depth_images(folder / "depth"))
     first = numbers[0] if depths is None else min(numbers[0], depths[0])
     return (numbers - first) / np.median(steps)
 
 
-def _without_color(folder: Path, files: list[FrameFiles]) -> list[str]:
-    """A warning if there are depth images whose colour image is missing."""
-    used = {entry.depth for entry in files}
-    unused = [path.name for path in image_files(folder / "depth", (".png",)) if path not in used]
-    if not unused:
-        return []
-    return [f"{folder / 'depth'}: {len(unused)} images have no colour image and are left out; the first: {unused[0]}"]
-
-
 def _add_poses(recording: Recording, path: Path) -> None:
-    """Poses in the order of the frames when there are as many; a TUM trajectory of another length is paired by time."""
-    lines = data_lines(path)
-    count = len(recording.files)
-    if lines and len(lines[0][1].replace(",", " ").split()) == 8:
-        times, poses, problems = read_tum_poses(path)
-        if len(poses) != count:
-            if recording.time_source.startswith("nominal"):
-                raise SequenceError(
-                    f"{path}: expected {count} poses, one a frame, found {len(poses)} (and the images "
-                    "tell no time to pair them by)"
-                )
-            if problems:
-                raise SequenceError(next(iter(problems.values())))
-            poses = poses_at(recording.timestamps, times, poses)
-        elif recording.time_source.startswith("nominal"):
-            recording.timestamps, recording.time_source = times, path.name
-        elif (np.diff(times) < 0).any():
-            recording.warnings.append(f"{path}: times do not increase; the poses are taken in the order of the lines")
+    """Poses of lines without times in the order of the frames; of lines with as many as there are frames, too; else
+    paired by time, or by the numbers of the images where the first number of a line counts frames."""
+    rows = read_pose_rows(path)
+    count, nominal = len(recording.files), recording.time_source.startswith("nominal")
+    if rows.ids is not None:
+        take_rows_by_number(recording, rows, rows.ids)
+    elif rows.stamps is None:
+        take_rows(recording, rows)
+    elif len(rows.poses) == count:
+        _take_in_order(recording, rows, rows.stamps)
+    elif are_counted(rows.stamps):
+        take_rows_by_number(recording, rows, rows.stamps)
+    elif nominal:
+        raise SequenceError(
+            f"{path}: expected {count} poses, one a frame, found {len(rows.poses)} (and the images tell no time to "
+            "pair them by)"
+        )
     else:
-        poses, problems = read_matrix_rows(path)
-        if len(poses) != count:
-            raise SequenceError(f"{path}: expected {count} poses, one a frame, found {len(poses)}")
-    recording.take_poses(poses, path.name, problems)
+        take_rows_by_time(recording, rows)
+
+
+def _take_in_order(recording: Recording, rows: PoseRows, stamps: np.ndarray) -> None:
+    """One pose a frame; where the images tell no time, the file's is theirs."""
+    if recording.time_source.startswith("nominal"):
+        if np.isfinite(stamps).all() and not are_counted(stamps):
+            unit = unit_of_stamps(stamps, None)
+            recording.timestamps, recording.time_source = stamps * UNITS[unit], rows.path.name
+            if unit != "s":
+                recording.time_source += f", read as {unit}"
+    elif (np.diff(stamps) < 0).any():
+        recording.warnings.append(
+            f"{rows.path}: times do not increase; the poses are taken in the order of the lines"
+        )
+    take_rows(recording, rows)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
-from ggslam.sequences.pose_files import data_lines, read_tum_poses
+from ggslam.sequences.pose_files import data_lines, read_pose_rows
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     FrameFiles,
@@ -46,11 +46,8 @@ class IclNuimFormat:
             problems=missing_depth_problems(files),
         )  # fmt: skip
         truth = sorted(folder.glob("*.gt.freiburg"))
-        if len(truth) > 1:
-            names = ", ".join(path.name for path in truth)
-            raise SequenceError(f"{folder}: expected one *.gt.freiburg, found {names}")
         if truth:
-            _add_poses(recording, truth[0], numbers)
+            options.add_truth(recording, lambda: _add_poses(recording, truth, numbers))
         return recording
 
 
@@ -73,16 +70,15 @@ def _frames(folder: Path) -> tuple[list[int], list[FrameFiles]]:
     return numbers, files
 
 
-def _add_poses(recording: Recording, path: Path, numbers: list[int]) -> None:
-    rows, poses, problems = read_tum_poses(path)
-    if problems:
-        raise SequenceError(next(iter(problems.values())))
-    by_number = dict(zip(rows.round().astype(int).tolist(), MIRROR @ poses @ MIRROR, strict=True))
+def _add_poses(recording: Recording, paths: list[Path], numbers: list[int]) -> None:
+    if len(paths) > 1:
+        names = ", ".join(path.name for path in paths)
+        raise SequenceError(f"{recording.path}: expected one *.gt.freiburg, found {names}")
+    rows = read_pose_rows(paths[0], (8,))
+    assert rows.stamps is not None
+    told = np.isfinite(rows.stamps)
+    mirrored = MIRROR @ rows.poses[told] @ MIRROR
+    by_number = dict(zip(rows.stamps[told].round().astype(int).tolist(), mirrored, strict=True))
     unknown = np.full((4, 4), np.nan)
-    recording.poses = np.array([by_number.get(number, unknown) for number in numbers])
-    recording.pose_source = f"{path.name} (y mirrored)"
-    without = int(np.isnan(recording.poses[:, 0, 0]).sum())
-    if without == len(numbers):
-        raise SequenceError(f"{path}: no row has the number of a frame in associations.txt")
-    if without:
-        recording.warnings.append(f"{without} of {len(numbers)} frames have no true pose in {path.name}")
+    poses = np.array([by_number.get(number, unknown) for number in numbers])
+    recording.take_poses(poses, f"{paths[0].name} (y mirrored)", rows.problems)

@@ -15,9 +15,9 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
-from ggslam.sequences.images import read_confidence
+from ggslam.sequences.images import read_color, read_confidence
 from ggslam.sequences.json_files import OPENCV_FROM_OPENGL, camera_of, number_of, read_object
-from ggslam.sequences.pose_files import invalid_pose_reason
+from ggslam.sequences.pose_files import poses_of_frames
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     FrameFiles,
@@ -74,16 +74,17 @@ class PolycamFormat:
             raise SequenceError(f"{root / 'depth'}: folder is missing; export the raw data of a LiDAR capture")
         paths = [root / f"{prefix}cameras" / f"{color.stem}.json" for color in colors]
         described = [_read_description(path, options) for path in paths]
-        cameras = options.recorded_camera(lambda: _cameras(paths, described)) or [None] * len(paths)
+        cameras = options.recorded_camera(lambda: _cameras(paths, described, colors[0])) or [None] * len(paths)
         files = [
             FrameFiles(color, root / "depth" / f"{color.stem}.png", None, _confidence(root, color), camera)
             for color, camera in zip(colors, cameras, strict=True)
         ]
         recording = Recording(
             self.name, folder, files, nominal_timestamps(len(files)), 1000.0, cameras[0],
-            problems=missing_depth_problems(files), pose_source=f"{prefix}cameras/*.json (ARKit axes)",
+            problems=missing_depth_problems(files),
         )  # fmt: skip
-        _add_poses(recording, paths, described)
+        source = f"{prefix}cameras/*.json (ARKit axes)"
+        options.add_truth(recording, lambda: _add_poses(recording, source, paths, described))
         return recording
 
 
@@ -92,11 +93,19 @@ def _read_description(path: Path, options: ReadOptions) -> dict[str, Any] | None
     return read_object(path) if path.is_file() else options.recorded_camera(lambda: read_object(path))
 
 
-def _cameras(paths: list[Path], described: list[dict[str, Any] | None]) -> list[Camera | None]:
-    return [
-        camera_of(path, *(number_of(path, values or {}, key) for key in ("width", "height", "fx", "fy", "cx", "cy")))
-        for path, values in zip(paths, described, strict=True)
-    ]
+def _cameras(paths: list[Path], described: list[dict[str, Any] | None], first: Path) -> list[Camera | None]:
+    """Of each frame. Files without width and height are of the size of the images, which `first` tells."""
+    size: dict[str, Any] = {}
+    if any(values is not None and "width" not in values and "height" not in values for values in described):
+        height, width = read_color(first).shape[:2]
+        size = {"width": width, "height": height}
+    cameras: list[Camera | None] = []
+    for path, values in zip(paths, described, strict=True):
+        told = values or {}
+        told = told if {"width", "height"} & told.keys() else {**size, **told}
+        numbers = (number_of(path, told, key) for key in ("width", "height", "fx", "fy", "cx", "cy"))
+        cameras.append(camera_of(path, *numbers))
+    return cameras
 
 
 def _confidence(root: Path, color: Path) -> PolycamConfidence | None:
@@ -104,18 +113,16 @@ def _confidence(root: Path, color: Path) -> PolycamConfidence | None:
     return PolycamConfidence(path) if path.is_file() else None
 
 
-def _add_poses(recording: Recording, paths: list[Path], described: list[dict[str, Any] | None]) -> None:
-    if not any(described):
-        return
-    poses = np.full((len(paths), 4, 4), np.nan)
-    for i, (path, values) in enumerate(zip(paths, described, strict=True)):
+def _add_poses(
+    recording: Recording, source: str, paths: list[Path], described: list[dict[str, Any] | None]
+) -> None:
+    def pose_of(i: int) -> np.ndarray | None:
+        values, T = described[i], np.eye(4)
         if values is None:
-            continue
-        T = np.eye(4)
-        T[:3] = [[number_of(path, values, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-        reason = invalid_pose_reason(T)
-        if reason is None:
-            poses[i] = T @ OPENCV_FROM_OPENGL
-        else:
-            recording.problems.setdefault(i, f"{path}: {reason}")
-    recording.poses = poses
+            return None
+        T[:3] = [[number_of(paths[i], values, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+        return T @ OPENCV_FROM_OPENGL
+
+    if any(described):
+        poses, problems = poses_of_frames(len(paths), pose_of, paths.__getitem__)
+        recording.take_poses(poses, source, problems)

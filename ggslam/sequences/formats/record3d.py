@@ -18,11 +18,10 @@ import numpy as np
 
 from ggslam.errors import MissingDependency, SequenceError
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.sequences.archive import Archive, ArchiveImage
 from ggslam.sequences.images import decode_color, find_damage
 from ggslam.sequences.json_files import OPENCV_FROM_OPENGL, camera_of, number_of, numbers_of, parse_object
-from ggslam.sequences.pose_files import invalid_pose_reason
+from ggslam.sequences.pose_files import pose_of_numbers, poses_of_frames
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     NOMINAL_RATE,
@@ -66,7 +65,7 @@ class Record3DFormat:
             for i, name in enumerate(colors)
             if name.removesuffix(".jpg") + ".depth" not in archive.names
         }
-        _add_poses(recording, place, metadata)
+        options.add_truth(recording, lambda: _add_poses(recording, place, metadata))
         return recording
 
 
@@ -170,18 +169,15 @@ def _times(place: str, metadata: dict[str, Any], count: int) -> tuple[np.ndarray
 
 
 def _add_poses(recording: Recording, place: str, metadata: dict[str, Any]) -> None:
-    if not isinstance(metadata.get("poses"), list) or not metadata["poses"]:
+    rows = metadata.get("poses")
+    if not isinstance(rows, list) or not rows:
         return
-    count = len(recording.files)
-    rows = numbers_of(place, metadata, "poses")
-    if rows.size != 7 * len(metadata["poses"]) or len(metadata["poses"]) < count:
-        raise SequenceError(f"{place}: expected {count} poses of 7 numbers, found {len(metadata['poses'])}")
-    poses = np.full((count, 4, 4), np.nan)
-    for i, row in enumerate(rows.reshape(-1, 7)[:count]):
-        if not np.isfinite(row).all() or np.linalg.norm(row[:4]) < 0.5:
-            continue
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = quaternion_to_matrix(row[[3, 0, 1, 2]]), row[4:]
-        if invalid_pose_reason(T) is None:
-            poses[i] = T @ OPENCV_FROM_OPENGL
-    recording.poses, recording.pose_source = poses, "metadata, poses (ARKit axes)"
+
+    def pose_of(i: int) -> np.ndarray | None:
+        if i >= len(rows):
+            return None
+        row = numbers_of(f"{place}, poses", {str(i): rows[i]}, str(i), 7)
+        return pose_of_numbers(np.concatenate([row[4:], row[:4]])) @ OPENCV_FROM_OPENGL
+
+    poses, problems = poses_of_frames(len(recording.files), pose_of, lambda i: f"{place}, pose {i}")
+    recording.take_poses(poses, "metadata, poses (ARKit axes)", problems)

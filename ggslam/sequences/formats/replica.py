@@ -44,7 +44,7 @@ class ReplicaFormat:
             self.name, folder, files, nominal_timestamps(len(files)), depth_scale, camera,
             instance_names=names, problems=missing_depth_problems(files),
         )  # fmt: skip
-        add_row_poses(recording, folder / "traj.txt")
+        options.add_truth(recording, lambda: add_row_poses(recording, folder / "traj.txt"))
         return recording
 
     def _files(self, folder: Path, color: Path) -> FrameFiles:

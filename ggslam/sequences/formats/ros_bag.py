@@ -17,11 +17,13 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import is_valid_pose
 from ggslam.sequences.association import pair_images, poses_at
+from ggslam.sequences.camera_files.lens_models import distortion_of
 from ggslam.sequences.formats.ros_images import color_image, depth_image, in_metres
 from ggslam.sequences.formats.ros_messages import Bag, BagImage
 from ggslam.sequences.formats.ros_topics import (
     REGISTERED,
     Topics,
+    check_holds_poses,
     find_topics,
     is_rectified,
     poses_of,
@@ -39,7 +41,6 @@ from ggslam.sequences.recording import (
     Recording,
 )
 
-FISHEYE = ("equidistant", "fisheye")
 STORAGES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 """Ends of the names of files that ROS 2 stores messages in."""
 BAG_START = b"#ROSBAG V2.0"
@@ -108,8 +109,10 @@ def _read(name: str, path: Path, bag: Bag, options: ReadOptions) -> Recording:
         distortion=lens.distortion, fisheye=lens.fisheye,
     )  # fmt: skip
     options.recorded_depth_camera(lambda: _place_depth(recording, bag, topics, options.own_camera))
-    if topics.pose is not None:
-        _add_poses(recording, bag, topics.pose)
+    pose = topics.pose
+    if pose is not None:
+        check_holds_poses(bag, pose)
+        options.add_truth(recording, lambda: _add_poses(recording, bag, pose))
     return recording
 
 
@@ -163,12 +166,7 @@ def _camera(place: str, info: Any, rectified: bool) -> Camera:
 
 
 def _distortion(place: str, info: Any) -> tuple[np.ndarray | None, bool]:
-    values, fisheye = np.asarray(_value(info, "d"), float).reshape(-1), info.distortion_model in FISHEYE
-    if not values.size or not np.any(values):
-        return None, False
-    if not np.isfinite(values).all() or len(values) not in ((4,) if fisheye else (4, 5, 8, 12, 14)):
-        raise SequenceError(f"{place}: {len(values)} distortion coefficients of '{info.distortion_model}' are unknown")
-    return values, fisheye
+    return distortion_of(place, str(info.distortion_model), np.asarray(_value(info, "d"), float).reshape(-1))
 
 
 def _place_depth(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera | None) -> None:
@@ -201,10 +199,4 @@ def _place_depth(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera 
 
 def _add_poses(recording: Recording, bag: Bag, topic: str) -> None:
     times, poses = poses_of(bag, topic)
-    recording.poses = poses_at(recording.timestamps, times, poses)
-    recording.pose_source = topic
-    without = int(np.isnan(recording.poses[:, 0, 0]).sum())
-    if without == len(recording.files):
-        raise SequenceError(f"{bag.path}, {topic}: no pose is near in time to any image")
-    if without:
-        recording.warnings.append(f"{without} of {len(recording.files)} frames have no pose near in time in {topic}")
+    recording.take_poses(poses_at(recording.timestamps, times, poses), topic)

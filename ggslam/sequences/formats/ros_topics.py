@@ -134,16 +134,33 @@ def poses_of(bag: Bag, topic: str) -> tuple[np.ndarray, np.ndarray]:
     """
     times, poses = [], []
     for message in bag.messages(topic):
-        held = message
-        while hasattr(held, "pose"):  # PoseStamped holds one, Odometry and PoseWithCovarianceStamped two
-            held = held.pose
-        held = getattr(held, "transform", held)
-        if not hasattr(message, "header") or not (hasattr(held, "orientation") or hasattr(held, "rotation")):
+        held = _held_pose(message)
+        if held is None:
             raise SequenceError(f"{bag.path}, {topic}: {bag.types[topic]} holds no pose")
         stamp = message.header.stamp
         times.append(float(stamp.sec + 1e-9 * stamp.nanosec))
         poses.append(pose_of(held))
     return np.array(times), np.array(poses).reshape(-1, 4, 4)
+
+
+def check_holds_poses(bag: Bag, topic: str) -> None:
+    """Raises SequenceError if a topic that a user names for poses is of another kind; an empty one passes."""
+    try:
+        message = bag.message(topic, 0)
+    except SequenceError:  # empty or damaged: then there are no poses
+        return
+    if _held_pose(message) is None:
+        raise SequenceError(f"{bag.path}, {topic}: {bag.types[topic]} holds no pose")
+
+
+def _held_pose(message: Any) -> Any | None:
+    """What holds position and turn in a PoseStamped, Odometry or TransformStamped; None in another message."""
+    held = message
+    while hasattr(held, "pose"):  # PoseStamped holds one, Odometry and PoseWithCovarianceStamped two
+        held = held.pose
+    held = getattr(held, "transform", held)
+    is_pose = hasattr(message, "header") and (hasattr(held, "orientation") or hasattr(held, "rotation"))
+    return held if is_pose else None
 
 
 def static_transform(bag: Bag, to_frame: str, from_frame: str) -> np.ndarray | None:

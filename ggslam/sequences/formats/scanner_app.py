@@ -19,7 +19,7 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.images import read_color
 from ggslam.sequences.json_files import OPENCV_FROM_OPENGL, camera_of, number_of, numbers_of, read_object
-from ggslam.sequences.pose_files import invalid_pose_reason
+from ggslam.sequences.pose_files import poses_of_frames
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     FrameFiles,
@@ -61,12 +61,12 @@ class ScannerAppFormat:
         times = [number_of(path, values, "time") for path, values in zip(paths, described, strict=True) if timed]
         recording = Recording(
             self.name, folder, frames, np.array(times) if timed else nominal_timestamps(len(frames)), 1000.0,
-            cameras[0], pose_source="frame_*.json, cameraPoseARFrame (ARKit axes)",
-            warnings=_warnings(files, len(whole)),
+            cameras[0], warnings=_warnings(files, len(whole)),
         )  # fmt: skip
         if timed:
             recording.time_source = "frame_*.json, time"
-        _add_poses(recording, paths, described)
+        source = "frame_*.json, cameraPoseARFrame (ARKit axes)"
+        options.add_truth(recording, lambda: _add_poses(recording, source, paths, described))
         return recording
 
 
@@ -107,13 +107,9 @@ def _cameras(color: Path, paths: list[Path], described: list[dict[str, Any]]) ->
     return cameras
 
 
-def _add_poses(recording: Recording, paths: list[Path], described: list[dict[str, Any]]) -> None:
-    poses, problems = np.full((len(paths), 4, 4), np.nan), {}
-    for i, (path, values) in enumerate(zip(paths, described, strict=True)):
-        T = numbers_of(path, values, "cameraPoseARFrame", 16).reshape(4, 4)
-        reason = invalid_pose_reason(T)
-        if reason is None:
-            poses[i] = T @ OPENCV_FROM_OPENGL
-        else:
-            problems[i] = f"{path}: {reason}"
-    recording.take_poses(poses, recording.pose_source, problems)
+def _add_poses(recording: Recording, source: str, paths: list[Path], described: list[dict[str, Any]]) -> None:
+    def pose_of(i: int) -> np.ndarray:
+        return numbers_of(paths[i], described[i], "cameraPoseARFrame", 16).reshape(4, 4) @ OPENCV_FROM_OPENGL
+
+    poses, problems = poses_of_frames(len(paths), pose_of, paths.__getitem__)
+    recording.take_poses(poses, source, problems)

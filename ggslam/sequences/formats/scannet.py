@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.masks import find_masks
-from ggslam.sequences.pose_files import invalid_pose_reason, read_intrinsics, read_matrix
+from ggslam.sequences.pose_files import poses_of_frames, read_intrinsics, read_matrix
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     Calibration,
@@ -48,7 +48,7 @@ class ScanNetFormat:
             self.name, folder, files, nominal_timestamps(len(files)), 1000.0, calibration=calibration,
             depth_calibration=depth_calibration, problems=missing_depth_problems(files), warnings=warnings,
         )  # fmt: skip
-        self._add_poses(recording, root / "pose", colors)
+        options.add_truth(recording, lambda: _add_poses(recording, root / "pose", colors))
         return recording
 
     def _masks(self, folder: Path, root: Path, colors: list[Path]) -> list[Path | None]:
@@ -65,20 +65,17 @@ class ScanNetFormat:
             return read_intrinsics(depth), []
         return None, [] if own else [f"{depth} is missing: the depth image is taken to be the same view as colour"]
 
-    def _add_poses(self, recording: Recording, folder: Path, colors: list[Path]) -> None:
-        paths = [folder / f"{color.stem}.txt" for color in colors]
-        poses = np.full((len(paths), 4, 4), np.nan)
-        for i, path in enumerate(paths):
-            if path.is_file():
-                T = read_matrix(path)
-                if invalid_pose_reason(T) is None:
-                    poses[i] = T
-        without = int(np.isnan(poses[:, 0, 0]).sum())
-        if without == len(paths):
-            return
-        recording.poses, recording.pose_source = poses, "pose/*.txt"
-        if without:
-            recording.warnings.append(f"{without} of {len(paths)} frames have no true pose (-inf or missing)")
+
+def _add_poses(recording: Recording, folder: Path, colors: list[Path]) -> None:
+    paths = [folder / f"{color.stem}.txt" for color in colors]
+
+    def pose_of(i: int) -> np.ndarray | None:
+        T = read_matrix(paths[i]) if paths[i].is_file() else None
+        return None if T is None or np.isinf(T).any() else T  # -inf: where tracking was lost
+
+    poses, problems = poses_of_frames(len(paths), pose_of, paths.__getitem__)
+    if problems or np.isfinite(poses).any():
+        recording.take_poses(poses, "pose/*.txt", problems)
 
 
 def _root(folder: Path) -> Path | None:

@@ -18,7 +18,7 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.formats.transforms_json import frames_of, read_transforms
 from ggslam.sequences.json_files import camera_of, number_of, numbers_of, read_object
-from ggslam.sequences.pose_files import invalid_pose_reason
+from ggslam.sequences.pose_files import poses_of_frames
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     FrameFiles,
@@ -92,9 +92,11 @@ class ScanNetPlusFormat:
         ]
         recording = Recording(
             self.name, folder, files, nominal_timestamps(len(files)), 1000.0, cameras[0],
-            problems=missing_depth_problems(files), pose_source=f"{path.name} (aligned_pose)",
+            problems=missing_depth_problems(files),
         )  # fmt: skip
-        _add_iphone_poses(recording, path, [(name, content[name]) for _, name in numbered])
+        entries = [(name, content[name]) for _, name in numbered]
+        _add_iphone_times(recording, path, entries)
+        options.add_truth(recording, lambda: _add_iphone_poses(recording, path, entries))
         return recording
 
 
@@ -119,20 +121,24 @@ def _iphone_cameras(path: Path, content: dict[str, Any], names: list[str]) -> li
     return cameras
 
 
-def _add_iphone_poses(recording: Recording, path: Path, frames: list[tuple[str, dict[str, Any]]]) -> None:
-    poses, times = np.full((len(frames), 4, 4), np.nan), []
-    for i, (name, frame) in enumerate(frames):
-        key = "aligned_pose" if "aligned_pose" in frame else "pose"
-        T = numbers_of(f"{path}, {name}", frame, key, 16).reshape(4, 4)
-        reason = invalid_pose_reason(T)
-        if reason is None:
-            poses[i] = T
-        else:
-            recording.problems.setdefault(i, f"{path}, {name}: {reason}")
-        times.append(number_of(f"{path}, {name}", frame, "timestamp") if "timestamp" in frame else np.nan)
-    recording.poses = poses
+def _add_iphone_times(recording: Recording, path: Path, frames: list[tuple[str, dict[str, Any]]]) -> None:
+    times = [
+        number_of(f"{path}, {name}", frame, "timestamp") if "timestamp" in frame else np.nan for name, frame in frames
+    ]
     if np.isfinite(times).all() and len(times) > 1 and (np.diff(times) > 0).all():
         recording.timestamps, recording.time_source = np.array(times), path.name
+
+
+def _add_iphone_poses(recording: Recording, path: Path, frames: list[tuple[str, dict[str, Any]]]) -> None:
+    def place_of(i: int) -> str:
+        return f"{path}, {frames[i][0]}"
+
+    def pose_of(i: int) -> np.ndarray:
+        key = "aligned_pose" if "aligned_pose" in frames[i][1] else "pose"
+        return numbers_of(place_of(i), frames[i][1], key, 16).reshape(4, 4)
+
+    poses, problems = poses_of_frames(len(frames), pose_of, place_of)
+    recording.take_poses(poses, f"{path.name} (aligned_pose)", problems)
 
 
 def _dslr(folder: Path) -> Path | None:

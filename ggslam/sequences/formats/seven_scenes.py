@@ -9,7 +9,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.calibration import depth_camera_entry, read_calibration
-from ggslam.sequences.pose_files import invalid_pose_reason, read_intrinsics, read_matrix
+from ggslam.sequences.pose_files import poses_of_frames, read_intrinsics, read_matrix
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     Calibration,
@@ -58,7 +58,7 @@ class SevenScenesFormat:
             self.name, folder, files, nominal_timestamps(len(files)), 1000.0, calibration=calibration,
             invalid_depth=65535, problems=missing_depth_problems(files), warnings=warnings, camera_source=source,
         )  # fmt: skip
-        self._add_poses(recording, bases)
+        options.add_truth(recording, lambda: _add_poses(recording, bases))
         return recording
 
     def _frames_folder(self, folder: Path) -> Path:
@@ -89,23 +89,14 @@ class SevenScenesFormat:
             return COLOR_CALIBRATION, "published, of colour"
         return DEPTH_CALIBRATION, "published, of depth"
 
-    def _add_poses(self, recording: Recording, bases: list[Path]) -> None:
-        poses = np.full((len(bases), 4, 4), np.nan)
-        found = False
-        for i, base in enumerate(bases):
-            path = Path(f"{base}.pose.txt")
-            if not path.is_file():
-                continue
-            found = True
-            T = read_matrix(path)
-            reason = invalid_pose_reason(T)
-            if reason is None:
-                poses[i] = T
-            else:
-                recording.problems.setdefault(i, f"{path}: {reason}")
-        if found:
-            recording.poses = poses
-            recording.pose_source = "frame-*.pose.txt"
+
+def _add_poses(recording: Recording, bases: list[Path]) -> None:
+    paths = [Path(f"{base}.pose.txt") for base in bases]
+    if any(path.is_file() for path in paths):
+        poses, problems = poses_of_frames(
+            len(paths), lambda i: read_matrix(paths[i]) if paths[i].is_file() else None, paths.__getitem__
+        )
+        recording.take_poses(poses, "frame-*.pose.txt", problems)
 
 
 def _is_of(place: Path, depth_camera: Path) -> bool:

@@ -82,10 +82,12 @@ class StrayFormat:
             for i, number in enumerate(numbers)
             if number - first >= video.count
         }
-        return Recording(
-            self.name, folder, files, table["timestamp"], 1000.0, cameras[0], poses=_poses(table),
-            pose_source="odometry.csv", time_source="odometry.csv", problems=problems, warnings=warnings,
+        recording = Recording(
+            self.name, folder, files, table["timestamp"], 1000.0, cameras[0], time_source="odometry.csv",
+            problems=problems, warnings=warnings,
         )  # fmt: skip
+        options.add_truth(recording, lambda: recording.take_poses(_poses(table), "odometry.csv"))
+        return recording
 
 
 def _first_row(table: dict[str, np.ndarray], depths: dict[str, Path], video: Video) -> tuple[int, list[str]]:

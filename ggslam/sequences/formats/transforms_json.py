@@ -19,7 +19,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.json_files import OPENCV_FROM_OPENGL, camera_of, number_of, numbers_of, read_object
-from ggslam.sequences.pose_files import invalid_pose_reason
+from ggslam.sequences.pose_files import poses_of_frames
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     FrameFiles,
@@ -101,11 +101,11 @@ def read_transforms(
         name, folder, files, np.array(times, float) if told else nominal_timestamps(len(files)),
         options.recorded_scale(lambda: _depth_scale(path, content, depths is None)), lens.common,
         distortion=lens.distortion, fisheye=lens.fisheye,
-        problems=missing_depth_problems(files), pose_source=f"{path.name} (OpenGL axes)",
+        problems=missing_depth_problems(files),
     )  # fmt: skip
     if told:
         recording.time_source = path.name
-    _add_poses(recording, path, frames)
+    options.add_truth(recording, lambda: _add_poses(recording, path, frames))
     return recording
 
 
@@ -181,13 +181,11 @@ def _depth_scale(path: Path, content: dict[str, Any], own: bool) -> float:
 
 
 def _add_poses(recording: Recording, path: Path, frames: list[dict[str, Any]]) -> None:
-    poses = np.full((len(frames), 4, 4), np.nan)
-    for i, frame in enumerate(frames):
-        T = numbers_of(f"{path}, frame {frame['file_path']}", frame, "transform_matrix", 16).reshape(4, 4)
-        T = T @ OPENCV_FROM_OPENGL
-        reason = invalid_pose_reason(T)
-        if reason is None:
-            poses[i] = T
-        else:
-            recording.problems.setdefault(i, f"{path}, frame {frame['file_path']}: {reason}")
-    recording.poses = poses
+    def place_of(i: int) -> str:
+        return f"{path}, frame {frames[i]['file_path']}"
+
+    def pose_of(i: int) -> np.ndarray:
+        return numbers_of(place_of(i), frames[i], "transform_matrix", 16).reshape(4, 4) @ OPENCV_FROM_OPENGL
+
+    poses, problems = poses_of_frames(len(frames), pose_of, place_of)
+    recording.take_poses(poses, f"{path.name} (OpenGL axes)", problems)

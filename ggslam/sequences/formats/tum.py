@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.association import TOLERANCE, pair_images, poses_at, span
-from ggslam.sequences.pose_files import data_lines, read_tum_poses
+from ggslam.sequences.association import pair_images
+from ggslam.sequences.pose_files import data_lines, read_pose_rows, take_rows_by_time
 from ggslam.sequences.recording import (
     NO_OPTIONS,
     Calibration,
@@ -55,7 +55,9 @@ class TumFormat:
             depth_delays=depth_times[[j for _, j in pairs]] - times, time_source="rgb.txt",
             problems=missing_depth_problems(files), warnings=warnings, camera_source=source,
         )  # fmt: skip
-        self._add_poses(recording)
+        truth = folder / "groundtruth.txt"
+        if truth.is_file():
+            options.add_truth(recording, lambda: take_rows_by_time(recording, read_pose_rows(truth, (8, 9))))
         return recording
 
     def _calibration(self, folder: Path, warnings: list[str]) -> tuple[Calibration, np.ndarray | None, str]:
@@ -77,24 +79,6 @@ class TumFormat:
             warnings.append(f"intrinsics are of {source}; `intrinsics` or `camera` tell others")
         calibration, distortion = CALIBRATIONS[number]
         return calibration, None if distortion is None else np.array(distortion), source
-
-    def _add_poses(self, recording: Recording) -> None:
-        path = recording.path / "groundtruth.txt"
-        if not path.is_file():
-            return
-        pose_times, poses, problems = read_tum_poses(path)
-        if problems:
-            raise SequenceError(next(iter(problems.values())))
-        recording.poses = poses_at(recording.timestamps, pose_times, poses)
-        recording.pose_source = path.name
-        without = int(np.isnan(recording.poses[:, 0, 0]).sum())
-        if without == len(recording.files):
-            raise SequenceError(
-                f"{path}: no pose within {TOLERANCE} s of any image; poses span {span(pose_times)}, images "
-                f"{span(recording.timestamps)}"
-            )
-        if without:
-            recording.warnings.append(f"{without} of {len(recording.files)} frames have no true pose near in time")
 
 
 def read_image_list(path: Path) -> tuple[np.ndarray, list[str]]:

@@ -48,7 +48,7 @@ class VmapFormat:
             self.name, folder, files, nominal_timestamps(len(files)), DEPTH_SCALE, CAMERA,
             problems=missing_depth_problems(files), warnings=warnings,
         )  # fmt: skip
-        add_row_poses(recording, root / "traj_w_c.txt")
+        options.add_truth(recording, lambda: add_row_poses(recording, root / "traj_w_c.txt"))
         return recording
 
 
