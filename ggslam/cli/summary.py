@@ -100,7 +100,8 @@ def _trajectory_line(t: TrajectoryScoresRecord | None) -> str:
     lengths = (t.ate_rmse_m, t.ate_mean_m, t.ate_raw_rmse_m, t.rpe_trans_m)
     ate, mean, raw, rpe = (f"{_text(length, 100, '.2f')} cm" for length in lengths)
     turn = _text(t.rpe_rot_deg, 1, ".3f")
-    return f"trajectory: ATE RMSE {ate}, mean {mean} (aligned), raw {raw}; RPE {rpe}, {turn} deg"
+    frames = "1 frame" if t.frames_compared == 1 else f"{t.frames_compared} frames"
+    return f"trajectory: ATE RMSE {ate}, mean {mean} (aligned), raw {raw}; RPE {rpe}, {turn} deg; over {frames}"
 
 
 def _surface_line(s: SurfaceScoresRecord) -> str:

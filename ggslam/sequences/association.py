@@ -79,8 +79,8 @@ def left_out(images: int, used: int, names: tuple[str, str]) -> list[str]:
     if count <= FEW * images:
         return []
     return [
-        f"{count} of {images} colour images ({names[0]}) are left out: no depth image ({names[1]}) is within "
-        f"{TOLERANCE:g} s that does not go with another one"
+        f"{count} of {images} colour images ({names[0]}) have no depth image of their own ({names[1]}) within "
+        f"{TOLERANCE:g} s and are left out"
     ]
 
 

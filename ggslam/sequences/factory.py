@@ -19,6 +19,7 @@ from ggslam.sequences.formats.record3d import Record3DFormat
 from ggslam.sequences.formats.replica import ReplicaFormat
 from ggslam.sequences.formats.ros_bag import Ros1Format, Ros2Format
 from ggslam.sequences.formats.ros_topics import ROLES
+from ggslam.sequences.formats.rtabmap import RtabmapFormat
 from ggslam.sequences.formats.scanner_app import ScannerAppFormat
 from ggslam.sequences.formats.scannet import ScanNetFormat
 from ggslam.sequences.formats.scannetpp import ScanNetPlusFormat
@@ -53,6 +54,7 @@ FORMATS: tuple[RecordingFormat, ...] = (
     PolycamFormat(),
     StrayFormat(),
     ScannerAppFormat(),
+    RtabmapFormat(),
     RealSenseFormat(),
     Ros1Format(),
     Ros2Format(),

@@ -151,7 +151,8 @@ def _try(sequence: Sequence, index: int, report: SequenceReport, masks: bool) ->
     try:
         return sequence.frame(index, masks=masks)
     except SequenceError as error:
-        report.damaged.append(str(error))
+        if str(error) not in report.damaged:  # a frame may be asked for twice
+            report.damaged.append(str(error))
         return None
 
 

@@ -87,6 +87,8 @@ class Sequence:
         skipped_frames: damaged frames skipped so far (only with on_bad_frame="skip").
     """
 
+    pose_problem: str = ""
+
     def __init__(
         self, recording: Recording, selection: range, *, scale: float | None = None,
         on_bad_frame: OnBadFrame = "error", reopen: Callable[[], Recording] | None = None,
@@ -115,7 +117,7 @@ class Sequence:
         self.depth_scale: float = recording.depth_scale
         self.instance_names: dict[int, str] = dict(recording.instance_names)
         self.pose_source: str = recording.pose_source
-        self.pose_problem: str = recording.pose_problem
+        self.pose_problem = recording.pose_problem
         self.time_source: str = recording.time_source
         self.camera_source: str = recording.camera_source
         self.warnings: list[str] = list(recording.warnings)
@@ -130,6 +132,8 @@ class Sequence:
         self._geometry = self._measure(scale)
         self.color_size: tuple[int, int] = self._geometry.color_size
         self.depth_size: tuple[int, int] = self._geometry.depth_size
+        if self.camera_source and recording.camera is not None:
+            self.camera_source += _scaling(recording.camera, self.color_size)
         self.camera: Camera = self._geometry.camera
         self.scale: float = self._geometry.scale
         if self.scale < 1 and min(self.camera.width, self.camera.height) < SMALLEST_SIDE:
@@ -375,6 +379,12 @@ class Sequence:
             return geometry
         reason = first_error or self._recording.problems[self._selection[0]]
         raise SequenceError(f"{self.path}: none of {len(self)} frames can be read; the first: {reason}")
+
+
+def _scaling(stated: Camera, size: tuple[int, int]) -> str:
+    """That intrinsics are brought to the size of the images, in words; "" where they are of that size."""
+    own = (stated.width, stated.height)
+    return "" if own == size else f", scaled from {own[0]}x{own[1]} to images of {size[0]}x{size[1]}"
 
 
 def _lens(recording: Recording) -> str:

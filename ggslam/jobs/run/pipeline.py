@@ -127,7 +127,7 @@ def resume(
     """
     folder = RunFolder.open_unfinished(run)
     with stop_on_request() as stop, folder_lock(folder.path):
-        found = Resumption.of(folder, recording)
+        found = Resumption.of(folder, recording, evaluate)
         asked = RunRequest(
             found.request, folder.path, evaluate=found.start.evaluate if evaluate is None else evaluate,
             localize_only=found.start.localize_only, checkpoint_every=checkpoint_every,

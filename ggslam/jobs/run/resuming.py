@@ -34,12 +34,13 @@ class Resumption:
     earlier: RunFolder | None
 
     @staticmethod
-    def of(folder: RunFolder, recording: Path | None) -> Resumption:
+    def of(folder: RunFolder, recording: Path | None, evaluate: bool | None = None) -> Resumption:
         """That of a run.
 
         Args:
             folder: of the run, see `RunFolder.open_unfinished`.
             recording: where its recording is now; None: where it was.
+            evaluate: whether it will be scored; None: as it was asked to.
 
         Raises:
             GgslamError: see `resume`.
@@ -55,7 +56,7 @@ class Resumption:
             raise RunFolderError(f"{where}: the settings are not those that the run was begun with")
         config = config_from_dict(start.config, str(where))
         request = request_in(start.open, recording)
-        sequence = request.open()
+        sequence = request.open(truth=start.evaluate if evaluate is None else evaluate)
         found, expected = identity_of(sequence), start.recording
         differing = [name for name in expected if found.get(name) != expected[name]]
         if differing:

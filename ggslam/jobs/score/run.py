@@ -109,6 +109,7 @@ def _score(
     if metrics.trajectory is None:
         known = sequence.ground_truth is not None
         reason = "fewer than 3 frames have both poses" if known else "the recording has no ground-truth poses"
+        reason = f"no true poses: {sequence.pose_problem}" if sequence.pose_problem else reason
         notes.append(f"{reason}; no trajectory scores")
     if edits := folder.mark().edits:
         notes.append(f"the map was edited ({'; '.join(edits)}); the recording was not, so edits count as errors")

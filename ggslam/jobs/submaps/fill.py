@@ -198,13 +198,17 @@ def _open(
         return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights()
     frames = one_camera(wanted.open(), "a store of cells")
     sights = FrameSights(frames.camera, NativeContext())
-    return frames.stream(masks=False), _poses(request, frames.timestamps, frames.ground_truth), sights
+    return frames.stream(masks=False), _poses(request, frames.timestamps, frames.ground_truth, frames.pose_problem), sights
 
 
-def _poses(request: SubmapsRequest, timestamps: np.ndarray, own: np.ndarray | None) -> np.ndarray:
+def _poses(
+    request: SubmapsRequest, timestamps: np.ndarray, own: np.ndarray | None, problem: str = ""
+) -> np.ndarray:
+    """Of the items, [n, 4, 4]; `problem`: why the recording's own cannot be used."""
     if request.poses is None:
         if own is None or not np.isfinite(own).all((1, 2)).any():
-            raise SequenceError(f"{request.source}: no poses; `ggslam localize` finds them, `poses` names their file")
+            why = f" ({problem})" if problem else ""
+            raise SequenceError(f"{request.source}: no poses{why}; `ggslam localize` finds them, `poses` names their file")
         return own
     found = read_trajectory(request.poses)
     poses = np.full((len(timestamps), 4, 4), np.nan)

@@ -96,7 +96,8 @@ def _of_matrix(place: object, settings: Entries, name: str) -> Entries:
     if coefficients is not None:
         numbers = matrix_numbers(f"{place}, {coefficients}", settings[coefficients])
         found["distortion"] = numbers.tolist()
-    return found | {key: settings[key] for key in ("depth_scale", "T_color_depth", "color") if key in settings}
+    kept = ("depth_scale", "T_color_depth", "color", "local_transform")
+    return found | {key: settings[key] for key in kept if key in settings}
 
 
 def _refuse_part(place: object, settings: Entries) -> None:

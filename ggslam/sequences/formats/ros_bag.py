@@ -8,6 +8,7 @@ their frame comes. Depth of a camera beside the colour camera is registered by /
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import is_valid_pose
 from ggslam.sequences.association import pair_images, poses_at
 from ggslam.sequences.camera_files.lens_models import distortion_of
-from ggslam.sequences.formats.ros_images import color_image, depth_image, in_metres
+from ggslam.sequences.formats.ros_images import color_image, depth_in_unit, in_metres
 from ggslam.sequences.formats.ros_messages import Bag, BagImage
 from ggslam.sequences.formats.ros_topics import (
     REGISTERED,
@@ -90,21 +91,22 @@ def _whole_bag(path: Path) -> Path:
 
 def _read(name: str, path: Path, bag: Bag, options: ReadOptions) -> Recording:
     topics = find_topics(bag, options.topics)
-    color_times, depth_times = bag.stamps(topics.color), bag.stamps(topics.depth)
+    color_times, depth_times, time_source = _times(bag, topics)
     pairs, warnings = pair_images(path, color_times, depth_times, (topics.color, topics.depth))
+    metres = in_metres(bag.message(topics.depth, 0))
+    read_depth = partial(depth_in_unit, metres=metres)
     pairs.sort(key=lambda pair: color_times[pair[0]])
     files = [
         FrameFiles(
             BagImage(bag, topics.color, i, float(color_times[i]), color_image),
-            BagImage(bag, topics.depth, j, float(depth_times[j]), depth_image),
+            BagImage(bag, topics.depth, j, float(depth_times[j]), read_depth),
         )
         for i, j in pairs
     ]
     lens = options.recorded_camera(lambda: _color_lens(bag, topics)) or _Lens(None)
     recording = Recording(
         name, path, files, color_times[[i for i, _ in pairs]],
-        1.0 if in_metres(bag.message(topics.depth, 0)) else 1000.0, lens.camera,
-        time_source=f"headers of {topics.color}", warnings=warnings,
+        1.0 if metres else 1000.0, lens.camera, time_source=time_source, warnings=warnings,
         depth_delays=np.array([depth_times[j] - color_times[i] for i, j in pairs]),
         distortion=lens.distortion, fisheye=lens.fisheye,
     )  # fmt: skip
@@ -114,6 +116,32 @@ def _read(name: str, path: Path, bag: Bag, options: ReadOptions) -> Recording:
         check_holds_poses(bag, pose)
         options.add_truth(recording, lambda: _add_poses(recording, bag, pose))
     return recording
+
+
+def _times(bag: Bag, topics: Topics) -> tuple[np.ndarray, np.ndarray, str]:
+    """Times of colour and depth, float64 [n], [m], seconds, and where they come from: the headers, or where a driver
+    left those zero, when the messages were recorded."""
+    color, depth = bag.stamps(topics.color), bag.stamps(topics.depth)
+    for topic, times in ((topics.color, color), (topics.depth, depth)):
+        if not len(times):
+            raise SequenceError(f"{bag.path}: topic {topic} holds no messages")
+    if color.any() and depth.any():
+        return color, depth, f"headers of {topics.color}"
+    return bag.logged(topics.color), bag.logged(topics.depth), "when messages were recorded: their headers tell no time"
+
+
+def _first_info(bag: Bag, topic: str) -> Any:
+    """The first camera_info of a topic that is one: drivers send zeros before they have read their calibration. Where
+    all are zeros, the first."""
+    first = info = bag.message(topic, 0)
+    number = 0
+    while not (np.asarray(_value(info, "k"), float).reshape(-1)[0] > 0 and info.width > 0):
+        number += 1
+        try:
+            info = bag.message(topic, number)
+        except SequenceError:
+            return first
+    return info
 
 
 def _value(info: Any, name: str) -> Any:
@@ -133,7 +161,7 @@ class _Lens:
 def _color_lens(bag: Bag, topics: Topics) -> _Lens:
     if topics.color_info is None:
         raise SequenceError(f"{bag.path}: no camera_info belongs to {topics.color}; `topics` color_info=TOPIC names it")
-    info, rectified = bag.message(topics.color_info, 0), is_rectified(topics.color)
+    info, rectified = _first_info(bag, topics.color_info), is_rectified(topics.color)
     place = f"{bag.path}, {topics.color_info}"
     camera = _camera(place, info, rectified)
     return _Lens(camera) if rectified else _Lens(camera, *_distortion(place, info))
@@ -177,7 +205,7 @@ def _place_depth(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera 
     if camera is None:
         return
     place = f"{bag.path}, {topics.depth_info}"
-    info = bag.message(topics.depth_info, 0)
+    info = _first_info(bag, topics.depth_info)
     depth_camera = _camera(place, info, is_rectified(topics.depth))
     depth_frame = bag.message(topics.depth, 0).header.frame_id
     color_frame = bag.message(topics.color, 0).header.frame_id

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.images import decode, decode_color, find_damage
+from ggslam.sequences.images import PNG_SIGNATURE, decode, decode_color, find_damage
 
 COLOR: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None), "8uc3": (3, cv2.COLOR_BGR2RGB), "bgr8": (3, cv2.COLOR_BGR2RGB),
@@ -36,14 +36,31 @@ def is_depth(message: Any) -> bool | None:
     encoding = pixel_encoding(message).lower()
     if hasattr(message, "encoding"):
         return True if encoding in DEPTH else False if encoding in COLOR else None
+    if _is_grey_16_bit_png(bytes(message.data[:32])):  # whatever its format says, as plain "png"
+        return True
     if not any(depth in encoding for depth in (*DEPTH, "compresseddepth")):
         return False
     return True if any(way in encoding for way in ("compresseddepth", "png")) else None  # JPEG has 8 bits
 
 
+def _is_grey_16_bit_png(start: bytes) -> bool:
+    """By the header: bit depth and colour type stand behind width and height."""
+    return start.startswith(PNG_SIGNATURE) and start[24:26] == bytes([16, 0])
+
+
 def in_metres(message: Any) -> bool:
     """Whether a depth message holds metres (else millimetres)."""
-    return "32fc1" in pixel_encoding(message).lower()
+    encoding = pixel_encoding(message).lower()
+    return "32fc1" in encoding and (hasattr(message, "encoding") or "compresseddepth" in encoding)
+
+
+def depth_in_unit(place: str, message: Any, metres: bool) -> np.ndarray:
+    """Depth of an image message in metres or millimetres, whichever it holds: some bags change the encoding midway.
+    float32 or uint16 [H, W]; errors as `depth_image`."""
+    depth = depth_image(place, message)
+    if (depth.dtype.kind == "f") == metres:
+        return depth
+    return depth.astype(np.float32) * np.float32(1e-3 if metres else 1e3)
 
 
 def color_image(place: str, message: Any) -> np.ndarray:
@@ -90,10 +107,14 @@ def _rows(place: str, message: Any, dtype: np.dtype, channels: int) -> np.ndarra
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(bytes(message.data), np.uint8)
     used = width * channels * dtype.itemsize
-    if height < 1 or width < 1 or step < used or data.size < height * step:
+    what = f"{width}x{height} pixels of {message.encoding}"
+    if height < 1 or width < 1:
+        raise SequenceError(f"{place}: an image of {what} is none")
+    if step < used:
+        raise SequenceError(f"{place}: {what} need rows of {used} bytes, found rows of {step} (step)")
+    if data.size < height * step:
         raise SequenceError(
-            f"{place}: expected {width}x{height} pixels of {message.encoding} in rows of {step} bytes, found "
-            f"{data.size} bytes"
+            f"{place}: {what} in rows of {step} bytes (step) need {height * step} bytes, found {data.size} (truncated?)"
         )
     rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :used])
     return rows.view(dtype).reshape(height, width, channels)

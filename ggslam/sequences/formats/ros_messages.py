@@ -14,6 +14,7 @@ import numpy as np
 
 from ggslam.errors import GgslamError, MissingDependency, SequenceError
 
+NO_MESSAGE = "there is none"
 ZSTD_START = b"\x28\xb5\x2f\xfd"
 """First bytes of what zstd compressed."""
 
@@ -72,6 +73,16 @@ class Bag:
         self._logged[topic] = logged
         return np.array(stamps)
 
+    def logged(self, topic: str) -> np.ndarray:
+        """Times at which a topic's messages were recorded, float64 [n], seconds, in the order of the bag.
+
+        Raises:
+            SequenceError: the bag is damaged.
+        """
+        if topic not in self._logged:
+            self.stamps(topic)
+        return np.array(self._logged[topic], np.int64) * 1e-9
+
     def message(self, topic: str, number: int) -> Any:
         """Message `number` of a topic, in the order of the bag. Reading them in order is quick.
 
@@ -88,7 +99,7 @@ class Bag:
                 if at > number:
                     self._cursors[topic] = (at, cursor)
                     return self._reader.deserialize(raw, self._type(topic))
-        raise SequenceError(f"{place}: there is none")
+        raise SequenceError(f"{place}: {NO_MESSAGE}")
 
     def messages(self, topic: str) -> list[Any]:
         """All messages of a topic of small ones. Raises SequenceError if the bag is damaged."""

@@ -12,7 +12,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.poses import inverse, quaternion_to_matrix
 from ggslam.sequences.formats.ros_images import COLOR, DEPTH, is_depth, pixel_encoding
-from ggslam.sequences.formats.ros_messages import Bag
+from ggslam.sequences.formats.ros_messages import NO_MESSAGE, Bag
 
 ROLES = ("color", "depth", "color_info", "depth_info", "pose")
 """What a topic can be given for by name; the poses are of the colour camera (optical axes), to the world."""
@@ -64,8 +64,8 @@ def _kind(bag: Bag, topic: str) -> tuple[bool | None, str]:
     """Whether images are depth (None: neither depth nor colour that is known), and what is in the topic, in words."""
     try:
         message = bag.message(topic, 0)
-    except SequenceError:
-        return None, "empty or damaged"  # none to choose
+    except SequenceError as error:  # none to choose
+        return None, "no messages" if str(error).endswith(NO_MESSAGE) else "damaged"
     holds_depth = is_depth(message)
     return holds_depth, f"encoding '{pixel_encoding(message)}'{UNKNOWN if holds_depth is None else ''}"
 
@@ -92,6 +92,8 @@ def _best(bag: Bag, role: str, scores: dict[str, float], kinds: dict[str, str]) 
     """The topic that suits a role best; `kinds` tells for messages what is in each topic of images."""
     if not scores:
         held = ", ".join(f"{topic} ({kinds.get(topic, name)})" for topic, name in sorted(bag.types.items()))
+        if not held:
+            raise SequenceError(f"{bag.path}: is a bag without any topic: nothing was recorded")
         known = ", ".join(COLOR if role == "color" else DEPTH)
         read = f"; {role} is read as {known}, JPEG or PNG" if UNKNOWN in held else ""
         raise SequenceError(f"{bag.path}: no topic of {role} images; it holds {held}{read}")
@@ -133,6 +135,7 @@ def poses_of(bag: Bag, topic: str) -> tuple[np.ndarray, np.ndarray]:
         SequenceError: the topic holds messages of another type.
     """
     times, poses = [], []
+    logged = bag.logged(topic)
     for message in bag.messages(topic):
         held = _held_pose(message)
         if held is None:
@@ -140,7 +143,8 @@ def poses_of(bag: Bag, topic: str) -> tuple[np.ndarray, np.ndarray]:
         stamp = message.header.stamp
         times.append(float(stamp.sec + 1e-9 * stamp.nanosec))
         poses.append(pose_of(held))
-    return np.array(times), np.array(poses).reshape(-1, 4, 4)
+    found = np.array(times) if any(times) else logged  # without stamps: when they were recorded
+    return found, np.array(poses).reshape(-1, 4, 4)
 
 
 def check_holds_poses(bag: Bag, topic: str) -> None:

@@ -10,6 +10,13 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.association import pair_images
+from ggslam.sequences.calibration import (
+    camera_or_calibration,
+    distortion_entry,
+    number_entry,
+    read_calibration,
+)
+from ggslam.sequences.camera_files.finding import find_camera_file
 from ggslam.sequences.pose_files import data_lines, read_pose_rows, take_rows_by_time
 from ggslam.sequences.recording import (
     NO_OPTIONS,
@@ -47,23 +54,40 @@ class TumFormat:
         pairs, warnings = pair_images(folder, color_times, depth_times, ("rgb.txt", "depth.txt"))
         files = [FrameFiles(folder / color_files[i], folder / depth_files[j]) for i, j in pairs]
         times = color_times[[i for i, _ in pairs]]
-        calibration, distortion, source = DEFAULT_CALIBRATION, None, ""
-        if options.own_camera is None:
-            calibration, distortion, source = self._calibration(folder, warnings)
         recording = Recording(
-            self.name, folder, files, times, DEPTH_SCALE, calibration=calibration, distortion=distortion,
+            self.name, folder, files, times, DEPTH_SCALE, calibration=DEFAULT_CALIBRATION,
             depth_delays=depth_times[[j for _, j in pairs]] - times, time_source="rgb.txt",
-            problems=missing_depth_problems(files), warnings=warnings, camera_source=source,
+            problems=missing_depth_problems(files), warnings=warnings,
         )  # fmt: skip
+        if options.own_camera is None:
+            self._add_camera(recording, options)
         truth = folder / "groundtruth.txt"
         if truth.is_file():
             options.add_truth(recording, lambda: take_rows_by_time(recording, read_pose_rows(truth, (8, 9))))
         return recording
 
+    def _add_camera(self, recording: Recording, options: ReadOptions) -> None:
+        """The published camera that the folder's name tells; without such a name that of a file in the folder, else the
+        benchmark's default."""
+        folder = recording.path
+        named = any(CAMERA_IN_NAME.search(name) for name in _names(folder))
+        file = None if named else options.recorded_camera(lambda: find_camera_file(folder))
+        if file is None:
+            recording.calibration, recording.distortion, recording.camera_source = self._calibration(
+                folder, recording.warnings
+            )
+            return
+        settings = read_calibration(file)
+        recording.camera, recording.calibration = camera_or_calibration(file, settings)
+        recording.distortion, recording.fisheye = distortion_entry(file, settings)
+        recording.camera_source = file.name
+        if "depth_scale" in settings:
+            recording.depth_scale = options.recorded_scale(lambda: number_entry(file, settings, "depth_scale"))
+
     def _calibration(self, folder: Path, warnings: list[str]) -> tuple[Calibration, np.ndarray | None, str]:
         """Published calibration of the camera that the folder's name tells, and by which name. A link's own name comes
         before that of the folder it leads to."""
-        given, true = folder.absolute().name, folder.resolve().name
+        given, true = _names(folder)
         named = [(name, found[1]) for name in dict.fromkeys((given, true)) if (found := CAMERA_IN_NAME.search(name))]
         if not named:
             names = f"'{true}'" if given == true else f"'{given}', a link to '{true}',"
@@ -79,6 +103,11 @@ class TumFormat:
             warnings.append(f"intrinsics are of {source}; `intrinsics` or `camera` tell others")
         calibration, distortion = CALIBRATIONS[number]
         return calibration, None if distortion is None else np.array(distortion), source
+
+
+def _names(folder: Path) -> tuple[str, str]:
+    """The folder's name as given, and where a link leads."""
+    return folder.absolute().name, folder.resolve().name
 
 
 def read_image_list(path: Path) -> tuple[np.ndarray, list[str]]:
