@@ -206,6 +206,31 @@ def make_scanner_app(folder: Path) -> Path:
     return folder
 
 
+def make_rtabmap(folder: Path, prefix: str = "", T_robot_camera: np.ndarray | None = None) -> Path:
+    """Node ids are 2, 3, 5, 6, 8; poses bear ids, in another order; with a `T_robot_camera` they are the robot's."""
+    lines = ["#timestamp x y z qx qy qz qw id"]
+    for i, node in enumerate((2, 3, 5, 6, 8)):
+        write_color(folder / f"{prefix}rgb" / f"{node}.png", i)
+        write_depth(folder / f"{prefix}depth" / f"{node}.png", i, 1000)
+        file = folder / f"{prefix}calib" / f"{node}.yaml"
+        file.parent.mkdir(exist_ok=True)
+        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+        storage.write("camera_name", str(node))
+        storage.write("image_width", WIDTH)
+        storage.write("image_height", HEIGHT)
+        storage.write("camera_matrix", np.array([[30.0, 0, 15], [0, 31, 11], [0, 0, 1]]))
+        storage.write("distortion_model", "plumb_bob")
+        storage.write("distortion_coefficients", np.zeros((1, 5)))
+        if T_robot_camera is not None:
+            storage.write("local_transform", np.ascontiguousarray(T_robot_camera[:3]))
+        storage.release()
+        T = pose(i) if T_robot_camera is None else pose(i) @ np.linalg.inv(T_robot_camera)
+        numbers = (1000 + node / 30, *T[:3, 3], *quaternion_xyzw(T))
+        lines.insert(1, " ".join(f"{x:.9f}" for x in numbers) + f" {node}")
+    (folder / f"{prefix}poses.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
 class BagMessages:
     """Messages in the layout of realsense-ros; colour and depth compressed or raw, depth in millimetres or metres."""
 
@@ -315,6 +340,7 @@ MORE_MAKERS: dict[str, Callable[[Path], Path]] = {
     "vmap": make_vmap, "icl-nuim": make_icl_nuim, "nerfstudio": make_nerfstudio, "nerfcapture": make_nerfcapture,
     "scannet++": make_scannetpp_dslr, "scannet++ iphone": make_scannetpp_iphone, "record3d": make_record3d,
     "polycam": make_polycam, "strayscanner": make_stray, "3dscannerapp": make_scanner_app,
+    "rtabmap": make_rtabmap,
     "ros1": lambda folder: write_bag(folder / "walk.bag", False),
     "ros2": lambda folder: write_bag(folder / "walk", True),
 }  # fmt: skip

@@ -69,6 +69,9 @@ LACKS: dict[str, list[Callable[[Path], object]]] = {
         lambda f: (f / "keyframes" / "cameras" / "1004.json").unlink(),
     ],
     "strayscanner": [lambda f: (f / "camera_matrix.csv").unlink()],
+    "rtabmap": [
+        lambda f: change(f / "calib" / "5.yaml", "camera_matrix", "matrix"), lambda f: (f / "calib" / "3.yaml").unlink(),
+    ],
     "3dscannerapp": [lambda f: [without(path, "intrinsics") for path in f.glob("frame_*.json")]],
 }
 """Of each format that looks for intrinsics somewhere: ways to lack them. The others know them by heart."""

@@ -61,9 +61,8 @@ class RtabmapFormat:
             raise SequenceError(f"{folder}: expected one export with {self.layout}, found {found}")
         rgb, depth, calib = (folder / f"{prefixes[0]}{part}" for part in PARTS)
         pairs = pair_folders(folder, rgb, depth)
-        described = [_calibration(calib, color) for color in pairs.colors]
-        lens = options.recorded_camera(lambda: _lens(described))
-        cameras, (distortion, fisheye) = lens or ([None] * len(described), (None, False))
+        lens = options.recorded_camera(lambda: _lens([_calibration(calib, color) for color in pairs.colors]))
+        cameras, (distortion, fisheye) = lens or ([None] * len(pairs.colors), (None, False))
         changing = len(set(cameras)) > 1
         files = [
             FrameFiles(color, depth, camera=camera if changing else None)
@@ -77,7 +76,7 @@ class RtabmapFormat:
         )  # fmt: skip
         poses = next((p for name in POSES if (p := folder / f"{prefixes[0]}{name}").is_file()), None)
         if poses is not None:
-            options.add_truth(recording, lambda: _add_poses(recording, poses, described[0][1]))
+            options.add_truth(recording, lambda: _add_poses(recording, poses, calib, pairs.colors[0]))
         return recording
 
 
@@ -122,10 +121,11 @@ def _lens(
     return cameras, lenses[0]
 
 
-def _add_poses(recording: Recording, path: Path, settings: dict[str, Any]) -> None:
+def _add_poses(recording: Recording, path: Path, calib: Path, first: Path) -> None:
     rows = read_pose_rows(path)
-    if not path.name.endswith("camera_poses.txt") and "local_transform" in settings:
-        rows = _of_camera(rows, settings["local_transform"])
+    if not path.name.endswith("camera_poses.txt"):
+        settings = _calibration(calib, first)[1]
+        rows = _of_camera(rows, settings["local_transform"]) if "local_transform" in settings else rows
     if rows.ids is not None and recording.time_source != "names of the images":
         _take_times(recording, rows)
         take_rows_by_number(recording, rows, rows.ids)
