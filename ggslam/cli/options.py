@@ -56,12 +56,12 @@ Host = Annotated[str, typer.Option(help="Address to serve the page at; 0.0.0.0 l
 Port = Annotated[int, typer.Option(help="Port to serve the page at; 0 takes any free one.", min=0, max=65535)]
 DepthCamera = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="YAML file with the calibration of a separate depth camera."),
+    typer.Option(metavar="FILE", help="File with the calibration of a separate depth camera, T_color_depth included."),
 ]
 OwnCamera = Annotated[
     Path | None,
-    typer.Option("--camera", metavar="FILE", help="YAML file with the calibration of the colour camera, instead of the "
-                 "recording's own: width, height, fx, fy, cx, cy[, distortion, depth_scale]."),
+    typer.Option("--camera", metavar="FILE", help="File with the calibration of the colour camera, instead of the recording's "
+                 "own: a camera.yaml, or of OpenCV, ORB-SLAM, ROS, Kalibr, Open3D, COLMAP, or K.txt."),
 ]  # fmt: skip
 Intrinsics = Annotated[
     str | None,

@@ -13,6 +13,8 @@ from ggslam.sequences.association import pair_images
 from ggslam.sequences.recording import image_files, last_number
 from ggslam.sequences.stamps import times_of_names
 
+OF_NAMES = "names of the images"
+"""Where times come from, for reports."""
 DEPTH_SUFFIXES = (".png", ".npy")
 
 
@@ -50,7 +52,7 @@ def pair_folders(place: Path, color_folder: Path, depth_folder: Path) -> ImagePa
     if not colors:
         raise SequenceError(f"{color_folder}: no images")
     if not depths:
-        raise SequenceError(f"{depth_folder}: no PNG or .npy images{_held(depth_folder)}")
+        raise SequenceError(f"{depth_folder}: no PNG or .npy images{_other_file(depth_folder)}")
     times, depth_times = times_of_names(colors), times_of_names(depths)
     by_name = {path.stem: path for path in depths}
     if times is not None and depth_times is not None and not all(color.stem in by_name for color in colors):
@@ -93,6 +95,6 @@ def _without_color(folder: Path, depths: list[Path], used: list[Path]) -> list[s
     return [f"{folder}: {len(unused)} {are} no colour image and {left} left out; the first: {unused[0]}"]
 
 
-def _held(folder: Path) -> str:
+def _other_file(folder: Path) -> str:
     other = next((path.name for path in sorted(folder.iterdir()) if path.is_file()), None) if folder.is_dir() else None
     return "" if other is None else f", found {other}"

@@ -133,7 +133,7 @@ class Sequence:
         self.color_size: tuple[int, int] = self._geometry.color_size
         self.depth_size: tuple[int, int] = self._geometry.depth_size
         if self.camera_source and recording.camera is not None:
-            self.camera_source += _scaling(recording.camera, self.color_size)
+            self.camera_source += _scale_note(recording.camera, self.color_size)
         self.camera: Camera = self._geometry.camera
         self.scale: float = self._geometry.scale
         if self.scale < 1 and min(self.camera.width, self.camera.height) < SMALLEST_SIDE:
@@ -381,7 +381,7 @@ class Sequence:
         raise SequenceError(f"{self.path}: none of {len(self)} frames can be read; the first: {reason}")
 
 
-def _scaling(stated: Camera, size: tuple[int, int]) -> str:
+def _scale_note(stated: Camera, size: tuple[int, int]) -> str:
     """That intrinsics are brought to the size of the images, in words; "" where they are of that size."""
     own = (stated.width, stated.height)
     return "" if own == size else f", scaled from {own[0]}x{own[1]} to images of {size[0]}x{size[1]}"

@@ -70,7 +70,8 @@ LACKS: dict[str, list[Callable[[Path], object]]] = {
     ],
     "strayscanner": [lambda f: (f / "camera_matrix.csv").unlink()],
     "rtabmap": [
-        lambda f: change(f / "calib" / "5.yaml", "camera_matrix", "matrix"), lambda f: (f / "calib" / "3.yaml").unlink(),
+        lambda f: change(f / "calib" / "5.yaml", "camera_matrix", "matrix"),
+        lambda f: (f / "calib" / "3.yaml").unlink(),
     ],
     "3dscannerapp": [lambda f: [without(path, "intrinsics") for path in f.glob("frame_*.json")]],
 }

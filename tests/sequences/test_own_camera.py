@@ -75,7 +75,7 @@ def test_intrinsics_need_no_file_of_the_recording(make: Callable[[str], Path]) -
     (folder / "camera.yaml").unlink()
     sequence = open_sequence(folder, format="folder", intrinsics="30 31 15 11", depth_scale=5000)
     assert sequence.camera == Camera(32, 24, 30, 31, 15, 11)
-    with pytest.raises(SequenceError, match="holds no camera.yaml, and nothing tells the units of its depth .*`depth_sc"):
+    with pytest.raises(SequenceError, match="holds no camera.yaml; the units of its depth .*`depth_scale`"):
         open_sequence(folder, format="folder", intrinsics="30 31 15 11")
     scans = make("scannet")
     (scans / "frames" / "intrinsic" / "intrinsic_color.txt").unlink()

@@ -198,7 +198,8 @@ def _open(
         return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights()
     frames = one_camera(wanted.open(), "a store of cells")
     sights = FrameSights(frames.camera, NativeContext())
-    return frames.stream(masks=False), _poses(request, frames.timestamps, frames.ground_truth, frames.pose_problem), sights
+    poses = _poses(request, frames.timestamps, frames.ground_truth, frames.pose_problem)
+    return frames.stream(masks=False), poses, sights
 
 
 def _poses(
@@ -208,7 +209,9 @@ def _poses(
     if request.poses is None:
         if own is None or not np.isfinite(own).all((1, 2)).any():
             why = f" ({problem})" if problem else ""
-            raise SequenceError(f"{request.source}: no poses{why}; `ggslam localize` finds them, `poses` names their file")
+            raise SequenceError(
+                f"{request.source}: no poses{why}; `ggslam localize` finds them, `poses` names their file"
+            )
         return own
     found = read_trajectory(request.poses)
     poses = np.full((len(timestamps), 4, 4), np.nan)

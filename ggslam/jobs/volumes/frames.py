@@ -131,7 +131,8 @@ def frames_of_recording(request: SequenceRequest, objects: bool = True) -> Frame
     if not poses:
         why = f" ({sequence.pose_problem})" if sequence.pose_problem else ""
         raise ConfigError(
-            f"{sequence.path}: this recording tells no poses{why}; track it with `live`, or give the folder of a run of it"
+            f"{sequence.path}: this recording tells no poses{why}; track it with `live`, or give the folder of a run "
+            "of it"
         )
     source = FrameSource(str(sequence.path), sequence, poses, names=dict(sequence.instance_names))
     source.notes.append(f"poses of the recording itself ({sequence.pose_source})")

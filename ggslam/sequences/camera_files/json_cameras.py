@@ -20,7 +20,7 @@ def from_json(place: object, content: Entries) -> Entries:
     Raises:
         SequenceError: a matrix in it is no camera's.
     """
-    inner = next((content[key] for key in ("intrinsic", "camera") if isinstance(content.get(key), dict)), {})
+    inner: Entries = next((content[key] for key in ("intrinsic", "camera") if isinstance(content.get(key), dict)), {})
     values = {RENAMED.get(key, key): value for key, value in {**content, **inner}.items()}
     if "intrinsic_matrix" not in values:
         return values

@@ -34,6 +34,7 @@ def distortion_of(place: object, model: str, values: np.ndarray) -> tuple[np.nda
         raise SequenceError(f"{place}: lens distortion of the model '{model}' cannot be undone; known are {known}")
     counts = (4,) if fisheye else COUNTS
     if len(values) not in counts or not np.isfinite(values).all():
-        wanted = " or ".join(map(str, counts)).replace(" or ", ", ", len(counts) - 2)
-        raise SequenceError(f"{place}: expected {wanted} coefficients of '{model}' for 'distortion', found {len(values)}")
+        wanted = "4" if fisheye else "4, 5, 8, 12 or 14"
+        found = f"found {len(values)}" if np.isfinite(values).all() else "found what is no number"
+        raise SequenceError(f"{place}: expected {wanted} coefficients of '{model}' for 'distortion', {found}")
     return values, fisheye

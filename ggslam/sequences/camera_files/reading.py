@@ -15,6 +15,8 @@ from ggslam.sequences.json_files import parse_object
 from ggslam.sequences.recording import read_text
 
 OWN = ("fx", "fy", "cx", "cy")
+BESIDE = ("depth_scale", "T_color_depth", "color")
+"""Entries of ours that somebody may have added to another program's file."""
 _ENTRY = re.compile(r"^\s*[\w.]+\s*:(?:\s|$)", re.MULTILINE)
 """A line of YAML with a name; `#` begins a comment there as in tables."""
 
@@ -38,4 +40,4 @@ def read_entries(path: Path) -> dict[str, Any]:
     if any(name in settings for name in OWN):
         return settings
     foreign = from_yaml(path, settings)
-    return settings if foreign is None else foreign
+    return settings if foreign is None else foreign | {key: settings[key] for key in BESIDE if key in settings}

@@ -44,7 +44,7 @@ def from_text(place: object, text: str) -> Entries:
     if not words or not all(map(_is_number, words)) or len(words) not in (4, 9, 12, 16):
         raise SequenceError(
             f"{place}: expected a camera: a matrix of 3x3 or 4x4 numbers, 'fx fy cx cy', or COLMAP's cameras.txt; "
-            f"found {_described(words)}"
+            f"found {_description(words)}"
         )
     numbers = np.array(words, float)
     if not np.isfinite(numbers).all():
@@ -54,7 +54,7 @@ def from_text(place: object, text: str) -> Entries:
     return intrinsics_of_matrix(place, numbers)
 
 
-def _described(words: list[str]) -> str:
+def _description(words: list[str]) -> str:
     other = next((word for word in words if not _is_number(word)), None)
     return "nothing" if not words else f"{len(words)} numbers" if other is None else f"'{other[:40]}'"
 
@@ -76,7 +76,8 @@ def _of_colmap(place: object, rows: list[list[str]]) -> Entries:
         raise SequenceError(f"{place}: COLMAP's model {model} is not supported; known are {', '.join(COLMAP_MODELS)}")
     names, lens = COLMAP_MODELS[model][0].split(), COLMAP_MODELS[model][1]
     if len(words) != 2 + len(names) or not all(map(_is_number, words)):
-        raise SequenceError(f"{place}: expected width, height and {', '.join(names)} of {model}, found {' '.join(words)}")
+        wanted = f"width, height and {', '.join(names)}"
+        raise SequenceError(f"{place}: expected {wanted} of {model}, found {' '.join(words)[:80]}")
     width, height, *numbers = map(float, words)
     values = dict(zip(names, numbers, strict=True))
     found: Entries = {

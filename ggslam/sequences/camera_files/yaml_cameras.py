@@ -24,8 +24,8 @@ _OPENCV_TAG = re.compile(r"!!opencv-[\w-]+")
 
 
 def parse_camera_yaml(place: object, text: str) -> Any:
-    """Content of YAML as a standard or as OpenCV's FileStorage has it (`%YAML:1.0`, `!!opencv-matrix`), or as ROS prints
-    a message (`---` at its end). Raises SequenceError if it is none."""
+    """Content of YAML as the standard or as OpenCV's FileStorage has it (`%YAML:1.0`, `!!opencv-matrix`), or as ROS
+    prints a message (`---` at its end). Raises SequenceError if it is none."""
     text = _OPENCV_TAG.sub("", _OPENCV_DIRECTIVE.sub("", text))
     text = re.sub(r"(?:\n(?:---|\.\.\.)[ \t]*)+\s*\Z", "\n", text)
     try:
@@ -48,15 +48,15 @@ def from_yaml(place: object, settings: Entries) -> Entries | None:
         return _of_kalibr(f"{place}, {name}", camera if isinstance(camera, dict) else {})
     if isinstance(settings.get("intrinsics"), list):
         return _of_kalibr(str(place), settings)
-    flat = _flattened(settings)
-    name = next((name for name in ORB_CAMERAS if f"{name}.fx" in flat), None)
-    if name is not None:
-        return _of_orb(place, flat, name)
+    flat = _with_inner_names(settings)
+    orb = next((name for name in ORB_CAMERAS if f"{name}.fx" in flat), None)
+    if orb is not None:
+        return _of_orb(flat, orb)
     found = next((name for name in MATRIX_NAMES if name in settings), None)
     return None if found is None else _of_matrix(place, settings, found)
 
 
-def _flattened(settings: Entries) -> Entries:
+def _with_inner_names(settings: Entries) -> Entries:
     """`Camera: {fx: ...}` as `Camera.fx`, too."""
     inner = {
         f"{key}.{name}": value for key, held in settings.items() if isinstance(held, dict)
@@ -65,11 +65,11 @@ def _flattened(settings: Entries) -> Entries:
     return {**settings, **inner}
 
 
-def _of_orb(place: object, flat: Entries, name: str) -> Entries:
+def _of_orb(flat: Entries, name: str) -> Entries:
     """ORB-SLAM2 and 3 (`Camera.fx`, `Camera1.fx`), OpenVSLAM and stella (`Camera: {fx: ...}`)."""
     found = {key: flat[f"{name}.{key}"] for key in ("fx", "fy", "cx", "cy") if f"{name}.{key}" in flat}
-    for key, names in {"width": ("width", "cols"), "height": ("height", "rows")}.items():
-        value = next((flat[f"Camera.{n}"] for n in names if f"Camera.{n}" in flat), None)
+    for key, other in (("width", "cols"), ("height", "rows")):
+        value = next((flat[f"Camera.{n}"] for n in (key, other) if f"Camera.{n}" in flat), None)
         found |= {} if value is None else {key: value}
     model = str(next((flat[f"Camera.{key}"] for key in ("type", "model") if f"Camera.{key}" in flat), "pinhole"))
     if model.lower() == "rectified":
@@ -96,8 +96,7 @@ def _of_matrix(place: object, settings: Entries, name: str) -> Entries:
     if coefficients is not None:
         numbers = matrix_numbers(f"{place}, {coefficients}", settings[coefficients])
         found["distortion"] = numbers.tolist()
-    kept = ("depth_scale", "T_color_depth", "color", "local_transform")
-    return found | {key: settings[key] for key in kept if key in settings}
+    return found | ({"local_transform": settings["local_transform"]} if "local_transform" in settings else {})
 
 
 def _refuse_part(place: object, settings: Entries) -> None:
@@ -124,5 +123,4 @@ def _of_kalibr(place: str, camera: Entries) -> Entries:
     coefficients = next((name for name in DISTORTION_NAMES if camera.get(name) is not None), None)
     lens = str(camera.get("distortion_model", "opencv"))
     values = [] if coefficients is None else matrix_numbers(f"{place}, {coefficients}", camera[coefficients]).tolist()
-    found |= {"distortion": values, "distortion_model": lens}
-    return found | {key: camera[key] for key in ("depth_scale", "T_color_depth") if key in camera}
+    return found | {"distortion": values, "distortion_model": lens}

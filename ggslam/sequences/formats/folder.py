@@ -18,7 +18,7 @@ from ggslam.sequences.calibration import (
     read_calibration,
 )
 from ggslam.sequences.camera_files.finding import CAMERA_FILE, find_camera_file
-from ggslam.sequences.image_folders import ImagePairs, depth_images, pair_folders
+from ggslam.sequences.image_folders import OF_NAMES, ImagePairs, depth_images, pair_folders
 from ggslam.sequences.masks import find_masks
 from ggslam.sequences.pose_files import (
     PoseRows,
@@ -115,7 +115,7 @@ def _instances(path: Path, settings: dict[str, Any]) -> dict[int, str]:
 
 def _depth_scale(path: Path, settings: dict[str, Any]) -> float:
     if not settings and not path.exists():
-        raise SequenceError(f"{path.parent}: holds no {path.name}, and nothing tells the units of its depth images per metre")
+        raise SequenceError(f"{path.parent}: holds no {path.name}; the units of its depth images per metre are unknown")
     return number_entry(path, settings, "depth_scale")
 
 
@@ -132,7 +132,7 @@ def _timestamps(
             raise SequenceError(f"{path}: expected {len(colors)} times, one an image, found {len(times)}")
         return times, path.name
     if pairs.times is not None:
-        return pairs.times, "names of the images"
+        return pairs.times, OF_NAMES
     rate = number_entry(camera_file, settings, "frame_rate") if "frame_rate" in settings else NOMINAL_RATE
     if rate <= 0:
         raise SequenceError(f"{camera_file}: expected a positive 'frame_rate', found {rate:g}")

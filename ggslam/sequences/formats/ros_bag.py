@@ -127,7 +127,8 @@ def _times(bag: Bag, topics: Topics) -> tuple[np.ndarray, np.ndarray, str]:
             raise SequenceError(f"{bag.path}: topic {topic} holds no messages")
     if color.any() and depth.any():
         return color, depth, f"headers of {topics.color}"
-    return bag.logged(topics.color), bag.logged(topics.depth), "when messages were recorded: their headers tell no time"
+    source = "when messages were recorded: their headers tell no time"
+    return bag.log_times(topics.color), bag.log_times(topics.depth), source
 
 
 def _first_info(bag: Bag, topic: str) -> Any:

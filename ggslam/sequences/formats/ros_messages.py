@@ -73,7 +73,7 @@ class Bag:
         self._logged[topic] = logged
         return np.array(stamps)
 
-    def logged(self, topic: str) -> np.ndarray:
+    def log_times(self, topic: str) -> np.ndarray:
         """Times at which a topic's messages were recorded, float64 [n], seconds, in the order of the bag.
 
         Raises:

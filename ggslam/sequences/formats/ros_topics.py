@@ -135,9 +135,9 @@ def poses_of(bag: Bag, topic: str) -> tuple[np.ndarray, np.ndarray]:
         SequenceError: the topic holds messages of another type.
     """
     times, poses = [], []
-    logged = bag.logged(topic)
+    logged = bag.log_times(topic)
     for message in bag.messages(topic):
-        held = _held_pose(message)
+        held = _pose_in(message)
         if held is None:
             raise SequenceError(f"{bag.path}, {topic}: {bag.types[topic]} holds no pose")
         stamp = message.header.stamp
@@ -153,11 +153,11 @@ def check_holds_poses(bag: Bag, topic: str) -> None:
         message = bag.message(topic, 0)
     except SequenceError:  # empty or damaged: then there are no poses
         return
-    if _held_pose(message) is None:
+    if _pose_in(message) is None:
         raise SequenceError(f"{bag.path}, {topic}: {bag.types[topic]} holds no pose")
 
 
-def _held_pose(message: Any) -> Any | None:
+def _pose_in(message: Any) -> Any | None:
     """What holds position and turn in a PoseStamped, Odometry or TransformStamped; None in another message."""
     held = message
     while hasattr(held, "pose"):  # PoseStamped holds one, Odometry and PoseWithCovarianceStamped two

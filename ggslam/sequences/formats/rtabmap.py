@@ -20,7 +20,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import is_valid_pose
 from ggslam.sequences.calibration import camera_entry, distortion_entry, read_calibration
 from ggslam.sequences.camera_files.matrices import matrix_numbers
-from ggslam.sequences.image_folders import ImagePairs, pair_folders
+from ggslam.sequences.image_folders import OF_NAMES, pair_folders
 from ggslam.sequences.pose_files import (
     PoseRows,
     read_pose_rows,
@@ -68,12 +68,13 @@ class RtabmapFormat:
             FrameFiles(color, depth, camera=camera if changing else None)
             for color, depth, camera in zip(pairs.colors, pairs.depths, cameras, strict=True)
         ]
-        times, source = _times(pairs)
+        times = nominal_timestamps(len(pairs.colors)) if pairs.times is None else pairs.times
         recording = Recording(
             self.name, folder, files, times, DEPTH_SCALE, cameras[0], distortion=distortion, fisheye=fisheye,
             depth_delays=pairs.delays, problems=missing_depth_problems(files), warnings=pairs.warnings,
-            camera_source=f"{calib.name}/", **({"time_source": source} if source else {}),
+            camera_source=f"{calib.name}/",
         )  # fmt: skip
+        recording.time_source = recording.time_source if pairs.times is None else OF_NAMES
         poses = next((p for name in POSES if (p := folder / f"{prefixes[0]}{name}").is_file()), None)
         if poses is not None:
             options.add_truth(recording, lambda: _add_poses(recording, poses, calib, pairs.colors[0]))
@@ -89,12 +90,6 @@ def _prefixes(folder: Path) -> list[str]:
         name for name in names
         if (not name or name.endswith("_")) and all((folder / f"{name}{part}").is_dir() for part in PARTS)
     ]  # fmt: skip
-
-
-def _times(pairs: ImagePairs) -> tuple[np.ndarray, str]:
-    if pairs.times is None:
-        return nominal_timestamps(len(pairs.colors)), ""
-    return pairs.times, "names of the images"
 
 
 def _calibration(folder: Path, color: Path) -> tuple[Path, dict[str, Any]]:
@@ -126,14 +121,14 @@ def _add_poses(recording: Recording, path: Path, calib: Path, first: Path) -> No
     if not path.name.endswith("camera_poses.txt"):
         settings = _calibration(calib, first)[1]
         rows = _of_camera(rows, settings["local_transform"]) if "local_transform" in settings else rows
-    if rows.ids is not None and recording.time_source != "names of the images":
+    if rows.ids is not None and recording.time_source != OF_NAMES:
         _take_times(recording, rows)
         take_rows_by_number(recording, rows, rows.ids)
-    elif rows.stamps is None or recording.time_source != "names of the images":
+    elif rows.stamps is None or recording.time_source != OF_NAMES:
         if rows.stamps is not None and len(rows.poses) != len(recording.files):
             raise SequenceError(
                 f"{path}: expected {len(recording.files)} poses, one an image, found {len(rows.poses)}; their ids tell "
-                "which is whose (--poses_format 11)"
+                "which is whose (format 11 of rtabmap-export)"
             )
         take_rows(recording, rows)
     else:
