@@ -60,8 +60,8 @@ DepthCamera = Annotated[
 ]
 OwnCamera = Annotated[
     Path | None,
-    typer.Option("--camera", metavar="FILE", help="File with the calibration of the colour camera, instead of the recording's "
-                 "own: a camera.yaml, or of OpenCV, ORB-SLAM, ROS, Kalibr, Open3D, COLMAP, or K.txt."),
+    typer.Option("--camera", metavar="FILE", help="File with the calibration of the colour camera, instead of the "
+                 "recording's own: a camera.yaml, or of OpenCV, ORB-SLAM, ROS, Kalibr, Open3D, COLMAP, or K.txt."),
 ]  # fmt: skip
 Intrinsics = Annotated[
     str | None,

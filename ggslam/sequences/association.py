@@ -44,7 +44,7 @@ def pair_times(first: np.ndarray, second: np.ndarray, tolerance: float) -> list[
 
 
 def pair_images(
-    place: Path, color: np.ndarray, depth: np.ndarray, names: tuple[str, str]
+    place: Path, color: np.ndarray, depth: np.ndarray, names: tuple[str, str], few: float = FEW
 ) -> tuple[list[tuple[int, int]], list[str]]:
     """Pairs (i, j) of colour images and the depth images taken at about the same time, and warnings.
 
@@ -52,13 +52,14 @@ def pair_images(
         place: of the recording, for messages.
         color, depth: times float64 [n], [m], seconds.
         names: what lists the two, for messages.
+        few: share of the colour images that may be left out without a warning.
 
     Raises:
         SequenceError: nothing pairs up.
     """
     pairs = pair_times(color, depth, TOLERANCE)
     if pairs and 2 * len(pairs) >= min(len(color), len(depth)):
-        return pairs, left_out(len(color), len(pairs), names)
+        return pairs, _left_out(len(color), len(pairs), names, few)
     wide = pair_times(color, depth, WIDE_TOLERANCE)
     if not wide:
         gap = min((np.abs(depth - t).min() for t in color), default=np.inf) if len(depth) else np.inf
@@ -73,14 +74,15 @@ def pair_images(
     return wide, [warning]
 
 
-def left_out(images: int, used: int, names: tuple[str, str]) -> list[str]:
-    """A warning if more than `FEW` of the colour images have no depth of their time."""
+def _left_out(images: int, used: int, names: tuple[str, str], few: float) -> list[str]:
+    """A warning if more than the share `few` of the colour images have no depth of their time."""
     count = images - used
-    if count <= FEW * images:
+    if count <= few * images:
         return []
+    have, are = ("has", "is") if count == 1 else ("have", "are")
     return [
-        f"{count} of {images} colour images ({names[0]}) have no depth image of their own ({names[1]}) within "
-        f"{TOLERANCE:g} s and are left out"
+        f"{count} of {images} colour images ({names[0]}) {have} no depth image of the same time ({names[1]}) within "
+        f"{TOLERANCE:g} s and {are} left out"
     ]
 
 

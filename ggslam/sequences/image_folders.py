@@ -76,7 +76,7 @@ def _by_time(
     place: Path, colors: list[Path], times: np.ndarray, depths: list[Path], depth_times: np.ndarray
 ) -> ImagePairs:
     names = (colors[0].parent.name, depths[0].parent.name)
-    pairs, warnings = pair_images(place, times, depth_times, names)
+    pairs, warnings = pair_images(place, times, depth_times, names, few=0.0)
     pairs.sort(key=lambda pair: times[pair[0]])
     first, second = [i for i, _ in pairs], [j for _, j in pairs]
     chosen = times[first]

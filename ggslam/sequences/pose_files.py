@@ -71,6 +71,7 @@ def read_pose_rows(path: Path, counts: tuple[int, ...] = (7, 8, 9, 12, 16)) -> P
         first = f", found '{lines[0][1][:60]}' in line {lines[0][0]}" if lines else ", found no lines"
         raise SequenceError(f"{path}: expected poses as lines of {wanted} numbers{first}")
     count = found.most_common(1)[0][0]
+    lines = lines[1:] if _names_columns(lines[0][1], count) else lines
     poses, stamps, ids = np.full((len(lines), 4, 4), np.nan), np.full(len(lines), np.nan), np.full(len(lines), np.nan)
     problems = {}
     for row, (number, line, values) in enumerate(lines):
@@ -88,6 +89,12 @@ def read_pose_rows(path: Path, counts: tuple[int, ...] = (7, 8, 9, 12, 16)) -> P
         if count in (8, 9):
             stamps[row], ids[row] = values[0], values[-1]
     return PoseRows(path, poses, stamps if count in (8, 9) else None, ids if count == 9 else None, problems)
+
+
+def _names_columns(line: str, count: int) -> bool:
+    """Whether a line holds as many words as others hold numbers, none of them a number."""
+    words = line.replace(",", " ").split()
+    return len(words) == count and all(_numbers_in(word) is None for word in words)
 
 
 def _kind(values: np.ndarray) -> int:

@@ -24,7 +24,7 @@ def times_of_names(files: Iterable[ImageFile]) -> np.ndarray | None:
     lengths = {len(stem) for stem in stems}
     if len(lengths) == 1 and all(stem.isascii() and stem.isdigit() for stem in stems):
         unit = EPOCH_DIGITS.get(lengths.pop())
-        if unit is None:
+        if unit is None or any(stem.startswith("0") for stem in stems):  # KITTI numbers frames with ten digits
             return None
         return np.array([_exact_seconds(stem, unit) for stem in stems])
     try:

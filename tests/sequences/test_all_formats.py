@@ -125,6 +125,18 @@ def test_intrinsics_that_change_are_made_steady(make_more: Callable[[str], Path]
     assert sequence.camera.fx == 30
 
 
+def test_polycam_without_sizes(make_more: Callable[[str], Path]) -> None:
+    """Cameras are of the size of the images then."""
+    folder = make_more("polycam")
+    wanted = open_sequence(folder)
+    for path in (folder / "keyframes" / "cameras").iterdir():
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps({key: value for key, value in content.items() if key not in ("width", "height")}))
+    found = open_sequence(folder)
+    assert found.native_camera == wanted.native_camera and found.color_size == wanted.color_size
+    assert np.array_equal(found.frame(2).depth, wanted.frame(2).depth)
+
+
 def test_transforms_with_distortion_and_units(make_more: Callable[[str], Path]) -> None:
     folder = make_more("nerfstudio")
     path = folder / "transforms.json"

@@ -48,6 +48,12 @@ def test_every_kind_of_line(make: Make, text_of: Callable[[int], str]) -> None:
     assert sequence.warnings == []
 
 
+def test_a_line_of_names_is_no_pose(make: Make) -> None:
+    folder = make("folder")
+    (folder / "poses.txt").write_text("tx,ty,tz,qx,qy,qz,qw\n" + "\n".join(map(line, range(FRAMES))))
+    np.testing.assert_allclose(truth_of(open_sequence(folder)), ALL, atol=1e-6)
+
+
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 def test_units_of_time(make: Make, unit: str) -> None:
     """More poses than frames, at times in each unit; images have seconds."""
@@ -131,11 +137,13 @@ def test_names_that_are_times(tmp_path: Path, write: Callable[[int], str], unit:
     assert [round(float(frame.color[12, 16, 0])) for frame in sequence] == [0, 20, 40, 50]
     np.testing.assert_allclose([frame.depth[12, 16] for frame in sequence], [1, 1.1, 1.2, 1.3], atol=1e-6)
     np.testing.assert_allclose(sequence.timestamps, [times[i] / 1e9 for i in (0, 2, 4, 5)], atol=1e-3)
-    assert "2 of 6 colour images (rgb) have no depth image of their own (depth) within 0.02 s" in sequence.warnings[0]
+    told = "2 of 6 colour images (rgb) have no depth image of the same time (depth) within 0.02 s and are left out"
+    assert sequence.warnings == [told]
 
 
 def test_names_that_are_no_times(tmp_path: Path) -> None:
     assert times_of_names([Path(f"{i:06d}.png") for i in range(3)]) is None
+    assert times_of_names([Path(f"{i:010d}.png") for i in range(3)]) is None  # KITTI
     assert times_of_names([Path("rgb_1.5.png"), Path("rgb_1.6.png")]) is None
     assert times_of_names([Path("1600000000123456789.png")]) == pytest.approx(1600000000.123456789, abs=1e-6)
     assert unit_of_stamps(np.array([0.0, 33.3, 66.7]), None) == "ms"
