@@ -455,7 +455,7 @@ def _repair_container(path: Path, out: Path) -> None:
 
 RECORDINGS = ("replica", "tum", "7scenes", "scannet", "folder", "vmap", "icl-nuim", "nerfstudio", "nerfcapture",
               "scannet++", "scannet++ iphone", "record3d", "polycam", "strayscanner",
-              "3dscannerapp", "ros1", "ros2")  # fmt: skip
+              "3dscannerapp", "rtabmap", "ros1", "ros2")  # fmt: skip
 TARGETS = [
     Target("ply", _clouds_of := lambda folder: [p for p in _clouds(folder) if p.suffix == ".ply"], _ply_read, 8),
     Target("gaussians", _gaussian_plys, _gaussians_read, 6), Target("cloud", _clouds, _cloud_read, 8),

@@ -87,7 +87,8 @@ def _by_time(
 
 def _without_color(folder: Path, depths: list[Path], used: list[Path]) -> list[str]:
     """A warning if there are depth images whose colour image is missing."""
-    unused = [path.name for path in depths if path not in set(used)]
+    taken = set(used)
+    unused = [path.name for path in depths if path not in taken]
     if not unused:
         return []
     are = "image has" if len(unused) == 1 else "images have"

@@ -28,11 +28,15 @@ def invalid_pose_reason(T: np.ndarray) -> str | None:
     """What is wrong with a 4x4 matrix as a camera pose; None when nothing is."""
     if not np.isfinite(T).all():
         return "pose holds NaN or infinity"
-    if not is_valid_pose(T):
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers that no pose holds
+        valid = is_valid_pose(T)
+    if not valid:
         return "pose is not a rigid transform (its 3x3 part is no rotation)"
     return None
 
 
+MOST = 1e6
+"""Of a number of a quaternion, which has unit length but for rounding."""
 MATRIX = 16
 """Numbers of a line that is a matrix; 12 are the same without its last row."""
 
@@ -115,7 +119,7 @@ def pose_of_numbers(values: np.ndarray) -> np.ndarray:
         T[: len(values) // 4] = values.reshape(-1, 4)
         return T
     tx, ty, tz, qx, qy, qz, qw = values[-7:]
-    if not np.isfinite(values).all() or np.linalg.norm(values[-4:]) <= 0.5:
+    if not np.isfinite(values).all() or np.abs(values[-4:]).max() > MOST or np.linalg.norm(values[-4:]) <= 0.5:
         return np.full((4, 4), np.nan)
     T[:3, :3], T[:3, 3] = quaternion_to_matrix(np.array([qw, qx, qy, qz])), (tx, ty, tz)
     return T

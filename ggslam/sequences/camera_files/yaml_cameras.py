@@ -80,6 +80,8 @@ def _of_orb(flat: Entries, name: str) -> Entries:
     found |= {"distortion": values if fisheye or any(values[5:]) else values[:5], "distortion_model": model}
     scale = next((flat[key] for key in ("RGBD.DepthMapFactor", "DepthMapFactor", "Camera.depthmap_factor",
                                         "depthmap_factor") if key in flat), None)  # fmt: skip
+    rate = flat.get("Camera.fps")
+    found |= {"frame_rate": rate} if isinstance(rate, (int, float)) and rate > 0 else {}
     return found if scale is None else {**found, "depth_scale": scale}
 
 

@@ -123,7 +123,7 @@ def _timestamps(
     folder: Path, pairs: ImagePairs, camera_file: Path, settings: dict[str, Any]
 ) -> tuple[np.ndarray, str]:
     path, colors = folder / "timestamps.txt", pairs.colors
-    if path.is_file():
+    if path.is_file() and pairs.delays is None:  # else names are times, and some images are left out
         try:
             times = np.array([float(line.split()[0]) for _, line in data_lines(path)])
         except ValueError:
