@@ -356,6 +356,9 @@ def test_a_file_in_the_folder_is_found(make: Callable[[str], Path], name: str) -
     sequence = open_sequence(folder, depth_scale=5000)
     assert sequence.camera_source == f"{file}, scaled from 640x480 to images of 32x24"
     assert sequence.native_camera == CASES[name][2].resize(32, 24)
+    (folder / "poses.txt").unlink()
+    rate = "30 frames/s of calibration.yaml" if name == "orb-slam2" else "nominal 30 frames/s"
+    assert open_sequence(folder, depth_scale=5000).time_source == rate
     (folder / "K.txt").write_text("1 1 1 1")
     with pytest.raises(SequenceError, match=rf"holds .*{file}.*; which is the colour camera's is told by `camera`"):
         open_sequence(folder, depth_scale=5000)
