@@ -140,9 +140,13 @@ class ActiveKeyframes:
             self.active -= aside
             self.spare |= aside
 
+    def leave(self) -> None:
+        """Puts everything aside: the camera is elsewhere, nobody knows where."""
+        self.active, self.spare = set(), set()
+
     def restart(self, number: int) -> None:
         """After a jump to where keyframe `number` looks: what lies there is active, everything else put aside."""
-        self.active, self.spare = set(), set()
+        self.leave()
         self.activate_around(number)
 
     def activate_around(self, number: int) -> None:

@@ -30,6 +30,8 @@ _RIGID_M, _RIGID_DEG = 1e-4, 1e-3
 """Standard deviations of where the cameras of a rig are to one another."""
 SURE_INFORMATION = 1e6 * np.eye(6)
 """Of a motion that is sure to a millimetre and a milliradian: then drift is all that is unsure of it."""
+_ANYWHERE, _ANYWHERE_DEG = 10.0, 360.0
+"""Standard deviations of a motion that nothing is known of: so many times its length, and all round."""
 
 
 def odometry_covariance(T_i_j: np.ndarray, information: np.ndarray, settings: GraphSettings) -> np.ndarray:
@@ -95,13 +97,15 @@ class PoseGraph:
         return len(self.poses) - 1
 
     def add_odometry(
-        self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray, found: bool = False, rigid: bool = False
-    ) -> None:
+        self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray, found: bool = False, rigid: bool = False,
+        unknown: bool = False,
+    ) -> None:  # fmt: skip
         """The motion from an earlier node i to the newest node j. It is never doubted.
 
         Args:
             found: the camera was lost on the way, and found at node i.
             rigid: both are cameras of one rig at one instant; nothing drifts between them.
+            unknown: nothing is known of it: j begins a part at an arbitrary place (`KeyframeParts`).
 
         Raises:
             ValueError: j is not the newest node, has odometry already, or i is not before it.
@@ -111,6 +115,9 @@ class PoseGraph:
         s, covariance = self.settings, _isotropic(_RIGID_M, _RIGID_DEG)
         if not rigid:
             covariance = odometry_covariance(T_i_j, information, s)
+        if unknown:
+            far = _ANYWHERE * float(np.linalg.norm(T_i_j[:3, 3]))
+            covariance = covariance + covariance_in_frame(_isotropic(far, _ANYWHERE_DEG), T_i_j)
         if found:
             covariance += covariance_in_frame(_isotropic(s.found_translation, s.found_rotation_deg), T_i_j)
         self._tree.add(i, np.array(T_i_j, float), covariance)
@@ -133,8 +140,11 @@ class PoseGraph:
         squared = float(twist @ np.linalg.solve(closure_covariance(T_i_j, information, self.settings), twist))
         return (squared / chi_squared_limit(self.settings.inlier_probability)) ** 0.5
 
-    def optimise(self) -> GraphResult:
+    def optimise(self, waiting: Iterable[int] = ()) -> GraphResult:
         """Judges all closures, also those rejected before, and moves the nodes to agree with the believed ones.
+
+        Args:
+            waiting: numbers of closures that are not to be believed yet, whatever they say.
 
         Raises:
             MissingDependency: gtsam is not installed.
@@ -144,16 +154,18 @@ class PoseGraph:
         if len(self._tree) != len(self.poses):
             raise ValueError(f"node {len(self.poses) - 1} has no odometry yet")
         gtsam = _gtsam()
-        far = self._beyond_drift(self.poses, self._beyond_drift(self._tree.poses, range(len(self.loops))))
+        aside = dict.fromkeys(waiting, "not confirmed yet")
+        judged = [k for k in range(len(self.loops)) if k not in aside]
+        far = self._beyond_drift(self.poses, self._beyond_drift(self._tree.poses, judged))
         while True:
-            condensed, disagreeing, errors = self._settle(gtsam, far)
+            condensed, disagreeing, errors = self._settle(gtsam, far | aside)
             poses = condensed.all_poses()
             nearer = self._beyond_drift(poses, far)
             if len(nearer) == len(far):
                 break
             far = nearer  # what is out of odometry's reach may be near once the closures before it are closed
         self.poses = list(poses)
-        rejected = far | disagreeing
+        rejected = far | aside | disagreeing
         accepted = tuple(k for k in range(len(self.loops)) if k not in rejected)
         return GraphResult(poses, accepted, rejected, *errors, time.perf_counter() - start)
 

@@ -139,6 +139,8 @@ class Mapper(ABC):
         """Whether frames come at a camera's pace: keyframes do not wait then while one looks for what surfaces hide."""
         self.residency: Residency | None = None
         """Keeps a part of the map on disk; None: all of it is in memory."""
+        self.left_out: set[int] = set()
+        """Numbers of the keyframes that neither train the map nor have Gaussians in it any more."""
         self._valid: dict[int, np.ndarray | None] = {}
         self.extra_loss: ExtraLoss | None = None
         """A loss of the user's own, added to the mapper's; on the CPU only."""
@@ -207,6 +209,12 @@ class Mapper(ABC):
         for keyframe, T in zip(self.keyframes, T_new_old, strict=True):
             keyframe.T_camera_world = inverse(T @ keyframe.T_world_camera)
         move_with_keyframes(self.map, T_new_old)
+
+    def leave_out(self, numbers: set[int]) -> None:
+        """Takes the Gaussians of some keyframes out of the map, which is all in memory, and trains on these no more."""
+        self.left_out |= numbers
+        gone = torch.tensor(sorted(self.left_out), dtype=self.map.birth_keyframe.dtype, device=self.map.device)
+        self.map.keep(~torch.isin(self.map.birth_keyframe, gone))
 
     def mend(self, kept: list[int], doubted: list[int], iterations: int) -> None:
         """After the keyframes were moved so that two ends of a loop meet: drops what the newer end had mapped again,
@@ -303,21 +311,26 @@ class Mapper(ABC):
         return ~keyframe.moving if valid is None else valid & ~keyframe.moving
 
     def _trainable(self) -> Sequence[int]:
-        return range(len(self.keyframes)) if self.residency is None else self.residency.trainable()
+        return self._all_numbers if self.residency is None else self.residency.trainable()
+
+    @property
+    def _all_numbers(self) -> Sequence[int]:
+        numbers = range(len(self.keyframes))
+        return [k for k in numbers if k not in self.left_out] if self.left_out else numbers
 
     def _draw(self, numbers: Sequence[int]) -> Keyframe:
         return self.keyframes[numbers[self._sampler.draw(len(numbers))]]
 
     def stages(self) -> Iterable[Sequence[int]]:
         """Numbers of all keyframes, some after the others: of those handed out the whole map is in memory."""
-        return (range(len(self.keyframes)),) if self.residency is None else self.residency.stages()
+        return (self._all_numbers,) if self.residency is None else self.residency.stages()
 
     def _stages(self, steps: int) -> Iterator[tuple[Sequence[int], int]]:
         """Keyframes to train together, and how many of `steps` are theirs: as many as their share of all keyframes."""
-        done = 0
+        done, total = 0, len(self._all_numbers)
         for numbers in self.stages():
             before, done = done, done + len(numbers)
-            yield numbers, steps * done // len(self.keyframes) - steps * before // len(self.keyframes)
+            yield numbers, steps * done // total - steps * before // total
 
     def last_iterations(self, before: int) -> int:
         """Iterations of the final refinement after so many, unless a user says how many there are."""
@@ -325,7 +338,8 @@ class Mapper(ABC):
             return round(WHOLE_END_SHARE * before)
         if self.is_live or not before:
             return round(LIVE_END_SHARE * before)
-        return max(round(END_SHARE * before), LEAST_VISITS * sum(k.frame_index != ELSEWHERE for k in self.keyframes))
+        own = sum(self.keyframes[k].frame_index != ELSEWHERE for k in self._all_numbers)
+        return max(round(END_SHARE * before), LEAST_VISITS * own)
 
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
         """One iteration on the whole images of one keyframe.
@@ -388,9 +402,9 @@ class Mapper(ABC):
 
     def _is_world(self, keyframe: Keyframe) -> bool:
         """Whether its pose stays: the first keyframe is the world, with those that its rig took at the same instant."""
-        first = self.keyframes[0].instant
-        if keyframe.index == 0 or first is None or keyframe.instant != first:
-            return keyframe.index == 0
+        number, first = self._all_numbers[0], self.keyframes[self._all_numbers[0]].instant
+        if keyframe.index == number or first is None or keyframe.instant != first:
+            return keyframe.index == number
         return all(earlier.instant == first for earlier in self.keyframes[: keyframe.index])
 
     def _move_rig(self, keyframe: Keyframe, T_before: np.ndarray) -> None:
@@ -474,7 +488,7 @@ class Mapper(ABC):
         if self.identity is None:
             return
         start, settings = time.perf_counter(), self.identity.settings
-        total = settings.final_passes * len(self.keyframes) if settings.schedule == "sampled" else 0
+        total = settings.final_passes * len(self._all_numbers) if settings.schedule == "sampled" else 0
         for numbers, steps in self._stages(total) if total else ():
             for i in range(0, steps, FINAL_STEPS_A_VIEW):
                 keyframe = self._draw(numbers)

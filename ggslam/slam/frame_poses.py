@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.slam.result import TrackedFrame
-from ggslam.tracking.tracker import TrackingResult
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 
 class FramePoses:
@@ -50,6 +51,14 @@ class FramePoses:
                 tracking.overlap, tracking.rmse_m, tracking.status.value, tracking.reason,
             )
         )  # fmt: skip
+
+    def locate_last(self, keyframe: int, T_keyframe_camera: Sequence[np.ndarray]) -> None:
+        """The last frames, which were lost, have these poses [4, 4] relative to a keyframe that came after them."""
+        for k, T in enumerate(T_keyframe_camera, start=len(self.frames) - len(T_keyframe_camera)):
+            self.frames[k] = replace(
+                self.frames[k], keyframe=keyframe, T_keyframe_camera=T, status=TrackingStatus.RECOVERED.value,
+                reason="from the frame after it, with which a part of the map begins",
+            )  # fmt: skip
 
     def as_tracked(self, frame: TrackedFrame) -> np.ndarray:
         """T_world_camera [4, 4] of a frame that was just added as tracked."""

@@ -13,8 +13,10 @@ import numpy as np
 
 from ggslam.features.orb import FeatureView
 from ggslam.loops.activity import ActiveKeyframes
+from ggslam.loops.condensed import Link
+from ggslam.loops.parts import KeyframeParts
 from ggslam.loops.places import Place, PlaceIndex
-from ggslam.loops.pose_graph import SURE_INFORMATION, PoseGraph
+from ggslam.loops.pose_graph import SURE_INFORMATION, GraphResult, PoseGraph
 from ggslam.loops.revisits import Revisits
 from ggslam.loops.uncertainty import information_in_frame
 from ggslam.loops.verification import Verification
@@ -23,6 +25,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
 from ggslam.slam.loop_settings import LoopSettings
+from ggslam.slam.part_joining import find_agreeing_links
 from ggslam.slam.place_comparison import PlaceComparison
 from ggslam.tracking.gicp import AlignmentResult
 from ggslam.tracking.points import PointSource
@@ -35,7 +38,8 @@ class LoopEvent:
     """What came of a candidate, or of a frame that was lost.
 
     Attributes:
-        kind: "closed", "verified" (believed later or never), "refused", "found again".
+        kind: "closed", "verified" (believed later or never), "refused", "found again"; "new part", "joined",
+            "left out" (see `slam.map_parts`).
         frame: index of the frame.
         keyframe: number of the newer keyframe (of the one it would become, for a frame found again).
         old_keyframe: the one it was compared with.
@@ -106,6 +110,7 @@ class LoopCloser:
         self.activity = ActiveKeyframes(settings.activity)
         self.poses: list[np.ndarray] = []
         """T_world_camera of the keyframes as tracked and corrected (the mapper refines its own on top)."""
+        self.parts = KeyframeParts()
         self.revisits = Revisits(settings.revisits)
         self.comparison = PlaceComparison(
             settings.verification, settings.neighbourhood, surface, tracker, context
@@ -115,6 +120,8 @@ class LoopCloser:
         self._found_at: tuple[int, int] | None = None
         """When a lost camera was found (see `_moment`), and the keyframe it was found at; until its first keyframe is
         in."""
+        self._parts_begin: set[int] = set()
+        """Moments of the frames that begin a part, until their keyframes are in."""
         self._taken: list[tuple[int | None, int]] = []
         """Instant and camera number of each keyframe of a rig; instants are None without one."""
         self._lock = threading.RLock()
@@ -151,15 +158,18 @@ class LoopCloser:
             # In real time, keyframes from before the camera was lost may still come after it was found.
             belated = self._found_at is not None and _moment(frame) < self._found_at[0]
             before, rigid = self._came_from(frame)
-            self._connect(tracking, belated, before, rigid)
-            self.activity.add(T, tracking.median_depth_m, None if rigid else before)
+            begins = _moment(frame) in self._parts_begin
+            self._connect(tracking, belated, before, rigid, begins)
+            if begins:
+                self._leave_behind(frame, belated)
+            self.activity.add(T, tracking.median_depth_m, None if rigid or begins else before)
             self.poses.append(T.copy())
             self._taken.append((frame.instant, frame.camera_number))
             self.places.add(len(self.poses) - 1, place)
             if belated:
                 self.activity.active.discard(len(self.poses) - 1)
             correction = None if belated else self._look_back(frame, place, tracking)
-            if correction is None and (self.activity.update() or belated):
+            if correction is None and (self.activity.update() or belated or begins):
                 self._surface.arrange(self.activity.active)
         self.seconds += time.perf_counter() - start
         return correction
@@ -186,8 +196,16 @@ class LoopCloser:
         same = [k for k in range(first, newest + 1) if self._taken[k][1] == frame.camera_number]
         return (same[0] if same else first), False
 
-    def _connect(self, tracking: TrackingResult, belated: bool, before: int, rigid: bool) -> None:
-        """The new keyframe's node, tied to the one before it, or to where a lost camera was found again."""
+    def _leave_behind(self, first: Frame, belated: bool) -> None:
+        """What was mapped is out of sight of a part that begins, unless the camera was found there meanwhile."""
+        self._parts_begin.remove(_moment(first))
+        if not belated:
+            self.activity.leave()
+            self._verified.clear()
+
+    def _connect(self, tracking: TrackingResult, belated: bool, before: int, rigid: bool, begins: bool) -> None:
+        """The new keyframe's node, tied to the one before it, or to where a lost camera was found again; where a part
+        begins, by a motion that nothing is known of."""
         T, number = tracking.T_world_camera, len(self.poses)
         self.graph.add_node(T)
         found = self._found_at is not None and not belated
@@ -199,7 +217,11 @@ class LoopCloser:
             information = SURE_INFORMATION  # without an alignment, what drift allows for is all that is unsure
             if tracking.alignment is not None:
                 information = information_in_frame(tracking.alignment.information, T_before_world)
-            self.graph.add_odometry(before, number, T_before_world @ T, information, found, rigid)
+            self.graph.add_odometry(before, number, T_before_world @ T, information, found, rigid, unknown=begins)
+        if begins:
+            self.parts.begin()
+        else:
+            self.parts.add(before)
 
     def _look_back(self, frame: Frame, place: Place, tracking: TrackingResult) -> Correction | None:
         number, s = len(self.poses) - 1, self.settings
@@ -228,7 +250,7 @@ class LoopCloser:
         loop = self.graph.add_loop(old, number, found.T_old_new, found.information)
         correction = self.poses[old] @ found.T_old_new @ inverse(self.poses[number])
         self._verified.append(_Found(number, old, correction, self.poses[number]))
-        return self._close(frame, old, loop) if self._is_confirmed() else None
+        return self._close(frame.index, old, loop) if self._is_confirmed() else None
 
     def _revisit(
         self, frame: Frame, place: Place, tracking: TrackingResult, chosen: set[int], T_expected: np.ndarray
@@ -283,26 +305,114 @@ class LoopCloser:
             count += apart < s.agreement_m and turned < s.agreement_deg
         return count >= s.confirmations
 
-    def _close(self, frame: Frame, old: int, loop: int) -> Correction | None:
-        before = np.array(self.graph.poses)
-        result, number = self.graph.optimise(), len(self.poses) - 1
-        if loop in result.rejected:
-            reason = f"the pose graph does not believe it: {result.rejected[loop]}"
-            self.events.append(LoopEvent("refused", frame.index, number, old, reason))
-            self.graph.poses = list(before)
-            self.revisits.pause()
+    def _close(self, frame_index: int, old: int, loop: int) -> Correction | None:
+        number = len(self.poses) - 1
+        joins = not self.parts.together(old, number)
+        result = self._optimise(frame_index, loop)
+        if result is None:
             return None
         poses = result.poses
         T_new_old = poses @ inverse(np.array(self.poses))
         kept, doubted = self.activity.inactive(), self.activity.active | self.activity.spare
         if old in doubted:
             kept, doubted = self.activity.visits(old)
-        moved = float(np.linalg.norm(poses[-1][:3, 3] - self.poses[-1][:3, 3]))
-        reason = f"{len(result.accepted)} of {len(self.graph.loops)} closures believed, {result.seconds:.2f} s"
-        self.events.append(LoopEvent("closed", frame.index, number, old, reason, moved))
+        if joins:
+            kept &= self.parts.members(old)
+            self._note_joined(frame_index, old, number)
+        else:
+            moved = float(np.linalg.norm(poses[-1][:3, 3] - self.poses[-1][:3, 3]))
+            reason = f"{len(result.accepted)} of {len(self.graph.loops)} closures believed, {result.seconds:.2f} s"
+            self.events.append(LoopEvent("closed", frame_index, number, old, reason, moved))
         self.activity.activate_around(old)
         self.revisits.tie(old, number)
         return Correction(poses, T_new_old, kept, doubted, set(self.activity.active))
+
+    def _optimise(self, frame_index: int, number: int) -> GraphResult | None:
+        """The graph with a closure that is to be believed; None, and the graph as it was, if it is not."""
+        loop, before = self.graph.loops[number], list(self.graph.poses)
+        if not self.parts.together(loop.i, loop.j):
+            self._bring_together(loop)
+        result = self.graph.optimise(self._between_other_parts(loop))
+        if number not in result.rejected:
+            return result
+        reason = f"the pose graph does not believe it: {result.rejected[number]}"
+        self.events.append(LoopEvent("refused", frame_index, loop.j, loop.i, reason))
+        self.graph.poses = before
+        self.revisits.pause()
+        return None
+
+    # --- parts -------------------------------------------------------------------------------------------------------
+
+    def join_parts(self) -> Correction | None:
+        """Looks for places that two parts have in common, whole part against whole part, when there are no more frames.
+
+        Returns:
+            The correction that makes one of two parts, as of `add`; there may be more to join then. None: nothing is.
+        """
+        start, correction = time.perf_counter(), None
+        with self._lock:
+            firsts = self.parts.all()
+            for younger in firsts[:0:-1]:
+                for older in firsts[: firsts.index(younger)]:
+                    correction = correction or self._join(older, younger)
+        self.seconds += time.perf_counter() - start
+        return correction
+
+    def _join(self, older: int, younger: int) -> Correction | None:
+        olds, news = (sorted(self.parts.members(k)) for k in (older, younger))
+        links = find_agreeing_links(
+            olds, news, self.poses, self.places, self._surface, self.comparison, self._camera, self.settings.graph,
+            self.settings.candidates,
+        )  # fmt: skip
+        if len(links) < self.settings.confirmations:
+            return None
+        loops = [self.graph.add_loop(olds[k.old], news[k.new], k.T_old_new, k.information) for k in links]
+        result = self._optimise(-1, loops[0])
+        if result is None:
+            return None
+        self._note_joined(-1, olds[links[0].old], news[links[0].new])
+        both = {*olds, *news}
+        T_new_old = result.poses @ inverse(np.array(self.poses))
+        return Correction(result.poses, T_new_old, set(olds), set(news), both)
+
+    def begin_part(self, frame: Frame, first: int) -> None:
+        """A lost frame, which will be added as a keyframe, begins a part; `first`: index of its first frame."""
+        with self._lock:
+            self._parts_begin.add(_moment(frame))
+            reason = f"part {len(self.parts.begun) + len(self._parts_begin)} begins"
+            self.events.append(LoopEvent("new part", first, len(self.poses), -1, reason))
+
+    def move_world(self, T_new_old: np.ndarray) -> None:
+        """Everything is moved [4, 4]."""
+        with self._lock:
+            self.poses = [T_new_old @ T for T in self.poses]
+            self.graph.poses = list(self.poses)
+            self.activity.move(np.array(self.poses))
+            self._surface.arrange(self.activity.active, np.array(self.poses))
+
+    def _between_other_parts(self, loop: Link) -> list[int]:
+        """Numbers of the closures between parts that will not be one by this closure either: nothing but one another
+        could contradict them."""
+        parts = {self.parts.of[loop.i], self.parts.of[loop.j]}
+        ends = [(self.parts.of[other.i], self.parts.of[other.j]) for other in self.graph.loops]
+        return [k for k, (i, j) in enumerate(ends) if i != j and {i, j} != parts]
+
+    def _bring_together(self, loop: Link) -> None:
+        """Puts the graph's nodes of the younger of two parts to where a loop has them: the optimisation starts near its
+        end."""
+        old, new, T_old_new = loop.i, loop.j, loop.T_i_j
+        if self.parts.of[new] < self.parts.of[old]:
+            old, new, T_old_new = new, old, inverse(T_old_new)
+        T = self.poses[old] @ T_old_new @ inverse(self.poses[new])
+        for k in self.parts.members(new):
+            self.graph.poses[k] = T @ self.graph.poses[k]
+
+    def _note_joined(self, frame_index: int, old: int, new: int) -> None:
+        """Two parts are one."""
+        older, younger = sorted((old, new), key=lambda k: self.parts.of[k])
+        names = [self.parts.name(self.parts.members(k)) for k in (younger, older)]
+        self.events.append(LoopEvent("joined", frame_index, new, old, f"{names[0]} was joined to {names[1]}"))
+        self.parts.join(old, new)
 
     # --- lost frames -------------------------------------------------------------------------------------------------
 
@@ -359,6 +469,7 @@ class LoopCloser:
             if number:
                 self.graph.add_odometry(number - 1, number, inverse(self.poses[-1]) @ T, SURE_INFORMATION)
             self.poses.append(T.astype(float))
+            self.parts.add(number - 1)
             self._taken.append((None, 0))
             self.activity.add(T, float(depth))
         if not len(self.poses) == len(self.places) == len(self._surface):

@@ -141,6 +141,14 @@ class MapCorrections:
         self._unite_objects(correction)
         self._mapper.mend(sorted(ends), sorted(correction.doubted), loops.settings.repair_iterations)
 
+    def move_world(self, T_new_old: np.ndarray, loops: LoopCloser) -> None:
+        """Moves everything [4, 4]; for the end, when nothing is tracked any more."""
+        moves = np.tile(T_new_old, (len(loops.poses), 1, 1))
+        self._mapper.move_keyframes(moves)
+        with self._publishing:
+            loops.move_world(T_new_old)
+            self._moves.append(T_new_old)
+
     def _unite_objects(self, correction: Correction) -> None:
         """One thing that was mapped when the camera left and again when it came back has two ids: it keeps the older.
         """

@@ -80,10 +80,11 @@ class RealtimeSlam:
         slam, start = self.slam, time.perf_counter()
         slam.times.start()
         frame = slam.receive(frame)
+        slam.takes_keyframes = self._jobs.qsize() < MAX_WAITING  # and no fewer will wait until this one is put in
         with self._beside_mapper:
             tracking = slam.track(frame)
         frame = slam.without_movers(frame)
-        is_keyframe = self._jobs.qsize() < MAX_WAITING and slam.wants_keyframe(frame, tracking)
+        is_keyframe = slam.takes_keyframes and slam.wants_keyframe(frame, tracking)
         if is_keyframe:
             slam.poses.add_keyframe(tracking.T_world_camera)
             self._jobs.put((frame, tracking, slam.moves_followed))

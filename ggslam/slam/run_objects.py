@@ -38,7 +38,8 @@ class RunObjects:
             return self.learned
         self._settled = True  # if it fails below, the map can still be had by another call
         earlier = None if self.learned is None else self.learned.observations
-        seen = observations(mapper.keyframes, identity.current, earlier)
+        keyframes = [keyframe for keyframe in mapper.keyframes if keyframe.index not in mapper.left_out]
+        seen = observations(keyframes, identity.current, earlier)
         labels = mapper.vote_labels()
         sizes = np.bincount(labels, minlength=65536)
         if pager is not None:
@@ -47,9 +48,9 @@ class RunObjects:
         if self._masks.supervision != "masks":
             points = typical_points(mapper.map.means.cpu().numpy(), labels)
             since = {i: observation.first_frame for i, observation in seen.items()}
-            chances = count_chances(points, since, mapper.keyframes)
+            chances = count_chances(points, since, keyframes)
         ids, known = identity.classifier.class_ids, earlier or {}
-        noise = self._masks.noise(ids, seen, len(mapper.keyframes), sizes, chances, known)
+        noise = self._masks.noise(ids, seen, len(keyframes), sizes, chances, known)
         identity.forget(mapper.map, noise)
         mapper.finish_identity()
         kept = {i: observation for i, observation in seen.items() if i not in noise}

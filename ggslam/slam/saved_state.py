@@ -19,6 +19,7 @@ from ggslam.features.orb import FeatureView, Landmarks
 from ggslam.loops.activity import ActiveKeyframes
 from ggslam.loops.condensed import Link
 from ggslam.loops.odometry import OdometryTree
+from ggslam.loops.parts import KeyframeParts
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.loops.pose_graph import PoseGraph
 from ggslam.loops.revisits import Revisits
@@ -61,7 +62,9 @@ from ggslam.slam.earlier_views import EarlierViews
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.loop_closing import LoopCloser, LoopEvent, _Found
 from ggslam.slam.map_corrections import MapCorrections
+from ggslam.slam.map_parts import MapParts
 from ggslam.slam.object_masks import ObjectMasks
+from ggslam.slam.part_start import PartStart
 from ggslam.slam.result import LearnedObjects, SlamTimes, TrackedFrame
 from ggslam.slam.rig_clock import RigClock
 from ggslam.slam.rig_slam import RigSlam
@@ -78,6 +81,7 @@ from ggslam.tracking.edges_planes.voxels import FeatureMap
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.keyframes import KeyframeKind, KeyframePolicy
 from ggslam.tracking.motion import CameraMotion
+from ggslam.tracking.points import FramePoints
 from ggslam.tracking.residual_noise import ResidualNoise
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface, _Part
@@ -141,7 +145,10 @@ def check_state(slam: Slam) -> None:
         raise FormatError("the mean of the map: not of its Gaussians")
     slam.color_poses.check()
     counts = [len(surface), slam.poses.keyframes_made, len(mapper.keyframes)]
-    counts += [] if slam.loops is None else [len(slam.loops.poses), len(slam.loops.places)]
+    if slam.loops is not None:
+        counts += [len(slam.loops.poses), len(slam.loops.places), len(slam.loops.parts.of)]
+    if not mapper.left_out <= set(range(len(mapper.keyframes))):
+        raise FormatError("keyframes that were left out: not of this run")
     if len(set(counts)) > 1:
         raise FormatError(f"numbers of keyframes that do not agree: {counts}")
 
@@ -225,6 +232,7 @@ RULES: Rules = {
     ColorPoses: _but("mapper", "poses", "state", growing=_names("images")),
     FramePoses: Rule(growing=_names("frames")),
     MapCorrections: _but("_surface", "_mapper", "_pager", "_masks", "_publishing"),
+    MapParts: _but("_mapper", "_poses", "_corrections", "_loops"),
     RunObjects: _but("_masks"),
     RunMovers: _but("_reads_masks", "_margin", "context"),
     MoverDetector: _but("settings"),
@@ -252,6 +260,7 @@ RULES: Rules = {
         growing=_names("events"),
     ),
     PoseGraph: _but("settings", growing=_names("loops")),
+    PartStart: _but("target"),
     OdometryTree: Rule(growing=_names("parents", "poses", "covariances", "steps")),
     PlaceIndex: _but(
         "camera", "settings", "_bits", "_fern_pixels", "_fern_colors", "_fern_depths", "_lists",
@@ -275,7 +284,7 @@ RULES: Rules = {
          IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
          BoundingPlanes, BoundingPlane,
-         ShutterTimes, RigClock, EarlierViews, EarlierView),
+         ShutterTimes, RigClock, EarlierViews, EarlierView, KeyframeParts, FramePoints),
         Rule(),
     ),
 }  # fmt: skip

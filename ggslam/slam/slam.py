@@ -17,10 +17,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError
+from ggslam.features.orb import FeatureView
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.camera import Camera
@@ -35,6 +35,8 @@ from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.earlier_views import EarlierViews
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.map_corrections import MapCorrections
+from ggslam.slam.map_parts import MapParts
+from ggslam.slam.part_start import PartStart, pose_apart
 from ggslam.slam.parts import check_arguments, device_name, make_parts
 from ggslam.slam.result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
 from ggslam.slam.run_movers import RunMovers
@@ -99,12 +101,16 @@ class Slam:
         self.growing = True
         """Whether keyframes are made and the map is trained; off: frames are located in the map as it is."""
         self._corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
+        self._parts = MapParts(self.mapper, self.poses, self._corrections, self.loops)
         self._moves_followed = 0
         self._noise: DepthNoise | None = None
         self._objects = RunObjects(self.masks)
         self.color_poses = ColorPoses(self.mapper, self.poses, self.tracker.state)
         self._depth_edges, self._shutters, self._fixtures = DepthEdges(), ShutterTimes(), CameraFixtures()
         self.earlier_views = EarlierViews()
+        self.part_start = PartStart()
+        self.takes_keyframes = True
+        """Whether the next keyframe would be taken now; in real time none is while too many wait."""
         self.movers = RunMovers(self.config.movers, self.config.masks.source in ("auto", "recording"), self.context)
 
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
@@ -208,6 +214,7 @@ class Slam:
     @opencv_errors("after the last frame")
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refinement_steps`), then the result. `progress(done, total)` is called now and then."""
+        self.settle_parts()
         start, before = time.perf_counter() - self.times.refinement, self.mapper.times.iterations
         begin, steps = self.refine_iterations, self.refinement_steps  # `begin`: by a run that was cut off
 
@@ -233,18 +240,19 @@ class Slam:
         """What there is so far. The first call settles the objects: it is for the end."""
         self.times.loops = self.loops.seconds if self.loops is not None else 0.0
         self.mapper.end_refinement()
+        self.settle_parts()
         objects = self._objects.settle(self.mapper, self.pager) if self.growing else self._objects.learned
         cells = None if self.pager is None else self.pager.settle()
-        gaussians = self.map.to(torch.device("cpu"))
+        gaussians = self._parts.gaussians()
         return SlamResult(
-            gaussians, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
-            self.refine_iterations, objects, self.loops.events if self.loops else [],
+            gaussians, self._parts.keyframes(), self._parts.frames(), self.times, self.mapper.times,
+            self.dropped_frames, self.refine_iterations, objects, self._parts.events(),
             self._places(gaussians, cells), cells, None if self.pager is None else self.pager.report(),
             [*self._notes, *self._fixtures.notes(), *self.movers.notes(len(self.frames)),
              *self.earlier_views.notes(),
              *([] if self.pager is None else self.pager.budget.notes)],
             None if self.pager is None else self.pager.close, self.steps.to_csv(), device_name(self.map.device),
-            self.config, self.movers.pixels, self.movers.tracks.describe(),
+            self.config, self.movers.pixels, self._parts.movers(self.movers.tracks.describe()),
         )  # fmt: skip
 
     def _places(self, gaussians: GaussianMap, cells: GaussianCells | None) -> bytes | None:
@@ -252,10 +260,18 @@ class Slam:
         if self.loops is None or not len(self.surface):
             return None
         parts = [gaussians] if cells is None else (part for _, part in cells.parts())
-        poses = np.stack([k.T_world_camera for k in self.mapper.keyframes])
+        kept = self._parts.kept()
+        keyframes = [self.mapper.keyframes[k] for k in kept]
+        poses = np.stack([k.T_world_camera for k in keyframes])
         noise = self.tracker.noise or DepthNoise()
-        cameras = [k.camera for k in self.mapper.keyframes] if len(self.cameras) > 1 else None
-        return saved_places_to_bytes(self.camera, self.surface, self.loops, noise, self.scale, poses, parts, cameras)
+        cameras = [k.camera for k in keyframes] if len(self.cameras) > 1 else None
+        return saved_places_to_bytes(
+            self.camera, self.surface, self.loops, noise, self.scale, poses, parts, cameras, kept
+        )  # fmt: skip
+
+    def settle_parts(self) -> None:
+        """Makes one part of those that the recording fell into, see `MapParts`; when there are no more frames."""
+        self._parts.settle()
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, for a run that has no result."""
@@ -288,6 +304,10 @@ class Slam:
             if found is not None:
                 result, keyframe = found
                 self.poses.anchor_to(keyframe, self.loops.poses[keyframe])
+            else:
+                result = self._try_new_part(frame, result)
+        if result.status is not TrackingStatus.LOST:
+            self.part_start.forget()
         result = self.color_poses.align(frame, result)
         located = None if result.status is TrackingStatus.LOST else result.T_world_camera
         self._shutters.follow(located)
@@ -299,6 +319,22 @@ class Slam:
         self.times.tracking_by_frame.append(time.perf_counter() - start)
         self.times.tracking += self.times.tracking_by_frame[-1]
         return result
+
+    def _try_new_part(self, frame: Frame, lost: TrackingResult) -> TrackingResult:
+        """What tracking says of a lost frame that no place tells of: the same, or that a new part begins with it."""
+        loops, start = self.loops, self.part_start
+        if loops is None or not self.growing or self.pager is not None:
+            return lost
+        start.watch(frame, lost, self.tracker, self.tracker.context)
+        held_out = self.config.evaluation.is_held_out(frame.index)
+        if held_out or not self.takes_keyframes or not start.is_due(frame, self.tracker):
+            return lost
+        T = pose_apart(lost.T_world_camera, self.surface.poses, self.tracker.settings.points.max_depth)
+        loops.begin_part(frame, start.first)
+        keyframe = self.poses.keyframes_made
+        self.poses.locate_last(keyframe, start.begin(keyframe, lost, self.surface, T, self.tracker.context))
+        self.policy.begin_again()
+        return self.tracker.begin_part(FeatureView(frame.color, frame.depth, T), lost.points, T)
 
     def without_movers(self, frame: Frame) -> Frame:
         """The frame that was tracked last as the map gets it: without depth where something moves."""
@@ -322,6 +358,7 @@ class Slam:
 
     def _follow_moves(self) -> None:
         """The tracker goes along with corrections of the map made since the last frame."""
+        waits = len(self.surface) <= self.part_start.keyframe
         target, moves = self._corrections.news(self._moves_followed)
         self._moves_followed += len(moves)
         for T_new_old in moves:
@@ -330,6 +367,10 @@ class Slam:
             self.movers.move(T_new_old)
             self.policy.move(T_new_old)
             self.poses.move(T_new_old)
+        if not waits:
+            self.part_start.target = None
+        elif self.part_start.target is not None:
+            target = self.part_start.target
         if target is not None:
             self.tracker.set_target(target)
 

@@ -27,7 +27,7 @@ LONGER, LONGEST_ERROR, FEWEST_POSES = 1.4, 0.35, 10
 
 def judge_run(result: SlamResult) -> list[Verdict]:
     """What was measured while the run was made."""
-    checks = (_judge_motion, _judge_exposure, _judge_doubted, _judge_lost, _judge_dropped)
+    checks = (_judge_motion, _judge_exposure, _judge_doubted, _judge_lost, _judge_parts, _judge_dropped)
     return [verdict for check in checks for verdict in check(result)]
 
 
@@ -98,6 +98,15 @@ def _judge_lost(result: SlamResult) -> list[Verdict]:
         return []
     text = f"the camera was lost in {len(lost)} of {len(result.frames)} frames (the first: {lost[0]})"
     return [Verdict("lost", "wrong", f"{text}; move slower, and back to where it was found last")]
+
+
+def _judge_parts(result: SlamResult) -> list[Verdict]:
+    """Whether the recording fell into parts, of which the run has but one."""
+    left = [event.reason for event in result.loop_events if event.kind == "left out"]
+    if not left:
+        return []
+    hint = "record once more so that the camera comes back to a place that it has seen, or run the pieces by themselves"
+    return [Verdict("parts", "wrong", f"{'; '.join(left)}; {hint}")]
 
 
 def _judge_dropped(result: SlamResult) -> list[Verdict]:

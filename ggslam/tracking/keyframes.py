@@ -80,6 +80,10 @@ class KeyframePolicy:
         self.kind, self._frame_index, self._T_world_camera = kind, frame_index, tracked.T_world_camera.copy()
         return True
 
+    def begin_again(self) -> None:
+        """The camera is elsewhere: the next frame asked about becomes a keyframe."""
+        self.kind = None
+
     def move(self, T_new_old: np.ndarray) -> None:
         """The world about the last keyframe was moved by a correction [4, 4]."""
         self._T_world_camera = T_new_old @ self._T_world_camera

@@ -16,6 +16,9 @@ from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.tracking.settings import UNBOUNDED, DepthNoise, PointSettings
 
+THICKNESS = 0.01
+"""Of a point's disc along its normal against along the surface: the tracker's planes."""
+
 
 class PointSource(Protocol):
     """Points of a frame, which may still have to be computed or fetched."""
@@ -178,3 +181,14 @@ def extract_points(
     out = structures.DepthPointsOutput(*(address(array) for array in arrays))
     count = load_library().ggslam_depth_points(context.handle, address(depth), arguments, out)
     return FramePoints(*(array[:count] for array in arrays))
+
+
+def disc_points(points: np.ndarray, normals: np.ndarray, noise: DepthNoise) -> FramePoints:
+    """Points of a frame of which only float32 points and normals [n, 3] were kept; their shapes are discs."""
+    points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    covariances = np.stack([(i == j) - (1 - THICKNESS) * normals[:, i] * normals[:, j] for i, j in pairs], 1)
+    sigma = noise.constant + noise.square * points[:, 2].astype(float) ** 2
+    weights = (noise.sigma(1.0) / sigma) ** 2
+    pixels = np.zeros((len(points), 2), np.int32)
+    return FramePoints(points, normals, covariances.astype(np.float32), pixels, weights.astype(np.float32))

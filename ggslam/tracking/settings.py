@@ -176,6 +176,12 @@ class RecoverySettings:
     """Located frames whose features are matched, the latest first."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     """Of the frames, and when their matches make a start."""
+    new_part_after: int = setting(10, 0, 10**9, "frames")
+    """After so many lost frames in a row that show surfaces, each overlapping with the one before, a new part of the
+    map begins; a loop joins it to the others. 0: never; nor without `loops.enabled`, with a limit of memory, with a
+    rig, or where the map does not grow."""
+    new_part_seconds: float = setting(0.3, 0, 1e9, "s")
+    """And these frames span at least so long."""
 
 
 @dataclass(frozen=True)

@@ -205,6 +205,10 @@ class MeasuredSurface:
         for numbers in self._joined:
             self.target = self._gather([self._parts[number] for number in numbers], self.target)
 
+    def measured(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Points, metres, and normals float32 [n, 3] of a keyframe in its camera's frame."""
+        return self._parts[number].points, self._parts[number].normals
+
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Everything, for a file: points to 1/32767 of the farthest of a keyframe, normals to half a degree."""
         points = [np.float32(np.abs(p.points).max(initial=1e-6)) for p in self._parts]

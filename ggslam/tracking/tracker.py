@@ -188,6 +188,19 @@ class Tracker(ABC):
         motion.remember(view, points, self.settings)
         return TrackingResult(T.copy(), TrackingStatus.RECOVERED, found.overlap, found.rmse, source, points, found)
 
+    def begin_part(self, view: FeatureView, points: PointSource, T_world_camera: np.ndarray) -> TrackingResult:
+        """Nothing knows where a lost frame is: tracking goes on from it at a pose [4, 4] of the caller's choice.
+
+        Args:
+            view: the frame, which becomes a keyframe.
+            points: of the frame.
+            T_world_camera: where nothing else was mapped.
+        """
+        motion, T = self.state.motion, np.array(T_world_camera, float)
+        motion.restart(view, T)
+        motion.remember(view, points, self.settings)
+        return TrackingResult(T.copy(), TrackingStatus.FIRST, 1.0, 0.0, "a new part of the map begins", points)
+
     def _begin(self, view: FeatureView, points: PointSource) -> TrackingResult:
         """Before the first keyframe: the pose is given, and all a frame needs is depth to begin with."""
         motion, needed = self.state.motion, self.settings.align.min_matches

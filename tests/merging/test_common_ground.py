@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ggslam.loops.agreement import GroundLink, agreeing_links
 from ggslam.loops.settings import GraphSettings
-from ggslam.merging.common_ground import CommonGround, GroundLink, agreeing_links
+from ggslam.merging.common_ground import CommonGround
 from ggslam.merging.joint_graph import attachment_order, solve_joint_graph
 from ggslam.merging.settings import MergeSettings
 from ggslam.scene.poses import inverse, se3_exp, separation

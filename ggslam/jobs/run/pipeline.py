@@ -74,6 +74,8 @@ class RunOutcome:
         parts += [f"{len(r.dropped_frames)} frames dropped"] if r.dropped_frames else []
         closed = sum(event.kind == "closed" for event in r.loop_events)
         parts += [f"{closed} loop{'s' if closed > 1 else ''} closed"] if closed else []
+        joined = sum(event.kind == "joined" for event in r.loop_events)
+        parts += [f"{joined} part{'s' if joined > 1 else ''} joined"] if joined else []
         return ", ".join(parts)
 
 

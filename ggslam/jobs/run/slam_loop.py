@@ -126,6 +126,7 @@ class SlamLoop:
         self.stop.raise_if_any()
 
     def _refine(self, slam: Slam) -> SlamResult:
+        slam.settle_parts()
         wanted = slam.refinement_steps
         if wanted:
             self.observer.begin("refine", wanted)

@@ -162,9 +162,10 @@ class CpuMapper(Mapper):
 
     def drop_hidden(self) -> None:
         least = self.settings.pruning.min_weight
-        if not least or not self.keyframes or len(self._trainable()) < len(self.keyframes):
+        if not least or not self.keyframes or len(self._trainable()) < len(self._all_numbers):
             return
-        own, newest = [k for k in self.keyframes if k.frame_index != ELSEWHERE], self.keyframes[-1]
+        keyframes = [self.keyframes[k] for k in self._all_numbers]
+        own, newest = [k for k in keyframes if k.frame_index != ELSEWHERE], keyframes[-1]
         untrained = {k.index for k in own if k is newest or (k.instant is not None and k.instant == newest.instant)}
         born = self.map.birth_keyframe.numpy()
         stays = ~np.isin(born, [k.index for k in own if k.index not in untrained])

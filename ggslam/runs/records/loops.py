@@ -51,13 +51,24 @@ class LoopsRecord(RecordFile):
             f"{e.old_keyframe}"
             for e in self.events if e.kind == "closed"
         ]  # fmt: skip
+        notes += [_note_of_part(e) for e in self.events if e.kind in ("joined", "left out")]
+        begun = {e.frame: e.reason for e in self.events if e.kind == "new part"}
         reasons = {e.frame: e.reason for e in self.events if e.kind == "found again"}
         for stretch in self.lost:
             ending = " and not found again"
-            if stretch.after is not None:
+            if stretch.after in begun:
+                ending = f"; {begun[stretch.after]} at frame {stretch.after}"
+            elif stretch.after is not None:
                 reason = reasons.get(stretch.after)
                 ending = f", found again at frame {stretch.after}" + (f": {reason}" if reason else "")
             notes.append(
                 f"lost for {stretch.frames} frames ({stretch.seconds:.2f} s) from frame {stretch.first}{ending}"
             )
         return notes
+
+
+def _note_of_part(event: LoopEventRecord) -> str:
+    if event.kind == "left out":
+        return event.reason
+    when = f"at frame {event.frame}" if event.frame >= 0 else "when the recording had ended"
+    return f"{event.reason} {when}"

@@ -111,12 +111,21 @@ class FeatureTracker(Tracker):
     def relocate(self, view: FeatureView, points: PointSource, found: AlignmentResult, source: str) -> TrackingResult:
         """As `Tracker.relocate`; the local map begins anew there."""
         result = super().relocate(view, points, found, source)
-        self.local_map.clear()
-        scan = self._extractor.extract(view.depth, self.noise or DepthNoise())
-        self.local_map.add(scan, result.T_world_camera)
+        self._begin_again(view, result.T_world_camera)
+        return result
+
+    def begin_part(self, view: FeatureView, points: PointSource, T_world_camera: np.ndarray) -> TrackingResult:
+        """As `Tracker.begin_part`; the local map begins anew there."""
+        result = super().begin_part(view, points, T_world_camera)
+        self._begin_again(view, result.T_world_camera)
         return result
 
     # --- parts -------------------------------------------------------------------------------------------------------
+
+    def _begin_again(self, view: FeatureView, T_world_camera: np.ndarray) -> None:
+        """The local map is that of one view at a pose [4, 4]."""
+        self.local_map.clear()
+        self.local_map.add(self._extractor.extract(view.depth, self.noise or DepthNoise()), T_world_camera)
 
     def _points(self, frame: Frame) -> FramePoints:
         return extract_points(frame.depth, self.camera, self.settings.points, self.noise or DepthNoise(), self.context)

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of a run when it ends: those that have places in common become one, of the others one is the result.
+
+Parts that nothing joins lie at arbitrary places. They must not be in one map, nor in one trajectory: the largest stays,
+in a world that begins with its first keyframe; the frames of the others count as lost.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.mapper import Mapper
+from ggslam.movers.found import FoundMover
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.poses import inverse
+from ggslam.slam.frame_poses import FramePoses
+from ggslam.slam.loop_closing import LoopCloser, LoopEvent
+from ggslam.slam.map_corrections import MapCorrections
+from ggslam.slam.result import TrackedFrame
+from ggslam.tracking.tracker import TrackingStatus
+
+NOT_JOINED = "of a part of the recording that could not be joined"
+PART_EVENTS = ("new part", "left out")
+
+
+class MapParts:
+    """Makes one part of those there are.
+
+    Args:
+        mapper: whose map they are in.
+        poses: of the frames.
+        corrections: of the map.
+        loops: knows the parts, and finds what joins them; None: there is one part.
+    """
+
+    def __init__(
+        self, mapper: Mapper, poses: FramePoses, corrections: MapCorrections, loops: LoopCloser | None
+    ) -> None:
+        self._mapper, self._poses, self._corrections, self._loops = mapper, poses, corrections, loops
+
+    def settle(self) -> None:
+        """After the last frame; does nothing where there is one part."""
+        loops = self._loops
+        if loops is None or self._mapper.left_out:
+            return
+        while len(loops.parts.all()) > 1:
+            correction = loops.join_parts()
+            if correction is None:
+                self._keep_largest(loops)
+                return
+            self._corrections.apply(correction, loops)
+
+    def _keep_largest(self, loops: LoopCloser) -> None:
+        kept, frames = loops.parts.members(self._largest(loops)), self._poses.frames
+        gone = [k for k, frame in enumerate(frames) if _is_located(frame) and frame.keyframe not in kept]
+        for begin, end in _stretches(gone):
+            first, last = frames[begin].frame_index, frames[end].frame_index
+            name = loops.parts.name(loops.parts.members(frames[begin].keyframe))
+            which = f"frames {first}-{last} are {name}, which" if last > first else f"frame {first} is {name}, which"
+            reason = f"{which} could not be joined to the rest: no place of it was seen again"
+            loops.events.append(LoopEvent("left out", first, frames[begin].keyframe, -1, reason))
+        for k in gone:
+            frames[k] = replace(frames[k], status=TrackingStatus.LOST.value, reason=NOT_JOINED)
+        self._mapper.leave_out(set(range(len(loops.poses))) - kept)
+        first_kept = min(kept)
+        if first_kept > 0:  # the world is its first keyframe's camera
+            self._corrections.move_world(inverse(self._mapper.keyframes[first_kept].T_world_camera), loops)
+
+    def _largest(self, loops: LoopCloser) -> int:
+        """The part with the most frames, the oldest of several; but a map that the run began with is never left."""
+        if any(keyframe.frame_index == ELSEWHERE for keyframe in self._mapper.keyframes):
+            return 0
+        located = [frame.keyframe for frame in self._poses.frames if _is_located(frame)]
+        counts = Counter(loops.parts.of[keyframe] for keyframe in located if keyframe < len(loops.poses))
+        return min(counts, key=lambda part: (-counts[part], part), default=0)
+
+    def kept(self) -> list[int]:
+        """Numbers of the keyframes that are the result."""
+        return [k for k in range(len(self._mapper.keyframes)) if k not in self._mapper.left_out]
+
+    def keyframes(self) -> list[Keyframe]:
+        """Those that are the result, numbered as there are no others."""
+        keyframes, kept = self._mapper.keyframes, self.kept()
+        if len(kept) == len(keyframes):
+            return keyframes
+        return [_numbered(keyframes[k], number) for number, k in enumerate(kept)]
+
+    def frames(self) -> list[TrackedFrame]:
+        """The frames, which hang on these keyframes."""
+        frames, numbers = self._poses.frames, self._numbers()
+        return frames if numbers is None else [replace(f, keyframe=int(numbers[f.keyframe])) for f in frames]
+
+    def events(self) -> list[LoopEvent]:
+        """What happened to these keyframes, and which were left out."""
+        events = [] if self._loops is None else self._loops.events
+        numbers = self._numbers()
+        if numbers is None:
+            return events
+        left_out, told = self._mapper.left_out, []
+        for event in events:
+            ends = (event.keyframe, event.old_keyframe)
+            if event.kind in PART_EVENTS:
+                told.append(replace(event, keyframe=-1, old_keyframe=-1))
+            elif left_out.isdisjoint(ends):
+                told.append(replace(event, keyframe=int(numbers[ends[0]]), old_keyframe=int(numbers[ends[1]])))
+        return told
+
+    def gaussians(self) -> GaussianMap:
+        """The map in the host's memory, whose Gaussians know the number of the keyframe that inserted them."""
+        gaussians, numbers = self._mapper.map.to(torch.device("cpu")), self._numbers()
+        if numbers is None:
+            return gaussians
+        gaussians = copy.deepcopy(gaussians)
+        birth = gaussians.birth_keyframe.long()
+        found = torch.from_numpy(numbers)[birth.clamp(min=0)]
+        gaussians.birth_keyframe[:] = torch.where(birth < 0, birth, found).to(gaussians.birth_keyframe.dtype)
+        return gaussians
+
+    def movers(self, found: list[FoundMover]) -> list[FoundMover]:
+        """Of the movers that were found those that a frame of the result shows."""
+        lost = {f.frame_index for f in self._poses.frames if f.reason == NOT_JOINED}
+        return [mover for mover in found if lost.isdisjoint(sight.frame for sight in mover.sights)]
+
+    def _numbers(self) -> np.ndarray | None:
+        """By the number of a keyframe in the run that of the last one of the result up to it; None: they are the
+        same."""
+        left_out = self._mapper.left_out
+        if not left_out:
+            return None
+        stays = np.array([k not in left_out for k in range(len(self._mapper.keyframes) + 1)])
+        return np.maximum(np.cumsum(stays) - 1, 0)
+
+
+def _is_located(frame: TrackedFrame) -> bool:
+    return frame.status != TrackingStatus.LOST.value
+
+
+def _stretches(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last of each run of successive numbers, which rise."""
+    if not numbers:
+        return []
+    edges = np.flatnonzero(np.diff(numbers) > 1)
+    firsts, lasts = [0, *(edges + 1)], [*edges, len(numbers) - 1]
+    return [(numbers[a], numbers[b]) for a, b in zip(firsts, lasts, strict=True)]
+
+
+def _numbered(keyframe: Keyframe, number: int) -> Keyframe:
+    """A keyframe with another number, in the host's memory."""
+    k = keyframe
+    return Keyframe(
+        number, k.frame_index, k.timestamp, k.camera, k.color, k.depth, k.T_camera_world, k.mask, k.exposure,
+        k.iterations, None, k.camera_number, k.instant, k.moving,
+    )  # fmt: skip

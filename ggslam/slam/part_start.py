@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When a lost camera that no place tells of begins a new part of the map.
+
+Frames that see no surface (a covered lens) or too little of one another (a shaken camera) could not be tracked from one
+another either; they begin nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ggslam.native.loader import NativeContext
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse, orthonormalize
+from ggslam.tracking.gicp import AlignmentStatus, GicpTarget, align
+from ggslam.tracking.points import FramePoints
+from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.surface import MeasuredSurface
+from ggslam.tracking.tracker import Tracker, TrackingResult
+
+APART = 12.5
+"""How far apart parts are laid, in units of the farthest depth that is used: 100 m in a room, where float32 still tells
+hundredths of a millimetre."""
+
+
+@dataclass
+class PartStart:
+    """Watches the frames that are lost.
+
+    Attributes:
+        poses: of the latest frames in a row that can be tracked from one another, in the camera's frame of the first of
+            them, [4, 4] each.
+        first: index of the first of them.
+        since: time of the first of them, seconds.
+        reference: number in `poses` and points of the frame that the next one is aligned to.
+        before: points of the latest.
+        turned: float64 [4, 4], how the image had turned by then since the camera was lost (`CameraMotion.turned`).
+        keyframe: number of the keyframe that began the newest part.
+        target: what frames are aligned to until that is in.
+    """
+
+    poses: list[np.ndarray] = field(default_factory=list)
+    first: int = 0
+    since: float = 0.0
+    reference: tuple[int, FramePoints] | None = None
+    before: FramePoints | None = None
+    turned: np.ndarray = field(default_factory=lambda: np.eye(4))
+    keyframe: int = -1
+    target: GicpTarget | None = None
+
+    def forget(self) -> None:
+        """The camera is not lost, or shows nothing that it could be tracked by."""
+        self.poses, self.reference, self.before = [], None, None
+
+    def watch(self, frame: Frame, lost: TrackingResult, tracker: Tracker, context: NativeContext) -> None:
+        """A frame was lost, and no place tells where it is."""
+        if len(lost.points) < tracker.settings.align.min_matches:
+            self.forget()
+            return
+        points, T = lost.points.read(), self._locate(lost, tracker, context)
+        if T is None:
+            T, self.poses, self.reference = np.eye(4), [], (0, points)
+            self.first, self.since = frame.index, frame.timestamp
+        self.poses.append(T)
+        self.before, self.turned = points, tracker.state.motion.turned.copy()
+
+    def is_due(self, frame: Frame, tracker: Tracker) -> bool:
+        """Whether a part may begin with this frame, which was watched last."""
+        recovery = tracker.settings.recovery
+        enough = 0 < recovery.new_part_after <= len(self.poses)
+        return enough and frame.timestamp - self.since >= recovery.new_part_seconds
+
+    def begin(
+        self, keyframe: int, lost: TrackingResult, surface: MeasuredSurface, T_world_camera: np.ndarray,
+        context: NativeContext,
+    ) -> list[np.ndarray]:  # fmt: skip
+        """A part begins with a keyframe [4, 4]; frames are aligned to its points until it is in the surface.
+
+        Returns:
+            Where the watched frames before it were, in its camera's frame [4, 4], in their order.
+        """
+        own = MeasuredSurface(surface.settings, context)
+        own.finish = surface.finish
+        self.keyframe, self.target = keyframe, own.add(lost.points, T_world_camera)
+        *earlier, last = self.poses
+        self.forget()
+        return [inverse(last) @ T for T in earlier]
+
+    def _locate(self, lost: TrackingResult, tracker: Tracker, context: NativeContext) -> np.ndarray | None:
+        """The pose of a lost frame among those watched [4, 4]; None if it cannot be tracked from them."""
+        if self.reference is None or self.before is None:
+            return None
+        guess = self.poses[-1] @ inverse(self.turned) @ tracker.state.motion.turned
+        newest = len(self.poses) - 1
+        for number, points in (self.reference, (newest, self.before)):
+            found = _align_two(lost, points, inverse(self.poses[number]) @ guess, tracker, context)
+            if found is not None:
+                self.reference = number, points
+                return orthonormalize(self.poses[number] @ found)
+        return None
+
+
+def _align_two(
+    lost: TrackingResult, earlier: FramePoints, guess: np.ndarray, tracker: Tracker, context: NativeContext
+) -> np.ndarray | None:
+    """The pose of a frame in the camera's frame of an earlier one [4, 4]; None if too little of it was seen there."""
+    settings, noise = tracker.settings, tracker.noise or DepthNoise()
+    target = MeasuredSurface(settings.target, context).add(earlier, np.eye(4))
+    found = align(lost.points.read(), target, guess, settings.align, noise, context)
+    if found.status is AlignmentStatus.LOST or found.overlap < settings.recovery.convincing_overlap:
+        return None
+    return found.T_world_camera
+
+
+def pose_apart(T_world_camera: np.ndarray, keyframes: np.ndarray, farthest_m: float) -> np.ndarray:
+    """A pose [4, 4] for a new part: as the camera was last known to look, and far above everything mapped so far.
+
+    Args:
+        T_world_camera: the last known pose [4, 4].
+        keyframes: poses of the keyframes [K, 4, 4].
+        farthest_m: depth that is used at most, metres.
+    """
+    T = T_world_camera.copy()
+    highest = min(float(T[1, 3]), float(keyframes[:, 1, 3].min(initial=np.inf)))  # the y axis points down
+    T[1, 3] = highest - APART * farthest_m
+    return T
