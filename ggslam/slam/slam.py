@@ -323,7 +323,8 @@ class Slam:
     def _try_new_part(self, frame: Frame, lost: TrackingResult) -> TrackingResult:
         """What tracking says of a lost frame that no place tells of: the same, or that a new part begins with it."""
         loops, start = self.loops, self.part_start
-        if loops is None or not self.growing or self.pager is not None:
+        wanted = self.tracker.settings.recovery.new_part_after > 0 and self.pager is None
+        if loops is None or not self.growing or not wanted:
             return lost
         start.watch(frame, lost, self.tracker, self.tracker.context)
         held_out = self.config.evaluation.is_held_out(frame.index)

@@ -301,6 +301,8 @@ def _live(request: VolumesRequest, maps: VolumeMaps, observer: Observer) -> _Fus
     )  # fmt: skip
     outcome = execute(run, observer, follower)
     fused.name, fused.error = str(outcome.folder.path), outcome.error
+    if follower.follow_parts(outcome.result):  # of which some lay at arbitrary places
+        fused.poses = [T for T in outcome.result.trajectory() if np.isfinite(T).all()]
     if outcome.folder.has_objects():
         objects = outcome.folder.object_table()
         follower.settle(objects.ids())

@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.frame import Frame
-from ggslam.slam.result import StepReport
+from ggslam.slam.result import SlamResult, StepReport
 from ggslam.slam.slam import Slam
 from ggslam.tracking.tracker import TrackingStatus
 from ggslam.volumes.maps import VolumeMaps
@@ -47,6 +47,14 @@ class LiveVolumes:
         labels = next((keyframe.mask for keyframe in newest if keyframe.frame_index == frame.index), None)
         self.maps.add(frame, T, labels, report.seconds + time.perf_counter() - start)
         self._saw(frame, T)
+
+    def follow_parts(self, result: SlamResult) -> bool:
+        """At the end: fuses the keyframes anew if the recording fell into parts, some of which were left out or joined
+        since the last frame. Returns whether there were several parts."""
+        kinds = {event.kind for event in result.loop_events}
+        if "left out" in kinds or any(e.kind == "joined" and e.frame < 0 for e in result.loop_events):
+            self.maps.rebuild(_views(result.keyframes, self._objects))
+        return "new part" in kinds
 
     def settle(self, known_ids: list[int]) -> None:
         """At the end: what became one object later is one, and what is not among `known_ids` is none."""
