@@ -152,12 +152,17 @@ class ActiveKeyframes:
     def activate_around(self, number: int) -> None:
         """Takes back keyframe `number` and its neighbours in time that look at the same surface: how they lie to the
         camera is known now."""
-        near = self._near(number)
+        self._take_back(self.around(number))
+
+    def around(self, number: int) -> set[int]:
+        """Keyframe `number` and its neighbours in time that look at the same surface."""
+        near, found = self._near(number), {number}
         for step in (-1, 1):
             k = number
             while 0 <= k < len(self) and (near[k] or abs(k - number) <= self.settings.spread):
-                self._take_back({k})
+                found.add(k)
                 k += step
+        return found
 
     @property
     def median_depths(self) -> np.ndarray:

@@ -27,7 +27,7 @@ from ggslam.scene.poses import inverse, separation
 from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.part_joining import find_agreeing_links
 from ggslam.slam.place_comparison import PlaceComparison
-from ggslam.tracking.gicp import AlignmentResult
+from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult
@@ -438,13 +438,23 @@ class LoopCloser:
             if not found.accepted or alignment is None:
                 continue
             old = match.number
+            reason = f"keyframe {old}: {found.inliers} features, {found.overlap:.0%} of the voxels"
+            self.go_on_at(frame, old, reason)
+            return self._tracker.relocate(view, lost.points, alignment, reason), old
+        return None
+
+    def go_on_at(self, frame: Frame, old: int, reason: str) -> None:
+        """A lost frame was found about keyframe `old`; `reason` says how."""
+        with self._lock:
             self._found_at = _moment(frame), old
             self.activity.restart(old)
             self._surface.arrange(self.activity.active)
-            reason = f"keyframe {old}: {found.inliers} features, {found.overlap:.0%} of the voxels"
             self.events.append(LoopEvent("found again", frame.index, len(self.poses), old, reason))
-            return self._tracker.relocate(view, lost.points, alignment, reason), old
-        return None
+
+    def target_around(self, keyframe: int) -> GicpTarget:
+        """The surface about a keyframe, as `go_on_at` would arrange it."""
+        with self._lock:
+            return self._surface.of(sorted(self.activity.around(keyframe)))
 
     # --- files -------------------------------------------------------------------------------------------------------
 

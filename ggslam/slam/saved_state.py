@@ -60,6 +60,7 @@ from ggslam.slam.config import Config
 from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.earlier_views import EarlierViews
 from ggslam.slam.frame_poses import FramePoses
+from ggslam.slam.left_parts import LeftPart, LeftParts
 from ggslam.slam.loop_closing import LoopCloser, LoopEvent, _Found
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.map_parts import MapParts
@@ -261,6 +262,7 @@ RULES: Rules = {
     ),
     PoseGraph: _but("settings", growing=_names("loops")),
     PartStart: _but("target"),
+    LeftPart: _but("target"),
     OdometryTree: Rule(growing=_names("parents", "poses", "covariances", "steps")),
     PlaceIndex: _but(
         "camera", "settings", "_bits", "_fern_pixels", "_fern_colors", "_fern_depths", "_lists",
@@ -284,7 +286,8 @@ RULES: Rules = {
          IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
          BoundingPlanes, BoundingPlane,
-         ShutterTimes, RigClock, EarlierViews, EarlierView, KeyframeParts, FramePoints),
+         ShutterTimes, RigClock, EarlierViews, EarlierView, KeyframeParts, FramePoints,
+         LeftParts),
         Rule(),
     ),
 }  # fmt: skip

@@ -34,6 +34,7 @@ from ggslam.slam.config import Config
 from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.earlier_views import EarlierViews
 from ggslam.slam.frame_poses import FramePoses
+from ggslam.slam.left_parts import LeftParts
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.map_parts import MapParts
 from ggslam.slam.part_start import PartStart, pose_apart
@@ -108,7 +109,7 @@ class Slam:
         self.color_poses = ColorPoses(self.mapper, self.poses, self.tracker.state)
         self._depth_edges, self._shutters, self._fixtures = DepthEdges(), ShutterTimes(), CameraFixtures()
         self.earlier_views = EarlierViews()
-        self.part_start = PartStart()
+        self.part_start, self.left_parts = PartStart(), LeftParts()
         self.takes_keyframes = True
         """Whether the next keyframe would be taken now; in real time none is while too many wait."""
         self.movers = RunMovers(self.config.movers, self.config.masks.source in ("auto", "recording"), self.context)
@@ -298,9 +299,12 @@ class Slam:
         self._follow_moves()
         if not len(self.surface):
             self.use_scale(scene_scale(frame.depth))
-        result = self.tracker.track(self.movers.expect(frame))
+        expected = self.movers.expect(frame)
+        result = self.tracker.track(expected)
         if result.status is TrackingStatus.LOST and self.loops is not None and self.tracker.target is not None:
             found = self.loops.find(frame, result)
+            if found is None and self.left_parts.parts:
+                found = self.left_parts.find(expected, self.poses.anchor[0], self.tracker, self.loops)
             if found is not None:
                 result, keyframe = found
                 self.poses.anchor_to(keyframe, self.loops.poses[keyframe])
@@ -308,6 +312,7 @@ class Slam:
                 result = self._try_new_part(frame, result)
         if result.status is not TrackingStatus.LOST:
             self.part_start.forget()
+            self.left_parts.settle()
         result = self.color_poses.align(frame, result)
         located = None if result.status is TrackingStatus.LOST else result.T_world_camera
         self._shutters.follow(located)
@@ -330,6 +335,7 @@ class Slam:
         held_out = self.config.evaluation.is_held_out(frame.index)
         if held_out or not self.takes_keyframes or not start.is_due(frame, self.tracker):
             return lost
+        self.left_parts.leave(*self.poses.anchor, self.tracker)
         T = pose_apart(lost.T_world_camera, self.surface.poses, self.tracker.settings.points.max_depth)
         loops.begin_part(frame, start.first)
         keyframe = self.poses.keyframes_made

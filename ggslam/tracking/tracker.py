@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import enum
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -187,6 +187,25 @@ class Tracker(ABC):
         motion.restart(view, T)
         motion.remember(view, points, self.settings)
         return TrackingResult(T.copy(), TrackingStatus.RECOVERED, found.overlap, found.rmse, source, points, found)
+
+    def track_from(self, frame: Frame, motion: CameraMotion, target: GicpTarget) -> TrackingResult:
+        """Tries to locate a frame that was lost, as a camera that was lost elsewhere; if that succeeds without doubt,
+        tracking goes on there, else nothing changes and the frame is lost.
+
+        Args:
+            frame: the frame.
+            motion: of that camera; it is changed.
+            target: what was to be seen there.
+        """
+        state = self.state
+        before = state.motion, state.target
+        state.motion, state.target = motion, target
+        result = self.track(frame)
+        if result.status is TrackingStatus.DOUBTED:
+            result = replace(result, status=TrackingStatus.LOST)
+        if result.status is TrackingStatus.LOST:
+            state.motion, state.target = before
+        return result
 
     def begin_part(self, view: FeatureView, points: PointSource, T_world_camera: np.ndarray) -> TrackingResult:
         """Nothing knows where a lost frame is: tracking goes on from it at a pose [4, 4] of the caller's choice.

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from kept import build_once, generated_recording, session_folder
@@ -195,6 +196,71 @@ def test_another_run_goes_on_bit_for_bit(back: Path, joined: tuple[Slam, SlamRes
     assert result.places == whole.places
 
 
+def behind_a_board(frames: Sequence[Frame], hidden: range) -> list[Frame]:
+    """Something textured is held before the lens, 40 cm away, and turned a little from frame to frame."""
+    random = np.random.default_rng(0)
+    texture = cv2.resize(random.integers(0, 255, (40, 60, 3), np.uint8), (400, 300), interpolation=cv2.INTER_CUBIC)
+    u, v = np.meshgrid(np.arange(160), np.arange(120))
+    out = list(frames)
+    for k in hidden:
+        since = k - hidden.start
+        depth = 0.4 + 0.05 * np.sin(u / 25 + 0.1 * since) + 0.04 * np.cos(v / 20) + random.normal(0, 0.0015, u.shape)
+        color = texture[10 + since : 130 + since, 20 + 2 * since : 180 + 2 * since].copy()
+        out[k] = dataclasses.replace(frames[k], color=color, depth=depth.astype(np.float32))
+    return out
+
+
+def test_what_covers_the_view_for_long_takes_nothing_away(walk: Path) -> None:
+    """It becomes a part, and when it is gone the camera is found where it was lost, although no place tells that it is
+    there: the recording's other frames are located as if there had been no part."""
+    walked = frames_of(walk)
+    order = [*range(30), *np.linspace(30, 40, 40).round().astype(int), *range(40, 75)]
+    played = [dataclasses.replace(walked[i], index=k, timestamp=k / 30) for k, i in enumerate(order)]
+    frames = behind_a_board(played, range(30, 70))
+    slam = run(frames)
+    assert slam.loops is not None and len(slam.loops.parts.begun) == 2
+    result = slam.finish()
+    (found,) = (event for event in result.loop_events if event.kind == "found again")
+    assert found.frame == 70 and found.reason == "where the camera was lost before"
+    assert lost(result) == list(range(30, 70))
+    plain = run(frames, "tracking.recovery.new_part_after=0").finish()
+    errors, without = errors_mm(result, frames), errors_mm(plain, frames)
+    assert len(errors) == len(without) and errors.max() < without.max() + 10 < 40
+    tree, arrays = describe_state(run(frames[:60]))
+    again = Slam(slam.camera, slam.config, has_masks=False)
+    restore_state(again, tree, [array.copy() for array in arrays])
+    for frame in frames[60:]:
+        again.step(frame)
+    assert again.finish().trajectory().tobytes() == result.trajectory().tobytes()
+
+
+@pytest.mark.parametrize("setting", ["tracker=features", "movers.enabled=false", "loops.activity.forget_after=0.5"])
+def test_other_ways_of_running_join_parts_too(back: Path, setting: str) -> None:
+    frames = frames_of(back)
+    result = run(frames, setting).finish()
+    assert any(event.kind == "joined" for event in result.loop_events)
+    assert lost(result) == list(HIDDEN)
+    errors = errors_mm(result, frames)
+    assert np.sqrt((errors**2).mean()) < 20
+    assert_in_one_room(result)
+
+
+def test_objects_of_what_is_left_out_are_none(away: Path) -> None:
+    """With the recording's masks: those that the kept frames show, no others."""
+    sequence = open_sequence(away)
+    settings = load_config(None, ["mapping.iterations_per_frame=2", "refine_iterations=10", "masks.source=recording"])
+    slam, shown = Slam(sequence.camera, settings, has_masks=True), [set[int](), set[int]()]
+    for frame in sequence.stream(masks="lazy"):
+        slam.step(frame)
+    for keyframe in slam.mapper.keyframes:
+        assert keyframe.mask is not None
+        shown[keyframe.frame_index >= BEGINNING].update(np.unique(keyframe.mask).tolist())
+    result = slam.finish()
+    assert result.objects is not None and len(shown[0] - shown[1]) > 3
+    assert set(result.objects.observations) <= shown[1]
+    assert {o.id for o in result.object_table().objects if o.gaussians} <= shown[1]
+
+
 def test_a_run_that_only_localizes_begins_no_part(away: Path, tmp_path: Path) -> None:
     few: dict[str, Any] = {"overrides": CHEAP, "evaluate": False}
     execute(RunRequest(SequenceRequest(away, stop=BEGINNING), out=tmp_path / "map", **few))
@@ -231,7 +297,7 @@ def test_run_folders_have_one_part(away: Path, tmp_path: Path) -> None:
     result = execute(known).result
     assert set(range(18)) <= set(lost(result)) <= set(range(20))
     earlier = np.array([record.poses()[k] for k in range(18, 44)])
-    assert np.nanmax(np.abs(result.trajectory()[18:] - earlier)[:, :3, 3]) < 0.02
+    assert np.nanmax(np.abs(result.trajectory()[18:] - earlier)[:, :3, 3]) < 0.04
 
 
 def test_in_real_time_a_part_begins_before_its_keyframe_is_mapped(back: Path) -> None:

@@ -17,8 +17,9 @@ from ggslam.tracking.edges_planes.extraction import ScanFeatures
 from ggslam.tracking.edges_planes.local_map import LocalFeatureMap
 from ggslam.tracking.edges_planes.scans import DepthImageFeatures
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
-from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, PointMatches
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PointMatches
 from ggslam.tracking.gicp_tracker import GicpTracker
+from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.observability import about_point
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource, extract_points
@@ -112,6 +113,13 @@ class FeatureTracker(Tracker):
         """As `Tracker.relocate`; the local map begins anew there."""
         result = super().relocate(view, points, found, source)
         self._begin_again(view, result.T_world_camera)
+        return result
+
+    def track_from(self, frame: Frame, motion: CameraMotion, target: GicpTarget) -> TrackingResult:
+        """As `Tracker.track_from`, by G-ICP; the local map begins anew there."""
+        result = self._gicp.track_from(frame, motion, target)
+        if result.status is not TrackingStatus.LOST:
+            self._begin_again(self.state.motion.views[0], result.T_world_camera)
         return result
 
     def begin_part(self, view: FeatureView, points: PointSource, T_world_camera: np.ndarray) -> TrackingResult:
