@@ -65,8 +65,8 @@ def _known_run(folder: RunFolder, arrays: dict[str, Any], context: NativeContext
     normals = measured["normals"].astype(np.float32)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
     loops = folder.loops()
-    events = [] if loops is None else [e for e in loops.events if e.kind in ("closed", "joined")]
-    closures = [(min(ends), max(ends)) for e in events if (ends := (e.old_keyframe, e.keyframe))]
+    events = [] if loops is None else [event for event in loops.events if event.kind in ("closed", "joined")]
+    closures = [(min(e.old_keyframe, e.keyframe), max(e.old_keyframe, e.keyframe)) for e in events]
     return KnownRun(
         str(folder.path), cameras, tracking, DepthNoise(constant, square), scale, surface,
         np.split(measured["points"].astype(np.float32) * reach, ends), np.split(normals, ends),

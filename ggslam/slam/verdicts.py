@@ -8,7 +8,7 @@ import numpy as np
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.rendering.exposure import change_of
 from ggslam.scene.poses import fit_similarity
-from ggslam.sequences.verdicts import Verdict, judge_scale_by
+from ggslam.sequences.verdicts import Severity, Verdict, judge_scale_by
 from ggslam.slam.map_parts import NOT_JOINED
 from ggslam.slam.result import SlamResult
 from ggslam.tracking.gicp_tracker import MIN_TEXTURED
@@ -107,7 +107,7 @@ def _judge_parts(result: SlamResult) -> list[Verdict]:
     if not left:
         return []
     gone = sum(frame.reason == NOT_JOINED for frame in result.frames)
-    level = "wrong" if gone >= max(FEWEST_FRAMES, LOST_SHARE * len(result.frames)) else "doubtful"
+    level: Severity = "wrong" if gone >= max(FEWEST_FRAMES, LOST_SHARE * len(result.frames)) else "doubtful"
     hint = "record once more so that the camera comes back to a place that it has seen, or run the pieces by themselves"
     return [Verdict("parts", level, f"{'; '.join(left)}; {hint}")]
 
