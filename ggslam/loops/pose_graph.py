@@ -30,8 +30,9 @@ _RIGID_M, _RIGID_DEG = 1e-4, 1e-3
 """Standard deviations of where the cameras of a rig are to one another."""
 SURE_INFORMATION = 1e6 * np.eye(6)
 """Of a motion that is sure to a millimetre and a milliradian: then drift is all that is unsure of it."""
-_ANYWHERE, _ANYWHERE_DEG = 10.0, 360.0
-"""Standard deviations of a motion that nothing is known of: so many times its length, and all round."""
+_ANYWHERE, _ANYWHERE_DEG = 100.0, 3600.0
+"""Standard deviations of a motion that nothing is known of: so many times its length, and ten times around. Its pull is
+then below a hundredth of a millimetre."""
 
 
 def odometry_covariance(T_i_j: np.ndarray, information: np.ndarray, settings: GraphSettings) -> np.ndarray:

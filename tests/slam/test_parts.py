@@ -210,6 +210,7 @@ def behind_a_board(frames: Sequence[Frame], hidden: range) -> list[Frame]:
     return out
 
 
+@pytest.mark.long("three runs of a hundred frames, and one resumed")
 def test_what_covers_the_view_for_long_takes_nothing_away(walk: Path) -> None:
     """It becomes a part, and when it is gone the camera is found where it was lost, although no place tells that it is
     there: the recording's other frames are located as if there had been no part."""
@@ -300,6 +301,7 @@ def test_run_folders_have_one_part(away: Path, tmp_path: Path) -> None:
     assert np.nanmax(np.abs(result.trajectory()[18:] - earlier)[:, :3, 3]) < 0.04
 
 
+@pytest.mark.long("at a pace of ten frames a second")
 def test_in_real_time_a_part_begins_before_its_keyframe_is_mapped(back: Path) -> None:
     """Frames come at a third of a camera's pace; the machine may be slow, so that some may be dropped."""
     frames = frames_of(back)
