@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from ggslam.features.orb import FeatureView
 from ggslam.loops.activity import ActiveKeyframes
+from ggslam.loops.agreement import GroundLink
 from ggslam.loops.condensed import Link
 from ggslam.loops.parts import KeyframeParts
 from ggslam.loops.places import Place, PlaceIndex
@@ -25,7 +26,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
 from ggslam.slam.loop_settings import LoopSettings
-from ggslam.slam.part_joining import find_agreeing_links
+from ggslam.slam.part_joining import find_links, links_between
 from ggslam.slam.place_comparison import PlaceComparison
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.points import PointSource
@@ -343,37 +344,32 @@ class LoopCloser:
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
-    def join_parts(self) -> Correction | None:
-        """Looks for places that two parts have in common, whole part against whole part, when there are no more frames.
+    def common_places(self) -> list[GroundLink]:
+        """Places that parts have in common, as far as one finds them when there are no more frames."""
+        start = time.perf_counter()
+        links = find_links(
+            self.parts, self.poses, self.places, self._surface, self.comparison, self._camera, self.settings.candidates
+        )  # fmt: skip
+        self.seconds += time.perf_counter() - start
+        return links
+
+    def join(self, older: int, younger: int, links: Sequence[GroundLink]) -> Correction | None:
+        """Makes one part of two, each given as its oldest keyframe, by places that parts have in common.
 
         Returns:
-            The correction that makes one of two parts, as of `add`; there may be more to join then. None: nothing is.
+            As `add`; None if too few of the places agree.
         """
-        start, correction = time.perf_counter(), None
-        with self._lock:
-            firsts = self.parts.all()
-            for younger in firsts[:0:-1]:
-                for older in firsts[: firsts.index(younger)]:
-                    correction = correction or self._join(older, younger)
-        self.seconds += time.perf_counter() - start
-        return correction
-
-    def _join(self, older: int, younger: int) -> Correction | None:
-        olds, news = (sorted(self.parts.members(k)) for k in (older, younger))
-        links = find_agreeing_links(
-            olds, news, self.poses, self.places, self._surface, self.comparison, self._camera, self.settings.graph,
-            self.settings.candidates,
-        )  # fmt: skip
-        if len(links) < self.settings.confirmations:
+        olds, news = self.parts.members(older), self.parts.members(younger)
+        agreeing = links_between(links, olds, news, self.poses, self.settings.graph)
+        if len(agreeing) < self.settings.confirmations:
             return None
-        loops = [self.graph.add_loop(olds[k.old], news[k.new], k.T_old_new, k.information) for k in links]
+        loops = [self.graph.add_loop(k.old, k.new, k.T_old_new, k.information) for k in agreeing]
         result = self._optimise(-1, loops[0])
         if result is None:
             return None
-        self._note_joined(-1, olds[links[0].old], news[links[0].new])
-        both = {*olds, *news}
+        self._note_joined(-1, agreeing[0].old, agreeing[0].new)
         T_new_old = result.poses @ inverse(np.array(self.poses))
-        return Correction(result.poses, T_new_old, set(olds), set(news), both)
+        return Correction(result.poses, T_new_old, olds, news, olds | news)
 
     def begin_part(self, frame: Frame, first: int) -> None:
         """A lost frame, which will be added as a keyframe, begins a part; `first`: index of its first frame."""

@@ -15,6 +15,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from ggslam.loops.agreement import GroundLink
+from ggslam.loops.parts import KeyframeParts
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.movers.found import FoundMover
@@ -48,14 +50,17 @@ class MapParts:
     def settle(self) -> None:
         """After the last frame; does nothing where there is one part."""
         loops = self._loops
-        if loops is None or self._mapper.left_out:
+        if loops is None or self._mapper.left_out or len(loops.parts.all()) < 2:
             return
-        while len(loops.parts.all()) > 1:
-            correction = loops.join_parts()
+        links, refused = loops.common_places(), set[tuple[int, int]]()
+        while (pair := _next_pair(loops.parts, links, refused)) is not None:
+            correction = loops.join(*pair, links)
             if correction is None:
-                self._keep_largest(loops)
-                return
-            self._corrections.apply(correction, loops)
+                refused.add(pair)
+            else:
+                self._corrections.apply(correction, loops)
+        if len(loops.parts.all()) > 1:
+            self._keep_largest(loops)
 
     def _keep_largest(self, loops: LoopCloser) -> None:
         kept, frames = loops.parts.members(self._largest(loops)), self._poses.frames
@@ -136,6 +141,15 @@ class MapParts:
             return None
         stays = np.array([k not in left_out for k in range(len(self._mapper.keyframes) + 1)])
         return np.maximum(np.cumsum(stays) - 1, 0)
+
+
+def _next_pair(
+    parts: KeyframeParts, links: Sequence[GroundLink], refused: set[tuple[int, int]]
+) -> tuple[int, int] | None:
+    """The two parts with the most places in common, the older one first, that were not refused."""
+    ends = (sorted((parts.of[link.old], parts.of[link.new])) for link in links)
+    counts = Counter((older, younger) for older, younger in ends if older != younger)
+    return next((pair for pair, _ in counts.most_common() if pair not in refused), None)
 
 
 def _is_located(frame: TrackedFrame) -> bool:

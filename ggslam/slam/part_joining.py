@@ -1,55 +1,87 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether two parts of a run have places in common: whole part against whole part, when the recording has ended.
+"""Places that the parts of a run have in common: whole part against whole part, when the recording has ended.
 
 While it was recorded, a keyframe was compared with older ones alone, and a loop was believed if the next keyframes
-found the same. Here pairs from all over the two parts may confirm one another, as where runs are merged.
+found the same. Here pairs from all over two parts may confirm one another, as where runs are merged.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ggslam.loops.agreement import GroundLink, agreeing_links
+from ggslam.loops.parts import KeyframeParts
 from ggslam.loops.places import PlaceIndex
 from ggslam.loops.settings import GraphSettings
+from ggslam.loops.uncertainty import information_in_frame
 from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse
 from ggslam.slam.place_comparison import PlaceComparison
 from ggslam.tracking.points import disc_points
 from ggslam.tracking.surface import MeasuredSurface
 
-QUERIES = 60
-"""Keyframes of a part that are looked up in another one at most, spread evenly."""
+QUERIES = 200
+"""Keyframes that are looked up at most, spread evenly."""
 
 
-def find_agreeing_links(
-    older: Sequence[int], younger: Sequence[int], poses: Sequence[np.ndarray], places: PlaceIndex,
-    surface: MeasuredSurface, comparison: PlaceComparison, camera: Camera, settings: GraphSettings, candidates: int,
+def find_links(
+    parts: KeyframeParts, poses: Sequence[np.ndarray], places: PlaceIndex, surface: MeasuredSurface,
+    comparison: PlaceComparison, camera: Camera, candidates: int,
 ) -> list[GroundLink]:  # fmt: skip
-    """Pairs of keyframes of two parts that see the same surfaces and agree on how the parts lie to each other, the one
-    first that most agree with.
+    """Pairs of keyframes of different parts that see the same surfaces. Those of the largest part are not looked up,
+    but found.
 
     Args:
-        older, younger: numbers of the keyframes of either part, rising.
-        poses: T_world_camera of all keyframes, [4, 4] each.
-        places: of all keyframes.
-        surface: of all keyframes.
+        parts: of the keyframes.
+        poses: T_world_camera of the keyframes, [4, 4] each.
+        places: of the keyframes.
+        surface: of the keyframes.
         comparison: compares two of them.
-        camera: of all keyframes.
-        settings: how much tracking drifts within a part.
-        candidates: keyframes that are tried for one of the other part.
+        camera: of the keyframes.
+        candidates: keyframes that are tried for one, the likeliest first.
     """
+    largest = Counter(parts.of).most_common(1)[0][0]
+    asked = [k for k, part in enumerate(parts.of) if part != largest]
     links = []
-    for k in np.unique(np.linspace(0, len(younger) - 1, min(len(younger), QUERIES)).round().astype(int)).tolist():
-        new = younger[k]
+    for k in np.unique(np.linspace(0, len(asked) - 1, min(len(asked), QUERIES)).round().astype(int)).tolist():
+        new, own = asked[k], parts.members(asked[k])
         place = places.with_words(places[new])
         points = disc_points(*surface.measured(new), comparison.noise)
-        for match in places.query(place, candidates, lambda n: n not in older):
+        for match in places.query(place, candidates, own.__contains__):
             found, _ = comparison.find(points, place, places, poses, match.number, camera)
             if found.accepted:
-                at = older.index(match.number), k
-                links.append(GroundLink(*at, found.T_old_new, found.information, found.inliers, found.overlap))
+                inliers, overlap = found.inliers, found.overlap
+                links.append(GroundLink(match.number, new, found.T_old_new, found.information, inliers, overlap))
                 break
-    own = [np.array([poses[n] for n in numbers]) for numbers in (older, younger)]
-    return [links[k] for k in agreeing_links(links, own[0], own[1], settings)]
+    return links
+
+
+def links_between(
+    links: Sequence[GroundLink], older: set[int], younger: set[int], poses: Sequence[np.ndarray],
+    settings: GraphSettings,
+) -> list[GroundLink]:  # fmt: skip
+    """Those links that join two parts and agree on how these lie to each other, the one first that most agree with.
+
+    Args:
+        links: of all parts, whichever of a link's keyframes is the older one.
+        older, younger: numbers of the keyframes of either part; `old` of the links returned is of the first.
+        poses: T_world_camera of all keyframes, [4, 4] each.
+        settings: how much tracking drifts within a part.
+    """
+    turned = [*links, *map(_turn, links)]
+    ours = [link for link in turned if link.old in older and link.new in younger]
+    numbers = [sorted(older), sorted(younger)]
+    own = [np.array([poses[n] for n in part]) for part in numbers]
+    local = [replace(link, old=numbers[0].index(link.old), new=numbers[1].index(link.new)) for link in ours]
+    return [ours[k] for k in agreeing_links(local, own[0], own[1], settings)]
+
+
+def _turn(link: GroundLink) -> GroundLink:
+    """The link as seen from its other end."""
+    T_new_old = inverse(link.T_old_new)
+    information = information_in_frame(link.information, T_new_old)
+    return replace(link, old=link.new, new=link.old, T_old_new=T_new_old, information=information)
